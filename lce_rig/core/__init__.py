@@ -1,0 +1,1 @@
+"""Types and mathematics everything else is built on: numpy and scipy only, no files, no devices."""

@@ -1,0 +1,156 @@
+"""Camera models: pixels from points and rays from pixels, with their range of validity."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.geometry import Array
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera with distortion; pixel centres at integers.
+
+    Attributes:
+        fx_px, fy_px, cx_px, cy_px: the camera matrix.
+        width_px, height_px: size of the picture the numbers belong to.
+        model: "radtan" (k1 k2 p1 p2 [k3 [k4 k5 k6]], as OpenCV's plumb bob and rational models) or
+            "equidistant" (k1..k4, as OpenCV's fisheye and Kalibr's equi).
+        distortion: the coefficients, in the order above.
+    """
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    width_px: int
+    height_px: int
+    model: Literal["radtan", "equidistant"] = "radtan"
+    distortion: tuple[float, ...] = ()
+
+    @cached_property
+    def matrix(self) -> Array:
+        """The camera matrix K (3, 3)."""
+        return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1]])
+
+    @cached_property
+    def max_radius(self) -> float:
+        """Largest r = tan(angle) (radtan) or angle in rad (equidistant) up to which distortion is monotonic.
+
+        Beyond it the polynomial folds back and draws points from outside the field of view into the picture.
+        """
+        limit, n = (10.0, 20001) if self.model == "radtan" else (np.pi, 6284)
+        r = np.linspace(0.0, limit, n)
+        growth = np.diff(self._distorted_radius(r))
+        falling = np.flatnonzero(growth <= 0)
+        return float(r[falling[0]]) if len(falling) else float(limit)
+
+    def _coefficients(self, n: int) -> Array:
+        padded = np.zeros(n)
+        padded[: len(self.distortion)] = self.distortion
+        return padded
+
+    def _distorted_radius(self, r: Array) -> Array:
+        if self.model == "equidistant":
+            k = self._coefficients(4)
+            s = r * r
+            return np.asarray(r * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])))))
+        return np.asarray(r * self._radial_scale(r * r))
+
+    def _radial_scale(self, s: Array) -> Array:
+        k1, k2, _, _, k3, k4, k5, k6 = self._coefficients(8)
+        scale = (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6)))
+        return np.asarray(scale)
+
+    def _distort(self, xy: Array) -> Array:
+        """Distort normalised coordinates x/z, y/z (radtan only)."""
+        _, _, p1, p2, *_ = self._coefficients(8)
+        x, y = xy[..., 0], xy[..., 1]
+        s = x * x + y * y
+        scale = self._radial_scale(s)
+        return np.stack(
+            [
+                x * scale + 2 * p1 * x * y + p2 * (s + 2 * x * x),
+                y * scale + p1 * (s + 2 * y * y) + 2 * p2 * x * y,
+            ],
+            axis=-1,
+        )
+
+    def project(self, points_camera: NDArray[Any]) -> tuple[Array, NDArray[np.bool_]]:
+        """Project points into the picture.
+
+        Args:
+            points_camera: (..., 3) m, frame camera optical (x right, y down, z forward).
+
+        Returns:
+            Pixels (..., 2), NaN where invalid, and validity (...,): in front of the camera and within the
+            radius up to which the distortion is monotonic. A valid pixel may lie outside the picture.
+        """
+        points = np.asarray(points_camera, dtype=np.float64)
+        z = points[..., 2]
+        rho = np.hypot(points[..., 0], points[..., 1])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if self.model == "equidistant":
+                angle = np.arctan2(rho, z)
+                is_valid = (angle < self.max_radius) & np.isfinite(rho)
+                scale = np.where(rho > 1e-12, self._distorted_radius(angle) / rho, 1.0 / z)
+                xy = points[..., :2] * scale[..., None]
+            else:
+                is_valid = (z > 1e-6) & (rho < self.max_radius * z)
+                xy = self._distort(points[..., :2] / np.where(is_valid, z, 1.0)[..., None])
+        pixels = xy * [self.fx_px, self.fy_px] + [self.cx_px, self.cy_px]
+        pixels[~is_valid] = np.nan
+        return pixels, is_valid
+
+    def unproject(self, pixels: NDArray[Any]) -> Array:
+        """Find the unit ray through each pixel, by Newton's method.
+
+        Args:
+            pixels: (..., 2).
+
+        Returns:
+            (..., 3) unit vectors, frame camera optical; NaN where no ray within the valid radius fits.
+        """
+        xy = (np.asarray(pixels, dtype=np.float64) - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
+        return self._unproject_equidistant(xy) if self.model == "equidistant" else self._unproject_radtan(xy)
+
+    def _unproject_equidistant(self, xy: Array) -> Array:
+        radius = np.linalg.norm(xy, axis=-1)
+        angle = np.minimum(radius, 0.9 * self.max_radius)
+        k = self._coefficients(4) * [3, 5, 7, 9]
+        for _ in range(20):
+            s = angle * angle
+            slope = 1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])))
+            step = (self._distorted_radius(angle) - radius) / np.where(np.abs(slope) > 1e-3, slope, 1e-3)
+            angle = np.clip(angle - step, 0.0, self.max_radius)
+        angle = np.where(np.abs(self._distorted_radius(angle) - radius) < 1e-8, angle, np.nan)
+        direction = xy / np.where(radius > 1e-12, radius, 1.0)[..., None]
+        return np.concatenate([direction * np.sin(angle)[..., None], np.cos(angle)[..., None]], axis=-1)
+
+    def _unproject_radtan(self, xy: Array) -> Array:
+        guess = xy.copy()
+        step = 1e-6
+        for _ in range(20):
+            error = self._distort(guess) - xy
+            col_x = (self._distort(guess + [step, 0]) - self._distort(guess - [step, 0])) / (2 * step)
+            col_y = (self._distort(guess + [0, step]) - self._distort(guess - [0, step])) / (2 * step)
+            det = col_x[..., 0] * col_y[..., 1] - col_y[..., 0] * col_x[..., 1]
+            det = np.where(np.abs(det) > 1e-3, det, 1e-3)
+            dx = (col_y[..., 1] * error[..., 0] - col_y[..., 0] * error[..., 1]) / det
+            dy = (col_x[..., 0] * error[..., 1] - col_x[..., 1] * error[..., 0]) / det
+            guess = guess - np.clip(np.stack([dx, dy], axis=-1), -0.5, 0.5)
+        miss = np.linalg.norm(self._distort(guess) - xy, axis=-1)
+        is_bad = (miss > 1e-8) | (np.linalg.norm(guess, axis=-1) >= self.max_radius)
+        guess = np.where(is_bad[..., None], np.nan, guess)
+        rays = np.concatenate([guess, np.ones((*guess.shape[:-1], 1))], axis=-1)
+        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+
+    def is_inside(self, pixels: Array, margin_px: float = 0.0) -> NDArray[np.bool_]:
+        """Tell which pixels lie in the picture, at least `margin_px` from its border; NaN never does."""
+        u, v = pixels[..., 0], pixels[..., 1]
+        inside = (u >= margin_px) & (u <= self.width_px - 1 - margin_px)
+        inside &= (v >= margin_px) & (v <= self.height_px - 1 - margin_px)
+        return np.asarray(inside)

@@ -1,0 +1,70 @@
+"""What sensors deliver, as frozen samples."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """One picture.
+
+    Attributes:
+        sensor: name of the camera in the rig profile.
+        channel: channel of that camera ("frames", "events").
+        stamp_ns: mid exposure, device time; None where the recording carries no time.
+        host_ns: arrival at the host; None where unknown.
+        pixels: (H, W) grey or (H, W, 3) BGR, uint8.
+    """
+
+    sensor: str
+    channel: str
+    stamp_ns: int | None
+    pixels: NDArray[np.uint8]
+    host_ns: int | None = None
+
+    @property
+    def grey(self) -> NDArray[np.uint8]:
+        """The picture as (H, W) uint8 grey values (ITU-R BT.601 weights)."""
+        if self.pixels.ndim == 2:
+            return self.pixels
+        weights = np.array([0.114, 0.587, 0.299], dtype=np.float32)
+        return np.asarray(np.rint(self.pixels @ weights), dtype=np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One LiDAR revolution.
+
+    Attributes:
+        sensor: name of the LiDAR in the rig profile.
+        stamp_ns: first firing, device time; None where the recording carries no time.
+        points: (N, 3) float32 m, frame lidar (x forward, y left, z up); finite, no zero ranges.
+        intensity: (N,) float32; zeros where the recording has none.
+        ring: (N,) int16, 0 = lowest elevation.
+        offset_ns: (N,) int64 firing time after stamp_ns; None where the recording carries none.
+        host_ns: arrival at the host; None where unknown.
+    """
+
+    sensor: str
+    stamp_ns: int | None
+    points: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    ring: NDArray[np.int16]
+    offset_ns: NDArray[np.int64] | None = None
+    host_ns: int | None = None
+
+    def select(self, keep: NDArray[Any]) -> "Scan":
+        """Keep the points of a mask or index (N,) or (M,)."""
+        offset = None if self.offset_ns is None else self.offset_ns[keep]
+        return Scan(
+            self.sensor,
+            self.stamp_ns,
+            self.points[keep],
+            self.intensity[keep],
+            self.ring[keep],
+            offset,
+            self.host_ns,
+        )

@@ -1,0 +1,56 @@
+"""Errors the user can repair; each says what and where, and what to do about it."""
+
+
+class LceRigError(Exception):
+    """Base of every error the user can repair.
+
+    Args:
+        what: what is wrong and where (file and key, sensor, capture), one line.
+        hint: what to do about it; empty where `what` says it already.
+    """
+
+    exit_code = 1
+
+    def __init__(self, what: str, hint: str = "") -> None:
+        super().__init__(what)
+        self.what = what
+        self.hint = hint
+
+    def __str__(self) -> str:
+        return f"{self.what}\n  {self.hint}" if self.hint else self.what
+
+
+class UsageError(LceRigError):
+    """A command line that cannot be meant."""
+
+    exit_code = 2
+
+
+class ProfileError(LceRigError):
+    """A rig profile that cannot be used."""
+
+    exit_code = 3
+
+
+class SessionError(LceRigError):
+    """A session folder that cannot be read, written or continued."""
+
+    exit_code = 4
+
+
+class SourceError(LceRigError):
+    """A sensor, recording or dependency that cannot be read."""
+
+    exit_code = 5
+
+
+class NotEnoughDataError(LceRigError):
+    """Too few captures, or captures that leave a direction undetermined."""
+
+    exit_code = 6
+
+
+class ResultRefusedError(LceRigError):
+    """A result that was computed and must not be used."""
+
+    exit_code = 7

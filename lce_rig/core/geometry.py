@@ -1,0 +1,143 @@
+"""Rotations and poses as plain arrays.
+
+`T_a_b` is a (4, 4) array that takes points from frame b to frame a. A tangent vector is
+(translation m, rotation rad) with R = exp(phi^) R0 and t = t0 + tau, the order and meaning of
+ROS PoseWithCovariance. Every function takes leading batch axes.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def skew(v: Array) -> Array:
+    """Build v^, the matrix with v^ w = v x w.
+
+    Args:
+        v: (..., 3).
+    """
+    v = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def exp_so3(phi: Array) -> Array:
+    """Compute R = exp(phi^) by Rodrigues' formula, exact at zero.
+
+    Args:
+        phi: (..., 3) rotation vector, rad.
+    """
+    phi = np.asarray(phi, dtype=np.float64)
+    angle2 = np.sum(phi * phi, axis=-1)[..., None, None]
+    angle = np.sqrt(angle2)
+    small = angle2 < 1e-8
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0 - angle2 / 6.0, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
+    k = skew(phi)
+    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+
+
+def log_so3(R: Array) -> Array:
+    """Compute phi with R = exp(phi^), |phi| <= pi.
+
+    Args:
+        R: (..., 3, 3).
+    """
+    from scipy.spatial.transform import Rotation
+
+    R = np.asarray(R, dtype=np.float64)
+    flat = R.reshape(-1, 3, 3)
+    phi: Array = Rotation.from_matrix(flat).as_rotvec().reshape(*R.shape[:-2], 3)
+    return phi
+
+
+def project_to_so3(A: Array) -> Array:
+    """Find the rotation nearest to A in the Frobenius norm.
+
+    Args:
+        A: (..., 3, 3).
+    """
+    U, _, Vt = np.linalg.svd(A)
+    U = U.copy()
+    U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    return np.asarray(U @ Vt)
+
+
+def rotation_angle(R_1: Array, R_2: Array) -> Array:
+    """Measure the angle between two rotations in rad, accurate for tiny angles.
+
+    Args:
+        R_1: (..., 3, 3).
+        R_2: (..., 3, 3).
+    """
+    half_sine = np.linalg.norm(np.asarray(R_1) - R_2, axis=(-2, -1)) / np.sqrt(8.0)
+    return np.asarray(2.0 * np.arcsin(np.clip(half_sine, 0.0, 1.0)))
+
+
+def pose(R: Array, t: Array) -> Array:
+    """Build T from R (..., 3, 3) and t (..., 3)."""
+    R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
+    shape = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
+    T = np.zeros((*shape, 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
+
+
+def invert(T_a_b: Array) -> Array:
+    """Compute T_b_a (..., 4, 4)."""
+    R_b_a = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
+    return pose(R_b_a, -(R_b_a @ T_a_b[..., :3, 3:])[..., 0])
+
+
+def transform(T_a_b: Array, points_b: NDArray[Any]) -> Array:
+    """Take points from frame b to frame a: p_a = R p_b + t.
+
+    Args:
+        T_a_b: (..., 4, 4).
+        points_b: (..., N, 3) in m.
+    """
+    R_a_b = T_a_b[..., :3, :3]
+    return np.asarray(points_b @ np.swapaxes(R_a_b, -1, -2) + T_a_b[..., None, :3, 3], dtype=np.float64)
+
+
+def perturb(T: Array, tangent: Array) -> Array:
+    """Apply a tangent (translation m, rotation rad): R = exp(phi^) R0, t = t0 + tau.
+
+    Args:
+        T: (..., 4, 4).
+        tangent: (..., 6).
+    """
+    return pose(exp_so3(tangent[..., 3:]) @ T[..., :3, :3], T[..., :3, 3] + tangent[..., :3])
+
+
+def difference(T_1: Array, T_2: Array) -> Array:
+    """Compute the tangent (..., 6) that takes T_2 to T_1, the inverse of `perturb`."""
+    phi = log_so3(T_1[..., :3, :3] @ np.swapaxes(T_2[..., :3, :3], -1, -2))
+    return np.concatenate([T_1[..., :3, 3] - T_2[..., :3, 3], phi], axis=-1)
+
+
+def fit_plane(points: NDArray[Any]) -> tuple[Array, float]:
+    """Fit n.p + d = 0 by least squares, n towards the origin of the points' frame (d >= 0).
+
+    Args:
+        points: (N, 3) with N >= 3, m.
+
+    Returns:
+        Plane (4,) as (n, d) with unit n, and the rms distance of the points in m.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    centre = points.mean(axis=0)
+    spread = points - centre
+    _, eigenvectors = np.linalg.eigh(spread.T @ spread)
+    normal = eigenvectors[:, 0]
+    d = -float(normal @ centre)
+    if d < 0:
+        normal, d = -normal, -d
+    rms = float(np.sqrt(np.mean((spread @ normal) ** 2)))
+    return np.append(normal, d), rms

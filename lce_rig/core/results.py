@@ -1,0 +1,180 @@
+"""What the stages hand to each other, as frozen dataclasses."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.geometry import Array
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a capture is not used.
+
+    Attributes:
+        stage: "read", "image", "lidar", "pair" (the two sensors disagree) or "calibrate" (outlier).
+        cause: what was seen, with its figure: "2 rings on the board".
+        action: what to do: "come 0.8 m closer".
+    """
+
+    stage: Literal["read", "image", "lidar", "pair", "calibrate"]
+    cause: str
+    action: str
+
+
+@dataclass(frozen=True, eq=False)
+class ImageBoard:
+    """The board as one picture shows it.
+
+    Attributes:
+        corners_px: (rows * cols, 2) in the order of `Board.corners()`.
+        T_cam_board: (4, 4), the pose with the smaller reprojection error.
+        cov: (6, 6) of T_cam_board, tangent (translation m, rotation rad).
+        T_cam_board_alternative: (4, 4) second local minimum; None where there is none in front of the camera.
+        chi2_gap: by how much the alternative's cost is higher, in units of the corner variance.
+        is_ambiguous: whether the picture alone cannot decide between the two (chi2_gap < 9).
+        reprojection_px: rms of the corner residuals.
+        sigma_px: corner noise per coordinate, from the residuals and their degrees of freedom.
+        quality: figures by name: sharpness, tilt_deg, distance_m, square_px, border_px, ...
+    """
+
+    corners_px: Array
+    T_cam_board: Array
+    cov: Array
+    T_cam_board_alternative: Array | None
+    chi2_gap: float
+    is_ambiguous: bool
+    reprojection_px: float
+    sigma_px: float
+    quality: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class LidarBoard:
+    """The board as one scan shows it, frame lidar.
+
+    Attributes:
+        points: (N, 3) on the board as measured, m.
+        ring: (N,) int16 of each point.
+        edge_points: (M, 3) first and last point of each ring on the board, as measured, m.
+        edge_ring: (M,) int16.
+        edge_side: (M,) int8, -1 where the board ends towards smaller azimuth, +1 towards larger
+            (azimuth = atan2(y, x), counter-clockwise).
+        azimuth_step_rad: angle between neighbouring firings of one ring.
+        plane: (4,) as (n, d), n.p + d = 0, unit n towards the LiDAR (d > 0).
+        sigma_m: rms distance of `points` from the plane.
+        T_lidar_board: (4, 4) from the template; known up to the symmetries of a rectangle.
+        offset_ns: (N,) int64 firing time of each point after the scan's stamp; None without.
+        quality: figures by name: n_rings, n_points, thickness_m, width_m, height_m, edge_rms_m, template_m,
+            distance_m, ...
+    """
+
+    points: Array
+    ring: NDArray[np.int16]
+    edge_points: Array
+    edge_ring: NDArray[np.int16]
+    edge_side: NDArray[np.int8]
+    azimuth_step_rad: float
+    plane: Array
+    sigma_m: float
+    T_lidar_board: Array
+    offset_ns: NDArray[np.int64] | None = None
+    quality: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """One board placement seen by one camera channel and one LiDAR."""
+
+    capture: str
+    image: ImageBoard
+    lidar: LidarBoard
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Proof that a pose is the global minimum of its cost.
+
+    Attributes:
+        is_optimal: whether the gap is below the tolerance.
+        gap: bound on (cost - global minimum) / cost.
+    """
+
+    is_optimal: bool
+    gap: float
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSolution:
+    """A pose estimate T (4, 4) with cov (6, 6), the cost at T and its certificate."""
+
+    T: Array
+    cov: Array
+    cost: float
+    certificate: Certificate
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Errors of an extrinsic; the definitions stand in docs/conventions.md.
+
+    Attributes:
+        mpe_m: mean over captures of the mean distance of LiDAR board points from the camera's board plane.
+        mee_m: mean over captures of the mean distance of ring ends from the board's edges.
+        mge_m: mpe_m + mee_m.
+        reprojection_px: rms corner residual of the board poses.
+    """
+
+    mpe_m: float
+    mee_m: float
+    reprojection_px: float
+
+    @property
+    def mge_m(self) -> float:
+        """Mean geometric error, the paper's summary figure."""
+        return self.mpe_m + self.mee_m
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The extrinsic of one camera channel and one LiDAR, with everything needed to judge it.
+
+    Attributes:
+        T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
+        cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
+        egt_rotation_deg, egt_translation_m: error against a reference given by the user; None without.
+        verdict: "pass", "marginal" or "fail", with reasons.
+        captures_used: names of the captures behind the estimate.
+        captures_refused: why each other capture is not.
+        diagnostics: further figures by name.
+    """
+
+    camera: str
+    channel: str
+    lidar: str
+    T_cam_lidar: Array
+    cov: Array
+    certificate: Certificate
+    metrics: Metrics
+    n_captures: int
+    n_detected: int
+    captures_used: tuple[str, ...]
+    captures_refused: Mapping[str, Refusal]
+    verdict: Literal["pass", "marginal", "fail"]
+    reasons: tuple[str, ...]
+    egt_rotation_deg: float | None = None
+    egt_translation_m: float | None = None
+    diagnostics: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def sigma_rotation_deg(self) -> float:
+        """Root of the summed rotation variances, deg."""
+        return float(np.degrees(np.sqrt(np.trace(self.cov[3:, 3:]))))
+
+    @property
+    def sigma_translation_m(self) -> float:
+        """Root of the summed translation variances, m."""
+        return float(np.sqrt(np.trace(self.cov[:3, :3])))

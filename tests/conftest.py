@@ -1,0 +1,19 @@
+"""Settings all tests share."""
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+settings.register_profile("lce-rig", deadline=None, derandomize=True, max_examples=50)
+settings.load_profile("lce-rig")
+
+
+@pytest.fixture(scope="session")
+def recordings() -> Path:
+    """The folder of recordings by others, named by LCE_RIG_DATA."""
+    folder = os.environ.get("LCE_RIG_DATA")
+    if not folder or not Path(folder).is_dir():
+        pytest.skip("LCE_RIG_DATA names no folder of recordings")
+    return Path(folder)
