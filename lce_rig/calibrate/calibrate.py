@@ -1,0 +1,172 @@
+"""Algorithm 1 in order: consensus -> features -> planes -> outliers and weights -> draws -> final solution.
+
+References:
+    Jiao et al., "LCE-Calib: Automatic LiDAR-Frame/Event Camera Extrinsic Calibration With a Globally Optimal
+    Solution", IEEE/ASME Transactions on Mechatronics, 2023. Unlike there, candidates are judged on captures
+    they were not fitted to, draws are seeded, and each solution carries a certificate.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from lce_rig.calibrate.consensus import Consensus, find_consensus
+from lce_rig.calibrate.draws import Draws, draw_subsets
+from lce_rig.calibrate.estimate import CalibrationEstimate, CaptureResidual
+from lce_rig.calibrate.features import CaptureFeatures, extract_features
+from lce_rig.calibrate.initial import drop_uncertain, solve_planes
+from lce_rig.calibrate.metrics import capture_residual, summarise
+from lce_rig.calibrate.observability import describe_weakest, linearise, require_observable
+from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates
+from lce_rig.calibrate.outliers import reject_outliers
+from lce_rig.calibrate.problem import Problem, Solutions, Weights
+from lce_rig.core.board import Board
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Certificate, Observation, Refusal
+from lce_rig.solvers.covariance import jackknife_covariance
+
+# Weights are in units of one capture with residuals of this size, which gives the prior on the shift its scale.
+NOMINAL_SIGMA_M = 0.01
+
+
+def calibrate(
+    candidates: Sequence[CaptureCandidates],
+    board: Board,
+    options: CalibrateOptions | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> CalibrationEstimate:
+    """Estimate T_cam_lidar from what both sensors saw of the board.
+
+    Args:
+        candidates: of each capture in which both sensors saw something; their order does not matter.
+        board: its specification.
+        options: switches of the algorithm.
+        progress: called with (subsets done, subsets in all).
+
+    Raises:
+        NotEnoughDataError: too few captures, captures that agree with no extrinsic, or captures that leave a
+            direction undetermined, which is named.
+    """
+    options = options or CalibrateOptions()
+    consensus = _agree(candidates, board, options)
+    refused: dict[str, Refusal] = dict(consensus.refused)
+    observations = list(consensus.observations)
+    features = [extract_features(observation, board, options) for observation in observations]
+    problem = Problem(features, board, _weights(options, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
+    T_planes = solve_planes(features, problem)
+    require_observable(features, problem, T_planes)
+
+    outliers, sigmas = reject_outliers(features, problem, T_planes, options)
+    refused.update(outliers)
+    features = [f for f in features if f.capture not in outliers]
+    observations = [o for o in observations if o.capture not in outliers]
+    keep = drop_uncertain(features, T_planes) if options.use_uncertainty else None
+    problem = Problem(features, board, _weights(options, *sigmas), keep)
+    T_planes = solve_planes(features, problem)
+    require_observable(features, problem, T_planes)
+
+    draws = draw_subsets(problem, T_planes, options.n_draws, options.n_rounds, options.seed, progress)
+    T_start = T_planes if draws is None else draws.T_mean[draws.best]
+    solution = problem.solve(np.ones((1, problem.n_captures)), T_start, options.n_rounds)
+    return _report(observations, features, board, problem, solution, draws, refused, consensus)
+
+
+def _agree(candidates: Sequence[CaptureCandidates], board: Board, options: CalibrateOptions) -> Consensus:
+    """Find the consensus, or explain why there is none."""
+    needed = max(3, options.min_captures)
+    if len(candidates) < needed:
+        raise NotEnoughDataError(
+            f"{len(candidates)} captures show the board in both sensors, {needed} are needed",
+            "add captures: ten or more, with the board at different places and tilts",
+        )
+    consensus = find_consensus(candidates, board)
+    n_agreeing = 0 if consensus is None else len(consensus.observations)
+    if consensus is None or n_agreeing < needed:
+        raise NotEnoughDataError(
+            f"only {n_agreeing} of {len(candidates)} captures agree with one rigid extrinsic, {needed} are needed",
+            "check the board's size, the intrinsics and that pictures and scans are paired in time; add captures",
+        )
+    return consensus
+
+
+def _weights(options: CalibrateOptions, plane_sigma_m: float, edge_sigma_m: float) -> Weights:
+    """Weigh by the options where they say so, else by the inverse of the variances."""
+    unit = 1 / NOMINAL_SIGMA_M**2
+    plane = 1 / plane_sigma_m**2 if options.plane_weight is None else options.plane_weight * unit
+    edge = 1 / edge_sigma_m**2 if options.edge_weight is None else options.edge_weight * unit
+    has_shift = options.edge_shift == "free" and options.use_ptl
+    return Weights(
+        plane=plane if options.use_ptpl else 0.0,
+        edge=edge if options.use_ptl else 0.0,
+        shift_prior=1 / options.edge_shift_sigma_m**2 if has_shift else None,
+    )
+
+
+def _report(
+    observations: Sequence[Observation],
+    features: Sequence[CaptureFeatures],
+    board: Board,
+    problem: Problem,
+    solution: Solutions,
+    draws: Draws | None,
+    refused: dict[str, Refusal],
+    consensus: Consensus,
+) -> CalibrationEstimate:
+    T = solution.T[0]
+    cov = _covariance(problem, solution)
+    held_out = np.full(len(features), np.nan) if draws is None else draws.capture_held_out_m
+    residuals: list[CaptureResidual] = [
+        capture_residual(T, observation, board, float(error))
+        for observation, error in zip(observations, held_out, strict=True)
+    ]
+    certificates = solution.certificates
+    return CalibrationEstimate(
+        T_cam_lidar=T,
+        cov=cov[:6, :6],
+        certificate=Certificate(bool(certificates.is_optimal[0]), float(certificates.relative_gap[0])),
+        metrics=summarise(residuals),
+        used=tuple(f.capture for f in features),
+        refused=dict(sorted(refused.items())),
+        observations={observation.capture: observation for observation in observations},
+        residuals=tuple(residuals),
+        held_out_m=float(np.mean(held_out)),
+        weak_direction=describe_weakest(cov[:6, :6], features),
+        diagnostics=_diagnostics(problem, solution, cov, draws, consensus),
+    )
+
+
+def _covariance(problem: Problem, solution: Solutions) -> Array:
+    """Estimate the covariance (6 + k, 6 + k) of the solution, edge shift last."""
+    gradients, hessians = linearise(problem, solution.x[0], solution.edge_ids[0])
+    prior = np.zeros_like(hessians[0])
+    if problem.weights.shift_prior is not None:
+        prior[6, 6] = problem.weights.shift_prior
+    return jackknife_covariance(gradients, hessians, prior)
+
+
+def _diagnostics(
+    problem: Problem, solution: Solutions, cov: Array, draws: Draws | None, consensus: Consensus
+) -> dict[str, float]:
+    plane, edge = problem.errors(solution.x)
+    figures = {
+        "plane_weight": problem.weights.plane * NOMINAL_SIGMA_M**2,
+        "edge_weight": problem.weights.edge * NOMINAL_SIGMA_M**2,
+        "fit_plane_rms_m": float(np.sqrt(np.mean(plane**2))),
+        "fit_edge_rms_m": float(np.sqrt(np.mean(edge**2))),
+        "n_alternative_poses": float(consensus.n_alternative_poses),
+    }
+    if problem.n_shift:
+        figures["edge_shift_m"] = float(solution.linear[0, 3])
+        figures["edge_shift_sigma_m"] = float(np.sqrt(cov[6, 6]))
+    if draws is not None:
+        figures |= {
+            "best_subset_size": float(draws.sizes[draws.best]),
+            "n_solved": float(draws.n_solved),
+            "certified_share": draws.certified_share,
+            "draw_spread_rotation_deg": float(np.degrees(draws.spread_rotation_rad[draws.best])),
+            "draw_spread_translation_m": float(draws.spread_translation_m[draws.best]),
+        }
+    return figures
+
+

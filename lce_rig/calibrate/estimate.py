@@ -1,0 +1,59 @@
+"""What comes out of a calibration."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Certificate, Metrics, Observation, Refusal
+
+
+@dataclass(frozen=True)
+class CaptureResidual:
+    """How well one capture fits an extrinsic.
+
+    Attributes:
+        capture: its name.
+        plane_mean_m, plane_rms_m: distance of the LiDAR's board points from the camera's board plane.
+        edge_mean_m, edge_rms_m: distance in the board's plane of ring ends from the board's edges.
+        held_out_m: rms of both where the capture was not fitted; NaN without draws.
+        reprojection_px: rms corner residual of the board's pose.
+    """
+
+    capture: str
+    plane_mean_m: float
+    plane_rms_m: float
+    edge_mean_m: float
+    edge_rms_m: float
+    held_out_m: float
+    reprojection_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationEstimate:
+    """An extrinsic with its uncertainty, proof and residuals.
+
+    Attributes:
+        T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
+        cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
+        certificate: of the final cost over all captures used.
+        metrics: errors over all captures used.
+        used: names of the captures behind the estimate, sorted.
+        refused: why each other capture is not.
+        observations: capture -> the boards that were paired, for each capture used.
+        residuals: one per capture used, in the order of `used`.
+        held_out_m: mean over captures of `CaptureResidual.held_out_m`.
+        weak_direction: the least certain motion in words, with its standard deviation.
+        diagnostics: further figures by name.
+    """
+
+    T_cam_lidar: Array
+    cov: Array
+    certificate: Certificate
+    metrics: Metrics
+    used: tuple[str, ...]
+    refused: Mapping[str, Refusal]
+    observations: Mapping[str, Observation]
+    residuals: tuple[CaptureResidual, ...]
+    held_out_m: float
+    weak_direction: str
+    diagnostics: Mapping[str, float]

@@ -1,0 +1,72 @@
+"""Errors of an extrinsic, as the paper defines them and as they are useful."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lce_rig.calibrate.estimate import CaptureResidual
+from lce_rig.calibrate.features import extract_features
+from lce_rig.calibrate.options import CalibrateOptions
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, rotation_angle, transform
+from lce_rig.core.results import Metrics, Observation
+
+# What is measured must not depend on what was switched on while fitting.
+_AS_MEASURED = CalibrateOptions(point_projection="ray", half_step=False)
+
+
+def capture_residual(
+    T_cam_lidar: Array, observation: Observation, board: Board, held_out_m: float = float("nan")
+) -> CaptureResidual:
+    """Measure how well one capture fits an extrinsic.
+
+    Points are taken as the LiDAR measured them; ring ends are moved along their rays onto the board's plane and
+    compared with the printed size, without half step or shift.
+
+    Args:
+        T_cam_lidar: (4, 4).
+        observation: the boards of both sensors.
+        board: its size.
+        held_out_m: passed through.
+    """
+    features = extract_features(observation, board, _AS_MEASURED)
+    points_cam = transform(T_cam_lidar, observation.lidar.points)
+    plane = np.abs((points_cam - features.centre) @ features.normal)
+    ends_board = transform(features.T_board_cam @ T_cam_lidar, features.edge_points)
+    edge = edge_distances(ends_board, board)
+    return CaptureResidual(
+        capture=observation.capture,
+        plane_mean_m=float(plane.mean()),
+        plane_rms_m=_rms(plane),
+        edge_mean_m=float(edge.mean()),
+        edge_rms_m=_rms(edge),
+        held_out_m=held_out_m,
+        reprojection_px=observation.image.reprojection_px,
+    )
+
+
+def edge_distances(points_board: Array, board: Board) -> Array:
+    """Measure the distance in the board's plane of points (N, 3), frame board, from its nearest edge (N,) in m."""
+    beyond = np.abs(points_board[:, :2]) - [board.width_m / 2, board.height_m / 2]
+    to_side = np.hypot(beyond[:, 0], np.maximum(beyond[:, 1], 0))
+    to_rail = np.hypot(beyond[:, 1], np.maximum(beyond[:, 0], 0))
+    return np.asarray(np.minimum(to_side, to_rail))
+
+
+def summarise(residuals: Sequence[CaptureResidual]) -> Metrics:
+    """Average per-capture residuals: MPE, MEE (mean distances) and the rms corner residual."""
+    return Metrics(
+        mpe_m=float(np.mean([r.plane_mean_m for r in residuals])),
+        mee_m=float(np.mean([r.edge_mean_m for r in residuals])),
+        reprojection_px=_rms(np.array([r.reprojection_px for r in residuals])),
+    )
+
+
+def error_to_reference(T_cam_lidar: Array, T_reference: Array) -> tuple[float, float]:
+    """Compute the paper's EGT: angle in deg and distance in m between an extrinsic and a reference (4, 4)."""
+    angle = rotation_angle(T_cam_lidar[:3, :3], T_reference[:3, :3])
+    return float(np.degrees(angle)), float(np.linalg.norm(T_cam_lidar[:3, 3] - T_reference[:3, 3]))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))

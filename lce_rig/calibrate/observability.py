@@ -1,0 +1,111 @@
+"""Which motions of the extrinsic the captures determine, and which they leave open, in words."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.calibrate.features import CaptureFeatures
+from lce_rig.calibrate.problem import Problem, Weights
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.geometry import Array, skew
+from lce_rig.solvers.registration import vec_rotation, with_one
+
+# One capture's board plane, camera against LiDAR, is good to about this much.
+PLANE_SIGMA_M = 0.01
+# A motion that moves the board by more than this without a trace in the planes counts as undetermined.
+MAX_WEAK_SIGMA_M = 0.1
+_AXES = ("x axis (right)", "y axis (down)", "z axis (line of sight)")
+
+
+def linearise(
+    problem: Problem, x: Array, edge_ids: NDArray[np.int8], weights: Weights | None = None
+) -> tuple[Array, Array]:
+    """Expand each capture's cost in the tangent (translation m, rotation rad, edge shift m).
+
+    Args:
+        problem: F captures.
+        x: (m,) solution [vec R; t; d; 1].
+        edge_ids: (n,) its association.
+        weights: other weights than the problem's.
+
+    Returns:
+        Half the gradients (F, 6 + k) and half the Gauss-Newton Hessians (F, 6 + k, 6 + k), without prior.
+    """
+    w = weights or problem.weights
+    w = Weights(w.plane, w.edge, None if w.shift_prior is None else 0.0)
+    n = problem.n_captures
+    M = problem.moments(np.eye(n), np.repeat(edge_ids[None], n, axis=0), w)
+    k = problem.n_shift
+    J = np.zeros((problem.size, 6 + k))
+    R = x[:9].reshape(3, 3).T
+    # R = exp(phi^) R0: vec R moves by vec(e_k^ R0).
+    J[:9, 3:6] = vec_rotation(skew(np.eye(3)) @ R).T
+    J[9:12, :3] = np.eye(3)
+    if k:
+        J[12, 6] = 1
+    return (M @ x) @ J, J.T @ M @ J
+
+
+def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_cam_lidar: Array) -> None:
+    """Check that the boards' planes alone determine all six directions.
+
+    Edges could stand in for planes, but a set that needs them to is fragile: their errors are systematic.
+
+    Args:
+        features: of the captures in `problem`.
+        problem: their moments.
+        T_cam_lidar: (4, 4) estimate.
+
+    Raises:
+        NotEnoughDataError: a direction is left open; it is named.
+    """
+    x = with_one(np.concatenate([vec_rotation(T_cam_lidar[:3, :3]), T_cam_lidar[:3, 3], np.zeros(problem.n_shift)]))
+    planes = Weights(1 / PLANE_SIGMA_M**2, 0.0, problem.weights.shift_prior)
+    _, hessians = linearise(problem, x, problem.associate(x[None])[0], planes)
+    lever_m = lever_arm(features)
+    scale = np.r_[np.ones(3), np.full(3, lever_m)]
+    information = hessians.sum(axis=0)[:6, :6] / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(information)
+    weak = values < 1 / MAX_WEAK_SIGMA_M**2
+    if not weak.any():
+        return
+    names = list(dict.fromkeys(name_direction(vector) for vector in vectors[:, weak].T))
+    spread_deg = normal_spread_deg(features)
+    raise NotEnoughDataError(
+        f"{' and '.join(names)} cannot be told from {len(features)} captures: their boards are nearly parallel "
+        f"(normals spread by {spread_deg:.1f} deg)",
+        "add captures with the board tilted by 20 deg or more, left and right as well as up and down",
+    )
+
+
+def lever_arm(features: Sequence[CaptureFeatures]) -> float:
+    """Compute the rms distance of the boards from the camera, m: what a rotation of 1 rad moves them by."""
+    return float(np.sqrt(np.mean([f.centre @ f.centre for f in features])))
+
+
+def normal_spread_deg(features: Sequence[CaptureFeatures]) -> float:
+    """Measure how far normals spread about their least varied axis, rms in deg."""
+    normals = np.array([f.normal for f in features])
+    values = np.linalg.eigvalsh(np.cov(normals.T, bias=True))
+    # Unit vectors about one direction do not vary along it: the smaller of the two lateral spreads counts.
+    return float(np.degrees(np.sqrt(max(values[1], 0.0))))
+
+
+def name_direction(direction: Array) -> str:
+    """Name the main component of a motion (6,), translations and rotations in comparable units."""
+    main = int(np.argmax(np.abs(direction)))
+    kind = "translation along" if main < 3 else "rotation about"
+    return f"{kind} the camera's {_AXES[main % 3]}"
+
+
+def describe_weakest(cov: Array, features: Sequence[CaptureFeatures]) -> str:
+    """Say which motion is least certain, and how uncertain, from a covariance (6, 6)."""
+    lever_m = lever_arm(features)
+    scale = np.r_[np.ones(3), np.full(3, lever_m)]
+    _, vectors = np.linalg.eigh(cov * np.outer(scale, scale))
+    direction = vectors[:, -1]
+    main = int(np.argmax(np.abs(direction)))
+    sigma = float(np.sqrt(cov[main, main]))
+    figure = f"{1e3 * sigma:.1f} mm" if main < 3 else f"{np.degrees(sigma):.3f} deg"
+    return f"{name_direction(direction)}, sigma {figure}"

@@ -1,0 +1,59 @@
+"""What goes into a calibration: candidates per capture, and the switches of the algorithm."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from lce_rig.core.results import ImageBoard, LidarBoard
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureCandidates:
+    """What both sensors saw of the board in one capture.
+
+    Attributes:
+        capture: its name.
+        image: the board in the picture, with its second pose where there is one.
+        lidar: places in the scan where the board may be, best first.
+    """
+
+    capture: str
+    image: ImageBoard
+    lidar: Sequence[LidarBoard]
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """Switches of the algorithm; the defaults are the recommended set.
+
+    Attributes:
+        n_draws: I, subsets drawn for each subset size.
+        n_rounds: rounds of re-association in each draw.
+        seed: of the draws.
+        point_projection: how points come onto the fitted plane: along their rays ("ray"), along the plane's
+            normal as in the paper ("normal"), or not at all ("none").
+        use_uncertainty: leave out the tenth of the plane terms with the largest propagated variance.
+        use_ptpl, use_ptl: use point-to-plane, point-to-line terms in the refinement.
+        plane_weight, edge_weight: weights of the two terms; both None: 1 / variance, estimated from the data.
+        half_step: move ring ends outwards by half an azimuth step, to where the edge is expected.
+        edge_shift: "free": ring ends may lie beyond the printed size by a common distance, as the finite beam
+            makes them; "off": they may not.
+        edge_shift_sigma_m: standard deviation of that distance a priori.
+        reject_outliers: leave out captures that disagree with what the others predict.
+        min_captures: fewer captures are refused.
+    """
+
+    n_draws: int = 100
+    n_rounds: int = 3
+    seed: int = 0
+    point_projection: Literal["ray", "normal", "none"] = "ray"
+    use_uncertainty: bool = True
+    use_ptpl: bool = True
+    use_ptl: bool = True
+    plane_weight: float | None = None
+    edge_weight: float | None = None
+    half_step: bool = True
+    edge_shift: Literal["free", "off"] = "free"
+    edge_shift_sigma_m: float = 0.015
+    reject_outliers: bool = True
+    min_captures: int = 3

@@ -1,0 +1,144 @@
+"""May this extrinsic be used? Each doubt is one reason with its figure and what to do about it."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.scale import ScaleCheck, compare_scales
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import rotation_angle
+from lce_rig.rig import NominalExtrinsic, Rig
+
+Verdict = Literal["pass", "marginal", "fail"]
+_ORDER: tuple[Verdict, ...] = ("pass", "marginal", "fail")
+
+# Camera and LiDAR distances: intrinsics and squares measured with care agree to about 1 %.
+SCALE_MARGINAL, SCALE_FAIL = 0.01, 0.025
+# How many times the target a deviation may be before the result is of no use.
+SIGMA_FAIL = 3.0
+# Held-out residuals of a sound model exceed the fitted ones only slightly.
+HELD_OUT_MARGINAL = 1.6
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """One reason against a result, and how bad it is."""
+
+    verdict: Verdict
+    text: str
+
+
+def judge(estimate: CalibrationEstimate, rig: Rig, camera: str, lidar: str) -> tuple[Verdict, tuple[str, ...]]:
+    """Weigh everything known about an extrinsic.
+
+    Args:
+        estimate: the extrinsic with its residuals and refusals.
+        rig: thresholds, targets and the nominal extrinsic.
+        camera: name of the camera.
+        lidar: name of the LiDAR.
+
+    Returns:
+        The verdict, and the reasons for anything but a pass, worst first.
+    """
+    doubts = [
+        *_certificate(estimate),
+        *_precision(estimate, rig),
+        *_residuals(estimate, rig),
+        *_refusals(estimate),
+        *_nominal(estimate, rig.nominal(camera, lidar)),
+        *_scale(estimate, rig.board.to_board()),
+    ]
+    doubts.sort(key=lambda doubt: -_ORDER.index(doubt.verdict))
+    verdict = doubts[0].verdict if doubts else "pass"
+    return verdict, tuple(doubt.text for doubt in doubts)
+
+
+def _certificate(estimate: CalibrationEstimate) -> list[Doubt]:
+    if estimate.certificate.is_optimal:
+        return []
+    text = f"not certified as the global minimum (gap {estimate.certificate.gap:.1e}): collect more captures"
+    return [Doubt("fail", text)]
+
+
+def _precision(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
+    doubts = []
+    target = rig.calibration
+    rotation_deg = float(np.degrees(np.sqrt(np.trace(estimate.cov[3:, 3:]))))
+    translation_m = float(np.sqrt(np.trace(estimate.cov[:3, :3])))
+    for sigma, goal, what, unit, scale in (
+        (rotation_deg, target.target_sigma_deg, "rotation", "deg", 1.0),
+        (translation_m, target.target_sigma_m, "translation", "mm", 1000.0),
+    ):
+        if sigma > goal:
+            verdict: Verdict = "fail" if sigma > SIGMA_FAIL * goal else "marginal"
+            figures = f"{scale * sigma:.2g} {unit}, target {scale * goal:.2g} {unit}"
+            advice = f"weakest: {estimate.weak_direction}"
+            doubts.append(Doubt(verdict, f"{what} known to {figures}: collect more captures; {advice}"))
+    return doubts
+
+
+def _residuals(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
+    doubts = []
+    metrics, limits = estimate.metrics, rig.quality
+    for value, limit, what in (
+        (metrics.mpe_m, limits.max_mpe_m, "LiDAR points lie off the camera's board planes"),
+        (metrics.mee_m, limits.max_mee_m, "ring ends lie off the board's edges"),
+    ):
+        if value > limit:
+            text = f"{what} by {1000 * value:.0f} mm on average, limit {1000 * limit:.0f} mm"
+            doubts.append(Doubt("fail", f"{text}: was the board moving, or are board size or intrinsics wrong?"))
+    fitted = float(np.mean([np.hypot(r.plane_rms_m, r.edge_rms_m) for r in estimate.residuals]))
+    if np.isfinite(estimate.held_out_m) and estimate.held_out_m > HELD_OUT_MARGINAL * fitted:
+        text = f"captures left out fit worse ({1000 * estimate.held_out_m:.1f} mm) than captures used"
+        doubts.append(Doubt("marginal", f"{text} ({1000 * fitted:.1f} mm): collect more captures"))
+    return doubts
+
+
+def _refusals(estimate: CalibrationEstimate) -> list[Doubt]:
+    disagreeing = [name for name, why in sorted(estimate.refused.items()) if why.stage in ("pair", "calibrate")]
+    n = len(disagreeing) + len(estimate.used)
+    if 4 * len(disagreeing) <= n:
+        return []
+    verdict: Verdict = "fail" if 2 * len(disagreeing) > n else "marginal"
+    shown = ", ".join(disagreeing[:4]) + (" ..." if len(disagreeing) > 4 else "")
+    text = f"the sensors disagree in {len(disagreeing)} of {n} captures ({shown})"
+    return [Doubt(verdict, f"{text}: look for a moving board, a second board, or wrong pairing")]
+
+
+def _nominal(estimate: CalibrationEstimate, nominal: NominalExtrinsic | None) -> list[Doubt]:
+    if nominal is None:
+        return []
+    expected = nominal.to_matrix()
+    T = estimate.T_cam_lidar
+    angle_deg = float(np.degrees(rotation_angle(T[:3, :3], expected[:3, :3])))
+    shift_m = float(np.linalg.norm(T[:3, 3] - expected[:3, 3]))
+    if angle_deg <= nominal.tolerance_deg and shift_m <= nominal.tolerance_m:
+        return []
+    text = f"{angle_deg:.1f} deg and {1000 * shift_m:.0f} mm from the nominal extrinsic"
+    limit = f"tolerance {nominal.tolerance_deg:g} deg, {1000 * nominal.tolerance_m:g} mm"
+    advice = "check the profile's nominal_extrinsics, its camera and LiDAR frames, and that these sensors were used"
+    return [Doubt("fail", f"{text} ({limit}): {advice}")]
+
+
+def _scale(estimate: CalibrationEstimate, board: Board) -> list[Doubt]:
+    observations = [estimate.observations[name] for name in estimate.used]
+    if len(observations) < 4:
+        return []
+    check = compare_scales(observations)
+    if not check.is_off(SCALE_MARGINAL):
+        return []
+    verdict: Verdict = "fail" if check.is_off(SCALE_FAIL) else "marginal"
+    return [Doubt(verdict, explain_scale(check, board))]
+
+
+def explain_scale(check: ScaleCheck, board: Board) -> str:
+    """Say by how much distances differ, and what the squares would measure if they are the cause."""
+    percent = 100 * abs(check.ratio - 1)
+    longer = "longer" if check.ratio > 1 else "shorter"
+    square_mm = 1000 * board.square_m / check.ratio
+    return (
+        f"camera distances are {percent:.1f} +- {100 * check.sigma:.1f} % {longer} than the LiDAR's: the squares "
+        f"measure {square_mm:.1f} mm instead of {1000 * board.square_m:.1f} mm, or the intrinsics belong to another lens"
+    )

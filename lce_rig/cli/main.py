@@ -1,0 +1,128 @@
+"""`lce-rig`: the verbs, loaded when they are called, and the one place that turns errors into exit codes."""
+
+import importlib
+import os
+import sys
+import traceback
+from typing import Any
+
+import click
+
+from lce_rig import __version__
+from lce_rig.core.errors import LceRigError
+
+# Verb -> (module with a click command of the verb's name, help line). Modules are imported when the verb runs,
+# so that `lce-rig --help` stays instant.
+COMMANDS: dict[str, tuple[str, str]] = {
+    "rigs": ("lce_rig.cli.rigs", "List, show, check and derive rig profiles."),
+    "simulate": ("lce_rig.cli.simulate", "Make a session of a simulated rig, with exact truth."),
+    "collect": ("lce_rig.cli.collect", "Build a session from recordings."),
+    "check": ("lce_rig.cli.check", "Show what was detected in each capture, and why not."),
+    "calibrate": ("lce_rig.cli.calibrate", "Estimate the extrinsics of a session."),
+    "verify": ("lce_rig.cli.verify", "Draw the LiDAR into the pictures and print residuals."),
+}
+EXIT_BUG = 70
+EXIT_INTERRUPTED = 130
+
+EPILOG = """\b
+Exit codes: 0 done · 1 other error · 2 usage · 3 rig profile · 4 session ·
+5 recording, sensor or missing dependency · 6 not enough data ·
+7 result refused · 70 bug in lce-rig · 130 interrupted
+"""
+
+
+class LateGroup(click.Group):
+    """A group whose commands are imported only when they are asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """List the verbs in the order of the work."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import the verb's module."""
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = getattr(importlib.import_module(COMMANDS[cmd_name][0]), cmd_name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list of verbs without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Name the nearest verb when the one given does not exist."""
+        import difflib
+
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            near = difflib.get_close_matches(args[0], COMMANDS, n=1)
+            hint = f" Did you mean '{near[0]}'?" if near else ""
+            raise click.UsageError(f"No such command '{args[0]}'.{hint}", ctx)
+        return super().resolve_command(ctx, args)
+
+
+@click.group(
+    cls=LateGroup, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+)
+@click.version_option(__version__, prog_name="lce-rig", message="%(prog)s %(version)s")
+@click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+def cli(debug: bool) -> None:
+    """Find where a LiDAR sits relative to its cameras, frame or event, with a checkerboard.
+
+    \b
+    A first calibration:
+      lce-rig collect --rig rlfs --from recording/   builds session/
+      lce-rig check                                  what was seen in each capture
+      lce-rig calibrate                              extrinsics in session/calibration/
+      lce-rig verify                                 pictures in session/calibration/overlays/
+    """
+
+
+def _report(error: LceRigError) -> int:
+    click.secho(f"error: {error.what}", fg="red", err=True)
+    for line in error.hint.splitlines():
+        click.echo(f"  {line}", err=True)
+    return error.exit_code
+
+
+def run(arguments: list[str]) -> int:
+    """Run one command line and return its exit code.
+
+    Args:
+        arguments: the words after `lce-rig`.
+    """
+    show_traceback = "--debug" in arguments or bool(os.environ.get("LCE_RIG_DEBUG"))
+    try:
+        result: Any = cli.main(args=arguments, prog_name="lce-rig", standalone_mode=False)
+        return result if isinstance(result, int) else 0
+    except LceRigError as error:
+        if show_traceback:
+            traceback.print_exc()
+        return _report(error)
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("interrupted; what was written so far is whole", err=True)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # The reader of our output went away (`lce-rig check | head`): nothing to report, and nobody to read it.
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
+        return 0
+    except ModuleNotFoundError as error:
+        if show_traceback:
+            traceback.print_exc()
+        click.secho(f"error: the package '{error.name}' is missing", fg="red", err=True)
+        click.echo(f"  pip install {error.name}", err=True)
+        return 5
+    except Exception:
+        traceback.print_exc()
+        click.secho("this is a bug in lce-rig; please report it with the lines above", fg="red", err=True)
+        return EXIT_BUG
+
+
+def main() -> None:
+    """Entry point of the installed command."""
+    sys.exit(run(sys.argv[1:]))

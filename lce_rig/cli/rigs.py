@@ -1,0 +1,210 @@
+"""`lce-rig rigs`: list, show, check and derive rig profiles."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lce_rig.cli import show as screen
+
+if TYPE_CHECKING:
+    from lce_rig.rig import Rig
+
+
+@click.group(invoke_without_command=True)
+@click.pass_context
+def rigs(ctx: click.Context) -> None:
+    """List, show, check and derive rig profiles (called bare: list)."""
+    if ctx.invoked_subcommand is None:
+        ctx.invoke(list_profiles, as_json=False)
+
+
+@rigs.command("list")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+def list_profiles(as_json: bool) -> None:
+    """List the shipped profiles."""
+    from rich.table import Table
+
+    from lce_rig.rig import load_rig, shipped_profiles
+
+    profiles = [load_rig(name) for name in shipped_profiles()]
+    if as_json:
+        screen.print_json({"rigs": [_summary(rig) for rig in profiles]})
+        return
+    table = Table("rig", "LiDARs", "cameras (channels)", "board", "description")
+    for rig in profiles:
+        summary = _summary(rig)
+        cameras = ", ".join(
+            f"{name} ({', '.join(channels)})" for name, channels in summary["cameras"].items()
+        )
+        table.add_row(rig.name, ", ".join(summary["lidars"]), cameras, _board(rig), rig.description)
+    screen.print_table(table)
+    screen.note("a profile of your own: lce-rig rigs new NAME --from rlfs, then --rig NAME.yaml everywhere")
+
+
+def _summary(rig: "Rig") -> dict[str, Any]:
+    return {
+        "name": rig.name,
+        "description": rig.description,
+        "lidars": list(rig.lidars),
+        "cameras": {name: list(camera.channels) for name, camera in rig.cameras.items()},
+    }
+
+
+def _board(rig: "Rig") -> str:
+    cols, rows = rig.board.inner_corners
+    return f"{cols}x{rows} corners, {1e3 * rig.board.square_m:g} mm"
+
+
+@rigs.command("show")
+@click.argument("rig_name", metavar="RIG")
+@click.option("--json", "as_json", is_flag=True, help="Print every setting as JSON.")
+@click.option("--yaml", "as_yaml", is_flag=True, help="Print every setting, defaults included, as YAML.")
+def show_profile(rig_name: str, as_json: bool, as_yaml: bool) -> None:
+    """Show a profile: RIG is a name or a file."""
+    from lce_rig.rig import dump_rig, load_rig
+
+    rig = load_rig(rig_name)
+    if as_json:
+        screen.print_json(rig.model_dump(mode="json"))
+    elif as_yaml:
+        click.echo(dump_rig(rig), nl=False)
+    else:
+        for table in (_sensor_table(rig), _board_table(rig), _limit_table(rig)):
+            screen.print_table(table)
+        _warn_of_doubts(rig)
+
+
+def _sensor_table(rig: "Rig") -> Any:
+    from rich.table import Table
+
+    table = Table(
+        "sensor", "model", "frame", "lens", "topic", "stamps", title=f"{rig.name}: {rig.description}"
+    )
+    for name, lidar in rig.lidars.items():
+        lens = f"{lidar.min_range_m:g}-{lidar.max_range_m:g} m"
+        table.add_row(name, lidar.model, lidar.frame, lens, lidar.topic or "-", _stamps(lidar.timestamps))
+    for name, camera in rig.cameras.items():
+        given, (width, height) = camera.intrinsics, camera.resolution_px
+        lens = f"{width}x{height}, f {given.fx_px:.1f} {given.fy_px:.1f} px, {given.model}"
+        for channel, settings in camera.channels.items():
+            row = (
+                camera.model,
+                camera.optical_frame,
+                lens,
+                settings.topic or "-",
+                _stamps(settings.timestamps),
+            )
+            table.add_row(f"{name}/{channel}", *row)
+    return table
+
+
+def _stamps(settings: Any) -> str:
+    return f"{settings.reference}, clock {settings.clock}, sync {settings.sync}"
+
+
+def _board_table(rig: "Rig") -> Any:
+    from rich.table import Table
+
+    board = rig.board
+    (cols, rows), (x, y) = board.inner_corners, board.pattern_offset_m
+    table = Table("board", "")
+    table.add_row("inner corners", f"{cols} x {rows}")
+    table.add_row("square", f"{1e3 * board.square_m:g} mm")
+    table.add_row("plate", f"{board.width_m:g} x {board.height_m:g} m")
+    table.add_row("pattern's centre from the plate's", f"{1e3 * x:g}, {1e3 * y:g} mm (right, up)")
+    for entry in rig.nominal_extrinsics:
+        limits = f"within {entry.tolerance_deg:g} deg, {1e3 * entry.tolerance_m:g} mm"
+        table.add_row(f"drawing, {entry.lidar} to {entry.camera}", limits)
+    return table
+
+
+def _limit_table(rig: "Rig") -> Any:
+    from rich.table import Table
+
+    table = Table("threshold or weight", "value", "default")
+    for block in ("quality", "calibration"):
+        settings = getattr(rig, block)
+        for key, field in type(settings).model_fields.items():
+            value = getattr(settings, key)
+            default = "" if value == field.default else f"{field.default:g}"
+            table.add_row(f"{block}.{key}", f"{value:g}", default)
+    return table
+
+
+@rigs.command("check")
+@click.argument("file", metavar="FILE")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+def check_profile(file: str, as_json: bool) -> None:
+    """Check a profile; every problem is named with its line. Exits with 3 where there is one."""
+    from lce_rig.core.errors import ProfileError
+    from lce_rig.rig import find_profile, load_rig
+
+    try:
+        rig = load_rig(file)
+    except ProfileError as error:
+        if as_json:
+            problems = error.hint.splitlines() if error.hint else [error.what]
+            screen.print_json({"is_valid": False, "problems": problems, "warnings": []})
+        raise
+    if as_json:
+        screen.print_json({"is_valid": True, "problems": [], "warnings": rig.doubts()})
+        return
+    click.echo(f"{find_profile(file)}: a valid profile of rig {rig.name}")
+    _warn_of_doubts(rig)
+
+
+def _warn_of_doubts(rig: "Rig") -> None:
+    for doubt in rig.doubts():
+        screen.warn(doubt)
+
+
+@rigs.command("new")
+@click.argument("name")
+@click.option(
+    "--from", "origin", default="rlfs", show_default=True, help="Profile to start from, a name or a file."
+)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Set a key: board.square_m=0.08. May be repeated.",
+)
+@click.option("-o", "--output", help="File to write; NAME.yaml where left out, - for stdout.")
+def new_profile(name: str, origin: str, settings: tuple[str, ...], output: str | None) -> None:
+    """Derive a profile NAME from another; its comments stay."""
+    from lce_rig.core.errors import UsageError
+    from lce_rig.rig import derive_text, find_profile, load_rig
+
+    pairs = [setting.partition("=") for setting in settings]
+    for key, equals, value in pairs:
+        if not (key and equals and value):
+            raise UsageError(
+                f"--set {key}{equals}{value}: KEY=VALUE is expected, such as board.square_m=0.08"
+            )
+    parent = load_rig(origin)
+    path = Path(output or f"{name}.yaml")
+    original = find_profile(origin).read_text(encoding="utf-8")
+    values = [(key.strip(), value.strip()) for key, _, value in pairs]
+    text = derive_text(original, name, values, f"{path} (not written)", parent.name)
+    if output == "-":
+        click.echo(text, nl=False)
+        return
+    _write_new(path, text)
+    screen.note(f"wrote {path}; measure your board and edit it, then: lce-rig rigs check {path}")
+    _warn_of_doubts(load_rig(path))
+
+
+def _write_new(path: Path, text: str) -> None:
+    from lce_rig.core.errors import ProfileError
+
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError as error:
+        raise ProfileError(
+            f"{path}: exists already", "choose another file with -o, or remove it first"
+        ) from error
+    except OSError as error:
+        raise ProfileError(f"{path}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,65 @@
+"""How results look in a terminal: tables, progress bars, notes. Results on stdout, the rest on stderr."""
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import click
+
+Progress = Callable[[int, int], None]
+
+
+def note(text: str) -> None:
+    """Say something that is not the result."""
+    click.echo(text, err=True)
+
+
+def warn(text: str) -> None:
+    """Say something the user should look at."""
+    click.secho(f"warning: {text}", fg="yellow", err=True)
+
+
+def print_json(document: Any) -> None:
+    """Print a result for machines."""
+    click.echo(json.dumps(document, indent=2, allow_nan=False))
+
+
+def print_table(table: Any) -> None:
+    """Print a rich table on stdout, as wide as it needs where nobody watches."""
+    from rich.console import Console
+
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Progress]:
+    """Show a bar on stderr while work is done; plain silence where stderr is no terminal.
+
+    Yields:
+        A callback (done, total).
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(compact=True),
+    )
+    console = Console(stderr=True)
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(title, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def print_lines(lines: list[str]) -> None:
+    """Print lines with rich markup on stdout, unbroken where nobody watches."""
+    from rich.console import Console
+
+    console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
+    for line in lines:
+        console.print(line)

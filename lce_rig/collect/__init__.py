@@ -1,0 +1,5 @@
+"""From recordings to a session of captures, unattended."""
+
+from lce_rig.collect.collect import CollectOptions, CollectReport, collect
+
+__all__ = ["CollectOptions", "CollectReport", "collect"]

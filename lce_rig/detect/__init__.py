@@ -1,0 +1,1 @@
+"""Find the calibration board: in pictures and in LiDAR scans."""

@@ -1,0 +1,108 @@
+"""What the sensors saw of the board: by pair of sensors, and as flat arrays that a session can keep between runs."""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+
+Arrays = dict[str, NDArray[Any]]
+LidarDetection = list[LidarBoard] | Refusal
+ImageDetection = ImageBoard | Refusal
+
+_KINDS = {kind.__name__: kind for kind in (ImageBoard, LidarBoard, Refusal)}
+
+
+def to_arrays(detection: ImageDetection | LidarDetection) -> Arrays:
+    """Flatten a detection into named arrays; figures and names travel as one JSON text.
+
+    Args:
+        detection: one image board, the LiDAR candidates of a scan, or a refusal.
+    """
+    items = detection if isinstance(detection, list) else [detection]
+    arrays: Arrays = {}
+    heads = []
+    for index, item in enumerate(items):
+        head: dict[str, Any] = {"kind": type(item).__name__}
+        for name, value in _fields(item):
+            if isinstance(value, np.ndarray):
+                arrays[f"{index}.{name}"] = value
+            else:
+                head[name] = dict(value) if isinstance(value, Mapping) else value
+        heads.append(head)
+    text = json.dumps({"is_list": isinstance(detection, list), "items": heads}, default=float)
+    arrays["head"] = np.frombuffer(text.encode(), dtype=np.uint8)
+    return arrays
+
+
+def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> ImageDetection | LidarDetection:
+    """Rebuild what `to_arrays` flattened.
+
+    Raises:
+        ValueError: the arrays are not a detection.
+    """
+    try:
+        document = json.loads(bytes(arrays["head"]).decode())
+        items = [_rebuild(index, head, arrays) for index, head in enumerate(document["items"])]
+        return items if document["is_list"] else items[0]
+    except (KeyError, TypeError, IndexError, UnicodeDecodeError) as error:
+        raise ValueError(f"not a detection: {error!r}") from error
+
+
+def _fields(item: Any) -> Sequence[tuple[str, Any]]:
+    return [(field.name, getattr(item, field.name)) for field in dataclasses.fields(item)]
+
+
+def _rebuild(index: int, head: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Any:
+    kind = _KINDS[head.pop("kind")]
+    prefix = f"{index}."
+    own = {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)}
+    return kind(**head, **own)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One camera channel and one LiDAR of a rig."""
+
+    camera: str
+    channel: str
+    lidar: str
+
+    def __str__(self) -> str:
+        return f"{self.camera}.{self.channel} and {self.lidar}"
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What every sensor saw of the board in every capture that holds a sample of it.
+
+    Attributes:
+        images: (camera, channel) -> capture -> detection.
+        lidars: LiDAR -> capture -> detection.
+    """
+
+    images: Mapping[tuple[str, str], Mapping[str, ImageDetection]]
+    lidars: Mapping[str, Mapping[str, LidarDetection]]
+
+    @property
+    def pairs(self) -> list[Pair]:
+        """Every camera channel with every LiDAR that share captures, sorted."""
+        return [
+            Pair(camera, channel, lidar)
+            for (camera, channel), images in sorted(self.images.items())
+            for lidar, scans in sorted(self.lidars.items())
+            if images.keys() & scans.keys()
+        ]
+
+    def captures(self, pair: Pair) -> list[str]:
+        """Name the captures in which both sensors of a pair have a sample, sorted."""
+        return sorted(self.images[pair.camera, pair.channel].keys() & self.lidars[pair.lidar].keys())
+
+    def of(self, pair: Pair, capture: str) -> tuple[ImageDetection, LidarDetection]:
+        """Give what both sensors of a pair saw in one capture."""
+        return self.images[pair.camera, pair.channel][capture], self.lidars[pair.lidar][capture]

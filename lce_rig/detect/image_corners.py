@@ -1,0 +1,156 @@
+"""Inner corners of a checkerboard in a grey picture, in the order of `Board.corners()`."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.detect.image_saddle import fit_crossings
+
+Grey = NDArray[np.uint8]
+
+# Pictures wider than this are first searched at half their size, narrower ones at twice: the finders want
+# squares of 10 to 60 px.
+_WIDE_PX = 700
+_SMALL_SQUARE_PX = 12.0
+_SB = cv2.CALIB_CB_NORMALIZE_IMAGE
+_SB_THOROUGH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+_CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+
+
+def find_corners(grey: Grey, board: Board) -> Array | None:
+    """Find the inner corners, cheapest attempt first, and refine them to sub-pixel accuracy.
+
+    Args:
+        grey: (H, W).
+        board: tells the number of inner corners.
+
+    Returns:
+        (rows * cols, 2) px in the order of `Board.corners()`, or None.
+    """
+    for found in _attempts(grey, (board.cols, board.rows)):
+        if found is not None:
+            corners = fit_crossings(grey, found.reshape(board.rows, board.cols, 2)).grid_px.reshape(-1, 2)
+            return order_corners(grey, corners, board)
+    return None
+
+
+def refine_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
+    """Move corners to the saddle points of the grey values, by `cv2.cornerSubPix`.
+
+    The window reaches 40 % of the shortest side of the squares, so that it holds one corner only.
+    """
+    window = int(np.clip(0.4 * shortest_side_px(corners_px, board), 2, 15))
+    points = corners_px.astype(np.float32).reshape(-1, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+    refined = cv2.cornerSubPix(grey, points, (window, window), (-1, -1), criteria)
+    return np.asarray(refined, dtype=np.float64).reshape(-1, 2)
+
+
+def order_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
+    """Sort a grid of corners as `Board.corners()` does: row by row from the top left as the print is looked at.
+
+    A finder may start at any of the grid's ends. A camera looks at the front of the print, so the order that
+    turns from rows to columns clockwise in the picture (v points down) is the one that is not mirrored. Where the
+    pattern is not symmetric under 180 deg, the outer square at the top left is black by convention; where it is,
+    the order with its top row up in the picture is taken.
+
+    Args:
+        grey: (H, W) the picture, whose squares tell black from white.
+        corners_px: (rows * cols, 2) row by row in any direction.
+        board: the board.
+    """
+    grid = corners_px.reshape(board.rows, board.cols, 2)
+    along_row = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0)
+    along_column = grid[-1].mean(axis=0) - grid[0].mean(axis=0)
+    if along_row[0] * along_column[1] - along_row[1] * along_column[0] < 0:
+        grid = grid[:, ::-1]
+    turns = (0, 1, 2, 3) if board.rows == board.cols else (0, 2)
+    candidates = [np.rot90(grid, turn) for turn in turns]
+    blackness = [black_top_left(grey, candidate) for candidate in candidates]
+    if max(blackness) - min(blackness) > 1e-6:
+        candidates = [
+            candidate for candidate, black in zip(candidates, blackness, strict=True) if black > 0
+        ] or candidates
+    best = min(candidates, key=lambda candidate: candidate[0, :, 1].mean() - candidate[-1, :, 1].mean())
+    return np.ascontiguousarray(best.reshape(-1, 2))
+
+
+def black_top_left(grey: Grey, grid_px: Array) -> float:
+    """Tell by how many grey values the squares of the top left one's colour are darker than the others.
+
+    Args:
+        grey: (H, W).
+        grid_px: (rows, cols, 2).
+    """
+    values = square_values(grey, grid_px)
+    is_even = np.indices(values.shape).sum(axis=0) % 2 == 0
+    return float(np.mean(values[~is_even]) - np.mean(values[is_even]))
+
+
+def square_values(grey: Grey, grid_px: Array) -> Array:
+    """Sample the grey value at the centre of each square between four corners, (rows - 1, cols - 1)."""
+    centres = (grid_px[:-1, :-1] + grid_px[1:, :-1] + grid_px[:-1, 1:] + grid_px[1:, 1:]) / 4
+    return sample(grey, centres)
+
+
+def sample(grey: Grey, pixels: Array) -> Array:
+    """Interpolate grey values bilinearly at (..., 2) px; the border's value is kept beyond it."""
+    maps = np.asarray(pixels, dtype=np.float32).reshape(-1, 1, 2)
+    values = cv2.remap(grey.astype(np.float32), maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, dtype=np.float64).reshape(pixels.shape[:-1])
+
+
+def shortest_side_px(corners_px: Array, board: Board) -> float:
+    """Measure the shortest side of all squares between the corners, px."""
+    grid = corners_px.reshape(board.rows, board.cols, 2)
+    sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
+    return float(min(sides))
+
+
+def _attempts(grey: Grey, size: tuple[int, int]) -> Iterator[Array | None]:
+    """Run the finders one after the other, cheapest first; the caller stops at the first success."""
+    if grey.shape[1] > _WIDE_PX:
+        yield _sector_based(grey, size, 0.5, _SB)
+        yield _classic(grey, size, 1.0)
+        yield _sector_based(grey, size, 1.0, _SB)
+        return
+    yield _classic(grey, size, 2.0)
+    level = level_contrast(grey)
+    yield _sector_based(level, size, 1.0, _SB_THOROUGH)
+    yield _sector_based(level, size, 2.0, _SB_THOROUGH)
+    yield _sector_based(grey, size, 2.0, _SB_THOROUGH)
+
+
+def level_contrast(grey: Grey) -> Grey:
+    """Bring every neighbourhood of a low-contrast picture to the same mean and spread."""
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
+    mean = cv2.GaussianBlur(smooth, (0, 0), 8.0)
+    spread = np.sqrt(cv2.GaussianBlur((smooth - mean) ** 2, (0, 0), 8.0)) + 4.0
+    return np.asarray(np.clip(128 + 50 * (smooth - mean) / spread, 0, 255), dtype=np.uint8)
+
+
+def _sector_based(grey: Grey, size: tuple[int, int], scale: float, flags: int) -> Array | None:
+    """Run `cv2.findChessboardCornersSB` (A. Duda, U. Frese, BMVC 2018) at a scale of the picture."""
+    is_found, corners = cv2.findChessboardCornersSB(_resize(grey, scale), size, flags=flags)
+    return _to_full_scale(corners, scale) if is_found else None
+
+
+def _classic(grey: Grey, size: tuple[int, int], scale: float) -> Array | None:
+    is_found, corners = cv2.findChessboardCorners(_resize(grey, scale), size, flags=_CLASSIC)
+    return _to_full_scale(corners, scale) if is_found else None
+
+
+def _resize(grey: Grey, scale: float) -> Grey:
+    if scale == 1.0:
+        return grey
+    how = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
+    return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=how), dtype=np.uint8)
+
+
+def _to_full_scale(corners: NDArray[np.float32], scale: float) -> Array:
+    # Pixel centres are integers: the centre of the first pixel lies half a pixel inside the picture.
+    return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5

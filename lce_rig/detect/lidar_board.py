@@ -1,0 +1,68 @@
+"""Find the board in a full LiDAR scan, without a prior."""
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.data import Scan
+from lce_rig.core.results import LidarBoard, Refusal
+from lce_rig.detect.lidar_features import Beam, build_board, refine
+from lce_rig.detect.lidar_plates import propose_plates
+from lce_rig.detect.lidar_segments import cut_segments, order_scan
+
+MAX_CANDIDATES = 4
+
+
+def find_lidar_boards(
+    scan: Scan,
+    board: Board,
+    *,
+    min_range_m: float = 0.4,
+    max_range_m: float = 6.0,
+    min_rings: int = 4,
+    max_template_m: float = 0.06,
+    beam: Beam | None = None,
+) -> list[LidarBoard] | Refusal:
+    """Find the plates of the board's size in a scan, best first.
+
+    Rings are cut into straight segments, segments in one plane grow into plates, the board's outline is
+    registered with each plate, and the plates that it fits are measured.
+
+    Args:
+        scan: one revolution, or part of one.
+        board: the outer size is what is looked for.
+        min_range_m: nearer returns are ignored.
+        max_range_m: plates farther away are ignored.
+        min_rings: fewest rings on the board.
+        max_template_m: largest mean distance of the outline from where the rings end; grows with the noise.
+        beam: light spot of the LiDAR; that of a VLP-16 where None.
+
+    Returns:
+        At most 4 boards, or why there is none.
+
+    References:
+        LCE-Calib, "Automatic Feature Extraction From LiDARs": selection and features.
+    """
+    ordered = order_scan(scan, min_range_m)
+    segments = cut_segments(ordered, max_range_m)
+    plates = propose_plates(ordered, segments, board)
+    found: list[tuple[float, LidarBoard]] = []
+    for k in range(len(plates.plane)):
+        refined = refine(ordered, board, plates.plane[k], plates.centre[k])
+        if refined is None:
+            continue
+        view, placement = refined
+        if placement.error_m > max_template_m + 2 * ordered.sigma_m:
+            continue
+        candidate = build_board(ordered, scan, board, view, placement, beam or Beam())
+        if candidate.quality["n_rings"] < min_rings or len(candidate.points) < 10:
+            continue
+        found.append((placement.error_m, candidate))
+    found.sort(key=lambda item: item[0])
+    distinct: list[LidarBoard] = []
+    for _, candidate in found:
+        centre = candidate.T_lidar_board[:3, 3]
+        if all(np.linalg.norm(centre - other.T_lidar_board[:3, 3]) > 0.2 for other in distinct):
+            distinct.append(candidate)
+    if not distinct:
+        return Refusal("lidar", "no plate of the board's size", "show the board to the LiDAR at 1.5-3 m, free of other things")
+    return distinct[:MAX_CANDIDATES]

@@ -1,0 +1,291 @@
+"""What the calibration needs from a registered board: plane, points, ring ends and measured size."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.data import Scan
+from lce_rig.core.geometry import Array, pose
+from lce_rig.core.results import LidarBoard
+from lce_rig.detect.lidar_segments import MAX_STEPS, OrderedScan
+from lce_rig.detect.lidar_template import Placement, PlaneView, register, signed_distance, view_plane
+
+SURROUND_M = 0.20
+SIZE_PRIOR_M = 0.10
+
+
+@dataclass(frozen=True)
+class Beam:
+    """The light spot of a LiDAR: half of it reaches over an edge before the board's return is lost.
+
+    Attributes:
+        aperture_m: width of the beam where it leaves the sensor.
+        divergence_rad: full angle by which it widens.
+    """
+
+    aperture_m: float = 0.0127
+    divergence_rad: float = 0.003
+
+    def half_width_m(self, distance_m: float) -> float:
+        """Compute half the width of the spot at a distance."""
+        return (self.aperture_m + self.divergence_rad * distance_m) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class RingEnds:
+    """First and last return of each ring on the board, E of them.
+
+    Attributes:
+        beam: (E,) index in the plane view.
+        side: (E,) -1 or +1.
+        gap: (E, 2) from one beam to the next along the ring at that end, outwards, in the plane view, m.
+        is_border: (E,) whether the surface itself ends there: no occluder before it, no plane behind it.
+    """
+
+    beam: NDArray[np.intp]
+    side: NDArray[np.int8]
+    gap: Array
+    is_border: NDArray[np.bool_]
+
+
+def fit_plane_to_ranges(points: Array, start: Array, scale_m: float, n_rounds: int = 4) -> Array:
+    """Fit a plane to ranges: minimise sum rho_T(r_i - 1 / (m . u_i)) over m, n = -m / |m|, d = 1 / |m|.
+
+    The beams' directions u_i are exact and the noise lies along them. Orthogonal least squares would turn the
+    plane towards the sensor, by sigma^2 / spread^2 rad at 45 deg. rho_T is Tukey's biweight at 4.7 scales.
+
+    Args:
+        points: (N, 3) m, frame lidar.
+        start: (4,) plane as (n, d).
+        scale_m: noise of a range.
+        n_rounds: Gauss-Newton rounds.
+
+    Returns:
+        (4,) plane as (n, d), n towards the LiDAR.
+    """
+    range_m = np.linalg.norm(points, axis=1)
+    rays = points / range_m[:, None]
+    m = -start[:3] / start[3]
+    for _ in range(n_rounds):
+        predicted = 1.0 / (rays @ m)
+        residual = range_m - predicted
+        weight = np.maximum(1.0 - (residual / (4.7 * scale_m)) ** 2, 0.0) ** 2
+        jacobian = -rays * (predicted**2)[:, None]
+        hessian = (jacobian * weight[:, None]).T @ jacobian
+        m = m + np.linalg.solve(hessian + 1e-9 * np.eye(3), jacobian.T @ (weight * residual))
+    return np.append(-m, 1.0) / np.linalg.norm(m)
+
+
+def refine(
+    scan: OrderedScan, board: Board, plane: Array, centre: Array, placement: Placement | None = None
+) -> tuple[PlaneView, Placement] | None:
+    """Fit plane and outline in turn, twice, to the single returns.
+
+    Args:
+        scan: all returns.
+        board: gives the rectangle.
+        plane: (4,) first guess.
+        centre: (3,) m, first guess of the plate's centre.
+        placement: unused start; the outline is searched at all angles in the first round.
+
+    Returns:
+        The beams about the plate and the outline among them, None where too few returns lie on the plane.
+    """
+    del placement
+    radius_m = float(np.hypot(board.width_m, board.height_m)) / 2 + SURROUND_M
+    tolerance_m = 4.0 * scan.sigma_m + 0.01
+    view = view_plane(scan, plane, centre, radius_m, tolerance_m)
+    found = register(view, board)
+    for _ in range(2):
+        if found is None:
+            return None
+        distance, _ = signed_distance(found.local(view.uv), found.half_m)
+        on = view.member[view.is_on & (distance < 0.0)]
+        if len(on) < 10:
+            return None
+        height = scan.points[on] @ view.plane[:3] + view.plane[3]
+        scale_m = 1.4826 * float(np.median(np.abs(height - np.median(height)))) + 0.001
+        cosine = abs(float(view.plane[:3] @ view.origin)) / float(np.linalg.norm(view.origin))
+        plane = fit_plane_to_ranges(scan.points[on], view.plane, scale_m / cosine)
+        residual = scan.points[on] @ plane[:3] + plane[3]
+        scale_m = 1.4826 * float(np.median(np.abs(residual)))
+        centre = view.origin + view.axes @ [found.u_m, found.v_m]
+        tolerance_m = 3.5 * scale_m + 0.004
+        view = view_plane(scan, plane, centre, radius_m, tolerance_m)
+        found = register(view, board, [Placement(0.0, 0.0, found.angle_rad, found.half_m)])
+    return None if found is None else (view, found)
+
+
+def find_ring_ends(scan: OrderedScan, view: PlaneView, is_board: NDArray[np.bool_]) -> RingEnds:
+    """Take the first and last board return of each ring and look at the beams beyond them.
+
+    Args:
+        scan: all returns.
+        view: beams about the board.
+        is_board: (M,) which of them return from it.
+    """
+    board = np.flatnonzero(is_board)
+    ring = scan.ring[view.member[board]]
+    is_first = np.diff(ring, prepend=-1) != 0
+    is_last = np.append(is_first[1:], True)
+    n_on_ring = np.flatnonzero(is_last) - np.flatnonzero(is_first) + 1
+    is_long = n_on_ring >= 3
+    first, last = np.flatnonzero(is_first)[is_long], np.flatnonzero(is_last)[is_long]
+    beam = np.concatenate([board[first], board[last]])
+    inner = np.concatenate([board[first + 2], board[last - 2]])
+    n_steps = np.mod(np.abs(scan.azimuth[view.member[beam]] - scan.azimuth[view.member[inner]]), 2 * np.pi)
+    n_steps = np.maximum(np.minimum(n_steps, 2 * np.pi - n_steps) / max(scan.step_rad, 1e-6), 1.0)
+    side = np.repeat(np.array([-1, 1], dtype=np.int8), len(first))
+    gap = (view.uv[beam] - view.uv[inner]) / n_steps[:, None]
+    beyond, beyond_exists = _outwards(scan, view.member[beam], side, 1)
+    further, further_exists = _outwards(scan, view.member[beam], side, 2)
+    height_1 = scan.points[beyond] @ view.plane[:3] + view.plane[3]
+    height_2 = scan.points[further] @ view.plane[:3] + view.plane[3]
+    is_occluded = beyond_exists & (height_1 > view.tolerance_m)
+    goes_on = beyond_exists & (np.abs(height_1) <= view.tolerance_m)
+    goes_on &= further_exists & (np.abs(height_2) <= view.tolerance_m)
+    return RingEnds(beam, side, gap, ~(is_occluded | goes_on))
+
+
+def _outwards(
+    scan: OrderedScan, member: NDArray[np.intp], side: NDArray[np.int8], n: int
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Find the n-th return beyond each ring end and whether it is there: same ring, a few firings off."""
+    other = np.clip(member + n * side.astype(np.intp), 0, len(scan.index) - 1)
+    turn = np.abs(np.mod(scan.azimuth[other] - scan.azimuth[member] + np.pi, 2 * np.pi) - np.pi)
+    exists = (scan.ring[other] == scan.ring[member]) & (turn < (n + MAX_STEPS) * scan.step_rad) & (other != member)
+    return other, exists
+
+
+def measure_size(
+    ends: RingEnds, uv: Array, placement: Placement, beyond_m: float
+) -> tuple[Placement, Array, Array, Array]:
+    """Fit a rectangle of free size to the ring ends: least squares of their distance from the nearest edge.
+
+    An end lies half a step of the ring inside the edge on average, and half a light spot outside
+    (`beyond_m`); both along the edge's normal. A weak prior holds a side that no end shows.
+
+    Args:
+        ends: ring ends.
+        uv: (M, 2) of the plane view, m.
+        placement: of the rectangle with the nominal size.
+        beyond_m: how far the light spot reaches over an edge.
+
+    Returns:
+        The fitted rectangle, the standard deviation of its width and height (2,), the residuals (E,) in m,
+        positive outwards, and the step along the edge's normal (E,) in m.
+    """
+    local = placement.local(uv[ends.beam])
+    over = np.abs(local) - placement.half_m
+    axis = over.argmax(axis=1)
+    rows = np.arange(len(axis))
+    sign = np.where(local[rows, axis] < 0, -1.0, 1.0)
+    gap_local = placement.local(ends.gap + [placement.u_m, placement.v_m])
+    step_m = np.abs(gap_local[rows, axis])
+    half = np.asarray(placement.half_m)
+    # Unknowns: shift along x and y, angle, half width, half height.
+    jacobian = np.zeros((len(axis), 5))
+    jacobian[rows, axis] = sign
+    jacobian[:, 2] = sign * np.where(axis == 0, -local[:, 1], local[:, 0])
+    jacobian[rows, 3 + axis] = 1.0
+    target = np.abs(local[rows, axis]) - half[axis] - (beyond_m - step_m / 2)
+    sigma_m = np.sqrt(step_m**2 / 12 + 0.003**2)
+    usable = ends.is_border
+    prior = np.diag([0.0, 0.0, 0.0, 4.0, 4.0]) / SIZE_PRIOR_M**2 + 1e-3 * np.eye(5)
+    x = np.zeros(5)
+    for _ in range(6):
+        residual = target - jacobian @ x
+        scale = np.maximum(np.median(np.abs(residual[usable])) * 1.4826, 0.003) if usable.any() else 0.01
+        weight = usable * np.maximum(1 - (residual / (4.7 * np.maximum(scale, sigma_m))) ** 2, 0.0) ** 2
+        information = (jacobian * (weight / sigma_m**2)[:, None]).T @ jacobian + prior
+        x = np.linalg.solve(information, jacobian.T @ (weight / sigma_m**2 * target))
+    residual = target - jacobian @ x
+    cov = np.linalg.inv(information)
+    freedom = max(1.0, float((weight > 0).sum()) - 5)
+    chi2 = float((weight * (residual / sigma_m) ** 2).sum()) / freedom
+    size_sigma_m = 2 * np.sqrt(np.diag(cov)[3:] * max(1.0, chi2))
+    cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
+    fitted = Placement(
+        placement.u_m + float(cosine * x[0] - sine * x[1]),
+        placement.v_m + float(sine * x[0] + cosine * x[1]),
+        placement.angle_rad + float(x[2]),
+        (float(half[0] + x[3]), float(half[1] + x[4])),
+        placement.error_m,
+    )
+    return fitted, size_sigma_m, residual, step_m
+
+
+def build_board(
+    scan: OrderedScan, source: Scan, board: Board, view: PlaneView, placement: Placement, beam: Beam
+) -> LidarBoard:
+    """Collect the returns inside the outline, keep the ring ends that are the board's own, and sum up.
+
+    Args:
+        scan: all returns, ordered.
+        source: the scan they come from.
+        board: nominal size.
+        view: beams about the board.
+        placement: of the nominal rectangle.
+        beam: light spot of the LiDAR.
+    """
+    distance_m = float(np.linalg.norm(view.origin))
+    beyond_m = beam.half_width_m(distance_m)
+    away, _ = signed_distance(placement.local(view.uv), placement.half_m)
+    is_board = view.is_on & (away <= beyond_m + 0.015)
+    ends = find_ring_ends(scan, view, is_board)
+    fitted, size_sigma_m, residual, step_m = measure_size(ends, view.uv, placement, beyond_m)
+    limit_m = step_m / 2 + 0.010 + 0.5 * beyond_m
+    is_good = ends.is_border & (np.abs(residual) <= limit_m)
+    order = np.lexsort((ends.side, scan.ring[view.member[ends.beam]]))
+    order = order[is_good[order]]
+    kept, edge = view.member[is_board], view.member[ends.beam[order]]
+    points = scan.points[kept]
+    height = points @ view.plane[:3] + view.plane[3]
+    size_m = 2 * np.asarray(fitted.half_m)
+    size_sigma_m = np.hypot(size_sigma_m, beyond_m)
+    spec_m = np.array([board.width_m, board.height_m])
+    weight = 1.0 / size_sigma_m**2
+    incidence = np.arccos(np.clip(view.plane[3] / distance_m, 0.0, 1.0))
+    quality = {
+        "n_rings": float(len(np.unique(scan.ring[kept]))),
+        "n_points": float(len(kept)),
+        "n_ring_ends": float(len(edge)),
+        "n_ring_ends_dropped": float(len(ends.beam) - len(edge)),
+        "thickness_m": float(np.percentile(height, 97.5) - np.percentile(height, 2.5)),
+        "width_m": float(size_m[0]),
+        "height_m": float(size_m[1]),
+        "width_sigma_m": float(size_sigma_m[0]),
+        "height_sigma_m": float(size_sigma_m[1]),
+        "size_ratio": float((weight * size_m / spec_m).sum() / weight.sum()),
+        "edge_rms_m": float(np.sqrt(np.mean(residual[is_good] ** 2))) if is_good.any() else float("nan"),
+        "template_m": placement.error_m,
+        "distance_m": distance_m,
+        "incidence_deg": float(np.degrees(incidence)),
+        "range_noise_m": scan.sigma_m,
+    }
+    return LidarBoard(
+        points=points,
+        ring=scan.ring[kept],
+        edge_points=scan.points[edge],
+        edge_ring=scan.ring[edge],
+        edge_side=ends.side[order],
+        azimuth_step_rad=scan.step_rad,
+        plane=view.plane,
+        sigma_m=float(np.sqrt(np.mean(height**2))),
+        T_lidar_board=_pose_of(view, placement),
+        offset_ns=None if source.offset_ns is None else source.offset_ns[scan.index[kept]],
+        quality=quality,
+    )
+
+
+def _pose_of(view: PlaneView, placement: Placement) -> Array:
+    """Compute T_lidar_board of a placement, y upwards where the rectangle leaves the choice."""
+    direction = np.array([np.cos(placement.angle_rad), np.sin(placement.angle_rad)])
+    if direction[0] < 0:
+        direction = -direction
+    x = view.axes @ direction
+    normal = view.plane[:3]
+    R = np.stack([x, np.cross(normal, x), normal], axis=1)
+    return pose(R, view.origin + view.axes @ [placement.u_m, placement.v_m])

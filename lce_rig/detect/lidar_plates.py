@@ -1,0 +1,175 @@
+"""Plates of about the board's size: clusters of straight segments that lie in one plane."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.detect.lidar_segments import MAX_INCIDENCE_RAD, Indices, OrderedScan, Segments
+
+MAX_PAIRS = 600
+N_ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Plates:
+    """K plates, the most promising first.
+
+    Attributes:
+        plane: (K, 4) as (n, d), n.p + d = 0, n towards the LiDAR.
+        centre: (K, 3) mean of the plate's returns, m.
+        n_rings: (K,).
+        size_m: (K, 2) long and short side of the rectangle with the same second moments.
+        thickness_m: (K,) rms distance of the returns from the plane.
+    """
+
+    plane: Array
+    centre: Array
+    n_rings: Indices
+    size_m: Array
+    thickness_m: Array
+
+    def select(self, keep: NDArray[np.bool_] | Indices) -> "Plates":
+        """Keep the plates of a mask or index."""
+        return Plates(*(getattr(self, field.name)[keep] for field in fields(self)))
+
+
+def propose_plates(scan: OrderedScan, segments: Segments, board: Board, n_plates: int = 8) -> Plates:
+    """Grow plates from pairs of neighbouring segments and keep different ones of plausible size.
+
+    Each pair of parallel segments on rings at most two apart spans a plane. A plane takes all segments in reach
+    that lie in it and is fitted again to their sums, a few times over, for all planes at once.
+
+    Args:
+        scan: gives the noise.
+        segments: straight segments of all lengths.
+        board: gives the reach.
+        n_plates: the most plates to return.
+    """
+    diagonal_m = float(np.hypot(board.width_m, board.height_m))
+    tolerance_m = 2.0 * scan.sigma_m + 0.01
+    segments = segments.select(segments.lateral_m < tolerance_m)
+    first, second = _neighbours(segments, diagonal_m)
+    sums = _sums(segments)
+    plates = _fit(np.repeat(np.arange(len(first)), 2), np.stack([first, second], 1).ravel(), segments, sums)
+    is_kept = (plates.thickness_m < tolerance_m) & _faces_lidar(plates)
+    for _ in range(N_ROUNDS):
+        row, column = _members(plates.select(is_kept), segments, 0.6 * diagonal_m, tolerance_m)
+        plates = _fit(row, column, segments, sums)
+        # The same members give the very same sums.
+        is_kept = np.zeros(len(plates.centre), dtype=np.bool_)
+        is_kept[np.unique(plates.centre[:, 0], return_index=True)[1]] = True
+        is_kept &= (plates.n_rings >= 2) & _faces_lidar(plates) & (plates.size_m[:, 0] < 1.5 * diagonal_m)
+    is_kept &= _is_plausible(plates, board)
+    return _different(plates.select(is_kept), board, diagonal_m, n_plates)
+
+
+def _neighbours(segments: Segments, diagonal_m: float) -> tuple[Indices, Indices]:
+    """List the pairs of board-like segments that can lie side by side on one plate."""
+    is_seed = (segments.length_m > 0.2 * diagonal_m) & (segments.length_m < 1.15 * diagonal_m)
+    distance = np.linalg.norm(segments.centre, axis=1)
+    along_beam = np.einsum("ij,ij->i", segments.direction, segments.centre)
+    is_seed &= np.abs(along_beam) < np.sin(MAX_INCIDENCE_RAD) * distance
+    seed = np.flatnonzero(is_seed)
+    ring, centre, direction = segments.ring[seed], segments.centre[seed], segments.direction[seed]
+    ring_gap = ring[None] - ring[:, None]
+    # Few pairs are on neighbouring rings: everything else is computed for them only.
+    first, second = np.nonzero((ring_gap >= 1) & (ring_gap <= 1))
+    away = centre[second] - centre[first]
+    reach = segments.length_m[seed]
+    is_near = np.einsum("ij,ij->i", away, away) < (0.6 * diagonal_m) ** 2
+    is_near &= np.abs(np.einsum("ij,ij->i", direction[first], direction[second])) > 0.95
+    is_near &= np.abs(np.einsum("ij,ij->i", direction[first], away)) < 0.4 * (reach[first] + reach[second])
+    first, second = seed[first[is_near]], seed[second[is_near]]
+    best = np.argsort(-segments.count[first] - segments.count[second], kind="stable")[:MAX_PAIRS]
+    return first[best], second[best]
+
+
+def _sums(segments: Segments) -> Array:
+    """Stack count, sum of p and sum of p p^T of each segment (S, 13)."""
+    outer = segments.centre[:, :, None] * segments.centre[:, None, :]
+    second = (segments.scatter + segments.count[:, None, None] * outer).reshape(-1, 9)
+    return np.concatenate([segments.count[:, None], segments.count[:, None] * segments.centre, second], axis=1)
+
+
+def _fit(row: Indices, column: Indices, segments: Segments, sums: Array) -> Plates:
+    """Fit a plane to the sums of each plate's segments.
+
+    Args:
+        row: (L,) plate of each membership, rising.
+        column: (L,) segment of each membership, rising within a plate.
+        segments: S of them.
+        sums: (S, 13) of the segments.
+    """
+    start = np.flatnonzero(np.diff(row, prepend=-1))
+    if len(start) == 0:
+        none = np.zeros(0)
+        return Plates(np.zeros((0, 4)), np.zeros((0, 3)), start, np.zeros((0, 2)), none)
+    total = np.add.reduceat(sums[column], start)
+    count = total[:, 0]
+    centre = total[:, 1:4] / count[:, None]
+    spread = total[:, 4:].reshape(-1, 3, 3) / count[:, None, None] - centre[:, :, None] * centre[:, None, :]
+    eigenvalues, eigenvectors = np.linalg.eigh(spread)
+    eigenvalues = np.maximum(eigenvalues, 0.0)
+    normal = eigenvectors[:, :, 0]
+    d = -np.einsum("ij,ij->i", normal, centre)
+    plane = np.concatenate([normal, d[:, None]], axis=1) * np.where(d < 0, -1.0, 1.0)[:, None]
+    is_new_ring = (np.diff(row, prepend=-1) != 0) | (np.diff(segments.ring[column], prepend=-1) != 0)
+    n_rings = np.add.reduceat(is_new_ring.astype(np.intp), start)
+    return Plates(plane, centre, n_rings, np.sqrt(12.0 * eigenvalues[:, [2, 1]]), np.sqrt(eigenvalues[:, 0]))
+
+
+def _members(plates: Plates, segments: Segments, reach_m: float, tolerance_m: float) -> tuple[Indices, Indices]:
+    """List which segments lie in which plane, within reach of its centre: (plate, segment), rising."""
+    row, column = _within_reach(plates.centre, segments.centre, reach_m)
+    normal = plates.plane[row, :3]
+    offset = np.einsum("ij,ij->i", normal, segments.centre[column]) + plates.plane[row, 3]
+    scatter = segments.scatter[column] / segments.count[column, None, None]
+    variance = np.einsum("ij,ijk,ik->i", normal, scatter, normal)
+    is_member = offset * offset + variance < tolerance_m**2
+    return row[is_member], column[is_member]
+
+
+def _within_reach(centres: Array, others: Array, reach_m: float, block: int = 32) -> tuple[Indices, Indices]:
+    """List the pairs (row, column) of points closer than the reach, a block of rows at a time for the cache."""
+    half_squared = np.einsum("ij,ij->i", others, others) / 2
+    limit = (reach_m**2 - np.einsum("ij,ij->i", centres, centres)) / 2
+    rows, columns = [], []
+    for begin in range(0, len(centres), block):
+        dot = centres[begin : begin + block] @ others.T
+        row, column = np.nonzero(half_squared - dot < limit[begin : begin + block, None])
+        rows.append(row + begin)
+        columns.append(column)
+    return np.concatenate(rows or [np.zeros(0, np.intp)]), np.concatenate(columns or [np.zeros(0, np.intp)])
+
+
+def _faces_lidar(plates: Plates) -> NDArray[np.bool_]:
+    """Tell which planes (K,) the beams meet at less than the largest incidence; d = distance of the plane."""
+    distance = np.linalg.norm(plates.centre, axis=1)
+    return np.asarray(plates.plane[:, 3] > np.cos(MAX_INCIDENCE_RAD) * distance)
+
+
+def _is_plausible(plates: Plates, board: Board) -> NDArray[np.bool_]:
+    """Tell which plates (K,) can be the board, part of which may be hidden or outside the rings."""
+    long_m, short_m = max(board.width_m, board.height_m), min(board.width_m, board.height_m)
+    ratio = plates.size_m / [long_m, short_m]
+    return np.asarray((ratio[:, 0] > 0.5) & (ratio[:, 0] < 1.5) & (ratio[:, 1] > 0.25) & (ratio[:, 1] < 1.5))
+
+
+def _different(plates: Plates, board: Board, diagonal_m: float, n_plates: int) -> Plates:
+    """Keep the most board-like plate of each place and orientation."""
+    long_m, short_m = max(board.width_m, board.height_m), min(board.width_m, board.height_m)
+    misfit = np.abs(np.log(np.maximum(plates.size_m, 1e-3) / [long_m, short_m])).sum(axis=1)
+    # Few rings say little about a size; many returns on a wrong size say no.
+    rank = np.argsort(misfit - 0.1 * np.minimum(plates.n_rings, 8), kind="stable")
+    chosen: list[int] = []
+    while len(rank) and len(chosen) < n_plates:
+        best = int(rank[0])
+        chosen.append(best)
+        apart = np.linalg.norm(plates.centre[rank] - plates.centre[best], axis=1)
+        cosine = plates.plane[rank, :3] @ plates.plane[best, :3]
+        offset = np.abs(plates.plane[rank, :3] @ plates.centre[best] + plates.plane[rank, 3])
+        rank = rank[(apart > 0.3 * diagonal_m) | (cosine < 0.95) | (offset > 0.05)]
+    return plates.select(np.array(chosen, dtype=np.intp))

@@ -1,0 +1,227 @@
+"""A scan as rings of ordered returns, cut into straight segments that are described by their sums."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.data import Scan
+from lce_rig.core.geometry import Array
+
+Indices = NDArray[np.intp]
+
+# The board is found up to this angle between its normal and the beam; more is not a useful view.
+MAX_INCIDENCE_RAD = np.radians(70.0)
+MAX_STEPS = 3.6  # firings from one return to the next on the same surface; dark squares drop single ones
+RANGE_NOISE_FLOOR_M = 0.004
+
+
+@dataclass(frozen=True, eq=False)
+class OrderedScan:
+    """The usable returns of a scan, ring after ring, each by rising azimuth from a gap or jump onwards.
+
+    No surface is cut in two by the seam at azimuth +-pi.
+
+    Attributes:
+        index: (N,) of each return in the scan it comes from.
+        points: (N, 3) m, frame lidar.
+        range_m: (N,).
+        azimuth: (N,) atan2(y, x), rad.
+        ring: (N,).
+        is_break: (N,) whether the return before it in its ring lies on another surface or too far off.
+        step_rad: angle between neighbouring firings of one ring.
+        sigma_m: noise of a single range.
+    """
+
+    index: Indices
+    points: Array
+    range_m: Array
+    azimuth: Array
+    ring: NDArray[np.int16]
+    is_break: NDArray[np.bool_]
+    step_rad: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Runs of neighbouring returns of one ring, S of them, by ring and azimuth.
+
+    Attributes:
+        start, end: (S,) half-open range of returns in the `OrderedScan`.
+        ring: (S,).
+        count: (S,) number of returns.
+        centre: (S, 3) mean, m.
+        scatter: (S, 3, 3) sum of (p - mean)(p - mean)^T, m^2.
+        direction: (S, 3) unit vector from the first to the last return.
+        length_m: (S,) between them.
+        lateral_m: (S,) rms distance of the returns from the segment's line.
+    """
+
+    start: Indices
+    end: Indices
+    ring: NDArray[np.int16]
+    count: Array
+    centre: Array
+    scatter: Array
+    direction: Array
+    length_m: Array
+    lateral_m: Array
+
+    def select(self, keep: NDArray[np.bool_]) -> "Segments":
+        """Keep the segments of a mask (S,)."""
+        return Segments(*(getattr(self, field.name)[keep] for field in fields(self)))
+
+
+def order_scan(scan: Scan, min_range_m: float) -> OrderedScan:
+    """Sort the returns of a scan by ring and azimuth and estimate its noise.
+
+    Args:
+        scan: the full revolution or any part of it.
+        min_range_m: nearer returns are dropped, as are NaN, infinite and zero ones.
+    """
+    points = scan.points.astype(np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        range_m = np.sqrt(np.einsum("ij,ij->i", points, points))
+        azimuth = np.arctan2(points[:, 1], points[:, 0])
+        is_usable = (range_m >= min_range_m) & (range_m < 1e4)  # false for NaN and infinity
+    # Drivers deliver by time, which is almost by azimuth: a stable sort finds the presorted runs.
+    order = np.argsort(scan.ring, kind="stable")
+    order = order[is_usable[order]]
+    order = order[np.argsort(scan.ring[order] * 8.0 + azimuth[order], kind="stable")]
+    ring, azimuth, range_m = scan.ring[order], azimuth[order], range_m[order]
+    if len(order) == 0:
+        empty = np.zeros(0)
+        no_break = np.zeros(0, dtype=np.bool_)
+        return OrderedScan(order, np.zeros((0, 3)), empty, empty, ring, no_break, 0.0, RANGE_NOISE_FLOOR_M)
+    starts = np.flatnonzero(np.diff(ring, prepend=ring[0] - 1))
+    counts = np.diff(np.append(starts, len(order)))
+    previous = np.arange(len(order)) - 1
+    previous[starts] = starts + counts - 1
+    turn = np.mod(azimuth - azimuth[previous], 2 * np.pi)
+    jump = np.abs(range_m - range_m[previous])
+    step_rad, sigma_m = _azimuth_step(turn), _range_noise(turn, range_m, ring)
+    limit = max_range_jump(range_m, turn, sigma_m)
+    is_break = (turn > MAX_STEPS * step_rad) | (jump > limit)
+    # Turn each ring so that it begins at its first break.
+    position = np.arange(len(order))
+    first = np.minimum.reduceat(np.where(is_break, position, len(order)), starts)
+    shift = np.where(first < len(order), first - starts, 0)
+    start_of, count_of = np.repeat(starts, counts), np.repeat(counts, counts)
+    turned = start_of + (position - start_of + np.repeat(shift, counts)) % count_of
+    is_break = is_break[turned]
+    is_break[starts] = True
+    order = order[turned]
+    return OrderedScan(
+        order, points[order], range_m[turned], azimuth[turned], ring[turned], is_break, step_rad, sigma_m
+    )
+
+
+def max_range_jump(range_m: Array, turn: Array, sigma_m: float) -> Array:
+    """Compute the largest change of range in m between neighbours on one tilted plane, with its noise."""
+    slope = np.tan(MAX_INCIDENCE_RAD)
+    return np.asarray(range_m * np.minimum(turn, 0.02) * slope + 6.0 * sigma_m)
+
+
+def _azimuth_step(turn: Array) -> float:
+    """Find the firing interval in rad: the mean of the common differences of azimuth, 0 without returns."""
+    forward = turn[(turn > 1e-4) & (turn < 0.05)]
+    if len(forward) == 0:
+        return 0.0
+    middle = float(np.median(forward))
+    return float(np.mean(forward[np.abs(forward - middle) < 0.3 * middle]))
+
+
+def _range_noise(turn: Array, range_m: Array, ring: NDArray[np.int16]) -> float:
+    """Estimate sigma of a range from its second differences along the rings, 0 on planes up to curvature.
+
+    The lower quartile of |r[i-1] - 2 r[i] + r[i+1]| / sqrt(6) is taken: edges and foliage spoil the upper part.
+    """
+    second = np.abs(range_m[:-2] - 2 * range_m[1:-1] + range_m[2:])
+    is_plain = (ring[:-2] == ring[2:]) & (turn[1:-1] < 0.01) & (turn[2:] < 0.01)
+    second = second[is_plain]
+    if len(second) < 20:
+        return 0.01
+    quartile = float(np.partition(second, len(second) // 4)[len(second) // 4])
+    return max(quartile / (0.3186 * np.sqrt(6.0)), RANGE_NOISE_FLOOR_M)
+
+
+def cut_segments(scan: OrderedScan, max_range_m: float, min_points: int = 4) -> Segments:
+    """Cut the rings at gaps and jumps, then at bends, and keep the straight pieces.
+
+    A run whose returns leave its chord is cut where they leave it most, as a polyline is simplified.
+
+    Args:
+        scan: all returns.
+        max_range_m: runs whose first return is farther are dropped.
+        min_points: runs with fewer returns are dropped.
+
+    References:
+        D. Douglas and T. Peucker, "Algorithms for the reduction of the number of points required to represent
+        a digitized line", Cartographica 10(2), 1973.
+    """
+    start = np.flatnonzero(scan.is_break)
+    end = np.append(start[1:], len(scan.index))
+    tolerance_m = 4.0 * scan.sigma_m + 0.01
+    is_kept = (end - start >= min_points) & (scan.range_m[start] <= max_range_m) if len(start) else start > 0
+    start, end = start[is_kept], end[is_kept]
+    done = []
+    for _ in range(4):
+        if len(start) == 0:
+            break
+        worst, distance = _worst_from_chord(scan, start, end)
+        is_straight = distance <= tolerance_m
+        done.append(np.stack([start[is_straight], end[is_straight]]))
+        bent = ~is_straight
+        start, middle, end = start[bent], worst[bent], end[bent]
+        start, end = np.concatenate([start, middle]), np.concatenate([middle, end])
+        is_kept = end - start >= min_points
+        start, end = start[is_kept], end[is_kept]
+    bounds = np.concatenate([*done, np.stack([start, end])], axis=1)
+    bounds = bounds[:, np.argsort(bounds[0])]
+    return _describe(scan, bounds[0], bounds[1])
+
+
+def _worst_from_chord(scan: OrderedScan, start: Indices, end: Indices) -> tuple[Indices, Array]:
+    """Find in each run the return farthest from the line through its ends, and that distance in m.
+
+    The ends are means of three returns, so that the noise of one does not tilt the chord.
+    """
+    count = end - start
+    begins = np.cumsum(count) - count
+    member = np.repeat(start - begins, count) + np.arange(int(count.sum()))
+    points = scan.points[member]
+    first = (scan.points[start] + scan.points[start + 1] + scan.points[start + 2]) / 3
+    last = (scan.points[end - 1] + scan.points[end - 2] + scan.points[end - 3]) / 3
+    direction = last - first
+    direction /= np.maximum(np.linalg.norm(direction, axis=1), 1e-9)[:, None]
+    offset = points - np.repeat(first, count, axis=0)
+    along = np.einsum("ij,ij->i", offset, np.repeat(direction, count, axis=0))
+    squared = np.einsum("ij,ij->i", offset, offset) - along * along
+    largest = np.maximum.reduceat(squared, begins)
+    position = np.where(squared >= np.repeat(largest, count), np.arange(len(member)), len(member))
+    worst = member[np.minimum.reduceat(position, begins)]
+    return worst, np.sqrt(np.maximum(largest, 0.0))
+
+
+def _describe(scan: OrderedScan, start: Indices, end: Indices) -> Segments:
+    """Sum up the returns of each run."""
+    if len(start) == 0:
+        none, no_vector = np.zeros(0), np.zeros((0, 3))
+        ring = np.zeros(0, dtype=np.int16)
+        return Segments(start, end, ring, none, no_vector, np.zeros((0, 3, 3)), no_vector, none, none)
+    count = (end - start).astype(np.float64)
+    begins = np.cumsum(end - start) - (end - start)
+    member = np.repeat(start - begins, end - start) + np.arange(int(count.sum()))
+    points = scan.points[member]
+    centre = np.add.reduceat(points, begins) / count[:, None]
+    spread = points - np.repeat(centre, end - start, axis=0)
+    products = spread[:, [0, 0, 0, 1, 1, 2]] * spread[:, [0, 1, 2, 1, 2, 2]]
+    scatter = np.add.reduceat(products, begins)[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    chord = scan.points[end - 1] - scan.points[start]
+    length_m = np.linalg.norm(chord, axis=1)
+    direction = chord / np.maximum(length_m, 1e-9)[:, None]
+    along = np.einsum("ij,ijk,ik->i", direction, scatter, direction)
+    across = np.einsum("ijj->i", scatter) - along
+    lateral_m = np.sqrt(np.maximum(across, 0.0) / count)
+    return Segments(start, end, scan.ring[start], count, centre, scatter, direction, length_m, lateral_m)

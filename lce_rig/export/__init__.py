@@ -1,0 +1,99 @@
+"""Results as files that other programs read; each is read back before it is handed out."""
+
+from collections.abc import Callable, Iterable, Sequence
+from importlib import import_module
+from pathlib import Path
+
+from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError
+from lce_rig.core.results import Calibration
+from lce_rig.rig import Rig
+
+Exporter = Callable[[Sequence[Calibration], Rig, Path], list[Path]]
+
+# Format -> module and function, imported when used.
+EXPORTS: dict[str, str] = {
+    "extrinsics": "lce_rig.export.extrinsics:export_extrinsics",
+    "urdf": "lce_rig.export.urdf:export_urdf",
+    "camera_info": "lce_rig.export.camera_info:export_camera_info",
+    "static_tf": "lce_rig.export.static_tf:export_static_tf",
+    "kalibr": "lce_rig.export.kalibr:export_kalibr",
+    "autoware": "lce_rig.export.autoware:export_autoware",
+}
+
+
+def load_exporter(name: str) -> Exporter:
+    """Import the function (calibrations, rig, folder) -> paths of a format.
+
+    Raises:
+        UsageError: no such format.
+    """
+    if name not in EXPORTS:
+        raise UsageError(f"no export format is called {name}", f"there is {', '.join(EXPORTS)}")
+    module, function = EXPORTS[name].split(":")
+    exporter: Exporter = getattr(import_module(module), function)
+    return exporter
+
+
+def write_exports(
+    calibrations: Sequence[Calibration],
+    rig: Rig,
+    folder: Path,
+    *,
+    formats: Iterable[str] | None = None,
+    is_forced: bool = False,
+) -> list[Path]:
+    """Write all formats (or those named) into a folder, each read back and checked by probe points.
+
+    Exports of an earlier run are removed first, also when this one is refused: a file that stays behind would
+    pass for this result.
+
+    Args:
+        calibrations: what to write, one for each camera channel and LiDAR.
+        rig: the profile the calibrations belong to.
+        folder: as a rule the session's `calibration/`.
+        formats: keys of EXPORTS; all where left out.
+        is_forced: write also what failed; every file then says so.
+
+    Returns:
+        The files written, in the order of the formats.
+
+    Raises:
+        ResultRefusedError: a verdict is "fail"; nothing is written.
+        LceRigError: a file does not say what was calibrated; it and all others are removed again.
+    """
+    exporters = [load_exporter(name) for name in (EXPORTS if formats is None else formats)]
+    remove_exports(folder)
+    failed = [c for c in calibrations if c.verdict == "fail"]
+    if failed and not is_forced:
+        pairs = ", ".join(f"{c.camera}/{c.channel} and {c.lidar}" for c in failed)
+        reasons = "; ".join(reason for c in failed for reason in c.reasons)
+        raise ResultRefusedError(f"not exported: the calibration of {pairs} failed", reasons)
+    paths: list[Path] = []
+    try:
+        for exporter in exporters:
+            paths += exporter(calibrations, rig, folder)
+    except BaseException:
+        remove_exports(folder)
+        raise
+    return paths
+
+
+def remove_exports(folder: Path) -> None:
+    """Remove the exports that lce-rig wrote into a folder earlier, known by their first lines.
+
+    Raises:
+        SessionError: one cannot be removed.
+    """
+    for path in sorted(folder.glob("*")):
+        if path.suffix in (".yaml", ".urdf", ".txt") and path.is_file() and _is_ours(path):
+            try:
+                path.unlink()
+            except OSError as error:
+                raise SessionError(
+                    f"{path}: an earlier export cannot be removed: {error.strerror}"
+                ) from error
+
+
+def _is_ours(path: Path) -> bool:
+    with path.open("rb") as file:
+        return b", written by lce-rig " in file.read(300)

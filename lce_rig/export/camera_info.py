@@ -1,0 +1,90 @@
+"""camera_info_CAMERA.yaml: intrinsics as ROS's camera_info_manager reads them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.errors import LceRigError
+from lce_rig.core.results import Calibration
+from lce_rig.export.frames import choose_channels
+from lce_rig.export.probes import check_projection
+from lce_rig.export.writing import header, numbers, quoted, write_atomically
+from lce_rig.rig import Rig
+
+
+def export_camera_info(calibrations: Sequence[Calibration], rig: Rig, folder: Path) -> list[Path]:
+    """Write a file for each calibrated camera and check it by reading it back.
+
+    Raises:
+        LceRigError: a file does not project as the rig's camera does.
+    """
+    chosen = {calibration.camera: calibration for calibration in choose_channels(calibrations, rig)}
+    paths = []
+    for name, calibration in chosen.items():
+        path = folder / f"camera_info_{name}.yaml"
+        intrinsics = rig.cameras[name].to_intrinsics()
+        write_atomically(path, _text(name, intrinsics, header("camera_info", rig, [calibration])))
+        read = read_camera_info(path)
+        check_projection(path, "the camera model", calibration.T_cam_lidar, read, calibration, rig)
+        paths.append(path)
+    return paths
+
+
+def ros_distortion(intrinsics: Intrinsics) -> tuple[str, tuple[float, ...]]:
+    """Name the ROS distortion model and list the coefficients it wants (4, 5 or 8)."""
+    given = intrinsics.distortion
+    if intrinsics.model == "equidistant":
+        return "equidistant", given
+    # plumb_bob has five coefficients, k3 last; rational_polynomial eight.
+    model, count = ("plumb_bob", 5) if len(given) <= 5 else ("rational_polynomial", 8)
+    return model, (*given, *(0.0,) * (count - len(given)))
+
+
+def _text(name: str, intrinsics: Intrinsics, head: list[str]) -> str:
+    model, coefficients = ros_distortion(intrinsics)
+    projection = np.hstack([intrinsics.matrix, np.zeros((3, 1))])
+    lines = [f"# {line}" for line in head]
+    lines += [
+        f"image_width: {intrinsics.width_px}",
+        f"image_height: {intrinsics.height_px}",
+        f"camera_name: {quoted(name)}",
+        *_matrix("camera_matrix", intrinsics.matrix),
+        f"distortion_model: {model}",
+        *_matrix("distortion_coefficients", np.array([coefficients])),
+        *_matrix("rectification_matrix", np.eye(3)),
+        *_matrix("projection_matrix", projection),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _matrix(key: str, matrix: Any) -> list[str]:
+    n_rows, n_cols = matrix.shape
+    return [f"{key}:", f"  rows: {n_rows}", f"  cols: {n_cols}", f"  data: {numbers(matrix.ravel())}"]
+
+
+def read_camera_info(path: Path) -> Intrinsics:
+    """Read a camera model from a camera_info file.
+
+    Raises:
+        LceRigError: a model or shape that ROS does not know.
+    """
+    import yaml
+
+    data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    models: dict[str, tuple[Literal["radtan", "equidistant"], int]] = {
+        "plumb_bob": ("radtan", 5),
+        "rational_polynomial": ("radtan", 8),
+        "equidistant": ("equidistant", 4),
+    }
+    name, coefficients = data["distortion_model"], tuple(data["distortion_coefficients"]["data"])
+    K, P = np.array(data["camera_matrix"]["data"]), np.array(data["projection_matrix"]["data"])
+    if name not in models or len(coefficients) != models[name][1]:
+        raise LceRigError(f"{path}: {name} with {len(coefficients)} coefficients is unknown to ROS")
+    if not np.array_equal(P.reshape(3, 4), np.hstack([K.reshape(3, 3), np.zeros((3, 1))])):
+        raise LceRigError(f"{path}: projection_matrix does not belong to camera_matrix")
+    fx, _, cx, _, fy, cy, *_ = (float(value) for value in K)
+    size = data["image_width"], data["image_height"]
+    return Intrinsics(fx, fy, cx, cy, *size, model=models[name][0], distortion=coefficients)

@@ -1,0 +1,145 @@
+"""The tree of frames that URDF and static transforms describe, and the check that it is one."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lce_rig.core.errors import LceRigError
+from lce_rig.core.geometry import Array, invert, pose
+from lce_rig.core.results import Calibration
+from lce_rig.rig import Rig
+
+# REP-103: z forward, x right, y down in the optical frame; x forward, y left, z up in the camera's own.
+R_BODY_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+T_BODY_OPTICAL = pose(R_BODY_OPTICAL, np.zeros(3))
+RPY_BODY_OPTICAL = (-np.pi / 2, 0.0, -np.pi / 2)
+
+_VERDICTS = ("pass", "marginal", "fail")
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A fixed joint.
+
+    Attributes:
+        T_parent_child: (4, 4), the child's pose in the parent's frame.
+        is_optical: whether it is the turn from a camera's body to its optical frame.
+    """
+
+    parent: str
+    child: str
+    T_parent_child: Array
+    is_optical: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTree:
+    """Frames under one root, joints listed parents first."""
+
+    root: str
+    joints: tuple[Joint, ...]
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """All frames, the root first."""
+        return (self.root, *(joint.child for joint in self.joints))
+
+
+def build_trees(calibrations: Sequence[Calibration], rig: Rig) -> list[FrameTree]:
+    """Hang all calibrated sensors under the rig's base frame; what is not connected to it makes other trees.
+
+    Each camera has one place, so of several channels the one is taken that `choose_channels` names.
+
+    Raises:
+        LceRigError: a calibration names a sensor that the rig does not have.
+    """
+    chosen = choose_channels(calibrations, rig)
+    bodies = {name: lidar.frame for name, lidar in rig.lidars.items()}
+    bodies |= {name: camera.frame for name, camera in rig.cameras.items()}
+    used = [name for name in bodies if any(name in (c.camera, c.lidar) for c in chosen)]
+    used.sort(key=lambda name: bodies[name] != rig.base_frame)
+    optical = {camera.frame: camera.optical_frame for camera in rig.cameras.values()}
+    trees: list[FrameTree] = []
+    placed: set[str] = set()
+    for name in used:
+        if name not in placed:
+            joints = _grow(name, chosen, bodies, placed)
+            frames = [bodies[name], *(joint.child for joint in joints)]
+            joints += [Joint(f, optical[f], T_BODY_OPTICAL, is_optical=True) for f in frames if f in optical]
+            trees.append(FrameTree(bodies[name], tuple(joints)))
+    return trees
+
+
+def _grow(root: str, chosen: list[Calibration], bodies: dict[str, str], placed: set[str]) -> list[Joint]:
+    """Walk breadth first from one sensor to all that calibrations connect it with."""
+    joints: list[Joint] = []
+    placed.add(root)
+    queue = [root]
+    while queue:
+        here = queue.pop(0)
+        for calibration in chosen:
+            T_lidar_camera = invert(calibration.T_cam_lidar) @ invert(T_BODY_OPTICAL)
+            for parent, child, T in (
+                (calibration.lidar, calibration.camera, T_lidar_camera),
+                (calibration.camera, calibration.lidar, invert(T_lidar_camera)),
+            ):
+                if parent == here and child not in placed:
+                    joints.append(Joint(bodies[parent], bodies[child], T))
+                    placed.add(child)
+                    queue.append(child)
+    return joints
+
+
+def choose_channels(calibrations: Sequence[Calibration], rig: Rig) -> list[Calibration]:
+    """Keep one calibration of each camera and LiDAR: by verdict, then by the order of the profile's channels.
+
+    Raises:
+        LceRigError: a calibration names a sensor or channel that the rig does not have.
+    """
+    best: dict[tuple[str, str], Calibration] = {}
+    ranks: dict[tuple[str, str], tuple[int, int]] = {}
+    for calibration in calibrations:
+        _require_known(calibration, rig)
+        pair = calibration.camera, calibration.lidar
+        channels = list(rig.cameras[calibration.camera].channels)
+        rank = _VERDICTS.index(calibration.verdict), channels.index(calibration.channel)
+        if pair not in best or rank < ranks[pair]:
+            best[pair], ranks[pair] = calibration, rank
+    return list(best.values())
+
+
+def _require_known(calibration: Calibration, rig: Rig) -> None:
+    camera = rig.cameras.get(calibration.camera)
+    if camera is None or calibration.lidar not in rig.lidars or calibration.channel not in camera.channels:
+        pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
+        what = f"the result is about {pair}, which rig {rig.name} does not have"
+        raise LceRigError(what, "use the profile the session was made with")
+
+
+def check_tree(links: Sequence[str], joints: Iterable[tuple[str, str]]) -> None:
+    """Check that links and (parent, child) joints make one tree; no URDF parser at hand does so.
+
+    Raises:
+        LceRigError: a name twice, an unknown link, a link with two parents, no or several roots, or a loop.
+    """
+    twice = sorted({link for link in links if list(links).count(link) > 1})
+    if twice:
+        raise LceRigError(f"link {twice[0]} is defined twice")
+    parents: dict[str, str] = {}
+    for parent, child in joints:
+        for link in (parent, child):
+            if link not in links:
+                raise LceRigError(f"a joint names link {link}, which is not defined")
+        if child in parents:
+            raise LceRigError(f"link {child} has two parents, {parents[child]} and {parent}")
+        parents[child] = parent
+    roots = [link for link in links if link not in parents]
+    if len(roots) > 1:
+        raise LceRigError(f"several roots: {', '.join(roots)}")
+    for link in links:
+        seen = [link]
+        while seen[-1] in parents:
+            seen.append(parents[seen[-1]])
+            if seen[-1] in seen[:-1]:
+                raise LceRigError(f"a loop: {' < '.join(seen)}")

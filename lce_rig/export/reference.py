@@ -1,0 +1,67 @@
+"""A reference extrinsic from outside, to report errors against."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lce_rig.core.errors import SessionError
+from lce_rig.core.geometry import Array, project_to_so3
+
+# References are often printed with four digits.
+_ROUNDING = 5e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """T_cam_lidar (4, 4) by (camera, lidar), and one for pairs that are not named."""
+
+    by_pair: Mapping[tuple[str, str], Array]
+    default: Array | None
+
+    def of(self, camera: str, lidar: str) -> Array | None:
+        """Give the reference of a pair of sensors; None where the file has none for it."""
+        return self.by_pair.get((camera, lidar), self.default)
+
+
+def read_reference(path: Path) -> Reference:
+    """Read truth.json, result.json or any JSON with a 4x4 `T_cam_lidar`, at the top or in a list `pairs`.
+
+    Raises:
+        SessionError: there is none, or it is no rigid transform.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SessionError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise SessionError(f"{path}: is not JSON: {error}") from error
+    if not isinstance(document, dict):
+        raise SessionError(f"{path}: holds no T_cam_lidar")
+    pairs = document.get("pairs")
+    by_pair = {
+        (str(pair.get("camera")), str(pair.get("lidar"))): _pose(path, f"pairs[{i}].T_cam_lidar", pair)
+        for i, pair in enumerate(pairs if isinstance(pairs, list) else [])
+        if isinstance(pair, dict) and "T_cam_lidar" in pair
+    }
+    default = None if by_pair else _pose(path, "T_cam_lidar", document)
+    return Reference(by_pair, default)
+
+
+def _pose(path: Path, key: str, holder: Mapping[str, Any]) -> Array:
+    try:
+        T = np.array(holder["T_cam_lidar"], dtype=np.float64)
+    except (KeyError, TypeError, ValueError):
+        T = np.zeros(0)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise SessionError(f"{path}: {key} is missing or no 4x4 matrix of numbers")
+    R = project_to_so3(T[:3, :3])
+    if np.abs(R - T[:3, :3]).max() > _ROUNDING or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
+        raise SessionError(
+            f"{path}: {key} is no rigid transform", "It takes points from the LiDAR to the camera."
+        )
+    T[:3, :3] = R
+    return T

@@ -1,0 +1,179 @@
+"""result.json: the result of a calibration for machines; the same result gives the same bytes."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from lce_rig.core.errors import ResultRefusedError, SessionError
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Calibration
+from lce_rig.export.result_schema import PairRecord, ResultRecord
+from lce_rig.export.writing import MADE_BY, write_atomically
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class SavedResult:
+    """A result file's content."""
+
+    rig: str
+    made_by: str
+    calibrations: tuple[Calibration, ...]
+
+
+def to_json_dict(rig_name: str, calibrations: Sequence[Calibration]) -> dict[str, Any]:
+    """Build the content of result.json from plain types, keys in a fixed order.
+
+    Figures that could not be computed are null.
+
+    Raises:
+        ResultRefusedError: a pose or covariance is not finite.
+    """
+    pairs = [_pair(calibration) for calibration in calibrations]
+    return {"format_version": FORMAT_VERSION, "rig": rig_name, "made_by": MADE_BY, "pairs": pairs}
+
+
+def _pair(calibration: Calibration) -> dict[str, Any]:
+    metrics, certificate = calibration.metrics, calibration.certificate
+    refused = {
+        name: {"stage": refusal.stage, "cause": refusal.cause, "action": refusal.action}
+        for name, refusal in sorted(calibration.captures_refused.items())
+    }
+    return {
+        "camera": calibration.camera,
+        "channel": calibration.channel,
+        "lidar": calibration.lidar,
+        "T_cam_lidar": _matrix(calibration.T_cam_lidar, "T_cam_lidar", calibration),
+        "cov": _matrix(calibration.cov, "cov", calibration),
+        "sigma_rotation_deg": calibration.sigma_rotation_deg,
+        "sigma_translation_m": calibration.sigma_translation_m,
+        "n_captures": int(calibration.n_captures),
+        "n_detected": int(calibration.n_detected),
+        "captures_used": list(calibration.captures_used),
+        "captures_refused": refused,
+        "mpe_m": _figure(metrics.mpe_m),
+        "mee_m": _figure(metrics.mee_m),
+        "mge_m": _figure(metrics.mge_m),
+        "reprojection_px": _figure(metrics.reprojection_px),
+        "certificate": {"is_optimal": bool(certificate.is_optimal), "gap": _figure(certificate.gap)},
+        "egt_rotation_deg": _figure(calibration.egt_rotation_deg),
+        "egt_translation_m": _figure(calibration.egt_translation_m),
+        "verdict": calibration.verdict,
+        "reasons": list(calibration.reasons),
+        "diagnostics": {name: _figure(value) for name, value in sorted(calibration.diagnostics.items())},
+    }
+
+
+def _matrix(matrix: Array, name: str, calibration: Calibration) -> list[list[float]]:
+    if not np.isfinite(matrix).all():
+        pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
+        raise ResultRefusedError(
+            f"{name} of {pair} is not finite", "the captures leave a direction undetermined: add captures"
+        )
+    return [[float(value) for value in row] for row in np.asarray(matrix) + 0.0]
+
+
+def _figure(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else float(value)
+
+
+def result_text(rig_name: str, calibrations: Sequence[Calibration]) -> str:
+    """Write the content of result.json: deterministic, floats to the last digit, a matrix row a line."""
+    return _layout(to_json_dict(rig_name, calibrations), "") + "\n"
+
+
+def _layout(value: Any, indent: str) -> str:
+    """Lay JSON out as json.dumps(indent=2) does, but lists of plain values on one line."""
+    deeper = indent + "  "
+    if isinstance(value, dict) and value:
+        items = (
+            f"{deeper}{json.dumps(key, ensure_ascii=False)}: {_layout(item, deeper)}"
+            for key, item in value.items()
+        )
+        return "{\n" + ",\n".join(items) + f"\n{indent}}}"
+    if isinstance(value, list) and any(isinstance(item, list | dict) for item in value):
+        return "[\n" + ",\n".join(deeper + _layout(item, deeper) for item in value) + f"\n{indent}]"
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def write_result(path: Path, rig_name: str, calibrations: Sequence[Calibration]) -> None:
+    """Write result.json, whole or not at all.
+
+    Raises:
+        ResultRefusedError: a pose or covariance is not finite.
+        SessionError: the file cannot be written.
+    """
+    write_atomically(path, result_text(rig_name, calibrations))
+
+
+def read_result(path: Path) -> SavedResult:
+    """Read result.json back, exactly as it was written; keys that later versions may add are ignored.
+
+    Raises:
+        SessionError: no such file, or not a result that can be trusted; with the key at fault.
+    """
+    try:
+        data = json.loads(path.read_bytes(), parse_constant=_refuse_constant)
+    except FileNotFoundError as error:
+        raise SessionError(
+            f"{path}: there is no such file", "`lce-rig calibrate SESSION` writes it"
+        ) from error
+    except OSError as error:
+        raise SessionError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise SessionError(f"{path}: not JSON: {error}", "run `lce-rig calibrate SESSION` again") from error
+    version = data.get("format_version") if isinstance(data, dict) else None
+    if version != FORMAT_VERSION or isinstance(version, bool):
+        raise SessionError(
+            f"{path}: format_version is {version!r}, this lce-rig reads {FORMAT_VERSION}",
+            "run `lce-rig calibrate SESSION` again",
+        )
+    try:
+        record = ResultRecord.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        what = f"{path}: {key + ': ' if key else ''}{first['msg'].removeprefix('Value error, ')}"
+        raise SessionError(what, "run `lce-rig calibrate SESSION` again") from error
+    return SavedResult(record.rig, record.made_by, tuple(_calibration(pair) for pair in record.pairs))
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is no number")
+
+
+def _calibration(pair: PairRecord) -> Calibration:
+    from lce_rig.core.results import Certificate, Metrics, Refusal
+
+    def figure(value: float | None) -> float:
+        return np.nan if value is None else value
+
+    return Calibration(
+        camera=pair.camera,
+        channel=pair.channel,
+        lidar=pair.lidar,
+        T_cam_lidar=np.array(pair.T_cam_lidar, dtype=np.float64),
+        cov=np.array(pair.cov, dtype=np.float64),
+        certificate=Certificate(
+            pair.certificate.is_optimal, np.inf if pair.certificate.gap is None else pair.certificate.gap
+        ),
+        metrics=Metrics(figure(pair.mpe_m), figure(pair.mee_m), figure(pair.reprojection_px)),
+        n_captures=pair.n_captures,
+        n_detected=pair.n_detected,
+        captures_used=tuple(pair.captures_used),
+        captures_refused={
+            name: Refusal(refusal.stage, refusal.cause, refusal.action)
+            for name, refusal in pair.captures_refused.items()
+        },
+        verdict=pair.verdict,
+        reasons=tuple(pair.reasons),
+        egt_rotation_deg=pair.egt_rotation_deg,
+        egt_translation_m=pair.egt_translation_m,
+        diagnostics={name: figure(value) for name, value in pair.diagnostics.items()},
+    )

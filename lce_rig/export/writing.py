@@ -1,0 +1,90 @@
+"""Text on disk: numbers that read back exactly, files that exist whole or not at all."""
+
+import json
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+import lce_rig
+from lce_rig.core.errors import ResultRefusedError, SessionError
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Calibration
+from lce_rig.rig import Rig
+
+MADE_BY = f"lce-rig {lce_rig.__version__}"
+
+
+def number(value: float) -> str:
+    """Write a float with all its digits, as YAML 1.1, URDF and a shell read it.
+
+    Raises:
+        ResultRefusedError: the value is not finite.
+    """
+    value = float(value) + 0.0  # turns -0.0 into 0.0
+    if not np.isfinite(value):
+        raise ResultRefusedError(f"a figure of the result is not finite: {value}")
+    text = repr(value)
+    mantissa, e, exponent = text.partition("e")
+    # YAML 1.1 takes 1e-05 for a text: the mantissa needs its point.
+    return f"{mantissa}.0e{exponent}" if e and "." not in mantissa else text
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Write floats as a flow list: [1.0, 2.0]."""
+    return "[" + ", ".join(number(value) for value in values) + "]"
+
+
+def quoted(text: str) -> str:
+    """Write a text as a double-quoted scalar, valid in JSON and YAML."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def texts(values: Iterable[str]) -> str:
+    """Write texts as a flow list."""
+    return "[" + ", ".join(quoted(value) for value in values) + "]"
+
+
+def rows(matrix: Array, indent: str) -> list[str]:
+    """Write a matrix as YAML lines, a row a line."""
+    return [f"{indent}- {numbers(row)}" for row in matrix]
+
+
+def header(what: str, rig: Rig, calibrations: Sequence[Calibration]) -> list[str]:
+    """List the lines every file begins with, as comments: what it is, by whom, whether to use it."""
+    lines = [f"{what} of rig {rig.name}, written by {MADE_BY}"]
+    for calibration in calibrations:
+        if calibration.verdict == "fail":
+            pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
+            reasons = "; ".join(calibration.reasons) or "no reason given"
+            lines.append(f"NOT FOR USE: the calibration of {pair} failed: {' '.join(reasons.split())}")
+    return lines
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a file so that it is there whole or not at all, also after a power cut.
+
+    Raises:
+        SessionError: the folder cannot be written to.
+    """
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with temporary.open("w", encoding="utf-8", newline="\n") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+    except OSError as error:
+        raise SessionError(
+            f"{path}: cannot be written: {error.strerror or error}", "free space or choose another folder"
+        ) from error

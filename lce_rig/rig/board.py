@@ -1,0 +1,75 @@
+"""The board's block of a profile."""
+
+from typing import Annotated
+
+from pydantic import Field, field_validator, model_validator
+
+from lce_rig.core.board import Board
+from lce_rig.rig.settings import Positive, Settings, problem
+
+_MAX_SQUARE_M = 1.0
+_MAX_PLATE_M = 5.0
+
+
+class BoardSettings(Settings):
+    """A checkerboard printed on a rectangular plate.
+
+    Attributes:
+        inner_corners: (cols, rows) where four squares meet, one fewer each way than there are squares.
+        square_m: side of one square, measured over many squares on the print itself.
+        width_m: outer width of the plate, along the columns.
+        height_m: outer height of the plate, along the rows.
+        pattern_offset_m: (x right, y up) of the pattern's centre from the plate's centre.
+    """
+
+    inner_corners: tuple[Annotated[int, Field(ge=2, le=100)], Annotated[int, Field(ge=2, le=100)]]
+    square_m: Positive
+    width_m: Positive
+    height_m: Positive
+    pattern_offset_m: tuple[float, float] = (0.0, 0.0)
+
+    @field_validator("square_m")
+    @classmethod
+    def _square_is_in_metres(cls, value: float) -> float:
+        return _require_metres(value, _MAX_SQUARE_M)
+
+    @field_validator("width_m", "height_m")
+    @classmethod
+    def _plate_is_in_metres(cls, value: float) -> float:
+        return _require_metres(value, _MAX_PLATE_M)
+
+    @model_validator(mode="after")
+    def _pattern_fits_on_plate(self) -> "BoardSettings":
+        cols, rows = self.inner_corners
+        width, height = (cols + 1) * self.square_m, (rows + 1) * self.square_m
+        offset_x, offset_y = (2 * abs(offset) for offset in self.pattern_offset_m)
+        # Where the print fills the plate both are measured to a millimetre.
+        if width + offset_x <= self.width_m + 1e-3 and height + offset_y <= self.height_m + 1e-3:
+            return self
+        what = (
+            f"the pattern of {cols + 1}x{rows + 1} squares of {1e3 * self.square_m:g} mm is "
+            f"{width:.3g} x {height:.3g} m and does not fit on a plate {self.width_m:g} x {self.height_m:g} m"
+        )
+        if offset_x or offset_y:
+            x, y = self.pattern_offset_m
+            what += f" with its centre {x:g}, {y:g} m off the plate's"
+        if width + offset_y <= self.height_m + 1e-3 and height + offset_x <= self.width_m + 1e-3:
+            what += "; width and height look swapped, of either the plate or inner_corners [cols, rows]"
+        elif (cols - 1) * self.square_m <= self.width_m and (rows - 1) * self.square_m <= self.height_m:
+            what += "; were squares counted where inner corners are wanted (one fewer each way)?"
+        raise problem(what)
+
+    def to_board(self) -> Board:
+        """Build the board as the algorithms know it."""
+        cols, rows = self.inner_corners
+        return Board(cols, rows, self.square_m, self.width_m, self.height_m, self.pattern_offset_m)
+
+
+def _require_metres(value: float, limit: float) -> float:
+    if value <= limit:
+        return value
+    for unit, factor in (("centimetres", 1e-2), ("millimetres", 1e-3)):
+        # A square is never below 5 mm and a plate never below 5 cm, which tells 70 mm from 7 cm.
+        if limit / 200 <= value * factor <= limit and (unit == "millimetres" or value < 10):
+            raise problem(f"did you mean {value * factor:.3f} m? {value:g} looks like {unit}")
+    raise problem(f"{value:g} m is larger than any board (at most {limit:g} m)")

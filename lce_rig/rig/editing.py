@@ -1,0 +1,117 @@
+"""Edits of a profile's text that leave comments and layout as they are."""
+
+from collections.abc import Sequence
+
+import yaml
+
+from lce_rig.core.errors import UsageError
+from lce_rig.rig.document import read_document
+from lce_rig.rig.loading import rig_from_document
+
+
+def derive_text(text: str, name: str, settings: Sequence[tuple[str, str]], source: str, origin: str) -> str:
+    """Derive a profile's text from another's.
+
+    Args:
+        text: the other profile.
+        name: name of the new rig.
+        settings: (key path, YAML value) to set, such as ("board.square_m", "0.08").
+        source: what to call the new text in errors, as a rule the file it is for.
+        origin: name of the other profile.
+
+    Returns:
+        The new profile, which is valid.
+
+    Raises:
+        ProfileError: the new profile would not be valid.
+        UsageError: a value that is no YAML, or a path into something that has no keys.
+    """
+    head = f"# {name}: made from {origin} by `lce-rig rigs new`; the comments below are {origin}'s.\n"
+    text = head + set_value(text, "name", name)
+    for path, value in settings:
+        text = set_value(text, path, value)
+    rig_from_document(read_document(text, source))
+    return text
+
+
+def set_value(text: str, path: str, value: str) -> str:
+    """Set one key in YAML text; a key that is missing is added at the end of its block.
+
+    Args:
+        text: valid YAML.
+        path: keys and places in lists joined by dots: "nominal_extrinsics.0.tolerance_m".
+        value: the value as YAML on one line: "0.1", "[1, 2]".
+
+    Raises:
+        UsageError: a value that is no YAML on one line, or a path into something that has no keys.
+    """
+    wanted = _parsed(path, value)
+    root = yaml.compose(text, Loader=yaml.SafeLoader)
+    keys = path.split(".")
+    node, depth = _descend(root, keys)
+    if depth == len(keys):
+        new = text[: node.start_mark.index] + value + text[_end(node) :]
+    elif isinstance(node, yaml.MappingNode):
+        new = _insert(text, node, keys[depth:], value)
+    else:
+        raise UsageError(f"--set {path}: {'.'.join(keys[:depth])} has no key {keys[depth]}")
+    if _lookup(yaml.safe_load(new), keys) != wanted:
+        raise UsageError(f"--set {path}: {value!r} cannot be put there", "quote a text that holds : or #")
+    return new
+
+
+def _parsed(path: str, value: str) -> object:
+    try:
+        parsed: object = yaml.safe_load(value)
+    except (yaml.YAMLError, ValueError) as error:
+        raise UsageError(f"--set {path}: {value!r} is no YAML value") from error
+    if "\n" in value or not value.strip() or not all(path.split(".")):
+        raise UsageError(f"--set {path}={value}: KEY=VALUE is expected, such as board.square_m=0.08")
+    return parsed
+
+
+def _descend(node: yaml.Node, keys: Sequence[str]) -> tuple[yaml.Node, int]:
+    """Follow keys as far as they lead; return the node and how many keys were followed."""
+    for depth, key in enumerate(keys):
+        below = _child(node, key)
+        if below is None:
+            return node, depth
+        node = below
+    return node, len(keys)
+
+
+def _child(node: yaml.Node, key: str) -> yaml.Node | None:
+    if isinstance(node, yaml.MappingNode):
+        return next((value for name, value in node.value if name.value == key), None)
+    if isinstance(node, yaml.SequenceNode) and key.isdigit() and int(key) < len(node.value):
+        child: yaml.Node = node.value[int(key)]
+        return child
+    return None
+
+
+def _end(node: yaml.Node) -> int:
+    """Find where a node's text ends; a block's own mark lies behind the comments that follow it."""
+    if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
+        last = node.value[-1]
+        return _end(last[1] if isinstance(last, tuple) else last)
+    end: int = node.end_mark.index
+    return end
+
+
+def _insert(text: str, block: yaml.MappingNode, keys: Sequence[str], value: str) -> str:
+    for key in reversed(keys[1:]):
+        value = f"{{{key}: {value}}}"
+    entry = f"{keys[0]}: {value}"
+    if block.flow_style:
+        at = block.end_mark.index - 1
+        return f"{text[:at]}{', ' if block.value else ''}{entry}{text[at:]}"
+    at = text.find("\n", _end(block))
+    at = len(text) if at < 0 else at
+    indent = " " * block.start_mark.column
+    return f"{text[:at]}\n{indent}{entry}{text[at:]}"
+
+
+def _lookup(data: object, keys: Sequence[str]) -> object:
+    for key in keys:
+        data = data[int(key)] if isinstance(data, list) else data[key]  # type: ignore[index]
+    return data

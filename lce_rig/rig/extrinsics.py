@@ -1,0 +1,71 @@
+"""Nominal poses of a profile: what the drawing of the rig says, as a sanity check."""
+
+import numpy as np
+from pydantic import model_validator
+
+from lce_rig.core.geometry import Array, pose, project_to_so3
+from lce_rig.rig.settings import Name, Positive, Settings, problem
+
+Row = tuple[float, float, float]
+# Drawings and papers round to three digits: a unit quaternion's norm is then off by up to about 1e-3.
+_ROUNDING = 5e-3
+
+
+class NominalExtrinsic(Settings):
+    """Where the CAD model puts a camera; compared with the result, never an initial guess.
+
+    It takes points from the LiDAR's frame to the camera's optical frame: p_cam = R p_lidar + t. The rotation
+    is given in exactly one way.
+
+    Attributes:
+        quaternion_wxyz: unit quaternion of R, scalar first.
+        rpy_deg: (roll, pitch, yaw) about fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF.
+        matrix: the rows of R.
+        translation_m: t, the LiDAR's origin in the optical frame.
+        tolerance_deg: larger differences from the result are reported.
+        tolerance_m: larger differences from the result are reported.
+    """
+
+    camera: Name
+    lidar: Name
+    quaternion_wxyz: tuple[float, float, float, float] | None = None
+    rpy_deg: Row | None = None
+    matrix: tuple[Row, Row, Row] | None = None
+    translation_m: Row
+    tolerance_deg: Positive = 5.0
+    tolerance_m: Positive = 0.1
+
+    @model_validator(mode="after")
+    def _is_a_pose(self) -> "NominalExtrinsic":
+        given = [key for key in ("quaternion_wxyz", "rpy_deg", "matrix") if getattr(self, key) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) if given else "none"
+            raise problem(f"give the rotation as one of quaternion_wxyz, rpy_deg, matrix; {found} given")
+        if self.quaternion_wxyz is not None:
+            norm = float(np.linalg.norm(self.quaternion_wxyz))
+            if abs(norm - 1) > _ROUNDING:
+                raise problem(f"not a unit quaternion: its norm is {norm:.4g}", "quaternion_wxyz")
+        if self.matrix is not None:
+            R = np.array(self.matrix)
+            error = float(np.abs(R @ R.T - np.eye(3)).max())
+            if error > 2 * _ROUNDING:
+                raise problem(f"not a rotation: R R^T differs from the identity by {error:.3g}", "matrix")
+            if np.linalg.det(R) < 0:
+                raise problem("not a rotation but a mirroring: its determinant is -1", "matrix")
+        far = max(abs(value) for value in self.translation_m)
+        if far > 20:
+            what = f"{far:g} m between two sensors of one rig; are these millimetres?"
+            raise problem(what, "translation_m")
+        return self
+
+    def to_matrix(self) -> Array:
+        """Build T_cam_lidar (4, 4)."""
+        from scipy.spatial.transform import Rotation
+
+        if self.quaternion_wxyz is not None:
+            R = Rotation.from_quat(np.roll(self.quaternion_wxyz, -1)).as_matrix()
+        elif self.rpy_deg is not None:
+            R = Rotation.from_euler("xyz", self.rpy_deg, degrees=True).as_matrix()
+        else:
+            R = project_to_so3(np.array(self.matrix))
+        return pose(R, np.array(self.translation_m))

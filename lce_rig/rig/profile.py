@@ -1,0 +1,102 @@
+"""The whole profile of a rig: start reading the schema here."""
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from lce_rig.rig.board import BoardSettings
+from lce_rig.rig.extrinsics import NominalExtrinsic
+from lce_rig.rig.sensors import CameraSettings, LidarSettings
+from lce_rig.rig.settings import FrameName, Name, RigName, Settings, problem
+from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings
+
+
+class Rig(Settings):
+    """A rig: which sensors it carries and which board they look at.
+
+    Attributes:
+        format_version: version of this schema.
+        name: name of the rig; a session belongs to one rig by name.
+        description: one line for `lce-rig rigs`.
+        base_frame: a LiDAR's or camera's frame, root of the URDF; the first LiDAR's where left out.
+        lidars: settings by the LiDAR's name.
+        cameras: settings by the camera's name.
+        nominal_extrinsics: what the CAD model says, a sanity check only.
+    """
+
+    format_version: Literal[1]
+    name: RigName
+    description: str = ""
+    base_frame: FrameName | None = None
+    board: BoardSettings
+    lidars: Annotated[dict[Name, LidarSettings], Field(min_length=1)]
+    cameras: Annotated[dict[Name, CameraSettings], Field(min_length=1)]
+    nominal_extrinsics: tuple[NominalExtrinsic, ...] = ()
+    quality: QualitySettings = QualitySettings()
+    calibration: CalibrationSettings = CalibrationSettings()
+
+    @model_validator(mode="after")
+    def _frames_are_unique(self) -> "Rig":
+        seen: dict[str, str] = {}
+        for key, frame in self._frames():
+            if frame in seen:
+                raise problem(f"frame {frame} is used already by {seen[frame]}", key)
+            seen[frame] = key
+        roots = [frame for key, frame in self._frames() if not key.endswith("optical_frame")]
+        if self.base_frame is not None and self.base_frame not in roots:
+            raise problem(f"no sensor has frame {self.base_frame}; there is {', '.join(roots)}", "base_frame")
+        return self
+
+    @model_validator(mode="after")
+    def _sensors_are_known(self) -> "Rig":
+        for name in self.cameras:
+            if name in self.lidars:
+                raise problem(f"{name} is the name of a LiDAR already", f"cameras.{name}")
+        seen: set[tuple[str, str]] = set()
+        for index, entry in enumerate(self.nominal_extrinsics):
+            for kind, name, known in (
+                ("camera", entry.camera, list(self.cameras)),
+                ("lidar", entry.lidar, list(self.lidars)),
+            ):
+                if name not in known:
+                    what = f"no {kind} is called {name}; there is {', '.join(known)}"
+                    raise problem(what, f"nominal_extrinsics.{index}.{kind}")
+            if (entry.camera, entry.lidar) in seen:
+                what = f"a second entry for {entry.camera} and {entry.lidar}"
+                raise problem(what, f"nominal_extrinsics.{index}")
+            seen.add((entry.camera, entry.lidar))
+        return self
+
+    def _frames(self) -> Iterator[tuple[str, str]]:
+        for name, lidar in self.lidars.items():
+            yield f"lidars.{name}.frame", lidar.frame
+        for name, camera in self.cameras.items():
+            yield f"cameras.{name}.frame", camera.frame
+            yield f"cameras.{name}.optical_frame", camera.optical_frame
+
+    def doubts(self) -> list[str]:
+        """List what is allowed but rarely meant, as sentences with their key."""
+        (cols, rows), width_m, height_m = self.board.inner_corners, self.board.width_m, self.board.height_m
+        found = []
+        if (cols - rows) * (width_m - height_m) < 0:
+            found.append(
+                f"board: {cols}x{rows} inner corners run along the shorter side of the plate "
+                f"{width_m:g} x {height_m:g} m; are width_m and height_m swapped, or inner_corners [cols, rows]?"
+            )
+        stamps = [(f"lidars.{name}", lidar.timestamps) for name, lidar in self.lidars.items()]
+        for camera, settings in self.cameras.items():
+            stamps += [(f"cameras.{camera}.channels.{n}", c.timestamps) for n, c in settings.channels.items()]
+        found += [
+            f"{key}.timestamps: the sensor's own clock without sync drifts away from the others"
+            for key, settings in stamps
+            if settings.clock == "device" and settings.sync == "none"
+        ]
+        return found
+
+    def nominal(self, camera: str, lidar: str) -> NominalExtrinsic | None:
+        """Find the CAD pose of a pair of sensors; None where the profile has none."""
+        matches = (
+            entry for entry in self.nominal_extrinsics if (entry.camera, entry.lidar) == (camera, lidar)
+        )
+        return next(matches, None)

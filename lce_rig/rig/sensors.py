@@ -1,0 +1,185 @@
+"""The sensors' blocks of a profile: LiDARs, cameras, their channels, drivers and clocks."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.rig.settings import FrameName, Name, NotNegative, Positive, Settings, TopicName, problem
+
+Coefficient = Annotated[float, Field(ge=-1000, le=1000)]
+_COUNTS = {"radtan": ((0, 4, 5, 8), "4, 5 or 8 (or none)"), "equidistant": ((4,), "4")}
+
+
+class TimestampSettings(Settings):
+    """What a sensor's time stamps mean.
+
+    Attributes:
+        clock: whose clock is read: the sensor's own, the computer's, or UTC by GPS or PTP.
+        reference: the moment a stamp marks: start or middle of the exposure, first or last firing.
+        sync: how clocks are tied: by a shared pulse, by PTP, or not at all.
+        expected_offset_s: what to add to these stamps to get the rig's time.
+        tolerance_s: how far pairs of captures may lie apart after that.
+    """
+
+    clock: Literal["device", "host", "utc"] = "host"
+    reference: Literal["start", "mid_exposure", "first_firing", "last_firing"]
+    sync: Literal["hardware", "ptp", "none"] = "none"
+    expected_offset_s: Annotated[float, Field(ge=-3600, le=3600)] = 0.0
+    tolerance_s: Annotated[float, Field(gt=0, le=60)] = 0.05
+
+
+class DriverSettings(Settings):
+    """How a live sensor is reached.
+
+    Attributes:
+        port: UDP port of a networked sensor.
+        address: IP address of a networked sensor.
+        device: device file or serial number of an attached sensor.
+        controls: settings handed to the driver as they are.
+    """
+
+    port: Annotated[int, Field(ge=1, le=65535)] | None = None
+    address: str | None = None
+    device: str | None = None
+    controls: dict[str, bool | int | float | str] = Field(default_factory=dict)
+
+
+class LidarSettings(Settings):
+    """One spinning LiDAR.
+
+    Attributes:
+        model: maker's name of the model.
+        frame: frame of its points, x forward, y left, z up.
+        topic: topic of its clouds in bags.
+        min_range_m: nearer returns are ignored.
+        max_range_m: farther returns are ignored.
+    """
+
+    model: str = "VLP-16"
+    frame: FrameName = "lidar_link"
+    topic: TopicName | None = None
+    rate_hz: Positive = 10.0
+    min_range_m: NotNegative = 0.4
+    max_range_m: Positive = 100.0
+    timestamps: TimestampSettings = TimestampSettings(reference="first_firing")
+    driver: DriverSettings = DriverSettings()
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> "LidarSettings":
+        if self.min_range_m >= self.max_range_m:
+            raise problem(
+                f"{self.min_range_m:g} m is not below max_range_m {self.max_range_m:g} m", "min_range_m"
+            )
+        if self.timestamps.reference not in ("first_firing", "last_firing"):
+            what = f"{self.timestamps.reference} belongs to a camera; a LiDAR has first_firing or last_firing"
+            raise problem(what, "timestamps.reference")
+        return self
+
+
+class IntrinsicsSettings(Settings):
+    """A camera matrix and its distortion; pixel centres at integers.
+
+    Attributes:
+        model: radtan (OpenCV's and ROS's plumb_bob) or equidistant (OpenCV's fisheye).
+        distortion: radtan k1 k2 p1 p2 [k3 [k4 k5 k6]]; equidistant k1 k2 k3 k4.
+    """
+
+    model: Literal["radtan", "equidistant"] = "radtan"
+    fx_px: Positive
+    fy_px: Positive
+    cx_px: float
+    cy_px: float
+    distortion: tuple[Coefficient, ...] = ()
+
+    @model_validator(mode="after")
+    def _has_right_number_of_coefficients(self) -> "IntrinsicsSettings":
+        counts, wanted = _COUNTS[self.model]
+        if len(self.distortion) not in counts:
+            what = f"{len(self.distortion)} coefficients given, {self.model} has {wanted}"
+            raise problem(what, "distortion")
+        return self
+
+
+class ChannelSettings(Settings):
+    """One stream of a camera.
+
+    Attributes:
+        kind: "frames", or "events" and the pictures reconstructed from them.
+        topic: topic of its pictures or events in bags.
+    """
+
+    kind: Literal["frames", "events"] = "frames"
+    topic: TopicName | None = None
+    timestamps: TimestampSettings = TimestampSettings(reference="mid_exposure")
+
+    @model_validator(mode="after")
+    def _has_a_camera_reference(self) -> "ChannelSettings":
+        if self.timestamps.reference not in ("start", "mid_exposure"):
+            what = f"{self.timestamps.reference} belongs to a LiDAR; a camera has start or mid_exposure"
+            raise problem(what, "timestamps.reference")
+        return self
+
+
+class CameraSettings(Settings):
+    """One camera: pixels, lens and the channels that share them.
+
+    Attributes:
+        model: maker's name of the model.
+        frame: the camera's body frame, x forward, y left, z up.
+        optical_frame: frame of its optics, x right, y down, z forward.
+        resolution_px: (width, height) of the pictures.
+    """
+
+    model: str = ""
+    frame: FrameName = "camera_link"
+    optical_frame: FrameName = "camera_optical_frame"
+    resolution_px: tuple[Annotated[int, Field(ge=16, le=65535)], Annotated[int, Field(ge=16, le=65535)]]
+    intrinsics: IntrinsicsSettings
+    channels: Annotated[dict[Name, ChannelSettings], Field(min_length=1)] = Field(
+        default_factory=lambda: {"frames": ChannelSettings()}
+    )
+    driver: DriverSettings = DriverSettings()
+
+    @model_validator(mode="after")
+    def _intrinsics_belong_to_resolution(self) -> "CameraSettings":
+        given, size = self.intrinsics, self.resolution_px
+        sides = (
+            ("x", "width", given.cx_px, given.fx_px, size[0]),
+            ("y", "height", given.cy_px, given.fy_px, size[1]),
+        )
+        for axis, side, centre, focal, length in sides:
+            if not 0 < centre < length - 1:
+                what = f"{centre:g} lies outside the picture, whose {side} is {length} px"
+                raise problem(what + self._other_resolution(), f"intrinsics.c{axis}_px")
+            if not 0.1 <= focal / length <= 30:
+                what = (
+                    f"a focal length of {focal:g} px is implausible for pictures with a {side} of {length} px"
+                )
+                raise problem(what + self._other_resolution(), f"intrinsics.f{axis}_px")
+        # A lens sits near the middle; numbers of another resolution are off by the same factor in x and y.
+        x, y = given.cx_px / size[0], given.cy_px / size[1]
+        if max(x, y) < 0.4 or min(x, y) > 0.6 or not (0.2 < x < 0.8 and 0.2 < y < 0.8):
+            point = f"{given.cx_px:g}, {given.cy_px:g}"
+            what = f"the principal point {point} is far from the middle of {size[0]}x{size[1]} px"
+            raise problem(what + self._other_resolution(), "intrinsics")
+        if not 0.5 < self.intrinsics.fx_px / self.intrinsics.fy_px < 2:
+            raise problem("fx_px and fy_px differ by more than a factor of two", "intrinsics.fy_px")
+        return self
+
+    def _other_resolution(self) -> str:
+        width, height = round(2 * self.intrinsics.cx_px), round(2 * self.intrinsics.cy_px)
+        return f"; were the intrinsics measured at another resolution (about {width}x{height})?"
+
+    def to_intrinsics(self) -> Intrinsics:
+        """Build the camera model as the algorithms know it."""
+        given = self.intrinsics
+        return Intrinsics(
+            given.fx_px,
+            given.fy_px,
+            given.cx_px,
+            given.cy_px,
+            *self.resolution_px,
+            model=given.model,
+            distortion=given.distortion,
+        )

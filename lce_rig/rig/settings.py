@@ -1,0 +1,51 @@
+"""Base of the profile's settings and the small vocabulary they share."""
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+_NAME = r"^[a-z][a-z0-9_]*$"
+_RIG_NAME = r"^[a-z0-9][a-z0-9_-]*$"
+_FRAME = r"^[A-Za-z][A-Za-z0-9_/-]*$"
+_TOPIC = r"^/?[A-Za-z][A-Za-z0-9_/]*$"
+
+# What each pattern means, for errors.
+PATTERNS = {
+    _NAME: "a name has lower-case letters, digits and _ and begins with a letter",
+    _RIG_NAME: "a rig's name has lower-case letters, digits, - and _",
+    _FRAME: "a frame has letters, digits, _, - and / and begins with a letter",
+    _TOPIC: "a topic has letters, digits, _ and /",
+}
+
+Name = Annotated[str, Field(pattern=_NAME, max_length=64)]
+RigName = Annotated[str, Field(pattern=_RIG_NAME, max_length=64)]
+FrameName = Annotated[str, Field(pattern=_FRAME, max_length=128)]
+TopicName = Annotated[str, Field(pattern=_TOPIC, max_length=256)]
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class Settings(BaseModel):
+    """A block of a profile: immutable, no unknown keys, no infinities."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_no_truth_values(cls, data: Any) -> Any:
+        """Refuse `yes` and `no`, which would pass for 1 and 0; no setting is a truth value."""
+        for key, value in data.items() if isinstance(data, dict) else ():
+            if any(isinstance(item, bool) for item in (value if isinstance(value, list) else [value])):
+                raise problem("a truth value (true, yes, on, false, no, off) is given", str(key))
+        return data
+
+
+def problem(what: str, key: str = "") -> PydanticCustomError:
+    """Build the error that a check across several keys raises.
+
+    Args:
+        what: what is wrong, with its figures.
+        key: the key at fault, relative to the block that is checked; empty for the block itself.
+    """
+    return PydanticCustomError("profile", "{what}", {"what": what, "key": key})

@@ -1,0 +1,65 @@
+"""Thresholds and weights of a profile; every one has a default and may be left out."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from lce_rig.rig.settings import NotNegative, Positive, Settings
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+class QualitySettings(Settings):
+    """From which figures on a capture is used, and a result passes.
+
+    Attributes:
+        min_square_px: least side of a square in the picture; below it corners are blurred together.
+        min_border_px: least distance of a corner from the picture's border.
+        max_tilt_deg: largest angle between the board's normal and the line of sight.
+        max_reprojection_px: largest rms corner residual.
+        min_rings: least number of LiDAR rings on the board.
+        min_points: least number of LiDAR points on the board.
+        max_thickness_m: largest rms distance of the board's points from their plane.
+        max_size_error: largest deviation of the board's size in the LiDAR from the profile, as a fraction.
+        max_edge_rms_m: largest rms distance of ring ends from the board's edges.
+        min_distance_m: nearest board.
+        max_distance_m: farthest board.
+        max_motion_m: how far the board may move while it counts as still.
+        min_captures: fewer captures make no calibration.
+        min_detected_fraction: a smaller share of captures with the board found is marginal.
+        max_mpe_m: largest mean distance of LiDAR points from the camera's board plane.
+        max_mee_m: largest mean distance of ring ends from the board's edges.
+    """
+
+    min_square_px: Positive = 3.0
+    min_border_px: NotNegative = 1.0
+    max_tilt_deg: Annotated[float, Field(gt=0, lt=90)] = 70.0
+    max_reprojection_px: Positive = 1.0
+    min_rings: Annotated[int, Field(ge=2, le=128)] = 4
+    min_points: Annotated[int, Field(ge=6)] = 40
+    max_thickness_m: Positive = 0.05
+    max_size_error: Fraction = 0.15
+    max_edge_rms_m: Positive = 0.06
+    min_distance_m: NotNegative = 0.8
+    max_distance_m: Positive = 6.0
+    max_motion_m: Positive = 0.01
+    min_captures: Annotated[int, Field(ge=3)] = 6
+    min_detected_fraction: Fraction = 0.5
+    max_mpe_m: Positive = 0.03
+    max_mee_m: Positive = 0.04
+
+
+class CalibrationSettings(Settings):
+    """Weights of the cost, and how sure the result has to be.
+
+    Attributes:
+        plane_weight: weight of a point's distance from the board's plane.
+        edge_weight: weight of a ring end's distance from the board's edge.
+        target_sigma_deg: standard deviation of the rotation to reach; above it a result is marginal.
+        target_sigma_m: standard deviation of the translation to reach; above it a result is marginal.
+    """
+
+    plane_weight: Positive = 1.0
+    edge_weight: Positive = 3.0
+    target_sigma_deg: Positive = 0.2
+    target_sigma_m: Positive = 0.01

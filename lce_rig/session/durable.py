@@ -1,0 +1,99 @@
+"""Files that survive a power cut, and the lock that keeps a second writer out."""
+
+import fcntl
+import os
+from pathlib import Path
+
+
+def write_new_file(path: Path, data: bytes) -> None:
+    """Write a file that is not there yet and flush it to the disk.
+
+    Raises:
+        OSError: FileExistsError, a full disk, no permission.
+    """
+    with path.open("xb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Put `data` in place of a file in one step: a reader sees the old or the new content, never a part.
+
+    Raises:
+        OSError: a full disk, no permission.
+    """
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        draft.unlink(missing_ok=True)
+        write_new_file(draft, data)
+        draft.replace(path)
+    except OSError:
+        draft.unlink(missing_ok=True)
+        raise
+    flush_folder(path.parent)
+
+
+def flush_folder(path: Path) -> None:
+    """Flush a folder's entries (names made, renamed, removed) to the disk."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def append_line(path: Path, line: str) -> None:
+    """Append one line and flush it; takes back what it wrote where the disk is full.
+
+    A torn last line of an earlier run that was killed is closed by a line break first.
+
+    Raises:
+        OSError: a full disk, no permission.
+    """
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        size = os.lseek(descriptor, 0, os.SEEK_END)
+        is_torn = size > 0 and os.pread(descriptor, 1, size - 1) != b"\n"
+        data = (b"\n" if is_torn else b"") + line.encode() + b"\n"
+        try:
+            written = 0
+            while written < len(data):
+                written += os.write(descriptor, data[written:])
+            os.fsync(descriptor)
+        except OSError:
+            os.ftruncate(descriptor, size)
+            raise
+    finally:
+        os.close(descriptor)
+
+
+class WriterLock:
+    """One writer per session.
+
+    The kernel holds the lock (flock) and drops it when its holder dies, however that happens: a lock is never
+    stale. The file names the holder, for the message only.
+
+    Raises:
+        BlockingIOError: somebody else writes; its argument is the holder's process id, or "".
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.pread(self._descriptor, 20, 0).decode("ascii", errors="replace").strip()
+            self.release()
+            raise BlockingIOError(holder) from None
+        os.ftruncate(self._descriptor, 0)
+        os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
+
+    def release(self) -> None:
+        """Let the next writer in; does nothing the second time."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def __del__(self) -> None:
+        self.release()

@@ -1,0 +1,316 @@
+"""A session folder: the frozen rig profile, captures, a journal and a cache of detections.
+
+Layout, every file plain: rig.yaml, session.json, journal.jsonl, detections/ and
+captures/000012/{meta.json, cam.frames.png, lidar.pcd}. A capture is written to captures/.new-000012/, its
+files are flushed, the folder is renamed and its parent flushed: it exists whole or not at all, whenever the
+power goes.
+"""
+
+import json
+import re
+import shutil
+from collections.abc import Iterable, Mapping
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import yaml
+from numpy.typing import NDArray
+
+from lce_rig import __version__
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.errors import LceRigError, SessionError
+from lce_rig.rig import Rig, dump_rig, load_rig
+from lce_rig.session import cache
+from lce_rig.session.capture import SAFE_NAME, Capture, content_hash, write_capture
+from lce_rig.session.durable import WriterLock, append_line, flush_folder, replace_file
+
+FORMAT_VERSION = 1
+MARKER, PROFILE, JOURNAL, LOCK = "session.json", "rig.yaml", "journal.jsonl", ".lock"
+CAPTURES, DETECTIONS, DRAFT_PREFIX = "captures", "detections", ".new-"
+
+
+class Session:
+    """A session, open for reading, or for writing by one process at a time.
+
+    `create`, `open` and `resume` make one. Use it in a `with` statement, or `close` it, so that the next
+    writer can come in.
+
+    Attributes:
+        path: the session's folder.
+        rig: the profile frozen when the session was created.
+    """
+
+    def __init__(self, path: Path, rig: Rig, lock: WriterLock | None) -> None:
+        self.path = path
+        self.rig = rig
+        self._lock = lock
+        self._names_by_content: dict[str, str] | None = None
+
+    @classmethod
+    def create(cls, path: Path | str, rig: Rig) -> "Session":
+        """Start a session in a new or empty folder and open it for writing.
+
+        Raises:
+            SessionError: the folder holds something already, or cannot be written.
+        """
+        path = Path(path)
+        if (path / MARKER).exists():
+            raise SessionError(
+                f"{path} is a session already", "Choose another folder, or continue this session."
+            )
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            others = {entry.name for entry in path.iterdir()} - {PROFILE, LOCK, JOURNAL, CAPTURES}
+            if any(not name.startswith((f".{PROFILE}.", f".{MARKER}.")) for name in others):
+                raise SessionError(
+                    f"{path} is not empty and no session: it holds {sorted(others)[0]}",
+                    "Choose another folder.",
+                )
+            lock = _take_lock(path)
+            (path / CAPTURES).mkdir(exist_ok=True)
+            replace_file(path / PROFILE, dump_rig(rig).encode())
+            marker = {"format_version": FORMAT_VERSION, "rig": rig.name, "made_by": f"lce-rig {__version__}"}
+            # Last, because its presence is what makes the folder a session.
+            replace_file(path / MARKER, (json.dumps(marker, indent=1) + "\n").encode())
+        except OSError as error:
+            raise _not_writable(path, error) from error
+        session = cls(path, rig, lock)
+        session.journal("created", rig=rig.name, made_by=f"lce-rig {__version__}")
+        return session
+
+    @classmethod
+    def open(cls, path: Path | str, *, writable: bool = False) -> "Session":
+        """Open an existing session; for writing it also clears what a killed writer left behind.
+
+        Raises:
+            SessionError: it is no session, damaged, made by a newer version, or another process writes to it.
+        """
+        path = Path(path)
+        _check_marker(path)
+        try:
+            rig = load_rig(path / PROFILE)
+        except LceRigError as error:
+            raise SessionError(
+                f"{path / PROFILE}: the session's profile cannot be used: {error.what}", error.hint
+            ) from error
+        if not writable:
+            return cls(path, rig, None)
+        try:
+            lock = _take_lock(path)
+            (path / CAPTURES).mkdir(exist_ok=True)
+            for draft in sorted((path / CAPTURES).glob(f"{DRAFT_PREFIX}*")):
+                shutil.rmtree(draft)
+        except OSError as error:
+            raise _not_writable(path, error) from error
+        return cls(path, rig, lock)
+
+    @classmethod
+    def resume(cls, path: Path | str, rig: Rig) -> "Session":
+        """Continue the session of this rig in a folder, or start one there.
+
+        Raises:
+            SessionError: as `create` and `open`, or the session belongs to another rig.
+        """
+        path = Path(path)
+        if not (path / MARKER).exists():
+            return cls.create(path, rig)
+        session = cls.open(path, writable=True)
+        differing = _differing_keys(session.rig, rig)
+        if differing:
+            session.close()
+            shown = "; ".join(differing[:5]) + (
+                f"; and {len(differing) - 5} more" if len(differing) > 5 else ""
+            )
+            raise SessionError(
+                f"{path} is a session of rig {session.rig.name!r}, not of this rig {rig.name!r}: {shown}",
+                "Collect into another folder, or use the profile in the session (its rig.yaml).",
+            )
+        return session
+
+    def __enter__(self) -> "Session":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let the next writer in; reading goes on working."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    @property
+    def captures(self) -> list[Capture]:
+        """Every whole capture, by name."""
+        folder = self.path / CAPTURES
+        names = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
+        return [Capture(folder / name) for name in names if re.fullmatch(r"\d{6,}", name)]
+
+    def capture(self, name: str) -> Capture:
+        """Find one capture.
+
+        Raises:
+            SessionError: there is none of that name.
+        """
+        for capture in self.captures:
+            if capture.name == name:
+                return capture
+        raise SessionError(f"{self.path} has no capture {name!r}; it has {len(self.captures)}")
+
+    def find_duplicate(self, images: Iterable[Image], scans: Iterable[Scan]) -> str | None:
+        """Name the capture that holds exactly this data already; None where it is new."""
+        return self._contents().get(content_hash(images, scans))
+
+    def add_capture(self, images: Iterable[Image], scans: Iterable[Scan], meta: Mapping[str, Any]) -> str:
+        """Store one capture so that it survives whatever happens after this returns.
+
+        Args:
+            images: at most one for each camera channel.
+            scans: at most one for each LiDAR.
+            meta: JSON values to keep with it.
+
+        Returns:
+            The capture's name.
+
+        Raises:
+            SessionError: the session is open for reading only, a sensor is not in the rig, or the disk is
+                full; what was captured before is not affected.
+        """
+        images, scans = list(images), list(scans)
+        if self._lock is None:
+            raise SessionError(f"{self.path} is open for reading only")
+        self._check_sensors(images, scans)
+        contents = self._contents()
+        captures = self.captures
+        name = f"{int(captures[-1].name) + 1 if captures else 0:06d}"
+        folder = self.path / CAPTURES / name
+        draft = folder.with_name(DRAFT_PREFIX + name)
+        try:
+            draft.mkdir()
+            write_capture(draft, images, scans, meta)
+            draft.rename(folder)
+            flush_folder(folder.parent)
+        except (OSError, ValueError) as error:
+            shutil.rmtree(draft, ignore_errors=True)
+            if isinstance(error, ValueError):
+                raise SessionError(f"capture {name} cannot be stored: {error}") from error
+            raise _not_writable(folder, error, len(captures)) from error
+        contents.setdefault(Capture(folder).content_sha256, name)
+        self.journal("captured", capture=name)
+        return name
+
+    def journal(self, event: str, **fields: Any) -> None:
+        """Append what happened, with the time, to journal.jsonl.
+
+        Raises:
+            SessionError: the disk is full or read-only.
+        """
+        now = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+        line = json.dumps({"time": now, "event": event, **fields}, sort_keys=True, default=str)
+        try:
+            append_line(self.path / JOURNAL, line)
+        except OSError as error:
+            raise _not_writable(self.path / JOURNAL, error, len(self.captures)) from error
+
+    def read_journal(self) -> list[dict[str, Any]]:
+        """List what happened; a line torn by a crash is left out."""
+        path = self.path / JOURNAL
+        entries = []
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
+            try:
+                entry = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(entry, dict):
+                entries.append(entry)
+        return entries
+
+    def store_cached(self, key: str, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, Any]) -> bool:
+        """Keep arrays and JSON values under a key such as "3f9a1c/000012" for `load_cached`.
+
+        Returns:
+            Whether it could be written; a full or read-only disk only costs the time saved.
+        """
+        return cache.store(self._cache_path(key), arrays, values)
+
+    def load_cached(self, key: str) -> cache.Cached | None:
+        """Give back what `store_cached` kept; None where there is nothing, or it is damaged."""
+        return cache.load(self._cache_path(key))
+
+    def _cache_path(self, key: str) -> Path:
+        parts = key.split("/")
+        if not all(SAFE_NAME.fullmatch(part) for part in parts):
+            raise ValueError(f"{key!r} is no cache key")
+        return self.path.joinpath(DETECTIONS, *parts[:-1], parts[-1] + ".npz")
+
+    def _contents(self) -> dict[str, str]:
+        if self._names_by_content is None:
+            self._names_by_content = {}
+            for capture in self.captures:
+                try:
+                    self._names_by_content.setdefault(capture.content_sha256, capture.name)
+                except SessionError:
+                    # A damaged capture is named when it is read; nothing is a duplicate of it.
+                    continue
+        return self._names_by_content
+
+    def _check_sensors(self, images: list[Image], scans: list[Scan]) -> None:
+        keys = [(i.sensor, i.channel) for i in images] + [(s.sensor, "") for s in scans]
+        if len(set(keys)) < len(keys) or not keys:
+            raise SessionError(
+                "a capture needs one picture a camera channel and one scan a lidar at most, and not nothing"
+            )
+        for image in images:
+            camera = self.rig.cameras.get(image.sensor)
+            if camera is None or image.channel not in camera.channels:
+                raise SessionError(
+                    f"rig {self.rig.name!r} has no camera channel {image.sensor}.{image.channel}"
+                )
+        for scan in scans:
+            if scan.sensor not in self.rig.lidars:
+                raise SessionError(f"rig {self.rig.name!r} has no lidar {scan.sensor!r}")
+
+
+def _check_marker(path: Path) -> None:
+    try:
+        marker = json.loads((path / MARKER).read_text(encoding="utf-8"))
+        version = int(marker["format_version"])
+    except FileNotFoundError:
+        hint = "Make one with `lce-rig collect` or `lce-rig simulate`."
+        raise SessionError(f"{path} is no session: it has no {MARKER}", hint) from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SessionError(f"{path / MARKER} cannot be read: {error}") from None
+    if version > FORMAT_VERSION:
+        raise SessionError(f"{path} was made by a newer lce-rig (format {version})", "Update lce-rig.")
+
+
+def _take_lock(path: Path) -> WriterLock:
+    try:
+        return WriterLock(path / LOCK)
+    except BlockingIOError as error:
+        holder = f"process {error.args[0]}" if error.args and error.args[0] else "another process"
+        raise SessionError(
+            f"{path} is being written by {holder}", "Wait for it to end, or stop it."
+        ) from None
+
+
+def _not_writable(path: Path, error: OSError, n_safe: int | None = None) -> SessionError:
+    safe = "" if n_safe is None else f" The {n_safe} captures before it are safe."
+    hint = (
+        f"Make room or choose another disk and run the same command again: it goes on where it stopped.{safe}"
+    )
+    return SessionError(f"{path} cannot be written: {error.strerror or error}", hint)
+
+
+def _differing_keys(theirs: Rig, ours: Rig) -> list[str]:
+    """List the keys in which two profiles differ, with both values; the description may differ."""
+    a, b = (_flatten(yaml.safe_load(dump_rig(rig))) for rig in (theirs, ours))
+    keys = sorted(key for key in a.keys() | b.keys() if a.get(key) != b.get(key) and key != "description")
+    return [f"{key} {a.get(key, 'absent')} there, {b.get(key, 'absent')} here" for key in keys]
+
+
+def _flatten(value: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(value, dict):
+        return {prefix.removesuffix("."): value}
+    return {k: v for key, inner in value.items() for k, v in _flatten(inner, f"{prefix}{key}.").items()}

@@ -1,0 +1,170 @@
+"""What a camera sees of the standing room: the costly half of a picture, computed once a session."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array
+from lce_rig.simulate.light import Mirrors, lamp_light, reached, static_radiance
+from lce_rig.simulate.room import Room
+from lce_rig.simulate.scene import Hits
+
+SHADOW_STEP_PX = 4
+_KNOT_STEP_PX = 4
+_CHUNK = 1 << 18
+
+
+@dataclass(frozen=True, eq=False)
+class Backdrop:
+    """A camera at its place in the room, and what it sees of it.
+
+    Attributes:
+        intrinsics: the lens.
+        T_world_cam: (4, 4).
+        corner_rays: (H + 1, W + 1, 3) unit rays through the pixels' corners, world.
+        radiance: (H, W, 3) linear (blue, green, red).
+        range_m: (H, W) along the ray through each pixel's centre.
+        mirrors: shiny surfaces, indexed by row-major pixel.
+        lamps: (P, 3) m, world.
+        shadow_points: (h, w, 3) m, what every fourth pixel sees, world.
+        shadow_share: (h, w, P) each lamp's share of the light there.
+    """
+
+    intrinsics: Intrinsics
+    T_world_cam: Array
+    corner_rays: Array
+    radiance: Array
+    range_m: Array
+    mirrors: Mirrors
+    lamps: Array
+    shadow_points: Array
+    shadow_share: Array
+
+    @property
+    def origin(self) -> Array:
+        """The camera's centre (3,), world."""
+        return np.asarray(self.T_world_cam[:3, 3])
+
+
+def build_backdrop(room: Room, T_world_cam: Array, intrinsics: Intrinsics) -> Backdrop:
+    """Render the standing room as a camera at T_world_cam (4, 4) sees it."""
+    shape = (intrinsics.height_px, intrinsics.width_px)
+    origin = T_world_cam[:3, 3]
+    corners = pixel_corner_rays(intrinsics) @ T_world_cam[:3, :3].T
+    rays = pixel_rays(corners).reshape(-1, 3)
+    flat, hits, mirrors = _render(room, origin, rays)
+    radiance = flat.reshape(*shape, 3)
+    _smooth_edges(radiance, corners, room, origin)
+
+    coarse = (slice(None, None, SHADOW_STEP_PX), slice(None, None, SHADOW_STEP_PX))
+    points = reached(origin, rays, hits).reshape(*shape, 3)[coarse]
+    normals = hits.normals.reshape(*shape, 3)[coarse]
+    share = lamp_light(room.lamps, points.reshape(-1, 3), normals.reshape(-1, 3))
+    return Backdrop(
+        intrinsics=intrinsics,
+        T_world_cam=T_world_cam,
+        corner_rays=corners,
+        radiance=radiance,
+        range_m=hits.range_m.reshape(shape),
+        mirrors=mirrors,
+        lamps=room.lamps,
+        shadow_points=points,
+        shadow_share=share.reshape(*points.shape[:2], -1),
+    )
+
+
+def pixel_corner_rays(intrinsics: Intrinsics) -> Array:
+    """Find the rays (H + 1, W + 1, 3) through the corners of all pixels, frame camera optical.
+
+    Newton's method on a grid of knots and cubic splines between them: within 1e-4 px of `Intrinsics.unproject`
+    at a twentieth of its time.
+    """
+    from scipy.interpolate import RectBivariateSpline
+
+    height, width = intrinsics.height_px, intrinsics.width_px
+    v, u = (
+        np.linspace(-0.5, size - 0.5, int(np.ceil(size / _KNOT_STEP_PX)) + 1) for size in (height, width)
+    )
+    knots = _rays_beyond_the_lens(intrinsics, np.stack(np.meshgrid(u, v), axis=-1))
+    rows, cols = np.arange(height + 1) - 0.5, np.arange(width + 1) - 0.5
+    rays = np.stack([RectBivariateSpline(v, u, knots[..., k])(rows, cols) for k in range(3)], axis=-1)
+    return unit(rays)
+
+
+def _rays_beyond_the_lens(intrinsics: Intrinsics, pixels: Array) -> Array:
+    """Unproject; where the lens model has folded back, go on outwards in proportion to the distance.
+
+    Real pictures are not black there: only the polynomial ends, not the lens.
+    """
+    centre = np.array([intrinsics.cx_px, intrinsics.cy_px])
+    focal = np.array([intrinsics.fx_px, intrinsics.fy_px])
+    rays = intrinsics.unproject(pixels)
+    radius = np.linalg.norm((pixels - centre) / focal, axis=-1)
+    is_known = np.isfinite(rays[..., 0])
+    if is_known.all():
+        return rays
+    # Just before it folds, the polynomial's slope falls to zero: leave it a little earlier.
+    limit = 0.96 * float(radius[~is_known].min())
+    beyond = radius > limit
+    inner = intrinsics.unproject(centre + (pixels[beyond] - centre) * (limit / radius[beyond])[:, None])
+    angle = np.arccos(np.clip(inner[:, 2], -1.0, 1.0)) * radius[beyond] / limit
+    side = inner[:, :2] / np.linalg.norm(inner[:, :2], axis=1, keepdims=True)
+    rays[beyond] = np.concatenate([np.sin(angle)[:, None] * side, np.cos(angle)[:, None]], axis=1)
+    return rays
+
+
+def unit(rays: Array) -> Array:
+    """Scale rays (..., 3) to length 1."""
+    return np.asarray(rays / np.sqrt(np.einsum("...c,...c->...", rays, rays))[..., None])
+
+
+def pixel_rays(corners: Array) -> Array:
+    """Find the unit rays (H, W, 3) through the pixels' centres from those through their corners."""
+    return unit(corners[:-1, :-1] + corners[:-1, 1:] + corners[1:, :-1] + corners[1:, 1:])
+
+
+def sub_rays(corners: Array, rows: NDArray[np.intp], cols: NDArray[np.intp], n: int) -> Array:
+    """Spread pixels (M,) into unit rays (M, n * n, 3) on a regular grid within each."""
+    f = (np.arange(n) + 0.5) / n
+    fv, fu = (grid.ravel()[:, None] for grid in np.meshgrid(f, f, indexing="ij"))
+    a, b = corners[rows, cols][:, None], corners[rows, cols + 1][:, None]
+    c, d = corners[rows + 1, cols][:, None], corners[rows + 1, cols + 1][:, None]
+    return unit((1 - fv) * ((1 - fu) * a + fu * b) + fv * ((1 - fu) * c + fu * d))
+
+
+def beside_changes(changes_down: NDArray[np.bool_], changes_across: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mark pixels (H, W) on either side of changes between rows (H - 1, W) or columns (H, W - 1)."""
+    edge = np.zeros((changes_across.shape[0], changes_down.shape[1]), dtype=np.bool_)
+    edge[1:] |= changes_down
+    edge[:-1] |= changes_down
+    edge[:, 1:] |= changes_across
+    edge[:, :-1] |= changes_across
+    return edge
+
+
+def _render(room: Room, origin: Array, rays: Array) -> tuple[Array, Hits, Mirrors]:
+    """Compute `static_radiance` in pieces that fit the cache and the memory."""
+    pieces = []
+    for start in range(0, len(rays), _CHUNK):
+        radiance, hits, mirrors = static_radiance(
+            room.raycaster, room.lamps, origin, rays[start : start + _CHUNK]
+        )
+        pieces.append((radiance, hits, mirrors, mirrors.index + start))
+    hits = Hits(*(np.concatenate([getattr(p[1], k) for p in pieces]) for k in ("range_m", "surface", "normals")))
+    fields = ("starts", "directions", "weight", "image", "range_m")
+    joined = [np.concatenate([getattr(p[2], k) for p in pieces]) for k in fields]
+    return np.concatenate([p[0] for p in pieces]), hits, Mirrors(np.concatenate([p[3] for p in pieces]), *joined)
+
+
+def _smooth_edges(radiance: Array, corners: Array, room: Room, origin: Array) -> None:
+    """Resample the pixels (H, W, 3) that differ much from a neighbour, in place."""
+    tone = np.sqrt(np.clip(radiance.mean(axis=2), 0.0, 1.0))
+    threshold, n = 0.05, 2
+    rows, cols = np.nonzero(
+        beside_changes(np.abs(np.diff(tone, axis=0)) > threshold, np.abs(np.diff(tone, axis=1)) > threshold)
+    )
+    rays = sub_rays(corners, rows, cols, n).reshape(-1, 3)
+    seen, _, _ = _render(room, origin, rays)
+    radiance[rows, cols] = seen.reshape(len(rows), n * n, 3).mean(axis=1)

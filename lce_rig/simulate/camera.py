@@ -1,0 +1,203 @@
+"""A camera of any lens model: the board and its carrier before the backdrop, anti-aliased, blurred and noisy."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.data import Image
+from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.simulate.backdrop import SHADOW_STEP_PX, Backdrop, beside_changes, pixel_rays, sub_rays
+from lce_rig.simulate.light import irradiance, reached
+from lce_rig.simulate.options import CameraNoise
+from lce_rig.simulate.scene import Hits, Scene
+
+_SUBPIXELS = 6  # samples a pixel along each axis wherever an edge runs through it
+_GAMMA = 1 / 2.2
+
+
+def render_image(
+    scene: Scene,
+    backdrop: Backdrop,
+    noise: CameraNoise,
+    rng: np.random.Generator,
+    *,
+    sensor: str = "cam",
+    channel: str = "frames",
+    stamp_ns: int = 0,
+) -> Image:
+    """Render one picture.
+
+    Args:
+        scene: the room of the backdrop, with the board and its carrier.
+        backdrop: the camera and what it sees of the standing room.
+        noise: the camera's errors.
+        rng: source of the sensor's noise.
+        sensor: name in the rig profile.
+        channel: channel of that camera.
+        stamp_ns: device time of mid exposure.
+    """
+    radiance = backdrop.radiance * _shadow(scene, backdrop)[..., None]
+    _paint_mirror_images(radiance, scene, backdrop)
+    _paint_moving(radiance, scene, backdrop)
+    return Image(sensor, channel, stamp_ns, _expose(radiance, noise, rng), stamp_ns)
+
+
+def _shadow(scene: Scene, backdrop: Backdrop) -> Array:
+    """Compute the share (H, W) of the light on the room that the board and its carrier let through."""
+    import cv2
+
+    shape = backdrop.shadow_points.shape[:2]
+    points = backdrop.shadow_points.reshape(-1, 3)
+    share = backdrop.shadow_share.reshape(len(points), -1)
+    lost = np.zeros(len(points))
+    for k, lamp in enumerate(backdrop.lamps):
+        lit = np.flatnonzero(share[:, k] > 0.01)
+        is_blocked = scene.occluders.is_blocked(points[lit], lamp)
+        lost[lit[is_blocked]] += share[lit[is_blocked], k]
+    through = 1.0 - 0.85 * lost / (share.sum(axis=1) + 0.35)
+    soft = cv2.GaussianBlur(through.reshape(shape), (0, 0), 1.2)
+    height, width = backdrop.range_m.shape
+    # Pixel k * step of the full picture is pixel k of the coarse one.
+    to_coarse = np.array([[1 / SHADOW_STEP_PX, 0, 0], [0, 1 / SHADOW_STEP_PX, 0]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(
+        cv2.warpAffine(soft, to_coarse, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    )
+
+
+def _region(scene: Scene, backdrop: Backdrop, *, is_mirrored: bool = False) -> tuple[slice, slice]:
+    """Bound the pixels that the board and its carrier (or their image in the floor) can touch."""
+    height, width = backdrop.range_m.shape
+    outline = transform(scene.T_world_board, scene.board.outline())
+    # Lenses bend straight edges: bound the plate by many points along them.
+    along = np.linspace(0, 1, 33)[:, None, None]
+    edges = (1 - along) * outline + along * np.roll(outline, -1, axis=0)
+    points = np.concatenate([*(s.mesh.vertices for s in scene.moving.surfaces), edges.reshape(-1, 3)])
+    if is_mirrored:
+        points = points * [1.0, 1.0, -1.0]
+    pixels, is_valid = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam), points))
+    if not is_valid.any():
+        return slice(0, 0), slice(0, 0)
+    if not is_valid.all():
+        return slice(0, height), slice(0, width)
+    low, high = np.floor(pixels.min(axis=0)) - 4, np.ceil(pixels.max(axis=0)) + 5
+    u0, u1 = (int(np.clip(value, 0, width)) for value in (low[0], high[0]))
+    v0, v1 = (int(np.clip(value, 0, height)) for value in (low[1], high[1]))
+    return slice(v0, v1), slice(u0, u1)
+
+
+def _paint_mirror_images(radiance: Array, scene: Scene, backdrop: Backdrop) -> None:
+    """Let the shiny floor show the board and its carrier in the picture (H, W, 3), in place."""
+    rows, cols = _region(scene, backdrop, is_mirrored=True)
+    mirrors = backdrop.mirrors
+    v, u = np.divmod(mirrors.index, backdrop.range_m.shape[1])
+    near = np.flatnonzero((v >= rows.start) & (v < rows.stop) & (u >= cols.start) & (u < cols.stop))
+    hits = scene.cast_moving(mirrors.starts[near], mirrors.directions[near])
+    seen = np.flatnonzero(hits.range_m < mirrors.range_m[near])
+    chosen = near[seen]
+    kept = Hits(hits.range_m[seen], hits.surface[seen], hits.normals[seen])
+    points = reached(mirrors.starts[chosen], mirrors.directions[chosen], kept)
+    image = scene.colour(kept, points) * irradiance(backdrop.lamps, points, kept.normals, scene.occluders)
+    radiance[v[chosen], u[chosen]] += mirrors.weight[chosen] * (image - mirrors.image[chosen])
+
+
+def _paint_moving(radiance: Array, scene: Scene, backdrop: Backdrop) -> None:
+    """Paint board and carrier over the backdrop (H, W, 3), in place, anti-aliased where an edge runs."""
+    rows, cols = _region(scene, backdrop)
+    if rows.stop <= rows.start or cols.stop <= cols.start:
+        return
+    corners = backdrop.corner_rays[rows.start : rows.stop + 1, cols.start : cols.stop + 1]
+    shape = (rows.stop - rows.start, cols.stop - cols.start)
+    rays = pixel_rays(corners).reshape(-1, 3)
+    hits = scene.cast_moving(backdrop.origin, rays)
+    behind = backdrop.range_m[rows, cols].ravel()
+    label = np.where(hits.range_m < behind, hits.surface, -1).astype(np.int32)
+    points = backdrop.origin + np.where(label >= 0, hits.range_m, 0.0)[:, None] * rays
+    on_board = label == scene.board_index
+    # Dark squares count as a surface of their own, so that edges of the print are found as edges.
+    label[np.flatnonzero(on_board)[scene.is_dark(points[on_board])]] += 1
+    picture = radiance[rows, cols]
+    seen = np.flatnonzero(label >= 0)
+    kept = Hits(hits.range_m[seen], hits.surface[seen], hits.normals[seen])
+    light = np.zeros((len(rays), 3))
+    light[seen] = irradiance(backdrop.lamps, points[seen], kept.normals, scene.occluders)
+    flat = picture.reshape(-1, 3).copy()
+    flat[seen] = scene.colour(kept, points[seen]) * light[seen]
+
+    grid = label.reshape(shape)
+    is_edge = _dilate(beside_changes(grid[1:] != grid[:-1], grid[:, 1:] != grid[:, :-1]))
+    is_carrier = (grid >= 0) & (grid < scene.board_index)
+    lights = [_spread(light.reshape(*shape, 3), mask) for mask in (is_carrier, grid >= scene.board_index)]
+    # Far from the carrier only the board can be met, which spares half the rays.
+    near_carrier = _dilate(_dilate(is_carrier))
+    for with_carrier in (False, True):
+        v, u = np.nonzero(is_edge & (near_carrier == with_carrier))
+        if len(v):
+            sampled = _resample(scene, backdrop, corners, picture, behind, lights, (v, u), with_carrier)
+            flat[v * shape[1] + u] = sampled
+    radiance[rows, cols] = flat.reshape(*shape, 3)
+
+
+def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Grow a mask (H, W) by one pixel, diagonals included."""
+    down = mask.copy()
+    down[1:] |= mask[:-1]
+    down[:-1] |= mask[1:]
+    out = down.copy()
+    out[:, 1:] |= down[:, :-1]
+    out[:, :-1] |= down[:, 1:]
+    return out
+
+
+def _spread(light: Array, mask: NDArray[np.bool_]) -> Array:
+    """Carry the light (H, W, 3) within a mask over its border, where samples of neighbouring pixels need it."""
+    import cv2
+
+    weight = mask.astype(np.float64)
+    window = (7, 7)
+    total = cv2.boxFilter(weight, -1, window, normalize=False)
+    summed = cv2.boxFilter(light * weight[..., None], -1, window, normalize=False)
+    return np.asarray(summed / np.maximum(total, 1e-9)[..., None])
+
+
+def _resample(
+    scene: Scene,
+    backdrop: Backdrop,
+    corners: Array,
+    picture: Array,
+    behind: Array,
+    lights: list[Array],
+    pixels: tuple[NDArray[np.intp], NDArray[np.intp]],
+    with_carrier: bool,
+) -> Array:
+    """Average many samples over each of some pixels (M,): board and carrier before the backdrop."""
+    v, u = pixels
+    n = _SUBPIXELS**2
+    rays = sub_rays(corners, v, u, _SUBPIXELS).reshape(-1, 3)
+    pixel = np.repeat(v * picture.shape[1] + u, n)
+    hits = scene.cast_moving(backdrop.origin, rays, with_carrier=with_carrier)
+    near = np.flatnonzero(hits.range_m < behind[pixel])
+    kept = Hits(hits.range_m[near], hits.surface[near], hits.normals[near])
+    points = backdrop.origin + kept.range_m[:, None] * rays[near]
+    on_carrier, on_board = (light.reshape(-1, 3)[pixel[near]] for light in lights)
+    light = np.where((kept.surface == scene.board_index)[:, None], on_board, on_carrier)
+    samples = picture.reshape(-1, 3)[pixel]
+    samples[near] = scene.colour(kept, points) * light
+    return np.asarray(samples.reshape(len(v), n, 3).mean(axis=1))
+
+
+def _expose(radiance: Array, noise: CameraNoise, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Turn linear radiance (H, W, 3) into a picture: vignetting, point spread, shot and read noise, gamma."""
+    import cv2
+
+    height, width = radiance.shape[:2]
+    v, u = np.mgrid[0:height, 0:width]
+    radius2 = ((u - (width - 1) / 2) ** 2 + (v - (height - 1) / 2) ** 2) / (((width - 1) ** 2 + (height - 1) ** 2) / 4)
+    linear = (radiance * (noise.exposure * (1 - noise.vignetting * radius2))[..., None]).astype(np.float32)
+    if noise.blur_px > 0:
+        linear = cv2.GaussianBlur(linear, (0, 0), noise.blur_px, borderType=cv2.BORDER_REPLICATE)
+    if np.isfinite(noise.full_well_e):
+        electrons = np.clip(linear, 0, None) * noise.full_well_e
+        sigma = np.sqrt(electrons + noise.read_noise_e**2)
+        linear = linear + sigma * rng.standard_normal(linear.shape, dtype=np.float32) / noise.full_well_e
+    tone = 255.0 * np.clip(linear, 0.0, 1.0) ** _GAMMA
+    return np.asarray(np.rint(tone), dtype=np.uint8)

@@ -1,0 +1,141 @@
+"""What surfaces look like to a camera and to a LiDAR; the prints on them are functions of position."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.geometry import Array
+
+Pattern = Literal["plain", "tiles", "panels", "poster", "wood", "cloth", "window"]
+
+
+@dataclass(frozen=True)
+class Material:
+    """How a surface reflects.
+
+    Attributes:
+        colour: linear (blue, green, red) albedo, 0..1.
+        reflectivity: at the LiDAR's 905 nm, 0..1; 0 gives no return (glass).
+        pattern: what is printed on it.
+        gloss: weight of the mirror image at grazing sight, 0..1.
+        emission: linear radiance of its own, in units of the albedo.
+    """
+
+    colour: tuple[float, float, float]
+    reflectivity: float
+    pattern: Pattern = "plain"
+    gloss: float = 0.0
+    emission: float = 0.0
+
+
+_LATTICE = np.random.default_rng(20240521).random((64, 64))
+
+
+def value_noise(u: Array, v: Array) -> Array:
+    """Interpolate a fixed random lattice of unit spacing: smooth stains, 0..1."""
+    u0, v0 = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+    fu, fv = u - u0, v - v0
+    fu, fv = fu * fu * (3 - 2 * fu), fv * fv * (3 - 2 * fv)
+    a, b = _LATTICE[u0 % 64, v0 % 64], _LATTICE[(u0 + 1) % 64, v0 % 64]
+    c, d = _LATTICE[u0 % 64, (v0 + 1) % 64], _LATTICE[(u0 + 1) % 64, (v0 + 1) % 64]
+    return np.asarray((a * (1 - fu) + b * fu) * (1 - fv) + (c * (1 - fu) + d * fu) * fv)
+
+
+def albedo(material: Material, points: Array, normals: Array) -> Array:
+    """Evaluate the print at points of a surface.
+
+    Args:
+        material: the surface's material.
+        points: (N, 3) m in the surface's own frame.
+        normals: (N, 3) unit, same frame.
+
+    Returns:
+        (N, 3) linear (blue, green, red) albedo.
+    """
+    # Texture coordinates: the two axes the surface is not facing along.
+    facing = np.argmax(np.abs(normals), axis=1)
+    rows = np.arange(len(points))
+    u = np.where(facing == 0, points[:, 1], points[:, 0])
+    v = points[rows, np.where(facing == 2, 1, 2)]
+    colour = np.asarray(material.colour)
+    shade = _PRINTS[material.pattern](u, v)
+    return np.clip(colour * shade, 0.0, 1.0) if shade.ndim == 2 else np.clip(colour * shade[:, None], 0.0, 1.0)
+
+
+def _plain(u: Array, v: Array) -> Array:
+    return 0.90 + 0.07 * value_noise(1.3 * u, 1.3 * v) + 0.05 * value_noise(9 * u, 9 * v)
+
+
+def _cloth(u: Array, v: Array) -> Array:
+    return 0.75 + 0.35 * value_noise(14 * u, 6 * v) + 0.1 * value_noise(90 * u, 90 * v)
+
+
+def _wood(u: Array, v: Array) -> Array:
+    grain = value_noise(3 * u + 0.3 * value_noise(2 * u, 2 * v), 45 * v)
+    return 0.75 + 0.35 * grain
+
+
+def _tiles(u: Array, v: Array) -> Array:
+    size_m, joint_m = 0.8, 0.006
+    each = 0.94 + 0.08 * _LATTICE[np.floor(u / size_m).astype(np.int64) % 64, np.floor(v / size_m).astype(np.int64) % 64]
+    stain = 0.82 + 0.2 * value_noise(0.9 * u + 7, 0.9 * v) + 0.06 * value_noise(25 * u, 25 * v)
+    is_joint = (np.mod(u, size_m) < joint_m) | (np.mod(v, size_m) < joint_m)
+    return np.where(is_joint, 0.45, each * np.minimum(stain, 1.05))
+
+
+def _panels(u: Array, v: Array) -> Array:
+    is_joint = (np.mod(u, 0.6) < 0.015) | (np.mod(v, 0.6) < 0.015)
+    return np.where(is_joint, 0.6, 0.95 + 0.05 * value_noise(30 * u, 30 * v))
+
+
+def _window(u: Array, v: Array) -> Array:
+    """A façade across the street: floors and window bands under a bright sky."""
+    band = (np.mod(v, 0.62) < 0.34) & (np.mod(u, 0.9) < 0.68)
+    front = np.where(band, 0.32 + 0.3 * value_noise(5 * u, 7 * v), 0.72)
+    is_frame = (np.mod(u + 0.02, 1.1) < 0.05) | (np.mod(v + 0.02, 1.4) < 0.05)
+    return np.where(is_frame, 0.12, np.where(v > 2.3, 1.0, front))
+
+
+def _poster(u: Array, v: Array) -> Array:
+    """A conference poster: a title bar, columns of text, coloured figures."""
+    x, y = np.mod(u / 0.9 + 0.5, 1.0), np.mod(v / 1.2 + 0.5, 1.0)
+    is_text = (np.mod(y, 0.018) < 0.009) & (value_noise(60 * x, np.floor(y / 0.018) * 3.7) > 0.35)
+    is_text &= (np.mod(x, 0.33) > 0.03) & (np.mod(x, 0.33) < 0.31) & (y < 0.84)
+    shade = np.where(is_text, 0.25, 0.95)[:, None] * np.ones(3)
+    figure = (np.mod(x, 0.33) > 0.04) & (np.mod(x, 0.33) < 0.30) & (np.mod(y + 0.07, 0.28) < 0.12) & (y < 0.8)
+    index = (np.floor(x / 0.33) + 3 * np.floor((y + 0.07) / 0.28)).astype(np.int64)
+    tints = np.array([[0.75, 0.45, 0.2], [0.25, 0.5, 0.85], [0.35, 0.7, 0.4], [0.3, 0.3, 0.7]])
+    graph = 0.5 + 0.6 * value_noise(40 * x, 40 * y)
+    shade = np.where(figure[:, None], tints[index % 4] * graph[:, None], shade)
+    return np.where((y > 0.86)[:, None], np.array([0.55, 0.28, 0.12]), shade)
+
+
+_PRINTS: dict[str, Any] = {
+    "plain": _plain,
+    "tiles": _tiles,
+    "panels": _panels,
+    "poster": _poster,
+    "wood": _wood,
+    "cloth": _cloth,
+    "window": _window,
+}
+
+
+def checker(
+    xy_board: Array, cols: int, rows: int, square_m: float, offset_m: tuple[float, float]
+) -> NDArray[np.bool_]:
+    """Tell which points of the print are dark; the outer square at the top left is.
+
+    Args:
+        xy_board: (..., 2) m, frame board.
+        cols: inner corners along x.
+        rows: inner corners along y.
+        square_m: side of one square.
+        offset_m: (x, y) of the pattern's centre from the plate's.
+    """
+    column = np.floor((xy_board[..., 0] - offset_m[0]) / square_m + (cols + 1) / 2)
+    row = np.floor((offset_m[1] - xy_board[..., 1]) / square_m + (rows + 1) / 2)
+    inside = (column >= 0) & (column <= cols) & (row >= 0) & (row <= rows)
+    return np.asarray(inside & ((column + row) % 2 == 0))

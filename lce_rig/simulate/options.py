@@ -1,0 +1,137 @@
+"""What can be chosen about a simulated rig; every default is a figure measured on real recordings or a data sheet's."""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+#: Range noise of the paper's simulated sets, levels 1..10, m.
+PAPER_RANGE_SIGMA_M = (0.0, 0.008, 0.016, 0.024, 0.032, 0.040, 0.048, 0.060, 0.080, 0.100)
+
+Carrier = Literal["stand", "person", "none"]
+
+
+@dataclass(frozen=True)
+class LidarNoise:
+    """How a spinning LiDAR errs.
+
+    Attributes:
+        range_sigma_m: white noise of each range.
+        range_offset_m: constant offset of all ranges.
+        laser_sigma_m: spread of the lasers' constant offsets (real ones repeat to +-10 mm).
+        dark_bias_m: how much longer a return of reflectivity 0 reads than one of reflectivity 1.
+        weak_bias_m: how much longer the weakest returns read (intensity 0; none from intensity 30 on).
+        rim_spread_rad: half-width of the azimuth error of points within a footprint of the board's border.
+        edge_growth_m: how much further the returns reach beyond the board's border than the beam explains.
+        divergence_rad: full opening of the beam, horizontal and vertical.
+        exit_size_m: size of the beam where it leaves the sensor, horizontal and vertical.
+        pulse_m: surfaces nearer to each other than this blend into one return.
+        dropout: probability that a return is lost.
+        is_quantised: whether ranges come in steps of 2 mm and azimuths in steps of 0.01 deg.
+    """
+
+    range_sigma_m: float = 0.010
+    range_offset_m: float = 0.0
+    laser_sigma_m: float = 0.008
+    dark_bias_m: float = 0.001
+    weak_bias_m: float = 0.010
+    rim_spread_rad: float = 0.0
+    edge_growth_m: float = 0.0
+    divergence_rad: tuple[float, float] = (0.0030, 0.0015)
+    exit_size_m: tuple[float, float] = (0.010, 0.010)
+    pulse_m: float = 0.5
+    dropout: float = 0.002
+    is_quantised: bool = True
+
+    @classmethod
+    def none(cls) -> "LidarNoise":
+        """An infinitely thin beam that measures exactly."""
+        return cls(
+            range_sigma_m=0.0,
+            laser_sigma_m=0.0,
+            dark_bias_m=0.0,
+            weak_bias_m=0.0,
+            divergence_rad=(0.0, 0.0),
+            exit_size_m=(0.0, 0.0),
+            dropout=0.0,
+            is_quantised=False,
+        )
+
+
+@dataclass(frozen=True)
+class CameraNoise:
+    """How a camera errs.
+
+    Attributes:
+        blur_px: sigma of the lens's point spread.
+        full_well_e: electrons at full scale; sets the shot noise.
+        read_noise_e: electrons of noise in the dark.
+        exposure: brightness; 1 shows the white of a well-lit board a little below full scale.
+        vignetting: loss of light at the picture's corners, 0..1.
+    """
+
+    blur_px: float = 0.6
+    full_well_e: float = 9000.0
+    read_noise_e: float = 8.0
+    exposure: float = 1.0
+    vignetting: float = 0.3
+
+    @classmethod
+    def none(cls) -> "CameraNoise":
+        """A perfect lens on a perfect sensor."""
+        return cls(blur_px=0.0, full_well_e=float("inf"), read_noise_e=0.0, vignetting=0.0)
+
+
+@dataclass(frozen=True)
+class SimulationOptions:
+    """What a simulated session shows and how its sensors err.
+
+    Attributes:
+        carrier: what carries the board.
+        noise_level: 1..10, the paper's simulated sets: the range noise of `PAPER_RANGE_SIGMA_M` and noise on
+            points near the board's rim instead of `lidar.range_sigma_m`; None for `lidar` as it is.
+        lidar, camera: the sensors' errors.
+        distance_m: range of the board's distance from the camera.
+        tilt_deg: largest tilt of the board out of the direction to the camera.
+        roll_deg: mean and half-width of the board's turn in its plane, 0 = upright, 45 = a diamond.
+        has_decoy_plate: whether a blank plate of the board's size stands in the room.
+        truth_rotation_deg, truth_translation_m: how far the true extrinsic lies from the profile's nominal one;
+            never more than 0.8 of the tolerances that the profile gives.
+        lidar_height_m: height of the LiDAR above the floor.
+        print_reflectivity: of the dark squares at 905 nm (the ink of the paper's boards is bright there).
+    """
+
+    carrier: Carrier = "stand"
+    noise_level: int | None = None
+    lidar: LidarNoise = field(default_factory=LidarNoise)
+    camera: CameraNoise = field(default_factory=CameraNoise)
+    distance_m: tuple[float, float] = (1.2, 4.0)
+    tilt_deg: float = 40.0
+    roll_deg: tuple[float, float] = (45.0, 15.0)
+    has_decoy_plate: bool = False
+    truth_rotation_deg: float = 2.0
+    truth_translation_m: float = 0.02
+    lidar_height_m: float = 1.0
+    print_reflectivity: float = 0.85
+
+    def __post_init__(self) -> None:
+        if self.noise_level is not None and not 1 <= self.noise_level <= len(PAPER_RANGE_SIGMA_M):
+            raise ValueError(f"noise_level is 1..{len(PAPER_RANGE_SIGMA_M)}, not {self.noise_level}")
+        if not 0 < self.distance_m[0] <= self.distance_m[1]:
+            raise ValueError(f"distance_m must be (near, far) with 0 < near <= far, not {self.distance_m}")
+
+    @property
+    def lidar_noise(self) -> LidarNoise:
+        """The LiDAR's errors with `noise_level` applied."""
+        if self.noise_level is None:
+            return self.lidar
+        sigma_m = PAPER_RANGE_SIGMA_M[self.noise_level - 1]
+        # The paper's simulator spreads points at the rim by 0.003 rad times the range, whatever the level.
+        quiet = replace(self.lidar, laser_sigma_m=0.0, dark_bias_m=0.0, weak_bias_m=0.0)
+        return replace(quiet, range_sigma_m=sigma_m, rim_spread_rad=0.0015)
+
+    @classmethod
+    def for_rig(cls, name: str) -> "SimulationOptions":
+        """Choose what the recordings of the rig of this name show."""
+        if name.startswith("sss"):
+            # The paper's simulated rig: a board hung in the air, and an extrinsic that is known exactly.
+            return cls(carrier="none", truth_rotation_deg=0.0, truth_translation_m=0.0)
+        return cls(carrier="person" if name.startswith("rles") else "stand")

@@ -1,0 +1,142 @@
+"""Where the board is shown: spread over the picture, near and far, tilted, and seen by the LiDAR."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.errors import LceRigError
+from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
+from lce_rig.simulate.lidar import LidarModel
+from lce_rig.simulate.options import SimulationOptions
+from lce_rig.simulate.room import Room
+from lce_rig.simulate.scene import Raycaster, Scene
+
+_ATTEMPTS = 400
+_WANTED_RINGS = 7
+_FEWEST_RINGS = 4
+_RETURNS_PER_RING = 6
+# Powers of 1/g with g^4 = g + 1: each column's multiples fill 0..1 evenly, and so do all three together.
+# M. Roberts, The unreasonable effectiveness of quasirandom sequences, 2018.
+_SPREAD = (1 / 1.2207440846057596) ** np.arange(1, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera and a LiDAR that both must see the board."""
+
+    camera: str
+    intrinsics: Intrinsics
+    T_world_cam: Array
+    lidar: str
+    model: LidarModel
+    T_world_lidar: Array
+
+
+def place_board(
+    view: View, board: Board, room: Room, options: SimulationOptions, index: int, rng: np.random.Generator, start: Array
+) -> Array:
+    """Choose T_world_board (4, 4) for one capture.
+
+    Args:
+        view: the sensors that must see the board.
+        board: the board.
+        room: the board and its carrier must stand free in it.
+        options: ranges of distance, tilt and roll.
+        index: of the capture; consecutive ones fill the picture evenly.
+        rng: source of the tilt and of what is tried next.
+        start: (3,) where the session's even filling begins, 0..1.
+
+    Raises:
+        LceRigError: there is no place that the camera and the LiDAR both see.
+    """
+    fallback, most_rings = None, 0
+    for attempt in range(_ATTEMPTS):
+        # The first tries keep near the even filling, later ones go anywhere.
+        even = np.mod(start + (index + 1) * _SPREAD, 1.0)
+        wander = min(1.0, attempt / 60)
+        where = np.mod(even + wander * rng.uniform(-0.5, 0.5, 3), 1.0)
+        T_world_board = _candidate(view, options, where, rng)
+        if T_world_board is None or not _is_in_picture(view, board, T_world_board):
+            continue
+        if not _stands_free(view, board, room, T_world_board):
+            continue
+        n_rings = count_rings(view, board, T_world_board)
+        if n_rings >= _WANTED_RINGS:
+            return T_world_board
+        if n_rings > most_rings:
+            fallback, most_rings = T_world_board, n_rings
+    if fallback is None or most_rings < _FEWEST_RINGS:
+        near, far = options.distance_m
+        raise LceRigError(
+            f"no place for the board {near:g}-{far:g} m before camera {view.camera} is seen by LiDAR {view.lidar}",
+            "Check the nominal extrinsic of the profile, or let the board come nearer or go farther.",
+        )
+    return fallback
+
+
+def _candidate(view: View, options: SimulationOptions, where: Array, rng: np.random.Generator) -> Array | None:
+    """Put the board's centre at a place in the picture and turn it about facing the camera."""
+    # Evenly over the disc of all tilts: strong ones tell most about the extrinsic.
+    tilt_rad = np.radians(options.tilt_deg) * np.sqrt(rng.uniform())
+    direction_rad = rng.uniform(0.0, 2 * np.pi)
+    roll_rad = np.radians(options.roll_deg[0] + options.roll_deg[1] * rng.uniform(-1.0, 1.0))
+    lens = view.intrinsics
+    pixel = (0.12 + 0.76 * where[:2]) * [lens.width_px - 1, lens.height_px - 1]
+    ray = view.T_world_cam[:3, :3] @ lens.unproject(pixel)
+    if not np.isfinite(ray).all() or np.hypot(ray[0], ray[1]) < 0.5:
+        return None
+    near, far = options.distance_m
+    centre = view.T_world_cam[:3, 3] + (near + (far - near) * where[2]) * ray
+    right = np.cross([0.0, 0.0, 1.0], -ray)
+    right /= np.linalg.norm(right)
+    facing = np.stack([right, np.cross(-ray, right), -ray], axis=1)
+    axis = np.array([np.cos(direction_rad), np.sin(direction_rad), 0.0])
+    turns = exp_so3(np.stack([tilt_rad * axis, [0.0, 0.0, roll_rad]]))
+    return pose(facing @ turns[0] @ turns[1], centre)
+
+
+def _is_in_picture(view: View, board: Board, T_world_board: Array) -> bool:
+    pattern = board.corners()
+    middle = pattern.mean(axis=0)
+    # The outer squares reach one square beyond the inner corners.
+    reach = (np.array([board.cols + 1, board.rows + 1]) * board.square_m) / 2
+    outer = middle + np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * np.append(reach, 0.0)
+    T_cam_board = invert(view.T_world_cam) @ T_world_board
+    pixels, is_valid = view.intrinsics.project(transform(T_cam_board, np.concatenate([pattern, outer])))
+    margin_px = 0.01 * view.intrinsics.width_px
+    return bool(np.all(is_valid & view.intrinsics.is_inside(pixels, margin_px)))
+
+
+def _stands_free(view: View, board: Board, room: Room, T_world_board: Array) -> bool:
+    centre, normal = T_world_board[:3, 3], T_world_board[:3, 2]
+    if abs(normal[2]) > 0.7:
+        return False  # nobody holds a board flat
+    to_lidar = view.T_world_lidar[:3, 3] - centre
+    if normal @ to_lidar < 0.45 * np.linalg.norm(to_lidar):
+        return False
+    outline = transform(T_world_board, board.outline())
+    behind = centre - 0.8 * normal
+    footing = np.array([[behind[0], behind[1], 0.6], [centre[0], centre[1], 0.6]])
+    if not room.is_free(np.concatenate([outline, footing])).all():
+        return False
+    eyes = [view.T_world_cam[:3, 3], view.T_world_lidar[:3, 3]]
+    return not any(room.raycaster.is_blocked(outline, eye).any() for eye in eyes)
+
+
+def count_rings(view: View, board: Board, T_world_board: Array) -> int:
+    """Count the LiDAR's rings that bring back at least a few returns from the board."""
+    scene = Scene(Raycaster(()), (), board, T_world_board)
+    outline = transform(invert(view.T_world_lidar) @ T_world_board, board.outline())
+    azimuth = np.arctan2(outline[:, 1], outline[:, 0])
+    spread = np.angle(np.exp(1j * (azimuth - azimuth[0])))
+    n_steps = int(np.ceil(np.ptp(spread) / view.model.step_rad)) + 1
+    across = azimuth[0] + spread.min() + view.model.step_rad * np.arange(n_steps)
+    elevation, around = (grid.ravel() for grid in np.meshgrid(view.model.elevations_rad, across, indexing="ij"))
+    level = np.cos(elevation)
+    rays = np.stack([level * np.cos(around), level * np.sin(around), np.sin(elevation)], axis=1)
+    hits = scene.cast_board(view.T_world_lidar[:3, 3], rays @ view.T_world_lidar[:3, :3].T)
+    returns = (hits.surface >= 0).reshape(len(view.model.elevations_rad), -1).sum(axis=1)
+    return int(np.sum(returns >= _RETURNS_PER_RING))
+

@@ -1,0 +1,235 @@
+"""The scene a ray meets: meshes that stand still, meshes that move with the board, and the board itself."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.simulate.materials import Material, albedo, checker
+from lce_rig.simulate.shapes import Mesh, rectangle
+
+PLATE = Material((0.86, 0.87, 0.88), 0.95)
+PRINT_ALBEDO = 0.035
+PLATE_BACK = Material((0.30, 0.38, 0.45), 0.6)
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A mesh of one material, in world coordinates; prints are laid out in the frame T_world_surface."""
+
+    name: str
+    mesh: Mesh
+    material: Material
+    T_world_surface: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """What rays meet first.
+
+    Attributes:
+        range_m: (N,) distance along the unit ray; inf where nothing is met.
+        surface: (N,) int32 index, -1 where nothing is met.
+        normals: (N, 3) unit, towards the side the ray comes from; zero where nothing is met.
+    """
+
+    range_m: Array
+    surface: NDArray[np.int32]
+    normals: Array
+
+
+class Raycaster:
+    """Finds the first of a fixed set of surfaces along rays (Embree, float32)."""
+
+    def __init__(self, surfaces: Sequence[Surface]) -> None:
+        self.surfaces = tuple(surfaces)
+        meshes = [surface.mesh for surface in surfaces]
+        self._normals = np.concatenate([mesh.normals for mesh in meshes]) if meshes else np.zeros((0, 3))
+        starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])[:-1]
+        corners = [mesh.triangles.astype(np.int64) + s for mesh, s in zip(meshes, starts, strict=True)]
+        self._triangles = np.concatenate(corners) if meshes else np.zeros((0, 3), dtype=np.int64)
+        self._first_triangle = np.cumsum([0] + [len(mesh.triangles) for mesh in meshes])[:-1]
+
+    @cached_property
+    def _engine(self) -> Any:
+        import open3d as o3d
+
+        engine = o3d.t.geometry.RaycastingScene(nthreads=1)
+        for surface in self.surfaces:
+            engine.add_triangles(
+                o3d.core.Tensor(surface.mesh.vertices.astype(np.float32)), o3d.core.Tensor(surface.mesh.triangles)
+            )
+        return engine
+
+    @staticmethod
+    def _rays(origins: Array, directions: Array) -> Any:
+        import open3d as o3d
+
+        rays = np.empty((len(directions), 6), dtype=np.float32)
+        rays[:, :3], rays[:, 3:] = origins, directions
+        return o3d.core.Tensor(rays)
+
+    def cast(self, origins: Array, directions: Array) -> Hits:
+        """Find the first surface along each ray.
+
+        Args:
+            origins: (N, 3) or (3,) m, world.
+            directions: (N, 3) unit, world.
+        """
+        if not self.surfaces:
+            return _nothing(len(directions))
+        answer = self._engine.cast_rays(self._rays(origins, directions), nthreads=1)
+        range_m = answer["t_hit"].numpy().astype(np.float64)
+        is_hit = np.isfinite(range_m)
+        surface = np.where(is_hit, answer["geometry_ids"].numpy().astype(np.int64), -1).astype(np.int32)
+        triangle = self._first_triangle[surface[is_hit]] + answer["primitive_ids"].numpy()[is_hit]
+        uv = answer["primitive_uvs"].numpy()[is_hit].astype(np.float64)
+        weights = np.stack([1 - uv.sum(axis=1), uv[:, 0], uv[:, 1]], axis=1)
+        normals = np.zeros((len(directions), 3))
+        normals[is_hit] = np.einsum("nk,nkc->nc", weights, self._normals[self._triangles[triangle]])
+        return Hits(range_m, surface, _unit_towards(normals, directions))
+
+    def is_blocked(self, origins: Array, targets: Array) -> NDArray[np.bool_]:
+        """Tell which straight lines from origins (N, 3) to targets (N, 3) or (3,) meet a surface on the way."""
+        if not self.surfaces:
+            return np.zeros(len(origins), dtype=np.bool_)
+        rays = self._rays(origins, targets - origins)
+        blocked = self._engine.test_occlusions(rays, tnear=1e-3, tfar=0.999, nthreads=1)
+        return np.asarray(blocked.numpy(), dtype=np.bool_)
+
+
+def _nothing(n: int) -> Hits:
+    return Hits(np.full(n, np.inf), np.full(n, -1, dtype=np.int32), np.zeros((n, 3)))
+
+
+def _unit_towards(normals: Array, directions: Array) -> Array:
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    side = np.where(np.einsum("nc,nc->n", normals, directions) > 0, -1.0, 1.0)
+    return np.asarray(normals * (side[:, None] / np.maximum(length, 1e-12)))
+
+
+class Scene:
+    """Everything one capture shows.
+
+    Args:
+        static: what stands still over a session.
+        moving: what stands elsewhere in each capture: the board's carrier.
+        board: the board.
+        T_world_board: (4, 4).
+        print_reflectivity: of the dark squares at the LiDAR's wavelength.
+
+    Surfaces are numbered static, then moving, then the board (`board_index`).
+    """
+
+    def __init__(
+        self,
+        static: Raycaster,
+        moving: Sequence[Surface],
+        board: Board,
+        T_world_board: Array,
+        print_reflectivity: float = 0.85,
+    ) -> None:
+        self.static = static
+        self.moving = Raycaster(moving)
+        self.board = board
+        self.T_world_board = T_world_board
+        self.print_reflectivity = print_reflectivity
+        self.board_index = len(static.surfaces) + len(moving)
+        self.surfaces = (*static.surfaces, *moving)
+
+    @cached_property
+    def occluders(self) -> Raycaster:
+        """The moving surfaces and the board, as things that cast shadows."""
+        plate = rectangle(self.board.width_m, self.board.height_m).moved(self.T_world_board)
+        return Raycaster([*self.moving.surfaces, Surface("board", plate, PLATE, self.T_world_board)])
+
+    def cast(self, origins: Array, directions: Array) -> Hits:
+        """Find what each ray meets first; the board is met analytically, in float64."""
+        hits = self.static.cast(origins, directions)
+        return self._nearer(hits, self.cast_moving(origins, directions))
+
+    def cast_moving(self, origins: Array, directions: Array, *, with_carrier: bool = True) -> Hits:
+        """Find what each ray meets first of the carrier and the board, whatever stands before them."""
+        hits = self.cast_board(origins, directions)
+        if not with_carrier or not self.moving.surfaces:
+            return hits
+        carrier = self.moving.cast(origins, directions)
+        shift = np.where(carrier.surface >= 0, len(self.static.surfaces), 0).astype(np.int32)
+        return self._nearer(Hits(carrier.range_m, carrier.surface + shift, carrier.normals), hits)
+
+    def cast_board(self, origins: Array, directions: Array) -> Hits:
+        """Intersect rays with the board's rectangle: p_z + s u_z = 0 in frame board."""
+        T_board_world = invert(self.T_world_board)
+        start = transform(T_board_world, np.atleast_2d(origins))
+        step = directions @ T_board_world[:3, :3].T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            range_m = -start[:, 2] / step[:, 2]
+            x = start[:, 0] + range_m * step[:, 0]
+            y = start[:, 1] + range_m * step[:, 1]
+        w, h = self.board.width_m / 2, self.board.height_m / 2
+        is_hit = (range_m > 1e-6) & (np.abs(x) <= w) & (np.abs(y) <= h)
+        normals = -np.sign(step[:, 2:]) * self.T_world_board[:3, 2]
+        return Hits(
+            np.where(is_hit, range_m, np.inf),
+            np.where(is_hit, self.board_index, -1).astype(np.int32),
+            np.where(is_hit[:, None], normals, 0.0),
+        )
+
+    @staticmethod
+    def _nearer(one: Hits, other: Hits) -> Hits:
+        is_other = other.range_m < one.range_m
+        return Hits(
+            np.where(is_other, other.range_m, one.range_m),
+            np.where(is_other, other.surface, one.surface).astype(np.int32),
+            np.where(is_other[:, None], other.normals, one.normals),
+        )
+
+    def is_dark(self, points_world: Array) -> NDArray[np.bool_]:
+        """Tell which points of the board (N, 3) lie on a dark square."""
+        board = self.board
+        xy = transform(invert(self.T_world_board), points_world)[:, :2]
+        return checker(xy, board.cols, board.rows, board.square_m, board.pattern_offset_m)
+
+    def is_front(self, normals: Array) -> NDArray[np.bool_]:
+        """Tell which normals (N, 3) of hits on the board belong to its printed side."""
+        return np.asarray(normals @ self.T_world_board[:3, 2] > 0)
+
+    def reflectivity(self, hits: Hits, points_world: Array) -> Array:
+        """Evaluate the reflectivity (N,) at the LiDAR's wavelength; 0 where nothing is met."""
+        values = [surface.material.reflectivity for surface in self.surfaces]
+        table = np.array([*values, PLATE.reflectivity, 0.0])
+        out = np.asarray(table[hits.surface], dtype=np.float64)
+        on_board = np.flatnonzero(hits.surface == self.board_index)
+        is_front = self.is_front(hits.normals[on_board])
+        out[on_board[~is_front]] = PLATE_BACK.reflectivity
+        is_print = is_front & self.is_dark(points_world[on_board])
+        out[on_board[is_print]] = self.print_reflectivity
+        return out
+
+    def colour(self, hits: Hits, points_world: Array) -> Array:
+        """Evaluate the linear albedo (N, 3); 0 where nothing is met."""
+        out = np.zeros((len(points_world), 3))
+        for index in np.unique(hits.surface):
+            rows = np.flatnonzero(hits.surface == index)
+            if index == self.board_index:
+                out[rows] = self._board_colour(hits.normals[rows], points_world[rows])
+            elif index >= 0:
+                out[rows] = surface_colour(self.surfaces[index], points_world[rows], hits.normals[rows])
+        return out
+
+    def _board_colour(self, normals: Array, points_world: Array) -> Array:
+        out = np.tile(np.array(PLATE.colour), (len(normals), 1))
+        out[self.is_dark(points_world)] = PRINT_ALBEDO
+        out[~self.is_front(normals)] = PLATE_BACK.colour
+        return out
+
+
+def surface_colour(surface: Surface, points_world: Array, normals: Array) -> Array:
+    """Evaluate a surface's print (N, 3) at points and normals (N, 3) in world coordinates."""
+    T_surface_world = invert(surface.T_world_surface)
+    return albedo(surface.material, transform(T_surface_world, points_world), normals @ T_surface_world[:3, :3].T)

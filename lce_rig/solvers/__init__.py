@@ -1,0 +1,1 @@
+"""Mathematical solvers: poses from points, planes and corners, with covariance and certificates."""

@@ -1,0 +1,187 @@
+"""Pose of a planar board from its corners in one picture: both local minima, with covariance."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array, invert, perturb, pose, project_to_so3, rotation_angle, skew, transform
+
+_MAX_STEPS = 30
+_SAME_POSE_RAD = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarPose:
+    """The minima of the reprojection cost f = sum |project(T p_i) - u_i|^2 of one board.
+
+    Attributes:
+        T_cam_board: (4, 4) the lower minimum.
+        cov: (6, 6) of T_cam_board, sigma^2 (J^T J)^-1, tangent (translation m, rotation rad).
+        T_cam_board_alternative: (4, 4) the other minimum; None where both starts reach the same one.
+        chi2_gap: (f_alternative - f) / sigma^2; infinite without an alternative.
+        reprojection_px: rms distance of a corner from its prediction.
+        sigma_px: noise per coordinate, sqrt(f / (2 n - 6)).
+    """
+
+    T_cam_board: Array
+    cov: Array
+    T_cam_board_alternative: Array | None
+    chi2_gap: float
+    reprojection_px: float
+    sigma_px: float
+
+
+def solve_planar_pose(corners_px: Array, corners_board: Array, intrinsics: Intrinsics) -> PlanarPose | None:
+    """Find T_cam_board and the second local minimum of the reprojection error.
+
+    A homography gives the first start. Mirroring the board's tilt in the line of sight gives the second: under
+    weak perspective both draw the same picture, which is why the cost of a plane has two minima. Either start
+    is refined by Levenberg-Marquardt in distorted pixels, so that any camera model is treated alike.
+
+    Args:
+        corners_px: (N, 2) measured, N >= 4.
+        corners_board: (N, 3) with z = 0, frame board, m.
+        intrinsics: the camera.
+
+    Returns:
+        The minima, or None where the corners admit no pose in front of the camera.
+
+    References:
+        T. Collins, A. Bartoli: Infinitesimal plane-based pose estimation. IJCV 109 (2014).
+    """
+    start = _pose_from_homography(corners_board, intrinsics.unproject(corners_px))
+    if start is None:
+        return None
+    first = refine_pose(start, corners_px, corners_board, intrinsics)
+    centre_board = corners_board.mean(axis=0)
+    second = refine_pose(mirror_tilt(first[0], centre_board), corners_px, corners_board, intrinsics)
+    # Starting over from the mirrored refined pose reaches a first minimum that a poor homography missed.
+    if second[1] < first[1]:
+        third = refine_pose(mirror_tilt(second[0], centre_board), corners_px, corners_board, intrinsics)
+        first = third if third[1] < first[1] else first
+    (T, cost), (T_other, cost_other) = sorted((first, second), key=lambda minimum: minimum[1])
+    if not np.isfinite(cost):
+        return None
+
+    _, J = _residuals_and_jacobian(T, corners_px, corners_board, intrinsics)
+    n = len(corners_px)
+    variance = max(cost / max(2 * n - 6, 1), 1e-12)
+    is_same = bool(rotation_angle(T[:3, :3], T_other[:3, :3]) < _SAME_POSE_RAD)
+    has_other = np.isfinite(cost_other) and not is_same
+    return PlanarPose(
+        T_cam_board=T,
+        cov=variance * np.linalg.inv(J.T @ J),
+        T_cam_board_alternative=T_other if has_other else None,
+        chi2_gap=float((cost_other - cost) / variance) if has_other else float("inf"),
+        reprojection_px=float(np.sqrt(cost / n)),
+        sigma_px=float(np.sqrt(variance)),
+    )
+
+
+def refine_pose(
+    T_cam_board: Array, corners_px: Array, corners_board: Array, intrinsics: Intrinsics
+) -> tuple[Array, float]:
+    """Minimise the reprojection error from a start by Levenberg-Marquardt.
+
+    Returns:
+        T_cam_board (4, 4) at the minimum and the cost there in px^2; infinite where the start projects nowhere.
+    """
+    T, damping = T_cam_board, 1e-4
+    residuals, J = _residuals_and_jacobian(T, corners_px, corners_board, intrinsics)
+    cost = float(residuals @ residuals)
+    if not np.isfinite(cost):
+        return T, float("inf")
+    for _ in range(_MAX_STEPS):
+        H, gradient = J.T @ J, J.T @ residuals
+        step = -np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
+        T_new = perturb(T, step)
+        new_residuals, new_J = _residuals_and_jacobian(T_new, corners_px, corners_board, intrinsics)
+        new_cost = float(new_residuals @ new_residuals)
+        if not new_cost < cost:
+            # Rejected at machine precision: this is the minimum, not a step that was too long.
+            if -gradient @ step < 1e-12 * cost or damping > 1e8:
+                break
+            damping *= 10
+            continue
+        gain = cost - new_cost
+        T, residuals, J, cost, damping = T_new, new_residuals, new_J, new_cost, damping / 10
+        if gain < 1e-10 * cost + 1e-20:
+            break
+    return T, cost
+
+
+def mirror_tilt(T_cam_board: Array, centre_board: Array) -> Array:
+    """Mirror the board's tilt in its line of sight, keeping its centre.
+
+    With S = diag(1, 1, -1) along the line of sight, R' = S R S turns the depth of every board point about the
+    centre's depth, up to the same picture under weak perspective.
+
+    Args:
+        T_cam_board: (4, 4).
+        centre_board: (3,) the point that stays, frame board, m.
+    """
+    centre_camera = transform(T_cam_board, centre_board[None])[0]
+    sight = centre_camera / np.linalg.norm(centre_camera)
+    S_camera = np.eye(3) - 2.0 * np.outer(sight, sight)
+    R = S_camera @ T_cam_board[:3, :3] @ np.diag([1.0, 1.0, -1.0])
+    return pose(R, centre_camera - R @ centre_board)
+
+
+def _pose_from_homography(corners_board: Array, rays: Array) -> Array | None:
+    """Decompose the homography board plane -> rays, H ~ [r1 r2 t]; None where the corners have no rays.
+
+    Rays beyond 90 deg from the axis have no x/z; turning all rays so that their mean is the axis keeps the
+    homography finite for wide fisheye pictures too.
+    """
+    if not np.all(np.isfinite(rays)):
+        return None
+    R_view = _rotation_to_axis(rays.mean(axis=0))
+    view = rays @ R_view.T
+    if np.any(view[:, 2] < 1e-3):
+        return None
+    target = view[:, :2] / view[:, 2:]
+    centre, size = corners_board.mean(axis=0), np.abs(corners_board - corners_board.mean(axis=0)).max()
+    plane = np.concatenate([(corners_board - centre)[:, :2] / size, np.ones((len(rays), 1))], axis=1)
+    # Normalising the target as well keeps the null vector of the DLT well conditioned (Hartley 1997).
+    shift, scale = target.mean(axis=0), np.abs(target - target.mean(axis=0)).max()
+    u, v = ((target - shift) / scale).T
+    zeros = np.zeros_like(plane)
+    A = np.concatenate(
+        [
+            np.concatenate([plane, zeros, -u[:, None] * plane], axis=1),
+            np.concatenate([zeros, plane, -v[:, None] * plane], axis=1),
+        ]
+    )
+    _, _, Vt = np.linalg.svd(A.T @ A)
+    H = np.array([[scale, 0, shift[0]], [0, scale, shift[1]], [0, 0, 1]]) @ Vt[-1].reshape(3, 3)
+    H *= np.sign(H[2, 2]) / np.sqrt(np.linalg.norm(H[:, 0]) * np.linalg.norm(H[:, 1]))
+    R = project_to_so3(np.stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])], axis=1))
+    t = H[:, 2] * size
+    return invert(pose(R_view, np.zeros(3))) @ pose(R, t - R @ centre)
+
+
+def _rotation_to_axis(direction: Array) -> Array:
+    """Build a rotation (3, 3) that takes `direction` to the z axis."""
+    z = direction / np.linalg.norm(direction)
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _residuals_and_jacobian(
+    T_cam_board: Array, corners_px: Array, corners_board: Array, intrinsics: Intrinsics
+) -> tuple[Array, Array]:
+    """Compute the residuals (2 N,) and their derivative (2 N, 6) by the tangent of T_cam_board.
+
+    The derivative of the camera model by the point is taken by central differences in one batched projection,
+    so that no camera model needs its own; that of the point by the tangent is [I, -(R p)^].
+    """
+    turned = corners_board @ T_cam_board[:3, :3].T
+    points = turned + T_cam_board[:3, 3]
+    h = 1e-6 * np.linalg.norm(points, axis=1)
+    offsets = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    pixels, _ = intrinsics.project(points + h[:, None] * offsets[:, None, :])
+    by_point = np.stack((pixels[1:4] - pixels[4:7]) / (2 * h[:, None]), axis=-1)
+    by_tangent = np.concatenate([by_point, -by_point @ skew(turned)], axis=-1)
+    return (pixels[0] - corners_px).ravel(), by_tangent.reshape(-1, 6)

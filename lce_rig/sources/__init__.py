@@ -1,0 +1,42 @@
+"""Recordings and sensors behind one door: `open_recording` finds the reader for a path."""
+
+from importlib import import_module
+from pathlib import Path
+
+from lce_rig.core.errors import SourceError
+from lce_rig.rig import Rig
+from lce_rig.sources.base import Recording, SourceOptions
+
+RECORDINGS = {
+    "folder": "lce_rig.sources.folder:FolderRecording",
+    ".bag": "lce_rig.sources.rosbag:BagRecording",
+    ".db3": "lce_rig.sources.rosbag:BagRecording",
+    ".mcap": "lce_rig.sources.rosbag:BagRecording",
+}
+"""Reader by suffix, or "folder"; imported when wanted."""
+
+
+def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = None) -> Recording:
+    """Open what lies at a path: a folder of pictures and clouds, or a bag (ROS 1, sqlite3, mcap).
+
+    Raises:
+        SourceError: nothing is there, or nothing that can be read.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise SourceError(f"{path} does not exist")
+    kind = _kind(path)
+    if kind not in RECORDINGS:
+        known = ", ".join(suffix for suffix in RECORDINGS if suffix != "folder")
+        hint = f"Give a folder with img/ and pcd/, or a bag ({known})."
+        raise SourceError(f"{path} is no recording this program reads", hint)
+    module, name = RECORDINGS[kind].split(":")
+    recording: Recording = getattr(import_module(module), name)(path, rig, options or SourceOptions())
+    return recording
+
+
+def _kind(path: Path) -> str:
+    if not path.is_dir():
+        return path.suffix.lower()
+    bags = sorted(p.suffix.lower() for p in path.iterdir() if p.suffix.lower() in (".bag", ".db3", ".mcap"))
+    return bags[0] if bags else "folder"

@@ -1,0 +1,160 @@
+"""Bags as streams of raw messages: ROS 1, ROS 2 sqlite3 and mcap, whole or torn."""
+
+import hashlib
+from collections.abc import Collection, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lce_rig.core.errors import SourceError
+from lce_rig.sources.bag_salvage import salvage
+
+SUFFIXES = (".bag", ".db3", ".mcap")
+_FINGERPRINT_BYTES = 65536
+
+
+@dataclass(frozen=True, eq=False)
+class RawMessage:
+    """A message as it lies in the bag.
+
+    Attributes:
+        msgtype: "sensor_msgs/PointCloud2", without ROS 2's "/msg".
+        encoding: "ros1" or "cdr".
+        log_ns: when the recorder received it.
+    """
+
+    topic: str
+    msgtype: str
+    encoding: str
+    log_ns: int
+    data: bytes
+
+
+class BagFile:
+    """One bag: a .bag, .db3 or .mcap file, or a ROS 2 folder.
+
+    Attributes:
+        path: the file or folder.
+        topics: (message type, number of messages) by topic.
+        damage: what is wrong with the bag, "" where nothing is; what can be read is read all the same.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read the list of topics.
+
+        Raises:
+            SourceError: nothing can be read.
+        """
+        self.path = path
+        self.damage = ""
+        self.topics: dict[str, tuple[str, int]] = {}
+        self._parts = self._find_parts()
+        try:
+            for part in self._parts:
+                with _reader(part) as reader:
+                    for connection in reader.connections:
+                        self._count(connection.topic, connection.msgtype, connection.msgcount)
+        except Exception as error:  # A torn file makes the reader fail in any way: struct, assert, zlib, ...
+            self._survey_damaged(error)
+
+    @property
+    def n_messages(self) -> int:
+        """Number of messages of all topics."""
+        return sum(count for _, count in self.topics.values())
+
+    def fingerprint(self) -> str:
+        """Hash names, sizes and both ends of the files: enough to know a recording again."""
+        digest = hashlib.sha256()
+        for file in self._files():
+            size = file.stat().st_size
+            with file.open("rb") as stream:
+                head = stream.read(_FINGERPRINT_BYTES)
+                stream.seek(max(size - _FINGERPRINT_BYTES, 0))
+                digest.update(f"{file.name} {size}".encode() + head + stream.read(_FINGERPRINT_BYTES))
+        return digest.hexdigest()
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """Yield the messages of some topics in the order the recorder received them.
+
+        Raises:
+            SourceError: at the place where the bag is damaged, after everything before it.
+        """
+        n_read, last_ns = 0, None
+        first_ns: int | None = None
+        try:
+            for part in self._parts:
+                for message in self._part_messages(part, topics):
+                    n_read, last_ns = n_read + 1, message.log_ns
+                    first_ns = message.log_ns if first_ns is None else first_ns
+                    yield message
+        except SourceError:
+            raise
+        except Exception as error:  # As above: damage shows in any way.
+            self.damage = _describe(error)
+        if self.damage:
+            length_s = 0.0 if first_ns is None or last_ns is None else (last_ns - first_ns) * 1e-9
+            raise SourceError(
+                f"{self.path} is damaged ({self.damage}): {n_read} messages over {length_s:.1f} s were read",
+                "What was captured from them is kept. Reindexing with ROS's own tools may bring back more.",
+            )
+
+    def _part_messages(self, part: Path, topics: Collection[str]) -> Iterator[RawMessage]:
+        if self.damage:
+            for topic, msgtype, encoding, log_ns, data in salvage(part):
+                if topic in topics:
+                    yield RawMessage(topic, _short_type(msgtype), encoding, log_ns, data)
+            return
+        with _reader(part) as reader:
+            wanted = [c for c in reader.connections if c.topic in topics]
+            if not wanted:
+                return
+            for connection, log_ns, data in reader.messages(connections=wanted):
+                encoding = getattr(connection.ext, "serialization_format", "ros1")
+                msgtype = _short_type(connection.msgtype)
+                yield RawMessage(connection.topic, msgtype, encoding, log_ns, bytes(data))
+
+    def _survey_damaged(self, error: Exception) -> None:
+        self.damage = _describe(error)
+        self.topics.clear()
+        for part in self._parts:
+            if not part.is_dir():
+                for topic, msgtype, *_ in salvage(part):
+                    self._count(topic, msgtype, 1)
+        if not self.topics:
+            raise SourceError(
+                f"{self.path} cannot be read: {self.damage}", "Record again, or try to reindex it."
+            )
+
+    def _count(self, topic: str, msgtype: str, n: int) -> None:
+        self.topics[topic] = (_short_type(msgtype), self.topics.get(topic, ("", 0))[1] + n)
+
+    def _find_parts(self) -> list[Path]:
+        """List what readers open: the path itself, or the files in a folder whose index was never written."""
+        if not self.path.is_dir() or (self.path / "metadata.yaml").is_file():
+            return [self.path]
+        return self._files()
+
+    def _files(self) -> list[Path]:
+        if not self.path.is_dir():
+            return [self.path]
+        return sorted(p for p in self.path.iterdir() if p.suffix.lower() in SUFFIXES)
+
+
+def _reader(part: Path) -> AbstractContextManager[Any]:
+    if part.suffix.lower() == ".bag":
+        from rosbags.rosbag1 import Reader as Ros1Reader
+
+        return Ros1Reader(part)
+    from rosbags.rosbag2 import Reader as Ros2Reader
+
+    return Ros2Reader(part)
+
+
+def _short_type(msgtype: str) -> str:
+    return msgtype.replace("/msg/", "/")
+
+
+def _describe(error: Exception) -> str:
+    text = " ".join(str(error).split()).rstrip(".")
+    return text[:200] if text else type(error).__name__

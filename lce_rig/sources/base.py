@@ -1,0 +1,100 @@
+"""What every recording offers."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
+
+from lce_rig.core.data import Image, Scan
+
+Sample: TypeAlias = Image | Scan
+PairMethod: TypeAlias = Literal["auto", "stem", "order", "time"]
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """How a recording is read, where the profile does not say or says otherwise.
+
+    Attributes:
+        camera, channel, lidar: whose pictures and clouds a folder holds; None takes the rig's first.
+        pair: how a folder's pictures and clouds are matched.
+        pair_tolerance_s: largest difference in time of a pair; None takes the profile's.
+        topics: topic by sensor ("cam", "cam.events", "lidar"), in place of the profile's.
+    """
+
+    camera: str | None = None
+    channel: str | None = None
+    lidar: str | None = None
+    pair: PairMethod = "auto"
+    pair_tolerance_s: float | None = None
+    topics: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """What the sensors saw of one board placement.
+
+    Attributes:
+        label: the files it came from, for messages: "00003.png + 00003.pcd".
+        key: fingerprint of those files; the same files give the same key wherever they lie.
+        notes: what had to be assumed or left out on the way, in words.
+    """
+
+    label: str
+    key: str
+    images: tuple[Image, ...]
+    scans: tuple[Scan, ...]
+    notes: tuple[str, ...] = ()
+
+
+class PairFiles(Protocol):
+    """A pair that has not been read yet."""
+
+    @property
+    def label(self) -> str:
+        """The files' names, for messages."""
+        ...
+
+    def key(self) -> str:
+        """Fingerprint the files without decoding them."""
+        ...
+
+    def read(self) -> Pair:
+        """Decode the files; SourceError names the one that cannot be read."""
+        ...
+
+
+class Recording(Protocol):
+    """Anything recorded.
+
+    Attributes:
+        path: where it lies.
+        notes: what was chosen, assumed or missing, in words; grows while it is read.
+    """
+
+    path: Path
+    notes: list[str]
+
+
+@runtime_checkable
+class PairedRecording(Recording, Protocol):
+    """A recording in which somebody has put pictures and clouds of each board placement side by side."""
+
+    pairs: Sequence[PairFiles]
+
+
+@runtime_checkable
+class ContinuousRecording(Recording, Protocol):
+    """A recording that runs on while the board is moved about.
+
+    Attributes:
+        key: fingerprint of the recording.
+        n_samples: number of samples to come, for progress.
+    """
+
+    key: str
+    n_samples: int
+
+    def samples(self) -> Iterator[Sample]:
+        """Yield what the sensors saw, in order of time, one sample at a time."""
+        ...

@@ -1,0 +1,179 @@
+"""From a cloud with whatever fields to a `Scan`: names, units and conventions are settled here, once."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.data import Scan
+from lce_rig.core.errors import SourceError
+from lce_rig.core.rings import rings_from_elevation
+from lce_rig.rig import LidarSettings
+
+INTENSITY_FIELDS = ("intensity", "reflectivity", "intensities", "i", "signal")
+RING_FIELDS = ("ring", "channel", "laser_id", "laserid", "line")
+TIME_FIELDS = ("time", "t", "timestamp", "offset", "offset_time", "time_offset", "timeoffset")
+MIN_RANGE_M = 1e-3
+# A sweep lasts 0.02 to 1.5 s whatever the spinning LiDAR; the same figure in another unit is far outside.
+SWEEP_S = (0.02, 1.5)
+NS_PER_UNIT = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
+
+
+@dataclass(frozen=True, eq=False)
+class CloudReading:
+    """A scan, and what had to be done to get it.
+
+    Attributes:
+        n_not_finite: points dropped because a coordinate is NaN or infinite.
+        n_zero_range: points dropped because they lie at the origin (no return).
+        notes: what the cloud lacks or how it was understood, in words; the same for like clouds.
+    """
+
+    scan: Scan
+    n_not_finite: int
+    n_zero_range: int
+    notes: tuple[str, ...]
+
+
+def to_scan(
+    cloud: NDArray[Any],
+    lidar: str,
+    settings: LidarSettings,
+    where: str,
+    stamp_ns: int | None = None,
+    host_ns: int | None = None,
+) -> CloudReading:
+    """Build a scan from a cloud with any fields.
+
+    Args:
+        cloud: structured (N,) with at least x, y, z in m, frame lidar.
+        lidar: the LiDAR's name in the profile.
+        settings: its settings; `timestamps.reference` says which firing `stamp_ns` marks.
+        where: file or topic, for messages.
+        stamp_ns: the cloud's stamp as recorded; None where there is none.
+        host_ns: arrival at the host.
+
+    Raises:
+        SourceError: no coordinates, no valid point, or no rings and none that could be told from elevations.
+    """
+    fields = {name.lower(): name for name in reversed(cloud.dtype.names or ())}
+    missing = [axis for axis in "xyz" if axis not in fields]
+    if missing:
+        have = ", ".join(cloud.dtype.names or ()) or "none"
+        raise SourceError(f"{where}: the cloud has no field {missing[0]!r}; its fields are {have}")
+    with np.errstate(over="ignore"):
+        points = np.stack([cloud[fields[axis]].astype(np.float32) for axis in "xyz"], axis=1)
+    is_finite = np.isfinite(points).all(axis=1)
+    is_far = np.zeros(len(points), dtype=bool)
+    is_far[is_finite] = np.linalg.norm(points[is_finite].astype(np.float64), axis=1) > MIN_RANGE_M
+    keep = np.flatnonzero(is_far)
+    if len(keep) == 0:
+        raise SourceError(f"{where}: the cloud has no valid point ({len(points)} in all)")
+    points, cloud, notes = points[keep], cloud[keep], list[str]()
+    ring = _ring(cloud, fields, points, where, notes)
+    offset_ns, stamp_ns = _times(cloud, fields, settings, stamp_ns, notes)
+    scan = Scan(lidar, stamp_ns, points, _intensity(cloud, fields, notes), ring, offset_ns, host_ns)
+    return CloudReading(scan, int((~is_finite).sum()), int(is_finite.sum() - len(keep)), tuple(notes))
+
+
+def _find(fields: dict[str, str], candidates: tuple[str, ...]) -> str | None:
+    return next((fields[name] for name in candidates if name in fields), None)
+
+
+def _intensity(cloud: NDArray[Any], fields: dict[str, str], notes: list[str]) -> NDArray[np.float32]:
+    name = _find(fields, INTENSITY_FIELDS)
+    if name is None:
+        notes.append("no intensity")
+        return np.zeros(len(cloud), dtype=np.float32)
+    return np.nan_to_num(cloud[name].astype(np.float32), posinf=0.0, neginf=0.0)
+
+
+def _ring(
+    cloud: NDArray[Any], fields: dict[str, str], points: NDArray[np.float32], where: str, notes: list[str]
+) -> NDArray[np.int16]:
+    name = _find(fields, RING_FIELDS)
+    values = np.zeros(len(cloud)) if name is None else cloud[name].astype(np.float64)
+    if name is None or (len(cloud) > 100 and np.ptp(values) == 0) or not np.isfinite(values).all():
+        try:
+            ring = rings_from_elevation(points)
+        except SourceError as error:
+            raise SourceError(f"{where}: {error.what}", error.hint) from None
+        notes.append("no ring field: rings told from elevations")
+        return ring
+    ids, ring_of_point = np.unique(values, return_inverse=True)
+    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    mean = np.bincount(ring_of_point, elevation) / np.bincount(ring_of_point)
+    rank = np.argsort(np.argsort(mean, kind="stable"), kind="stable")
+    is_whole = ids[0] >= 0 and ids[-1] < 2**15 and bool((ids == np.rint(ids)).all())
+    if is_whole and _counts_upwards(rank):
+        return values.astype(np.int16)
+    notes.append(f"field {name!r} does not count rings from the lowest: renumbered by elevation")
+    return rank[ring_of_point].astype(np.int16)
+
+
+def _counts_upwards(rank: NDArray[np.intp]) -> bool:
+    """Tell whether ring numbers rise with elevation, by Spearman's correlation.
+
+    Some drivers count lasers from the top (Ouster) or by firing order. Neighbouring rings with few near
+    points may swap their mean elevations, which is no reason to renumber.
+    """
+    if len(rank) < 3:
+        return bool((np.diff(rank) > 0).all())
+    return bool(np.corrcoef(np.arange(len(rank)), rank)[0, 1] > 0.98)
+
+
+def _times(
+    cloud: NDArray[Any],
+    fields: dict[str, str],
+    settings: LidarSettings,
+    stamp_ns: int | None,
+    notes: list[str],
+) -> tuple[NDArray[np.int64] | None, int | None]:
+    """Find each point's time after the first firing, and the stamp of the first firing."""
+    is_last = settings.timestamps.reference == "last_firing"
+    name = _find(fields, TIME_FIELDS)
+    ticks = None if name is None else _ticks(cloud[name])
+    if ticks is None or name is None:
+        notes.append(
+            "no time of each point" if name is None else f"field {name!r} carries no time of each point"
+        )
+        sweep_ns = round(1e9 / settings.rate_hz) if is_last else 0
+        return None, None if stamp_ns is None else stamp_ns - sweep_ns
+    first = ticks.min()
+    unit = _unit(float(ticks.max() - first), is_integer=cloud[name].dtype.kind in "iu")
+    if unit != ("ns" if cloud[name].dtype.kind in "iu" else "s"):
+        notes.append(f"field {name!r} taken as {unit}")
+    scale = NS_PER_UNIT[unit]
+    offset_ns = np.rint((ticks - first) * scale).astype(np.int64)
+    if stamp_ns is None:
+        return offset_ns, None
+    first_ns, last_ns = round(float(first) * scale), round(float(ticks.max()) * scale)
+    if abs(first_ns) > 10**12:
+        # Times since an epoch: only the stamp's own clock counts, for the cameras' sake.
+        return offset_ns, stamp_ns - (last_ns - first_ns if is_last else 0)
+    if is_last and first_ns >= 0:
+        return offset_ns, stamp_ns - last_ns + first_ns
+    # velodyne_pointcloud gives times relative to the stamp: negative where that marks the last packet.
+    return offset_ns, stamp_ns + first_ns
+
+
+def _ticks(values: NDArray[Any]) -> NDArray[Any] | None:
+    """Bring a time field to integers or float64; None where it is constant, not finite or rounded away."""
+    if values.dtype.kind in "iu":
+        ticks: NDArray[Any] = values.astype(np.int64)
+        return ticks if np.ptp(ticks) > 0 else None
+    ticks = values.astype(np.float64)
+    if not np.isfinite(ticks).all() or np.ptp(ticks) == 0:
+        return None
+    # A float32 of Unix time moves in steps of two minutes.
+    step = float(np.spacing(np.abs(values).max()))
+    return ticks if np.ptp(ticks) > 1000 * step else None
+
+
+def _unit(span: float, *, is_integer: bool) -> str:
+    for unit, scale in NS_PER_UNIT.items():
+        if SWEEP_S[0] <= span * scale * 1e-9 <= SWEEP_S[1]:
+            return unit
+    # A sector of a sweep may be shorter than any sweep: then the usual unit of the type it is.
+    return "ns" if is_integer else "s"

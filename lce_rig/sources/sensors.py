@@ -1,0 +1,37 @@
+"""Which sensor of the rig a recording's data belongs to."""
+
+from lce_rig.core.errors import SourceError
+from lce_rig.rig import Rig
+from lce_rig.sources.base import SourceOptions
+
+
+def choose_camera(rig: Rig, options: SourceOptions, notes: list[str]) -> tuple[str, str]:
+    """Name the (camera, channel) that a folder's pictures belong to: as asked, else the rig's first.
+
+    Raises:
+        SourceError: the rig has no such camera or channel.
+    """
+    camera = options.camera or next(iter(rig.cameras))
+    if camera not in rig.cameras:
+        raise SourceError(f"rig {rig.name!r} has no camera {camera!r}; it has {', '.join(rig.cameras)}")
+    channels = rig.cameras[camera].channels
+    channel = options.channel or next(iter(channels))
+    if channel not in channels:
+        raise SourceError(f"camera {camera!r} has no channel {channel!r}; it has {', '.join(channels)}")
+    if (len(rig.cameras) > 1 and not options.camera) or (len(channels) > 1 and not options.channel):
+        notes.append(f"pictures taken as camera {camera}, channel {channel}")
+    return camera, channel
+
+
+def choose_lidar(rig: Rig, options: SourceOptions, notes: list[str]) -> str:
+    """Name the LiDAR that a folder's clouds belong to: as asked, else the rig's first.
+
+    Raises:
+        SourceError: the rig has no such LiDAR.
+    """
+    lidar = options.lidar or next(iter(rig.lidars))
+    if lidar not in rig.lidars:
+        raise SourceError(f"rig {rig.name!r} has no lidar {lidar!r}; it has {', '.join(rig.lidars)}")
+    if len(rig.lidars) > 1 and not options.lidar:
+        notes.append(f"clouds taken as lidar {lidar}")
+    return lidar
