@@ -1,7 +1,7 @@
 """The story in order: captures -> detections -> extrinsics -> files and pictures. Start reading here.
 
-Every step takes a session and what the step before it made. Results are frozen dataclasses; only the session and the
-export layer touch files.
+Every step takes a session and what the step before it made. Results are frozen dataclasses; only the
+session and the export layer touch files.
 """
 
 import hashlib
@@ -9,21 +9,19 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-
-import numpy as np
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from lce_rig import __version__
 from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate, CaptureCandidates
 from lce_rig.calibrate import calibrate as estimate_extrinsic
+from lce_rig.calibrate.consensus import find_consensus
+from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.calibrate.verdict import judge
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import NotEnoughDataError, SessionError
-from lce_rig.core.geometry import Array, rotation_angle
-from lce_rig.core.results import Calibration, ImageBoard, Refusal
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Calibration, Refusal
 from lce_rig.detect.detection import (
     Detections,
     ImageDetection,
@@ -158,12 +156,8 @@ def calibrate(
 
 def compare_with_reference(calibration: Calibration, reference: Array) -> Calibration:
     """Report the error against a T_cam_lidar (4, 4) that somebody else vouches for."""
-    T = calibration.T_cam_lidar
-    return replace(
-        calibration,
-        egt_rotation_deg=float(np.degrees(rotation_angle(T[:3, :3], reference[:3, :3]))),
-        egt_translation_m=float(np.linalg.norm(T[:3, 3] - reference[:3, 3])),
-    )
+    rotation_deg, translation_m = error_to_reference(calibration.T_cam_lidar, reference)
+    return replace(calibration, egt_rotation_deg=rotation_deg, egt_translation_m=translation_m)
 
 
 def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandidates], dict[str, Refusal]]:
@@ -179,10 +173,19 @@ def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandida
     return candidates, refused
 
 
+def refusals(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refusal]:
+    """Say why captures of a pair cannot be used: a sensor saw no board, or both sensors disagree."""
+    candidates, refused = _candidates(detections, pair)
+    consensus = find_consensus(candidates, rig.board.to_board()) if len(candidates) >= 3 else None
+    return dict(sorted({**refused, **(consensus.refused if consensus else {})}.items()))
+
+
 def _commonest(refused: dict[str, Refusal]) -> str:
     """List the commonest causes of refusal, one a line."""
     counts = Counter((why.stage, why.cause, why.action) for why in refused.values())
-    return "\n".join(f"{n} x {stage}: {cause}: {action}" for (stage, cause, action), n in counts.most_common(3))
+    return "\n".join(
+        f"{n} x {stage}: {cause}: {action}" for (stage, cause, action), n in counts.most_common(3)
+    )
 
 
 def _judged(

@@ -55,7 +55,9 @@ SETS = (
 
 def main() -> None:
     """Run the parts asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("part", nargs="?", choices=["real", "simulated", "speed", "all"], default="all")
     parser.add_argument("--seeds", type=int, default=20, help="simulated sessions (default 20)")
     parser.add_argument("--splits", type=int, default=20, help="random split halves (default 20)")
@@ -69,20 +71,30 @@ def main() -> None:
         bench_speed()
 
 
+def print_head(*titles: str) -> None:
+    """Print the head of a Markdown table."""
+    print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles), flush=True)
+
+
+def print_row(*cells: object) -> None:
+    """Print a row of a Markdown table."""
+    print("| " + " | ".join(map(str, cells)) + " |", flush=True)
+
+
 # ------------------------------------------------------------------------------------------------ recordings
 
 
 def bench_real(n_splits: int, only: str) -> None:
     """Tabulate every recorded set that is there."""
-    print("| set | pairs | picture | LiDAR | used | EGT deg | EGT mm | split deg | split mm | MGE mm | claimed deg / mm | verdict |")
-    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
+    head = "set, pairs, picture, LiDAR, used, EGT deg, EGT mm, split deg, split mm, MGE mm, claimed deg / mm"
+    print_head(*head.split(", "), "verdict")
     for recorded in SETS:
         folder = recordings() / recorded.name
         if folder.is_dir() and only in recorded.name:
-            print(_real_row(recorded, folder, n_splits), flush=True)
+            print_row(*_real_row(recorded, folder, n_splits))
 
 
-def _real_row(recorded: RecordedSet, folder: Path, n_splits: int) -> str:
+def _real_row(recorded: RecordedSet, folder: Path, n_splits: int) -> tuple[object, ...]:
     with tempfile.TemporaryDirectory() as scratch:
         session = Path(scratch) / "session"
         collect(recorded, folder, session)
@@ -95,7 +107,7 @@ def _real_row(recorded: RecordedSet, folder: Path, n_splits: int) -> str:
     error = compare(estimate.T_cam_lidar, reference_of(folder))
     candidates = candidates_of(detections, pair)
     split = split_halves(candidates, rig, n_splits)
-    cells = (
+    return (
         recorded.name,
         len(names),
         n_image,
@@ -107,7 +119,6 @@ def _real_row(recorded: RecordedSet, folder: Path, n_splits: int) -> str:
         f"{calibration.sigma_rotation_deg:.3f} / {1000 * calibration.sigma_translation_m:.1f}",
         calibration.verdict,
     )
-    return "| " + " | ".join(map(str, cells)) + " |"
 
 
 def recordings() -> Path:
@@ -120,7 +131,16 @@ def recordings() -> Path:
 
 def collect(recorded: RecordedSet, folder: Path, session: Path) -> None:
     """Build a session with the command a user would type."""
-    words = ["collect", "--rig", recorded.rig, "--channel", recorded.channel, "--from", str(folder), str(session)]
+    words = [
+        "collect",
+        "--rig",
+        recorded.rig,
+        "--channel",
+        recorded.channel,
+        "--from",
+        str(folder),
+        str(session),
+    ]
     subprocess.run([sys.executable, "-m", "lce_rig", *words], check=True, stderr=subprocess.DEVNULL)
 
 
@@ -135,7 +155,9 @@ def detect(path: Path) -> tuple[Rig, pipeline.Detections]:
 def candidates_of(detections: pipeline.Detections, pair: pipeline.Pair) -> list[CaptureCandidates]:
     """List the captures in which both sensors found boards."""
     both = ((name, *detections.of(pair, name)) for name in detections.captures(pair))
-    return [CaptureCandidates(n, i, s) for n, i, s in both if isinstance(i, ImageBoard) and isinstance(s, list)]
+    return [
+        CaptureCandidates(n, i, s) for n, i, s in both if isinstance(i, ImageBoard) and isinstance(s, list)
+    ]
 
 
 def reference_of(folder: Path) -> Array:
@@ -180,12 +202,12 @@ def split_halves(candidates: list[CaptureCandidates], rig: Rig, n_splits: int) -
 
 def bench_simulated(n_seeds: int, n_captures: int = 30) -> None:
     """Tabulate errors against exact truth."""
-    print(f"| rig | seeds | captures | found by both | rms deg | rms mm | claimed deg / mm | NEES | not passed |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    head = "rig, seeds, captures, found by both, rms deg, rms mm, claimed deg / mm, NEES, not passed"
+    print_head(*head.split(", "))
     for name in ("rlfs",):
         rows = list(_simulated_runs(name, n_seeds, n_captures))
         deg, mm, nees, sigma_deg, sigma_mm, found, passed = np.array(rows).T
-        cells = (
+        print_row(
             name,
             n_seeds,
             n_captures,
@@ -196,7 +218,6 @@ def bench_simulated(n_seeds: int, n_captures: int = 30) -> None:
             f"{nees.mean():.1f}",
             int(n_seeds - passed.sum()),
         )
-        print("| " + " | ".join(map(str, cells)) + " |", flush=True)
 
 
 def _simulated_runs(name: str, n_seeds: int, n_captures: int) -> Iterator[tuple[float, ...]]:
@@ -236,14 +257,13 @@ def rms(values: Array) -> float:
 
 def bench_speed() -> None:
     """Tabulate times, processor seconds of one core, and the memory of the command line."""
-    print("| what | figure |")
-    print("|---|---|")
+    print_head("what", "figure")
     folder = recordings() / "rlfs01"
     with tempfile.TemporaryDirectory() as scratch:
         session = Path(scratch) / "session"
         collect(SETS[0], folder, session)
         for what, figure in (*_detector_speed(session), *_command_speed(session)):
-            print(f"| {what} | {figure} |", flush=True)
+            print_row(what, figure)
 
 
 def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
@@ -255,9 +275,15 @@ def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
     scans = [capture.scan("lidar") for capture in session.captures]
     found = [pipeline.detect_scan(rig, scan) for scan in scans]
     pictures = [capture.image("cam", "frames") for capture in session.captures]
-    yield "board in a full VLP-16 scan, no prior, median", milliseconds(lambda k: pipeline.detect_scan(rig, scans[k]))
+    yield (
+        "board in a full VLP-16 scan, no prior, median",
+        milliseconds(lambda k: pipeline.detect_scan(rig, scans[k])),
+    )
     yield "tracked, median", milliseconds(lambda k: track_lidar_board(scans[k], board, found[k][0]))  # type: ignore[index]
-    yield "board in a 1280x720 picture, median", milliseconds(lambda k: pipeline.detect_image(rig, pictures[k]))
+    yield (
+        "board in a 1280x720 picture, median",
+        milliseconds(lambda k: pipeline.detect_image(rig, pictures[k])),
+    )
     detections = pipeline.detect(session)
     candidates = candidates_of(detections, detections.pairs[0])
     thirty = (candidates * 2)[:30]

@@ -26,8 +26,10 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import Certificate, Observation, Refusal
 from lce_rig.solvers.covariance import jackknife_covariance
 
-# Weights are in units of one capture with residuals of this size, which gives the prior on the shift its scale.
+# Weights given by the user are in units of one capture with residuals of this size, which gives the prior on the
+# shift its scale.
 NOMINAL_SIGMA_M = 0.01
+_PLANE_FREEDOMS = 3
 
 
 def calibrate(
@@ -53,7 +55,7 @@ def calibrate(
     refused: dict[str, Refusal] = dict(consensus.refused)
     observations = list(consensus.observations)
     features = [extract_features(observation, board, options) for observation in observations]
-    problem = Problem(features, board, _weights(options, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
+    problem = Problem(features, board, _weights(options, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
     T_planes = solve_planes(features, problem)
     require_observable(features, problem, T_planes)
 
@@ -62,7 +64,7 @@ def calibrate(
     features = [f for f in features if f.capture not in outliers]
     observations = [o for o in observations if o.capture not in outliers]
     keep = drop_uncertain(features, T_planes) if options.use_uncertainty else None
-    problem = Problem(features, board, _weights(options, *sigmas), keep)
+    problem = Problem(features, board, _weights(options, features, *sigmas), keep)
     T_planes = solve_planes(features, problem)
     require_observable(features, problem, T_planes)
 
@@ -90,11 +92,20 @@ def _agree(candidates: Sequence[CaptureCandidates], board: Board, options: Calib
     return consensus
 
 
-def _weights(options: CalibrateOptions, plane_sigma_m: float, edge_sigma_m: float) -> Weights:
-    """Weigh by the options where they say so, else by the inverse of the variances."""
+def _weights(
+    options: CalibrateOptions, features: Sequence[CaptureFeatures], plane_sigma_m: float, edge_sigma_m: float
+) -> Weights:
+    """Weigh by the options where they say so, else by likelihood.
+
+    The camera's and the LiDAR's plane differ in three ways, by an offset and two tilts, however many points the
+    LiDAR's has; its ring ends err independently, by where their rays happen to fall. A capture's mean squares
+    therefore count 3 / sigma_plane^2 and M / sigma_edge^2, with M ring ends.
+    """
     unit = 1 / NOMINAL_SIGMA_M**2
-    plane = 1 / plane_sigma_m**2 if options.plane_weight is None else options.plane_weight * unit
-    edge = 1 / edge_sigma_m**2 if options.edge_weight is None else options.edge_weight * unit
+    n_ends = float(np.mean([len(f.edge_points) for f in features]))
+    by_options = options.plane_weight, options.edge_weight
+    plane = _PLANE_FREEDOMS / plane_sigma_m**2 if by_options[0] is None else by_options[0] * unit
+    edge = n_ends / edge_sigma_m**2 if by_options[1] is None else by_options[1] * unit
     has_shift = options.edge_shift == "free" and options.use_ptl
     return Weights(
         plane=plane if options.use_ptpl else 0.0,

@@ -95,12 +95,11 @@ def _judge(
 ) -> Draws:
     """Average held-out errors per size and capture, and candidates per size."""
     count = is_held_out.sum(axis=1)
-    total = np.sum(np.where(is_held_out, errors, 0.0), axis=1)
-    per_capture = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    overall = np.nanmean(per_capture, axis=0)
+    total = np.sum(errors * is_held_out, axis=1)
     # With few draws a capture may never have been left out at a size: its mean over the sizes stands in.
-    per_capture = np.where(np.isnan(per_capture), overall, per_capture)
-    held_out_m = np.nanmean(per_capture, axis=1)
+    overall = total.sum(axis=0) / np.maximum(count.sum(axis=0), 1)
+    per_capture = np.where(count > 0, total / np.maximum(count, 1), overall)
+    held_out_m = per_capture.mean(axis=1)
     best = int(np.argmin(held_out_m))
     R_mean = project_to_so3(T[:, :, :3, :3].mean(axis=1))
     t_mean = T[:, :, :3, 3].mean(axis=1)

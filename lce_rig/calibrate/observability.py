@@ -12,7 +12,7 @@ from lce_rig.core.geometry import Array, skew
 from lce_rig.solvers.registration import vec_rotation, with_one
 
 # One capture's board plane, camera against LiDAR, is good to about this much.
-PLANE_SIGMA_M = 0.01
+PLANE_SIGMA_M = 0.005
 # A motion that moves the board by more than this without a trace in the planes counts as undetermined.
 MAX_WEAK_SIGMA_M = 0.1
 _AXES = ("x axis (right)", "y axis (down)", "z axis (line of sight)")
@@ -61,7 +61,8 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
         NotEnoughDataError: a direction is left open; it is named.
     """
     x = with_one(np.concatenate([vec_rotation(T_cam_lidar[:3, :3]), T_cam_lidar[:3, 3], np.zeros(problem.n_shift)]))
-    planes = Weights(1 / PLANE_SIGMA_M**2, 0.0, problem.weights.shift_prior)
+    # Three freedoms of a plane, each as good as that.
+    planes = Weights(3 / PLANE_SIGMA_M**2, 0.0, problem.weights.shift_prior)
     _, hessians = linearise(problem, x, problem.associate(x[None])[0], planes)
     lever_m = lever_arm(features)
     scale = np.r_[np.ones(3), np.full(3, lever_m)]

@@ -1,4 +1,4 @@
-"""Do camera and LiDAR agree on distances? A constant factor between them means wrong squares or intrinsics."""
+"""Do camera and LiDAR agree on distances? A constant factor between them: wrong squares or intrinsics."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,15 +22,15 @@ class ScaleCheck:
     sigma: float
 
     def is_off(self, tolerance: float) -> bool:
-        """Tell whether the ratio differs from 1 by more than the tolerance, three standard deviations sure."""
+        """Tell whether the ratio is off by more than the tolerance, three standard deviations sure."""
         return abs(self.ratio - 1) - 3 * self.sigma > tolerance
 
 
 def compare_scales(observations: Sequence[Observation]) -> ScaleCheck:
     """Fit s, R and t of t_cam = s R p_lidar + t to the boards' centres, s in closed form.
 
-    Board centres of the LiDAR come from its own template, so that no extrinsic is needed. The deviation of s is
-    its jackknife over captures.
+    Board centres of the LiDAR come from its own template, so that no extrinsic is needed. The
+    deviation of s is its jackknife over captures.
 
     Args:
         observations: at least 4.

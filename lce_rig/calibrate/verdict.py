@@ -30,7 +30,9 @@ class Doubt:
     text: str
 
 
-def judge(estimate: CalibrationEstimate, rig: Rig, camera: str, lidar: str) -> tuple[Verdict, tuple[str, ...]]:
+def judge(
+    estimate: CalibrationEstimate, rig: Rig, camera: str, lidar: str
+) -> tuple[Verdict, tuple[str, ...]]:
     """Weigh everything known about an extrinsic.
 
     Args:
@@ -88,7 +90,8 @@ def _residuals(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
     ):
         if value > limit:
             text = f"{what} by {1000 * value:.0f} mm on average, limit {1000 * limit:.0f} mm"
-            doubts.append(Doubt("fail", f"{text}: was the board moving, or are board size or intrinsics wrong?"))
+            text += ": was the board moving, or are board size or intrinsics wrong?"
+            doubts.append(Doubt("fail", text))
     fitted = float(np.mean([np.hypot(r.plane_rms_m, r.edge_rms_m) for r in estimate.residuals]))
     if np.isfinite(estimate.held_out_m) and estimate.held_out_m > HELD_OUT_MARGINAL * fitted:
         text = f"captures left out fit worse ({1000 * estimate.held_out_m:.1f} mm) than captures used"
@@ -97,7 +100,8 @@ def _residuals(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
 
 
 def _refusals(estimate: CalibrationEstimate) -> list[Doubt]:
-    disagreeing = [name for name, why in sorted(estimate.refused.items()) if why.stage in ("pair", "calibrate")]
+    refused = sorted(estimate.refused.items())
+    disagreeing = [name for name, why in refused if why.stage in ("pair", "calibrate")]
     n = len(disagreeing) + len(estimate.used)
     if 4 * len(disagreeing) <= n:
         return []
@@ -118,7 +122,7 @@ def _nominal(estimate: CalibrationEstimate, nominal: NominalExtrinsic | None) ->
         return []
     text = f"{angle_deg:.1f} deg and {1000 * shift_m:.0f} mm from the nominal extrinsic"
     limit = f"tolerance {nominal.tolerance_deg:g} deg, {1000 * nominal.tolerance_m:g} mm"
-    advice = "check the profile's nominal_extrinsics, its camera and LiDAR frames, and that these sensors were used"
+    advice = "check nominal_extrinsics and the frames in the profile, and that these sensors were used"
     return [Doubt("fail", f"{text} ({limit}): {advice}")]
 
 
@@ -139,6 +143,7 @@ def explain_scale(check: ScaleCheck, board: Board) -> str:
     longer = "longer" if check.ratio > 1 else "shorter"
     square_mm = 1000 * board.square_m / check.ratio
     return (
-        f"camera distances are {percent:.1f} +- {100 * check.sigma:.1f} % {longer} than the LiDAR's: the squares "
-        f"measure {square_mm:.1f} mm instead of {1000 * board.square_m:.1f} mm, or the intrinsics belong to another lens"
+        f"camera distances are {percent:.1f} +- {100 * check.sigma:.1f} % {longer} than the LiDAR's: "
+        f"the squares measure {square_mm:.1f} mm instead of {1000 * board.square_m:.1f} mm, "
+        "or the intrinsics belong to another lens"
     )

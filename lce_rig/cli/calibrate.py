@@ -14,18 +14,59 @@ _COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 
 @click.command()
 @click.argument("session", type=click.Path(path_type=Path), default="session")
-@click.option("--reference", type=click.Path(path_type=Path), metavar="FILE", help="JSON with a T_cam_lidar to report the error against; never used in the estimate.")
+@click.option(
+    "--reference",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="JSON with a T_cam_lidar to report the error against; never used in the estimate.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export a failed result too, marked as failed.")
 @click.option("--seed", default=0, show_default=True, help="Seed of the draws over subsets.")
-@click.option("--draws", "n_draws", default=100, show_default=True, type=click.IntRange(0, 10_000), help="Subsets drawn for each size (the paper's I).")
-@click.option("--point-projection", type=click.Choice(["ray", "normal", "none"]), default="ray", show_default=True, help="How points come onto the board's plane: along the ray, along the normal (the paper), or not.")
-@click.option("--uncertainty/--no-uncertainty", "use_uncertainty", default=True, show_default=True, help="Leave out the tenth of the terms with the largest propagated variance.")
+@click.option(
+    "--draws",
+    "n_draws",
+    default=100,
+    show_default=True,
+    type=click.IntRange(0, 10_000),
+    help="Subsets drawn for each size (the paper's I).",
+)
+@click.option(
+    "--point-projection",
+    type=click.Choice(["ray", "normal", "none"]),
+    default="ray",
+    show_default=True,
+    help="How points come onto the board's plane: along the ray, along the normal (the paper), or not.",
+)
+@click.option(
+    "--uncertainty/--no-uncertainty",
+    "use_uncertainty",
+    default=True,
+    show_default=True,
+    help="Leave out the tenth of the terms with the largest propagated variance.",
+)
 @click.option("--ptpl/--no-ptpl", "use_ptpl", default=True, show_default=True, help="Point-to-plane terms.")
 @click.option("--ptl/--no-ptl", "use_ptl", default=True, show_default=True, help="Point-to-line terms.")
-@click.option("--half-step/--no-half-step", default=True, show_default=True, help="Move ring ends outwards by half an azimuth step.")
-@click.option("--edge-shift", type=click.Choice(["free", "off"]), default="free", show_default=True, help="Estimate how far returns reach beyond the plate's edges.")
-@click.option("--weights", type=click.Choice(["auto", "profile"]), default="auto", show_default=True, help="Weights of the terms: from the data, or from the profile as the paper.")
+@click.option(
+    "--half-step/--no-half-step",
+    default=True,
+    show_default=True,
+    help="Move ring ends outwards by half an azimuth step.",
+)
+@click.option(
+    "--edge-shift",
+    type=click.Choice(["free", "off"]),
+    default="free",
+    show_default=True,
+    help="Estimate how far returns reach beyond the plate's edges.",
+)
+@click.option(
+    "--weights",
+    type=click.Choice(["auto", "profile"]),
+    default="auto",
+    show_default=True,
+    help="Weights of the terms: from the data, or from the profile as the paper.",
+)
 def calibrate(
     session: Path,
     reference: Path | None,
@@ -36,8 +77,8 @@ def calibrate(
 ) -> None:
     """Estimate where the LiDAR sits relative to each camera of SESSION (default: session/).
 
-    Writes SESSION/calibration/: result.json, extrinsics.yaml, URDF, camera_info and static transforms. Exits with
-    7 where the result must not be used; exports are then left out unless --force is given.
+    Writes SESSION/calibration/: result.json, extrinsics.yaml, URDF, camera_info and static transforms.
+    Exits with 7 where the result must not be used; exports are then left out unless --force is given.
     """
     from lce_rig import pipeline
     from lce_rig.calibrate import CalibrateOptions
@@ -78,7 +119,9 @@ def exit_by_verdict(calibrations: Sequence[Calibration]) -> None:
     failed = [c for c in calibrations if c.verdict == "fail"]
     if failed:
         pairs = ", ".join(f"{c.camera}.{c.channel} and {c.lidar}" for c in failed)
-        raise ResultRefusedError(f"do not use the result of {pairs}", "\n".join(r for c in failed for r in c.reasons))
+        raise ResultRefusedError(
+            f"do not use the result of {pairs}", "\n".join(r for c in failed for r in c.reasons)
+        )
 
 
 def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> list[str]:
@@ -91,14 +134,17 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
         *("    " + "  ".join(f"{value: .6f}" for value in row) for row in c.T_cam_lidar[:3]),
         f"  known to     {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
         f"               weakest: {weak_direction}",
-        f"  captures     {len(c.captures_used)} used of {c.n_captures}, board found by both sensors in {c.n_detected}",
+        f"  captures     {len(c.captures_used)} used of {c.n_captures}, "
+        f"board found by both sensors in {c.n_detected}",
         f"  residuals    planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm, "
         f"left out {1000 * held_out_m:.1f} mm, corners {metrics.reprojection_px:.2f} px",
         f"  certificate  {'global minimum' if c.certificate.is_optimal else '[red]not proven[/]'}, "
         f"gap {c.certificate.gap:.0e}",
     ]
     if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
-        lines.append(f"  reference    off by {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm")
+        lines.append(
+            f"  reference    off by {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
+        )
     for name, why in c.captures_refused.items():
         lines.append(f"  [dim]{name} {why.stage}: {why.cause}: {why.action}[/]")
     lines += [f"  [{colour}]{reason}[/]" for reason in c.reasons]

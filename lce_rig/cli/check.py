@@ -1,14 +1,16 @@
 """`lce-rig check`: what was seen in every capture, and where one is refused, why and what to do."""
 
+import math
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 
 from lce_rig.cli import show
-from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
-from lce_rig.detect.detection import Detections, Pair
+from lce_rig.core.results import Refusal
+from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 
 
 @click.command()
@@ -31,64 +33,71 @@ def check(session: Path, as_json: bool, debug_images: bool) -> None:
         with show.progress_bar("drawing") as progress:
             folder = pipeline.write_debug_images(opened, detections, progress=progress)
         show.note(f"pictures of every capture: {folder}")
+    refusals = {pair: pipeline.refusals(opened.rig, detections, pair) for pair in detections.pairs}
     if as_json:
-        show.print_json({"format_version": 1, "rig": opened.rig.name, "pairs": _document(detections)})
+        show.print_json(
+            {"format_version": 1, "rig": opened.rig.name, "pairs": _document(detections, refusals)}
+        )
     else:
-        for pair in detections.pairs:
-            show.print_table(_table(detections, pair))
-            _summarise(detections, pair)
-    if not any(_is_usable(*detections.of(pair, name)) for pair in detections.pairs for name in detections.captures(pair)):
+        for pair, refused in refusals.items():
+            show.print_table(_table(detections, pair, refused))
+            _summarise(len(detections.captures(pair)), refused)
+    if all(len(refused) == len(detections.captures(pair)) for pair, refused in refusals.items()):
         raise NotEnoughDataError(
-            f"{session}: the board was found by both sensors in no capture",
+            f"{session}: no capture can be used",
             "See the causes above; --debug-images draws what was seen.",
         )
 
 
-def _is_usable(image: object, lidar: object) -> bool:
-    return isinstance(image, ImageBoard) and isinstance(lidar, list)
-
-
-def _document(detections: Detections) -> list[dict[str, Any]]:
+def _document(detections: Detections, refusals: Mapping[Pair, Mapping[str, Refusal]]) -> list[dict[str, Any]]:
     return [
         {
             "camera": pair.camera,
             "channel": pair.channel,
             "lidar": pair.lidar,
-            "captures": {name: _record(*detections.of(pair, name)) for name in detections.captures(pair)},
+            "captures": {
+                name: _record(*detections.of(pair, name), refused.get(name))
+                for name in detections.captures(pair)
+            },
         }
-        for pair in detections.pairs
+        for pair, refused in refusals.items()
     ]
 
 
-def _record(image: ImageBoard | Refusal, lidar: list[LidarBoard] | Refusal) -> dict[str, Any]:
-    record: dict[str, Any] = {"is_usable": _is_usable(image, lidar), "refusals": []}
-    for name, found in (("image", image), ("lidar", lidar)):
-        if isinstance(found, Refusal):
-            record["refusals"].append({"stage": found.stage, "cause": found.cause, "action": found.action})
-            record[name] = None
-        else:
-            best = found[0] if isinstance(found, list) else found
-            record[name] = {key: float(value) for key, value in best.quality.items()}
-    if isinstance(lidar, list) and record["lidar"] is not None:
-        record["lidar"]["n_candidates"] = len(lidar)
-    return record
+def _record(image: ImageDetection, lidar: LidarDetection, refusal: Refusal | None) -> dict[str, Any]:
+    best = lidar[0] if isinstance(lidar, list) else lidar
+    return {
+        "is_usable": refusal is None,
+        "refusal": None if refusal is None else vars(refusal),
+        "image": _figures(image),
+        "lidar": _figures(best),
+        "n_surfaces": len(lidar) if isinstance(lidar, list) else 0,
+    }
 
 
+def _figures(found: Any) -> dict[str, float | None] | None:
+    """Give a detection's quality record; a figure that could not be measured is null."""
+    if isinstance(found, Refusal):
+        return None
+    return {key: float(value) if math.isfinite(value) else None for key, value in found.quality.items()}
+
+
+# Heading, sensor, figure, scale to the heading's unit, digits.
 _COLUMNS = (
-    ("m", "image", "distance_m", "{:.2f}"),
-    ("tilt°", "image", "tilt_deg", "{:.0f}"),
-    ("corner px", "image", "corner_rms_px", "{:.2f}"),
-    ("sharp", "image", "sharpness", "{:.1f}"),
-    ("rings", "lidar", "n_rings", "{:.0f}"),
-    ("points", "lidar", "n_points", "{:.0f}"),
-    ("thick mm", "lidar", "thickness_m", "{:.1f}"),
-    ("width m", "lidar", "width_m", "{:.3f}"),
-    ("height m", "lidar", "height_m", "{:.3f}"),
-    ("ends mm", "lidar", "edge_rms_m", "{:.1f}"),
+    ("dist m", "image", "distance_m", 1.0, 2),
+    ("tilt deg", "image", "tilt_deg", 1.0, 0),
+    ("corners px", "image", "corner_rms_px", 1.0, 2),
+    ("sharp", "image", "sharpness", 1.0, 2),
+    ("rings", "lidar", "n_rings", 1.0, 0),
+    ("points", "lidar", "n_points", 1.0, 0),
+    ("thick mm", "lidar", "thickness_m", 1000.0, 0),
+    ("width m", "lidar", "width_m", 1.0, 3),
+    ("height m", "lidar", "height_m", 1.0, 3),
+    ("ends mm", "lidar", "edge_rms_m", 1000.0, 1),
 )
 
 
-def _table(detections: Detections, pair: Pair) -> Any:
+def _table(detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> Any:
     from rich.table import Table
 
     table = Table(title=str(pair), title_justify="left", pad_edge=False, box=None, header_style="bold")
@@ -97,31 +106,27 @@ def _table(detections: Detections, pair: Pair) -> Any:
         table.add_column(title, justify="right")
     table.add_column("")
     for name in detections.captures(pair):
-        image, lidar = detections.of(pair, name)
-        record = _record(image, lidar)
-        cells = [_cell(record[sensor], key, form) for _, sensor, key, form in _COLUMNS]
-        refusals = [found for found in (image, lidar) if isinstance(found, Refusal)]
-        text = "\n".join(f"[red]{r.stage}: {r.cause}[/]\n[dim]→ {r.action}[/]" for r in refusals)
-        if not refusals and isinstance(lidar, list) and len(lidar) > 1:
-            text = f"[yellow]{len(lidar)} surfaces of the board's size[/]"
-        table.add_row(name, *cells, text or "[green]ok[/]")
+        refusal = refused.get(name)
+        record = _record(*detections.of(pair, name), refusal)
+        cells = [_cell(record[sensor], key, scale, digits) for _, sensor, key, scale, digits in _COLUMNS]
+        state = "[green]ok[/]" if refusal is None else f"[red]{refusal.stage}[/]"
+        table.add_row(name, *cells, state)
     return table
 
 
-def _cell(figures: dict[str, float] | None, key: str, form: str) -> str:
-    if figures is None or key not in figures:
-        return "[red]-[/]" if figures is None else ""
-    return form.format(figures[key] * (1000 if "mm" in _title(key) else 1))
+def _cell(figures: Mapping[str, float | None] | None, key: str, scale: float, digits: int) -> str:
+    value = None if figures is None else figures.get(key)
+    return "-" if value is None else f"{scale * value:.{digits}f}"
 
 
-def _title(key: str) -> str:
-    return next(title for title, _, name, _ in _COLUMNS if name == key)
-
-
-def _summarise(detections: Detections, pair: Pair) -> None:
-    seen = [detections.of(pair, name) for name in detections.captures(pair)]
-    usable = sum(_is_usable(*both) for both in seen)
-    show.note(f"{usable} of {len(seen)} captures show the board to both sensors")
-    causes = Counter(found.stage for both in seen for found in both if isinstance(found, Refusal))
-    if causes:
-        show.note("refused: " + ", ".join(f"{count} by the {stage} stage" for stage, count in sorted(causes.items())))
+def _summarise(n_captures: int, refused: Mapping[str, Refusal]) -> None:
+    """Print each cause once, with the captures it holds for."""
+    show.note(f"{n_captures - len(refused)} of {n_captures} captures can be used")
+    names: dict[Refusal, list[str]] = {}
+    for name, refusal in sorted(refused.items()):
+        names.setdefault(refusal, []).append(name)
+    for refusal, captures in names.items():
+        show.note(f"  {', '.join(captures)}: {refusal.stage}: {refusal.cause}\n    -> {refusal.action}")
+    by_stage = Counter(refusal.stage for refusal in refused.values())
+    if len(by_stage) > 1:
+        show.note("  refused by stage: " + ", ".join(f"{stage} {n}" for stage, n in sorted(by_stage.items())))

@@ -11,8 +11,8 @@ import click
 from lce_rig import __version__
 from lce_rig.core.errors import LceRigError
 
-# Verb -> (module with a click command of the verb's name, help line). Modules are imported when the verb runs,
-# so that `lce-rig --help` stays instant.
+# Verb -> (module with a click command of the verb's name, help line). Modules are imported when the verb
+# runs, so that `lce-rig --help` stays instant.
 COMMANDS: dict[str, tuple[str, str]] = {
     "rigs": ("lce_rig.cli.rigs", "List, show, check and derive rig profiles."),
     "simulate": ("lce_rig.cli.simulate", "Make a session of a simulated rig, with exact truth."),
@@ -64,7 +64,9 @@ class LateGroup(click.Group):
 
 
 @click.group(
-    cls=LateGroup, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+    cls=LateGroup,
+    epilog=EPILOG,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, prog_name="lce-rig", message="%(prog)s %(version)s")
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
@@ -119,7 +121,7 @@ def run(arguments: list[str]) -> int:
         return 5
     except Exception:
         traceback.print_exc()
-        click.secho("this is a bug in lce-rig; please report it with the lines above", fg="red", err=True)
+        click.secho("this is a bug in lce-rig: please report it with these lines", fg="red", err=True)
         return EXIT_BUG
 
 

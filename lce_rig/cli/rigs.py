@@ -169,7 +169,7 @@ def _warn_of_doubts(rig: "Rig") -> None:
     "settings",
     multiple=True,
     metavar="KEY=VALUE",
-    help="Set a key: board.square_m=0.08. May be repeated.",
+    help="Set a key, as board.square_m=0.08; repeatable.",
 )
 @click.option("-o", "--output", help="File to write; NAME.yaml where left out, - for stdout.")
 def new_profile(name: str, origin: str, settings: tuple[str, ...], output: str | None) -> None:
@@ -187,7 +187,8 @@ def new_profile(name: str, origin: str, settings: tuple[str, ...], output: str |
     path = Path(output or f"{name}.yaml")
     original = find_profile(origin).read_text(encoding="utf-8")
     values = [(key.strip(), value.strip()) for key, _, value in pairs]
-    text = derive_text(original, name, values, f"{path} (not written)", parent.name)
+    target = name if output == "-" else str(path)
+    text = derive_text(original, name, values, f"{target} (not written)", parent.name)
     if output == "-":
         click.echo(text, nl=False)
         return

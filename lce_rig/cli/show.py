@@ -57,9 +57,9 @@ def progress_bar(title: str) -> Iterator[Progress]:
 
 
 def print_lines(lines: list[str]) -> None:
-    """Print lines with rich markup on stdout, unbroken where nobody watches."""
+    """Print lines with rich markup on stdout, broken only by the terminal itself."""
     from rich.console import Console
 
-    console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
+    console = Console(highlight=False, soft_wrap=True)
     for line in lines:
         console.print(line)

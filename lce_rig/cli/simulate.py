@@ -2,9 +2,9 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
-import numpy as np
 
 from lce_rig.cli import show
 
@@ -12,10 +12,16 @@ TRUTH = "truth.json"
 
 
 @click.command()
-@click.option("--rig", "rig_name", required=True, metavar="NAME|FILE", help="Rig profile: a shipped name or a file.")
+@click.option(
+    "--rig", "rig_name", required=True, metavar="NAME|FILE", help="Rig profile: a shipped name or a file."
+)
 @click.argument("session", type=click.Path(path_type=Path), default="session")
-@click.option("--captures", default=30, show_default=True, type=click.IntRange(1, 10_000), help="Board placements.")
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="The same seed, the same bytes.")
+@click.option(
+    "--captures", default=30, show_default=True, type=click.IntRange(1, 10_000), help="Board placements."
+)
+@click.option(
+    "--seed", default=0, show_default=True, type=click.IntRange(0), help="The same seed, the same bytes."
+)
 @click.option("--carrier", type=click.Choice(["stand", "person", "none"]), help="What holds the board.")
 @click.option(
     "--noise-level", type=click.IntRange(1, 10), help="Range noise of the paper's simulated sets, 0 to 10 cm."
@@ -28,7 +34,7 @@ def simulate(
     session: Path,
     captures: int,
     seed: int,
-    carrier: str | None,
+    carrier: Any,
     noise_level: int | None,
     range_sigma: float | None,
     range_offset: float | None,
@@ -61,15 +67,18 @@ def simulate(
     with Session.create(session, rig) as writer, show.progress_bar("simulating") as progress:
         truth = truth_extrinsics(rig, seed, options)
         _write_truth(session / TRUTH, truth, seed)
-        for done, capture in enumerate(simulate_captures(rig, n_captures=captures, seed=seed, options=options), 1):
+        for done, capture in enumerate(
+            simulate_captures(rig, n_captures=captures, seed=seed, options=options), 1
+        ):
             writer.add_capture(capture.images, capture.scans, {"source": f"simulated, seed {seed}"})
             progress(done, captures)
     show.note(f"{session}: {captures} simulated captures of rig {rig.name}; truth in {session / TRUTH}")
 
 
-def _write_truth(path: Path, truth: dict[tuple[str, str], np.ndarray], seed: int) -> None:  # type: ignore[type-arg]
+def _write_truth(path: Path, truth: dict[tuple[str, str], Any], seed: int) -> None:
     pairs = [
-        {"camera": camera, "lidar": lidar, "T_cam_lidar": T.tolist()} for (camera, lidar), T in sorted(truth.items())
+        {"camera": camera, "lidar": lidar, "T_cam_lidar": T.tolist()}
+        for (camera, lidar), T in sorted(truth.items())
     ]
     document = {"seed": seed, "T_cam_lidar": pairs[0]["T_cam_lidar"], "pairs": pairs}
     path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

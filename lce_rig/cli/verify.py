@@ -16,7 +16,9 @@ from lce_rig.cli import show
     metavar="FILE",
     help="A result.json of another session of this rig: check it on the captures of this one.",
 )
-@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the pictures go.")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the pictures go."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the residuals as JSON.")
 def verify(session: Path, result: Path | None, output: Path | None, as_json: bool) -> None:
     """Draw the LiDAR of each capture of SESSION (default: session/) into its pictures and print residuals.
@@ -35,7 +37,9 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
     with show.progress_bar("drawing") as progress:
         checks = pipeline.verify(opened, detections, saved.calibrations, folder=output, progress=progress)
     if as_json:
-        show.print_json({"format_version": 1, "rig": opened.rig.name, "pairs": [c.document() for c in checks]})
+        show.print_json(
+            {"format_version": 1, "rig": opened.rig.name, "pairs": [c.document() for c in checks]}
+        )
     else:
         for checked in checks:
             show.print_table(_table(checked))

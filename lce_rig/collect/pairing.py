@@ -31,7 +31,7 @@ class PairingCounts:
 
     Attributes:
         n_alone: scans with no picture within the tolerance.
-        nearest_ns: smallest difference in time of any picture to a scan; None where there was none to compare.
+        nearest_ns: smallest difference in time of any picture to a scan; None where none could be compared.
     """
 
     n_alone: int = 0
@@ -39,10 +39,10 @@ class PairingCounts:
 
 
 def pair_by_time(samples: Iterable[Image | Scan], rig: Rig, counts: PairingCounts) -> Iterator[Frame]:
-    """Give each scan of the rig's first LiDAR the nearest picture of each camera channel.
+    """Give each scan of the first LiDAR heard the nearest picture of each camera channel.
 
-    Samples come in order of receipt: a scan waits until every other sensor has passed its time, or a second has
-    gone by. Where clocks are set back, what waits is given up.
+    Samples come in order of receipt: a scan waits until every other sensor has passed its time, or a second
+    has gone by. Where clocks are set back, what waits is given up.
 
     Args:
         samples: pictures and scans; each sensor's stamps rise.
@@ -90,7 +90,7 @@ def _is_due(
     time_ns: int, newest_ns: int, buffers: dict[tuple[str, str], deque[tuple[int, Image | Scan]]]
 ) -> bool:
     has_all_passed = bool(buffers) and all(buffer[-1][0] >= time_ns for buffer in buffers.values() if buffer)
-    return newest_ns > time_ns + PATIENCE_NS or has_all_passed and all(buffers.values())
+    return newest_ns > time_ns + PATIENCE_NS or (has_all_passed and all(buffers.values()))
 
 
 def _frame(

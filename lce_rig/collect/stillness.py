@@ -127,7 +127,9 @@ class BoardWatcher:
         return True
 
 
-def find_still_moments(sightings: Iterable[Sighting], board: Board, options: StillnessOptions) -> Iterator[Still]:
+def find_still_moments(
+    sightings: Iterable[Sighting], board: Board, options: StillnessOptions
+) -> Iterator[Still]:
     """Yield the stillest moment of every stretch in which the board stands still.
 
     A stretch ends when the board moves, is lost, or has stood for `dwell_s`; it is then reported once.
@@ -149,7 +151,9 @@ def find_still_moments(sightings: Iterable[Sighting], board: Board, options: Sti
             since_ns = since_ns if best is not None else now_ns
             if best is None or motion_m < best.motion_m:
                 best = Still(window[len(window) // 2], motion_m)
-        if best is not None and (motion_m > options.max_motion_m or now_ns - since_ns > options.dwell_s * 1e9):
+        if best is not None and (
+            motion_m > options.max_motion_m or now_ns - since_ns > options.dwell_s * 1e9
+        ):
             yield best
             best = None
     if best is not None:

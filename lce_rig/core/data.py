@@ -68,3 +68,45 @@ class Scan:
             offset,
             self.host_ns,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Events:
+    """A stretch of an event camera's stream.
+
+    Attributes:
+        sensor: name of the camera in the rig profile.
+        t_ns: (N,) int64 device time, never decreasing; microsecond stamps times 1000, kept exactly.
+        x: (N,) uint16 column.
+        y: (N,) uint16 row.
+        polarity: (N,) bool, True where it became brighter.
+        width_px, height_px: resolution of the sensor.
+        host_ns: arrival of the first event at the host; None where unknown.
+    """
+
+    sensor: str
+    t_ns: NDArray[np.int64]
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    polarity: NDArray[np.bool_]
+    width_px: int
+    height_px: int
+    host_ns: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def between(self, start_ns: int, end_ns: int) -> "Events":
+        """Cut out the events with start_ns <= t < end_ns, without copying."""
+        first, last = np.searchsorted(self.t_ns, (start_ns, end_ns))
+        cut = slice(int(first), int(last))
+        return Events(
+            self.sensor,
+            self.t_ns[cut],
+            self.x[cut],
+            self.y[cut],
+            self.polarity[cut],
+            self.width_px,
+            self.height_px,
+            self.host_ns,
+        )

@@ -150,23 +150,23 @@ def _decode_ascii(body: bytes, header: _Header) -> NDArray[Any]:
         return np.empty(0, dtype=header.dtype)
     # Rows are read as the header's own types first: float64 would round 64-bit stamps. Some writers put
     # "nan" or "3.0" into integer columns; then float64 and a cast must do.
-    columns = [
-        (name, i)
-        for name in header.dtype.names or ()
-        for i in range(header.dtype[name].shape[0] if header.dtype[name].shape else 1)
-    ]
-    flat = np.dtype([(f"c{k}", header.dtype[name].base) for k, (name, _) in enumerate(columns)])
+    cloud = np.empty(header.n_points, dtype=header.dtype)
+    columns = [column for name in header.dtype.names or () for column in _columns(cloud[name])]
+    flat = np.dtype([(f"c{k}", column.dtype) for k, column in enumerate(columns)])
     text = io.BytesIO(b"\n".join(rows[: header.n_points]).replace(b",", b" "))
     try:
         table = np.loadtxt(text, dtype=flat, ndmin=1, comments=None)
     except ValueError:
         text.seek(0)
         table = _read_as_floats(text, flat)
-    cloud = np.empty(header.n_points, dtype=header.dtype)
-    for k, (name, i) in enumerate(columns):
-        target = cloud[name] if cloud[name].ndim == 1 else cloud[name][:, i]
-        target[...] = table[f"c{k}"]
+    for k, column in enumerate(columns):
+        column[...] = table[f"c{k}"]
     return cloud
+
+
+def _columns(field: NDArray[Any]) -> list[NDArray[Any]]:
+    """View a field (N,) or (N, c) as columns (N,)."""
+    return [field] if field.ndim == 1 else [field[:, i] for i in range(field.shape[1])]
 
 
 def _read_as_floats(text: io.BytesIO, flat: np.dtype[Any]) -> NDArray[Any]:

@@ -1,4 +1,4 @@
-"""What the sensors saw of the board: by pair of sensors, and as flat arrays that a session can keep between runs."""
+"""What the sensors saw of the board: by pair of sensors, and as flat arrays that a session can keep."""
 
 import dataclasses
 import json

@@ -1,6 +1,7 @@
 """Inner corners of a checkerboard in a grey picture, in the order of `Board.corners()`."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ Grey = NDArray[np.uint8]
 # Pictures wider than this are first searched at half their size, narrower ones at twice: the finders want
 # squares of 10 to 60 px.
 _WIDE_PX = 700
-_SMALL_SQUARE_PX = 12.0
+_SEARCH_PX = 640
 _SB = cv2.CALIB_CB_NORMALIZE_IMAGE
 _SB_THOROUGH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
@@ -112,17 +113,23 @@ def shortest_side_px(corners_px: Array, board: Board) -> float:
 
 
 def _attempts(grey: Grey, size: tuple[int, int]) -> Iterator[Array | None]:
-    """Run the finders one after the other, cheapest first; the caller stops at the first success."""
-    if grey.shape[1] > _WIDE_PX:
-        yield _sector_based(grey, size, 0.5, _SB)
-        yield _classic(grey, size, 1.0)
-        yield _sector_based(grey, size, 1.0, _SB)
+    """Run the finders one after the other, cheapest first; the caller stops at the first success.
+
+    The list is fixed, not timed, so that the same picture gives the same answer on any machine. What was found
+    by which attempt on the recordings behind this order stands in docs/benchmarks.md.
+    """
+    width = grey.shape[1]
+    if width > _WIDE_PX:
+        yield _classic(grey, size, min(1.0, 1280 / width))
+        yield _sector_based(grey, size, _SEARCH_PX / width, _SB)
+        small = _resize(grey, _SEARCH_PX / width)
+        yield _to_full_scale(_sector_based(level_contrast(small), size, 1.0, _SB_THOROUGH), _SEARCH_PX / width)
         return
     yield _classic(grey, size, 2.0)
     level = level_contrast(grey)
+    yield _classic(level, size, 2.0)
+    yield _sector_based(level, size, 1.5, _SB_THOROUGH)
     yield _sector_based(level, size, 1.0, _SB_THOROUGH)
-    yield _sector_based(level, size, 2.0, _SB_THOROUGH)
-    yield _sector_based(grey, size, 2.0, _SB_THOROUGH)
 
 
 def level_contrast(grey: Grey) -> Grey:
@@ -151,6 +158,8 @@ def _resize(grey: Grey, scale: float) -> Grey:
     return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=how), dtype=np.uint8)
 
 
-def _to_full_scale(corners: NDArray[np.float32], scale: float) -> Array:
+def _to_full_scale(corners: NDArray[Any] | None, scale: float) -> Array | None:
+    if corners is None:
+        return None
     # Pixel centres are integers: the centre of the first pixel lies half a pixel inside the picture.
     return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5

@@ -4,10 +4,12 @@ import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
+from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Refusal
 from lce_rig.detect.lidar_features import Beam, build_board, refine
-from lce_rig.detect.lidar_plates import propose_plates
+from lce_rig.detect.lidar_plates import Plates, propose_plates
 from lce_rig.detect.lidar_segments import cut_segments, order_scan
+from lce_rig.detect.lidar_template import Placement, plane_axes, register_ends
 
 MAX_CANDIDATES = 4
 
@@ -19,7 +21,7 @@ def find_lidar_boards(
     min_range_m: float = 0.4,
     max_range_m: float = 6.0,
     min_rings: int = 4,
-    max_template_m: float = 0.06,
+    max_template_m: float = 0.025,
     beam: Beam | None = None,
 ) -> list[LidarBoard] | Refusal:
     """Find the plates of the board's size in a scan, best first.
@@ -44,19 +46,18 @@ def find_lidar_boards(
     """
     ordered = order_scan(scan, min_range_m)
     segments = cut_segments(ordered, max_range_m)
-    plates = propose_plates(ordered, segments, board)
+    plates, ends = propose_plates(ordered, segments, board)
+    limit_m = min(max_template_m + 1.5 * ordered.sigma_m, 0.06)
     found: list[tuple[float, LidarBoard]] = []
-    for k in range(len(plates.plane)):
-        refined = refine(ordered, board, plates.plane[k], plates.centre[k])
+    for plane, origin, placement in _screen(plates, ends, board, limit_m):
+        refined = refine(ordered, plane, origin, placement, limit_m)
         if refined is None:
             continue
         view, placement = refined
-        if placement.error_m > max_template_m + 2 * ordered.sigma_m:
-            continue
         candidate = build_board(ordered, scan, board, view, placement, beam or Beam())
         if candidate.quality["n_rings"] < min_rings or len(candidate.points) < 10:
             continue
-        found.append((placement.error_m, candidate))
+        found.append((_doubt(candidate), candidate))
     found.sort(key=lambda item: item[0])
     distinct: list[LidarBoard] = []
     for _, candidate in found:
@@ -66,3 +67,21 @@ def find_lidar_boards(
     if not distinct:
         return Refusal("lidar", "no plate of the board's size", "show the board to the LiDAR at 1.5-3 m, free of other things")
     return distinct[:MAX_CANDIDATES]
+
+
+def _doubt(board: LidarBoard) -> float:
+    """Rank a candidate in m: how badly the outline fits, and how little of its size the rings can show."""
+    quality = board.quality
+    return quality["template_m"] + 0.25 * (quality["width_sigma_m"] + quality["height_sigma_m"])
+
+
+def _screen(plates: Plates, ends: Array, board: Board, limit_m: float) -> list[tuple[Array, Array, Placement]]:
+    """Register the outline with the ends of each plate's segments and keep the plates it fits, best first."""
+    if len(plates.centre) == 0:
+        return []
+    relative = ends - plates.centre[:, None]
+    placements = register_ends(relative @ plane_axes(plates.plane[:, :3]), board)
+    rank = sorted(range(len(placements)), key=lambda k: placements[k].error_m)
+    # What fits far worse than the best plate is no rival of it.
+    limit_m = min(limit_m, 3 * placements[rank[0]].error_m + 0.01)
+    return [(plates.plane[k], plates.centre[k], placements[k]) for k in rank if placements[k].error_m < limit_m]

@@ -1,6 +1,6 @@
 """What the calibration needs from a registered board: plane, points, ring ends and measured size."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +10,18 @@ from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, pose
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.lidar_segments import MAX_STEPS, OrderedScan
-from lce_rig.detect.lidar_template import Placement, PlaneView, register, signed_distance, view_plane
+from lce_rig.detect.lidar_template import (
+    Placement,
+    PlaneView,
+    plane_axes,
+    register,
+    signed_distance,
+    view_plane,
+)
 
 SURROUND_M = 0.20
 SIZE_PRIOR_M = 0.10
+SETTLED_M = 0.01  # an outline that moves less leaves the returns inside it, and so the plane, as they are
 
 
 @dataclass(frozen=True)
@@ -79,43 +87,46 @@ def fit_plane_to_ranges(points: Array, start: Array, scale_m: float, n_rounds: i
 
 
 def refine(
-    scan: OrderedScan, board: Board, plane: Array, centre: Array, placement: Placement | None = None
+    scan: OrderedScan, plane: Array, centre: Array, placement: Placement, limit_m: float
 ) -> tuple[PlaneView, Placement] | None:
-    """Fit plane and outline in turn, twice, to the single returns.
+    """Fit the plane to the single returns inside the outline, and the outline to the beams about it.
 
     Args:
         scan: all returns.
-        board: gives the rectangle.
         plane: (4,) first guess.
-        centre: (3,) m, first guess of the plate's centre.
-        placement: unused start; the outline is searched at all angles in the first round.
+        centre: (3,) m, the point of the plane the placement is counted from.
+        placement: first guess of the outline.
+        limit_m: largest error of the outline.
 
     Returns:
-        The beams about the plate and the outline among them, None where too few returns lie on the plane.
+        The beams about the plate and the outline among them, None where too few returns lie on the plane or
+        the outline does not fit.
     """
-    del placement
-    radius_m = float(np.hypot(board.width_m, board.height_m)) / 2 + SURROUND_M
+    radius_m = float(np.hypot(*placement.half_m)) + SURROUND_M
     tolerance_m = 4.0 * scan.sigma_m + 0.01
-    view = view_plane(scan, plane, centre, radius_m, tolerance_m)
-    found = register(view, board)
-    for _ in range(2):
-        if found is None:
-            return None
-        distance, _ = signed_distance(found.local(view.uv), found.half_m)
+    for _ in range(3):
+        centre = centre + plane_axes(plane[:3]) @ [placement.u_m, placement.v_m]
+        placement = replace(placement, u_m=0.0, v_m=0.0)
+        view = view_plane(scan, plane, centre, radius_m, tolerance_m)
+        distance, _ = signed_distance(placement.local(view.uv), placement.half_m)
         on = view.member[view.is_on & (distance < 0.0)]
         if len(on) < 10:
             return None
-        height = scan.points[on] @ view.plane[:3] + view.plane[3]
+        points = scan.points[on].astype(np.float64)
+        height = points @ plane[:3] + plane[3]
         scale_m = 1.4826 * float(np.median(np.abs(height - np.median(height)))) + 0.001
-        cosine = abs(float(view.plane[:3] @ view.origin)) / float(np.linalg.norm(view.origin))
-        plane = fit_plane_to_ranges(scan.points[on], view.plane, scale_m / cosine)
-        residual = scan.points[on] @ plane[:3] + plane[3]
-        scale_m = 1.4826 * float(np.median(np.abs(residual)))
-        centre = view.origin + view.axes @ [found.u_m, found.v_m]
-        tolerance_m = 3.5 * scale_m + 0.004
-        view = view_plane(scan, plane, centre, radius_m, tolerance_m)
-        found = register(view, board, [Placement(0.0, 0.0, found.angle_rad, found.half_m)])
-    return None if found is None else (view, found)
+        plane = fit_plane_to_ranges(points, plane, scale_m * float(np.linalg.norm(centre)) / plane[3])
+        height = points @ plane[:3] + plane[3]
+        tolerance_m = 3.5 * 1.4826 * float(np.median(np.abs(height))) + 0.004
+        view = view_plane(scan, plane, view.origin, radius_m, tolerance_m)
+        if len(view.chord_start) == 0:
+            return None
+        placement, centre = register(view, placement), view.origin
+        if placement.error_m > 1.5 * limit_m:
+            return None
+        if np.hypot(placement.u_m, placement.v_m) < SETTLED_M:
+            break
+    return (view, placement) if placement.error_m <= limit_m else None
 
 
 def find_ring_ends(scan: OrderedScan, view: PlaneView, is_board: NDArray[np.bool_]) -> RingEnds:
@@ -241,7 +252,7 @@ def build_board(
     order = np.lexsort((ends.side, scan.ring[view.member[ends.beam]]))
     order = order[is_good[order]]
     kept, edge = view.member[is_board], view.member[ends.beam[order]]
-    points = scan.points[kept]
+    points = scan.points[kept].astype(np.float64)
     height = points @ view.plane[:3] + view.plane[3]
     size_m = 2 * np.asarray(fitted.half_m)
     size_sigma_m = np.hypot(size_sigma_m, beyond_m)
@@ -268,7 +279,7 @@ def build_board(
     return LidarBoard(
         points=points,
         ring=scan.ring[kept],
-        edge_points=scan.points[edge],
+        edge_points=scan.points[edge].astype(np.float64),
         edge_ring=scan.ring[edge],
         edge_side=ends.side[order],
         azimuth_step_rad=scan.step_rad,

@@ -10,7 +10,8 @@ from lce_rig.core.geometry import Array
 from lce_rig.detect.lidar_segments import MAX_INCIDENCE_RAD, Indices, OrderedScan, Segments
 
 MAX_PAIRS = 600
-N_ROUNDS = 3
+N_ROUNDS = 2
+MAX_JOINT = 4  # returns between two segments of one chord: noise, a hand's edge, a dropped firing
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +37,10 @@ class Plates:
         return Plates(*(getattr(self, field.name)[keep] for field in fields(self)))
 
 
-def propose_plates(scan: OrderedScan, segments: Segments, board: Board, n_plates: int = 8) -> Plates:
+def propose_plates(scan: OrderedScan, segments: Segments, board: Board, n_plates: int = 10) -> tuple[Plates, Array]:
     """Grow plates from pairs of neighbouring segments and keep different ones of plausible size.
 
-    Each pair of parallel segments on rings at most two apart spans a plane. A plane takes all segments in reach
+    Each pair of parallel segments on neighbouring rings spans a plane. A plane takes all segments in reach
     that lie in it and is fitted again to their sums, a few times over, for all planes at once.
 
     Args:
@@ -47,6 +48,9 @@ def propose_plates(scan: OrderedScan, segments: Segments, board: Board, n_plates
         segments: straight segments of all lengths.
         board: gives the reach.
         n_plates: the most plates to return.
+
+    Returns:
+        The plates, and the first and last return of their segments (K, M, 3) in m; NaN fills the rows up.
     """
     diagonal_m = float(np.hypot(board.width_m, board.height_m))
     tolerance_m = 2.0 * scan.sigma_m + 0.01
@@ -55,6 +59,7 @@ def propose_plates(scan: OrderedScan, segments: Segments, board: Board, n_plates
     sums = _sums(segments)
     plates = _fit(np.repeat(np.arange(len(first)), 2), np.stack([first, second], 1).ravel(), segments, sums)
     is_kept = (plates.thickness_m < tolerance_m) & _faces_lidar(plates)
+    row = column = first
     for _ in range(N_ROUNDS):
         row, column = _members(plates.select(is_kept), segments, 0.6 * diagonal_m, tolerance_m)
         plates = _fit(row, column, segments, sums)
@@ -62,8 +67,21 @@ def propose_plates(scan: OrderedScan, segments: Segments, board: Board, n_plates
         is_kept = np.zeros(len(plates.centre), dtype=np.bool_)
         is_kept[np.unique(plates.centre[:, 0], return_index=True)[1]] = True
         is_kept &= (plates.n_rings >= 2) & _faces_lidar(plates) & (plates.size_m[:, 0] < 1.5 * diagonal_m)
-    is_kept &= _is_plausible(plates, board)
-    return _different(plates.select(is_kept), board, diagonal_m, n_plates)
+    best = _different(plates, np.flatnonzero(is_kept & _is_plausible(plates, board)), board, n_plates)
+    ends = [_ring_ends(scan, segments, column[row == k]) for k in best]
+    padded = np.full((len(best), max((len(e) for e in ends), default=1), 3), np.nan)
+    for k, e in enumerate(ends):
+        padded[k, : len(e)] = e
+    return plates.select(best), padded
+
+
+def _ring_ends(scan: OrderedScan, segments: Segments, members: Indices) -> Array:
+    """List the ends (M, 3) of a plate's segments in m; segments a few returns apart on a ring count as one."""
+    start, end = segments.start[members], segments.end[members]
+    is_joint = (start[1:] - end[:-1] <= MAX_JOINT) & (np.diff(segments.ring[members]) == 0)
+    first = start[np.append(True, ~is_joint)]
+    last = end[np.append(~is_joint, True)] - 1
+    return scan.points[np.concatenate([first, last])].astype(np.float64)
 
 
 def _neighbours(segments: Segments, diagonal_m: float) -> tuple[Indices, Indices]:
@@ -76,7 +94,7 @@ def _neighbours(segments: Segments, diagonal_m: float) -> tuple[Indices, Indices
     ring, centre, direction = segments.ring[seed], segments.centre[seed], segments.direction[seed]
     ring_gap = ring[None] - ring[:, None]
     # Few pairs are on neighbouring rings: everything else is computed for them only.
-    first, second = np.nonzero((ring_gap >= 1) & (ring_gap <= 1))
+    first, second = np.nonzero(ring_gap == 1)
     away = centre[second] - centre[first]
     reach = segments.length_m[seed]
     is_near = np.einsum("ij,ij->i", away, away) < (0.6 * diagonal_m) ** 2
@@ -129,7 +147,9 @@ def _members(plates: Plates, segments: Segments, reach_m: float, tolerance_m: fl
     scatter = segments.scatter[column] / segments.count[column, None, None]
     variance = np.einsum("ij,ijk,ik->i", normal, scatter, normal)
     is_member = offset * offset + variance < tolerance_m**2
-    return row[is_member], column[is_member]
+    row, column = row[is_member], column[is_member]
+    # Number the plates that still have members without gaps.
+    return np.cumsum(np.diff(row, prepend=row[:1]) != 0), column
 
 
 def _within_reach(centres: Array, others: Array, reach_m: float, block: int = 32) -> tuple[Indices, Indices]:
@@ -158,12 +178,12 @@ def _is_plausible(plates: Plates, board: Board) -> NDArray[np.bool_]:
     return np.asarray((ratio[:, 0] > 0.5) & (ratio[:, 0] < 1.5) & (ratio[:, 1] > 0.25) & (ratio[:, 1] < 1.5))
 
 
-def _different(plates: Plates, board: Board, diagonal_m: float, n_plates: int) -> Plates:
-    """Keep the most board-like plate of each place and orientation."""
+def _different(plates: Plates, candidates: Indices, board: Board, n_plates: int) -> Indices:
+    """Choose the most board-like plate of each place and orientation, the best first."""
     long_m, short_m = max(board.width_m, board.height_m), min(board.width_m, board.height_m)
-    misfit = np.abs(np.log(np.maximum(plates.size_m, 1e-3) / [long_m, short_m])).sum(axis=1)
+    misfit = np.abs(np.log(np.maximum(plates.size_m[candidates], 1e-3) / [long_m, short_m])).sum(axis=1)
     # Few rings say little about a size; many returns on a wrong size say no.
-    rank = np.argsort(misfit - 0.1 * np.minimum(plates.n_rings, 8), kind="stable")
+    rank = candidates[np.argsort(misfit - 0.1 * np.minimum(plates.n_rings[candidates], 8), kind="stable")]
     chosen: list[int] = []
     while len(rank) and len(chosen) < n_plates:
         best = int(rank[0])
@@ -171,5 +191,5 @@ def _different(plates: Plates, board: Board, diagonal_m: float, n_plates: int) -
         apart = np.linalg.norm(plates.centre[rank] - plates.centre[best], axis=1)
         cosine = plates.plane[rank, :3] @ plates.plane[best, :3]
         offset = np.abs(plates.plane[rank, :3] @ plates.centre[best] + plates.plane[rank, 3])
-        rank = rank[(apart > 0.3 * diagonal_m) | (cosine < 0.95) | (offset > 0.05)]
-    return plates.select(np.array(chosen, dtype=np.intp))
+        rank = rank[(apart > 0.3 * np.hypot(long_m, short_m)) | (cosine < 0.95) | (offset > 0.05)]
+    return np.array(chosen, dtype=np.intp)

@@ -9,6 +9,7 @@ from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array
 
 Indices = NDArray[np.intp]
+Floats = NDArray[np.float32]
 
 # The board is found up to this angle between its normal and the beam; more is not a useful view.
 MAX_INCIDENCE_RAD = np.radians(70.0)
@@ -34,9 +35,9 @@ class OrderedScan:
     """
 
     index: Indices
-    points: Array
-    range_m: Array
-    azimuth: Array
+    points: Floats
+    range_m: Floats
+    azimuth: Floats
     ring: NDArray[np.int16]
     is_break: NDArray[np.bool_]
     step_rad: float
@@ -80,7 +81,7 @@ def order_scan(scan: Scan, min_range_m: float) -> OrderedScan:
         scan: the full revolution or any part of it.
         min_range_m: nearer returns are dropped, as are NaN, infinite and zero ones.
     """
-    points = scan.points.astype(np.float64)
+    points = scan.points
     with np.errstate(over="ignore", invalid="ignore"):
         range_m = np.sqrt(np.einsum("ij,ij->i", points, points))
         azimuth = np.arctan2(points[:, 1], points[:, 0])
@@ -88,20 +89,21 @@ def order_scan(scan: Scan, min_range_m: float) -> OrderedScan:
     # Drivers deliver by time, which is almost by azimuth: a stable sort finds the presorted runs.
     order = np.argsort(scan.ring, kind="stable")
     order = order[is_usable[order]]
-    order = order[np.argsort(scan.ring[order] * 8.0 + azimuth[order], kind="stable")]
-    ring, azimuth, range_m = scan.ring[order], azimuth[order], range_m[order]
+    ring, azimuth = scan.ring[order], azimuth[order]
+    order, ring, azimuth = _by_azimuth(order, ring, azimuth)
+    range_m = range_m[order]
     if len(order) == 0:
-        empty = np.zeros(0)
         no_break = np.zeros(0, dtype=np.bool_)
-        return OrderedScan(order, np.zeros((0, 3)), empty, empty, ring, no_break, 0.0, RANGE_NOISE_FLOOR_M)
+        return OrderedScan(order, points[order], range_m, azimuth, ring, no_break, 0.0, RANGE_NOISE_FLOOR_M)
     starts = np.flatnonzero(np.diff(ring, prepend=ring[0] - 1))
     counts = np.diff(np.append(starts, len(order)))
     previous = np.arange(len(order)) - 1
     previous[starts] = starts + counts - 1
-    turn = np.mod(azimuth - azimuth[previous], 2 * np.pi)
+    turn = azimuth - azimuth[previous]
+    turn[turn < 0] += 2 * np.float32(np.pi)
     jump = np.abs(range_m - range_m[previous])
     step_rad, sigma_m = _azimuth_step(turn), _range_noise(turn, range_m, ring)
-    limit = max_range_jump(range_m, turn, sigma_m)
+    limit = _max_range_jump(range_m, turn, sigma_m)
     is_break = (turn > MAX_STEPS * step_rad) | (jump > limit)
     # Turn each ring so that it begins at its first break.
     position = np.arange(len(order))
@@ -117,22 +119,47 @@ def order_scan(scan: Scan, min_range_m: float) -> OrderedScan:
     )
 
 
-def max_range_jump(range_m: Array, turn: Array, sigma_m: float) -> Array:
+def _by_azimuth(
+    order: Indices, ring: NDArray[np.int16], azimuth: Floats
+) -> tuple[Indices, NDArray[np.int16], Floats]:
+    """Sort the returns of each ring, given in order of firing, by azimuth; drop those of a second turn.
+
+    A sweep of slightly more than one turn shows the same directions twice, 0.1 s apart: mixed, they would tear
+    what moves into two. Clouds that are not in order of firing lose nothing.
+    """
+    turn = _wrap(np.diff(azimuth, prepend=azimuth[:1]))
+    is_start = np.diff(ring, prepend=ring[:1] - 1) != 0
+    turn[is_start] = 0.0
+    if len(turn) and not 0.05 < np.mean(turn > 0) < 0.95:
+        total = np.cumsum(turn, dtype=np.float64)
+        total -= total[is_start][np.cumsum(is_start) - 1]
+        is_first_turn = np.abs(total) < 2 * np.pi
+        order, ring, azimuth = order[is_first_turn], ring[is_first_turn], azimuth[is_first_turn]
+    rank = np.argsort(ring * 8.0 + azimuth, kind="stable")
+    return order[rank], ring[rank], azimuth[rank]
+
+
+def _wrap(angle: Floats) -> Floats:
+    """Bring differences of two azimuths, rad, to -pi..pi."""
+    return np.asarray(angle - 2 * np.float32(np.pi) * np.rint(angle / (2 * np.float32(np.pi))))
+
+
+def _max_range_jump(range_m: Floats, turn: Floats, sigma_m: float) -> Floats:
     """Compute the largest change of range in m between neighbours on one tilted plane, with its noise."""
-    slope = np.tan(MAX_INCIDENCE_RAD)
+    slope = float(np.tan(MAX_INCIDENCE_RAD))
     return np.asarray(range_m * np.minimum(turn, 0.02) * slope + 6.0 * sigma_m)
 
 
-def _azimuth_step(turn: Array) -> float:
+def _azimuth_step(turn: Floats) -> float:
     """Find the firing interval in rad: the mean of the common differences of azimuth, 0 without returns."""
     forward = turn[(turn > 1e-4) & (turn < 0.05)]
     if len(forward) == 0:
         return 0.0
     middle = float(np.median(forward))
-    return float(np.mean(forward[np.abs(forward - middle) < 0.3 * middle]))
+    return float(np.mean(forward[np.abs(forward - middle) < 0.3 * middle], dtype=np.float64))
 
 
-def _range_noise(turn: Array, range_m: Array, ring: NDArray[np.int16]) -> float:
+def _range_noise(turn: Floats, range_m: Floats, ring: NDArray[np.int16]) -> float:
     """Estimate sigma of a range from its second differences along the rings, 0 on planes up to curvature.
 
     The lower quartile of |r[i-1] - 2 r[i] + r[i+1]| / sqrt(6) is taken: edges and foliage spoil the upper part.
@@ -213,12 +240,12 @@ def _describe(scan: OrderedScan, start: Indices, end: Indices) -> Segments:
     count = (end - start).astype(np.float64)
     begins = np.cumsum(end - start) - (end - start)
     member = np.repeat(start - begins, end - start) + np.arange(int(count.sum()))
-    points = scan.points[member]
+    points = scan.points[member].astype(np.float64)
     centre = np.add.reduceat(points, begins) / count[:, None]
     spread = points - np.repeat(centre, end - start, axis=0)
     products = spread[:, [0, 0, 0, 1, 1, 2]] * spread[:, [0, 1, 2, 1, 2, 2]]
     scatter = np.add.reduceat(products, begins)[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-    chord = scan.points[end - 1] - scan.points[start]
+    chord = scan.points[end - 1].astype(np.float64) - scan.points[start]
     length_m = np.linalg.norm(chord, axis=1)
     direction = chord / np.maximum(length_m, 1e-9)[:, None]
     along = np.einsum("ij,ijk,ik->i", direction, scatter, direction)

@@ -1,16 +1,18 @@
 """Register the board's rectangle in a plane: where the beams end, meet the plane, or pass through it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
-from lce_rig.detect.lidar_segments import MAX_STEPS, OrderedScan
+from lce_rig.detect.lidar_segments import MAX_STEPS, Indices, OrderedScan
 
 N_ANGLES = 12
 CAP_M = 0.10
+# What a beam says about the outline: it ends a chord, or should lie inside or outside.
+END, INSIDE, OUTSIDE, UNUSED = range(4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +33,12 @@ class PlaneView:
     plane: Array
     axes: Array
     origin: Array
-    member: NDArray[np.intp]
+    member: Indices
     uv: Array
     height_m: Array
     tolerance_m: float
-    chord_start: NDArray[np.intp]
-    chord_end: NDArray[np.intp]
+    chord_start: Indices
+    chord_end: Indices
 
     @property
     def is_on(self) -> NDArray[np.bool_]:
@@ -84,26 +86,35 @@ def view_plane(scan: OrderedScan, plane: Array, centre: Array, radius_m: float, 
     distance = float(np.linalg.norm(origin))
     # Coarse cone about the disc first: most returns are elsewhere.
     cosine = np.cos(np.arcsin(min(1.0, radius_m / max(distance, 1e-6))))
-    near = np.flatnonzero(scan.points @ origin > cosine * distance * scan.range_m)
-    points = scan.points[near]
+    near = np.flatnonzero(scan.points @ origin.astype(np.float32) > np.float32(cosine * distance) * scan.range_m)
+    points = scan.points[near].astype(np.float64)
     along_normal = points @ normal
     with np.errstate(divide="ignore", invalid="ignore"):
         pierced = points * (-d / along_normal)[:, None] - origin
     is_near = (along_normal < 0) & (np.einsum("ij,ij->i", pierced, pierced) <= radius_m**2)
     near, pierced, height_m = near[is_near], pierced[is_near], along_normal[is_near] + d
-    level = np.cross([0.0, 0.0, 1.0], normal)
-    if np.linalg.norm(level) < 1e-3:
-        level = np.cross([0.0, 1.0, 0.0], normal)
-    level /= np.linalg.norm(level)
-    axes = np.stack([level, np.cross(normal, level)], axis=1)
+    axes = plane_axes(normal)
     uv = pierced @ axes
     start, end = _longest_runs(scan, near, uv, np.abs(height_m) <= tolerance_m)
     return PlaneView(plane, axes, origin, near, uv, height_m, tolerance_m, start, end)
 
 
+def plane_axes(normal: Array) -> Array:
+    """Build unit vectors (..., 3, 2) of a plane: the first level, the second upwards; right-handed with n."""
+    x, y, z = normal[..., 0], normal[..., 1], normal[..., 2]
+    length = np.hypot(x, y)
+    is_level = length < 1e-3
+    safe = np.where(is_level, 1.0, length)
+    a, b = np.where(is_level, 0.0, -y / safe), np.where(is_level, -1.0, x / safe)
+    level = np.stack([a, b, np.zeros_like(a)], axis=-1)
+    # n x level, written out.
+    upwards = np.stack([-z * b, z * a, x * b - y * a], axis=-1)
+    return np.stack([level, upwards], axis=-1)
+
+
 def _longest_runs(
-    scan: OrderedScan, member: NDArray[np.intp], uv: Array, is_on: NDArray[np.bool_]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    scan: OrderedScan, member: Indices, uv: Array, is_on: NDArray[np.bool_]
+) -> tuple[Indices, Indices]:
     """Find the first and last beam of each ring's longest run on the plane, over gaps of a few firings."""
     on = np.flatnonzero(is_on)
     if len(on) < 2:
@@ -121,58 +132,51 @@ def _longest_runs(
     return on[start[best]], on[end[best]]
 
 
-def register(view: PlaneView, board: Board, starts: list[Placement] | None = None) -> Placement | None:
-    """Find the placement of the board's outline that the beams contradict least.
+def register(view: PlaneView, start: Placement) -> Placement:
+    """Find the placement of a rectangle, near a first guess, that the beams contradict least.
 
     The chords' ends should lie on the border, beams that return from the plane inside it, and beams that
-    return from behind the plane outside. Gauss-Newton on the signed distance from the rectangle with
-    Geman-McClure weights, from several angles at once; the ends' inequality partners are thinned out.
+    return from behind the plane outside.
 
     Args:
         view: beams about the plate.
-        board: gives the rectangle.
-        starts: placements to start from; all angles where None.
-
-    Returns:
-        The best placement, None where no ring has a chord.
+        start: first guess; gives the size.
     """
-    if len(view.chord_start) == 0:
-        return None
-    half = (board.width_m / 2, board.height_m / 2)
-    samples, kind = _samples(view)
-    if starts is None:
-        starts = _starts(samples[kind == 0], half)
-    state = np.array([[s.u_m, s.v_m, s.angle_rad] for s in starts])
-    if len(state) > 4:
-        state = state[np.argsort(_cost(state, samples, kind, half), kind="stable")[:4]]
-    for scale_m in (0.08, 0.06, 0.04, 0.03, 0.03, 0.03):
-        state = _step(state, samples, kind, half, scale_m)
-    cost = _cost(state, samples, kind, half)
-    best = int(np.argmin(cost))
-    u_m, v_m, angle_rad = (float(x) for x in state[best])
-    return Placement(u_m, v_m, angle_rad, half, float(cost[best]))
-
-
-def _samples(view: PlaneView) -> tuple[Array, NDArray[np.intp]]:
-    """Collect chord ends (kind 0), beams that should be inside (1) and outside (2), at most 96 of each."""
     ends = view.uv[np.concatenate([view.chord_start, view.chord_end])]
-    inside = view.uv[view.is_on]
-    outside = view.uv[view.height_m < -view.tolerance_m]
-    inside = inside[:: max(1, -(-len(inside) // 96))]
-    outside = outside[:: max(1, -(-len(outside) // 96))]
-    kind = np.repeat([0, 1, 2], [len(ends), len(inside), len(outside)])
-    return np.concatenate([ends, inside, outside]), kind
+    # Beams far from any border say the same as their neighbours: a sample is enough.
+    inside, outside = view.uv[view.is_on], view.uv[view.height_m < -view.tolerance_m]
+    inside = inside[:: max(1, -(-len(inside) // 120))]
+    outside = outside[:: max(1, -(-len(outside) // 120))]
+    kind = np.repeat([END, INSIDE, OUTSIDE], [len(ends), len(inside), len(outside)])
+    samples = np.concatenate([ends, inside, outside])
+    guess = np.array([[[start.u_m, start.v_m, start.angle_rad]]])
+    state, error_m = _search(guess, samples[None], kind[None], start.half_m, (0.04, 0.03, 0.03, 0.03))
+    u_m, v_m, angle_rad = (float(x) for x in state[0])
+    return Placement(u_m, v_m, angle_rad, start.half_m, float(error_m[0]))
 
 
-def _starts(ends: Array, half: tuple[float, float]) -> list[Placement]:
-    """Place the rectangle at equal angles over half a turn, each time in the middle of the ends' extent."""
-    starts = []
-    for angle in np.arange(N_ANGLES) * np.pi / N_ANGLES:
-        axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        local = ends @ axes
-        middle = axes @ (local.min(axis=0) + local.max(axis=0)) / 2
-        starts.append(Placement(float(middle[0]), float(middle[1]), float(angle), half))
-    return starts
+def register_ends(ends: Array, board: Board) -> list[Placement]:
+    """Find for each of G plates the placement of the board's outline whose border is nearest to its ends.
+
+    Args:
+        ends: (G, M, 2) where the rings begin and end in each plate's plane, m; NaN fills the rows up.
+        board: gives the rectangle.
+    """
+    half = (board.width_m / 2, board.height_m / 2)
+    kind = np.where(np.isnan(ends[..., 0]), UNUSED, END)
+    angle = np.arange(N_ANGLES) * np.pi / N_ANGLES
+    axes = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], axis=1).reshape(-1, 2, 2)
+    # At each angle the rectangle starts in the middle of the ends' extent.
+    local = ends[:, None] @ axes
+    middle = (np.nanmin(local, axis=2) + np.nanmax(local, axis=2)) / 2
+    centre = np.einsum("aij,gaj->gai", axes, middle)
+    starts = np.concatenate([centre, np.broadcast_to(angle[None, :, None], (*centre.shape[:2], 1))], axis=2)
+    samples = np.nan_to_num(ends)
+    cost = _cost(starts, samples, kind, half)
+    best = np.argsort(cost, axis=1, kind="stable")[:, :2]
+    starts = np.take_along_axis(starts, best[..., None], axis=1)
+    state, error_m = _search(starts, samples, kind, half, (0.08, 0.06, 0.04, 0.03))
+    return [Placement(*map(float, x), half, float(e)) for x, e in zip(state, error_m, strict=True)]
 
 
 def signed_distance(local: Array, half: tuple[float, float]) -> tuple[Array, Array]:
@@ -196,50 +200,58 @@ def signed_distance(local: Array, half: tuple[float, float]) -> tuple[Array, Arr
     return distance, gradient * np.where(local < 0, -1.0, 1.0)
 
 
+def _search(
+    state: Array, samples: Array, kind: Indices, half: tuple[float, float], scales_m: tuple[float, ...]
+) -> tuple[Array, Array]:
+    """Improve states (G, A, 3) and return the best of each group (G, 3) with its error (G,).
+
+    Gauss-Newton on the signed distance from the rectangle, with Geman-McClure weights of falling scale.
+    """
+    for scale_m in scales_m:
+        state = _step(state, samples, kind, half, scale_m)
+    cost = _cost(state, samples, kind, half)
+    best = np.argmin(cost, axis=1)
+    rows = np.arange(len(best))
+    return state[rows, best], cost[rows, best]
+
+
 def _residuals(
-    state: Array, samples: Array, kind: NDArray[np.intp], half: tuple[float, float]
+    state: Array, samples: Array, kind: Indices, half: tuple[float, float]
 ) -> tuple[Array, Array, Array]:
-    """Compute signed violations (K, M), their gradients (K, M, 2) and local points (K, M, 2)."""
-    cosine, sine = np.cos(state[:, 2]), np.sin(state[:, 2])
-    offset = samples[None] - state[:, None, :2]
-    x = offset[..., 0] * cosine[:, None] + offset[..., 1] * sine[:, None]
-    y = offset[..., 1] * cosine[:, None] - offset[..., 0] * sine[:, None]
-    local = np.stack([x, y], axis=-1)
+    """Compute signed violations (G, A, M), their gradients (G, A, M, 2) and local points (G, A, M, 2)."""
+    cosine, sine = np.cos(state[..., 2])[..., None], np.sin(state[..., 2])[..., None]
+    u = samples[:, None, :, 0] - state[..., 0][..., None]
+    v = samples[:, None, :, 1] - state[..., 1][..., None]
+    local = np.stack([u * cosine + v * sine, v * cosine - u * sine], axis=-1)
     distance, gradient = signed_distance(local, half)
-    is_satisfied = ((kind == 1) & (distance < 0)) | ((kind == 2) & (distance > 0))
-    return np.where(is_satisfied, 0.0, distance), gradient, local
+    kind = kind[:, None]
+    counts = (kind == END) | ((kind == INSIDE) & (distance > 0)) | ((kind == OUTSIDE) & (distance < 0))
+    return np.where(counts, distance, 0.0), gradient, local
 
 
-def _cost(state: Array, samples: Array, kind: NDArray[np.intp], half: tuple[float, float]) -> Array:
-    """Compute `Placement.error_m` of each state (K,)."""
+def _cost(state: Array, samples: Array, kind: Indices, half: tuple[float, float]) -> Array:
+    """Compute `Placement.error_m` of each state (G, A)."""
     violation = np.minimum(np.abs(_residuals(state, samples, kind, half)[0]), CAP_M)
-    n_ends, n_on = int((kind == 0).sum()), int((kind == 1).sum())
-    at_ends = violation[:, kind == 0].sum(axis=1) / max(n_ends, 1)
-    elsewhere = (violation[:, kind > 0] > 0.3 * CAP_M).sum(axis=1) / max(n_on, 1)
+    is_end, is_inside = (kind == END)[:, None], (kind == INSIDE)[:, None]
+    at_ends = (violation * is_end).sum(axis=-1) / np.maximum(is_end.sum(axis=-1), 1)
+    elsewhere = ((violation > 0.3 * CAP_M) & ~is_end).sum(axis=-1) / np.maximum(is_inside.sum(axis=-1), 1)
     return np.asarray(at_ends + CAP_M * elsewhere)
 
 
-def _step(
-    state: Array, samples: Array, kind: NDArray[np.intp], half: tuple[float, float], scale_m: float
-) -> Array:
-    """Take one damped Gauss-Newton step of (u, v, angle) from each state (K, 3)."""
+def _step(state: Array, samples: Array, kind: Indices, half: tuple[float, float], scale_m: float) -> Array:
+    """Take one damped Gauss-Newton step of (u, v, angle) from each state (G, A, 3)."""
     residual, gradient, local = _residuals(state, samples, kind, half)
-    weight = 1.0 / (1.0 + (residual / scale_m) ** 2) ** 2 * (residual != 0)
-    cosine, sine = np.cos(state[:, 2])[:, None], np.sin(state[:, 2])[:, None]
+    weight = (residual != 0) / (1.0 + (residual / scale_m) ** 2) ** 2
+    cosine, sine = np.cos(state[..., 2])[..., None], np.sin(state[..., 2])[..., None]
     jacobian = np.stack(
         [
-            -(gradient[..., 0] * cosine - gradient[..., 1] * sine),
-            -(gradient[..., 0] * sine + gradient[..., 1] * cosine),
+            gradient[..., 1] * sine - gradient[..., 0] * cosine,
+            -gradient[..., 0] * sine - gradient[..., 1] * cosine,
             gradient[..., 0] * local[..., 1] - gradient[..., 1] * local[..., 0],
         ],
         axis=-1,
     )
-    weighted = jacobian * weight[..., None]
-    hessian = np.swapaxes(weighted, 1, 2) @ jacobian + np.diag([0.1, 0.1, 0.01])
-    slope = np.einsum("kmi,km->ki", weighted, residual)
-    return np.asarray(state - np.linalg.solve(hessian, slope[..., None])[..., 0])
-
-
-def resized(placement: Placement, half_m: tuple[float, float]) -> Placement:
-    """Give a placement another size."""
-    return replace(placement, half_m=half_m)
+    weighted = np.swapaxes(jacobian * weight[..., None], -1, -2)
+    hessian = weighted @ jacobian + np.diag([0.1, 0.1, 0.01])
+    slope = weighted @ residual[..., None]
+    return np.asarray(state - np.linalg.solve(hessian, slope)[..., 0])

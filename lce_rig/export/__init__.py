@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError
 from lce_rig.core.results import Calibration
+from lce_rig.export.frames import require_known
 from lce_rig.rig import Rig
 
 Exporter = Callable[[Sequence[Calibration], Rig, Path], list[Path]]
@@ -58,9 +59,12 @@ def write_exports(
         The files written, in the order of the formats.
 
     Raises:
+        LceRigError: a calibration is about sensors that the rig does not have.
         ResultRefusedError: a verdict is "fail"; nothing is written.
         LceRigError: a file does not say what was calibrated; it and all others are removed again.
     """
+    for calibration in calibrations:
+        require_known(calibration, rig)
     exporters = [load_exporter(name) for name in (EXPORTS if formats is None else formats)]
     remove_exports(folder)
     failed = [c for c in calibrations if c.verdict == "fail"]

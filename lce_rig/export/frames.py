@@ -100,7 +100,7 @@ def choose_channels(calibrations: Sequence[Calibration], rig: Rig) -> list[Calib
     best: dict[tuple[str, str], Calibration] = {}
     ranks: dict[tuple[str, str], tuple[int, int]] = {}
     for calibration in calibrations:
-        _require_known(calibration, rig)
+        require_known(calibration, rig)
         pair = calibration.camera, calibration.lidar
         channels = list(rig.cameras[calibration.camera].channels)
         rank = _VERDICTS.index(calibration.verdict), channels.index(calibration.channel)
@@ -109,7 +109,12 @@ def choose_channels(calibrations: Sequence[Calibration], rig: Rig) -> list[Calib
     return list(best.values())
 
 
-def _require_known(calibration: Calibration, rig: Rig) -> None:
+def require_known(calibration: Calibration, rig: Rig) -> None:
+    """Check that a calibration is about sensors of the rig.
+
+    Raises:
+        LceRigError: a sensor or channel that the rig does not have.
+    """
     camera = rig.cameras.get(calibration.camera)
     if camera is None or calibration.lidar not in rig.lidars or calibration.channel not in camera.channels:
         pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
@@ -121,8 +126,10 @@ def check_tree(links: Sequence[str], joints: Iterable[tuple[str, str]]) -> None:
     """Check that links and (parent, child) joints make one tree; no URDF parser at hand does so.
 
     Raises:
-        LceRigError: a name twice, an unknown link, a link with two parents, no or several roots, or a loop.
+        LceRigError: no link, a name twice, an unknown link, a link with two parents, no or several roots, or a loop.
     """
+    if not links:
+        raise LceRigError("no links")
     twice = sorted({link for link in links if list(links).count(link) > 1})
     if twice:
         raise LceRigError(f"link {twice[0]} is defined twice")

@@ -13,6 +13,7 @@ KeyPath = tuple[str | int, ...]
 # A profile is a page or two; more is an attack by nested aliases or the wrong file.
 _MAX_NODES = 20_000
 _MAX_DEPTH = 20
+_PLAIN_TAGS = ("tag:yaml.org,2002:map", "tag:yaml.org,2002:seq")
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,10 @@ class _Reader:
         self._n_nodes += 1
         if self._n_nodes > _MAX_NODES or len(path) > _MAX_DEPTH:
             raise ProfileError(f"{self._source}: is too large or too deeply nested to be a rig profile")
+        if isinstance(node, yaml.CollectionNode) and node.tag not in _PLAIN_TAGS:
+            raise ProfileError(
+                f"{self._source}:{node.start_mark.line + 1}: the tag {node.tag} has no place here"
+            )
         if isinstance(node, yaml.MappingNode):
             return self._read_mapping(node, path)
         if isinstance(node, yaml.SequenceNode):

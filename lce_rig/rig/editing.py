@@ -1,5 +1,6 @@
 """Edits of a profile's text that leave comments and layout as they are."""
 
+import json
 from collections.abc import Sequence
 
 import yaml
@@ -27,7 +28,8 @@ def derive_text(text: str, name: str, settings: Sequence[tuple[str, str]], sourc
         UsageError: a value that is no YAML, or a path into something that has no keys.
     """
     head = f"# {name}: made from {origin} by `lce-rig rigs new`; the comments below are {origin}'s.\n"
-    text = head + set_value(text, "name", name)
+    # A name such as 346 is a text only in quotes.
+    text = head + set_value(text, "name", name if yaml.safe_load(name) == name else json.dumps(name))
     for path, value in settings:
         text = set_value(text, path, value)
     rig_from_document(read_document(text, source))
@@ -47,6 +49,8 @@ def set_value(text: str, path: str, value: str) -> str:
     """
     wanted = _parsed(path, value)
     root = yaml.compose(text, Loader=yaml.SafeLoader)
+    if root is None:
+        raise UsageError(f"--set {path}: there is nothing to set it in")
     keys = path.split(".")
     node, depth = _descend(root, keys)
     if depth == len(keys):
@@ -55,7 +59,7 @@ def set_value(text: str, path: str, value: str) -> str:
         new = _insert(text, node, keys[depth:], value)
     else:
         raise UsageError(f"--set {path}: {'.'.join(keys[:depth])} has no key {keys[depth]}")
-    if _lookup(yaml.safe_load(new), keys) != wanted:
+    if not _holds(new, keys, wanted):
         raise UsageError(f"--set {path}: {value!r} cannot be put there", "quote a text that holds : or #")
     return new
 
@@ -111,7 +115,11 @@ def _insert(text: str, block: yaml.MappingNode, keys: Sequence[str], value: str)
     return f"{text[:at]}\n{indent}{entry}{text[at:]}"
 
 
-def _lookup(data: object, keys: Sequence[str]) -> object:
-    for key in keys:
-        data = data[int(key)] if isinstance(data, list) else data[key]  # type: ignore[index]
-    return data
+def _holds(text: str, keys: Sequence[str], wanted: object) -> bool:
+    try:
+        data = yaml.safe_load(text)
+        for key in keys:
+            data = data[int(key)] if isinstance(data, list) else data[key]
+    except (yaml.YAMLError, ValueError, LookupError, TypeError):
+        return False
+    return bool(data == wanted)

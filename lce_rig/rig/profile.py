@@ -82,7 +82,7 @@ class Rig(Settings):
         if (cols - rows) * (width_m - height_m) < 0:
             found.append(
                 f"board: {cols}x{rows} inner corners run along the shorter side of the plate "
-                f"{width_m:g} x {height_m:g} m; are width_m and height_m swapped, or inner_corners [cols, rows]?"
+                f"{width_m:g} x {height_m:g} m; are width_m and height_m swapped, or the inner_corners?"
             )
         stamps = [(f"lidars.{name}", lidar.timestamps) for name, lidar in self.lidars.items()]
         for camera, settings in self.cameras.items():

@@ -3,6 +3,7 @@
 import io
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,9 +49,10 @@ def store(path: Path, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, A
 def load(path: Path) -> Cached | None:
     """Read one entry; None where there is none or it is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # From memory: numpy leaves a file that turns out to be no zip open.
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         values = json.loads(arrays.pop(_VALUES).tobytes())
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, AttributeError):
         return None
     return Cached(arrays, values) if isinstance(values, dict) else None

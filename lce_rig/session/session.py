@@ -14,7 +14,6 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-import yaml
 from numpy.typing import NDArray
 
 from lce_rig import __version__
@@ -24,9 +23,9 @@ from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import cache
 from lce_rig.session.capture import SAFE_NAME, Capture, content_hash, write_capture
 from lce_rig.session.durable import WriterLock, append_line, flush_folder, replace_file
+from lce_rig.session.identity import MARKER, check_marker, differing_keys, marker_of
 
-FORMAT_VERSION = 1
-MARKER, PROFILE, JOURNAL, LOCK = "session.json", "rig.yaml", "journal.jsonl", ".lock"
+PROFILE, JOURNAL, LOCK = "rig.yaml", "journal.jsonl", ".lock"
 CAPTURES, DETECTIONS, DRAFT_PREFIX = "captures", "detections", ".new-"
 
 
@@ -70,9 +69,8 @@ class Session:
             lock = _take_lock(path)
             (path / CAPTURES).mkdir(exist_ok=True)
             replace_file(path / PROFILE, dump_rig(rig).encode())
-            marker = {"format_version": FORMAT_VERSION, "rig": rig.name, "made_by": f"lce-rig {__version__}"}
             # Last, because its presence is what makes the folder a session.
-            replace_file(path / MARKER, (json.dumps(marker, indent=1) + "\n").encode())
+            replace_file(path / MARKER, marker_of(rig))
         except OSError as error:
             raise _not_writable(path, error) from error
         session = cls(path, rig, lock)
@@ -87,7 +85,7 @@ class Session:
             SessionError: it is no session, damaged, made by a newer version, or another process writes to it.
         """
         path = Path(path)
-        _check_marker(path)
+        check_marker(path)
         try:
             rig = load_rig(path / PROFILE)
         except LceRigError as error:
@@ -116,7 +114,7 @@ class Session:
         if not (path / MARKER).exists():
             return cls.create(path, rig)
         session = cls.open(path, writable=True)
-        differing = _differing_keys(session.rig, rig)
+        differing = differing_keys(session.rig, rig)
         if differing:
             session.close()
             shown = "; ".join(differing[:5]) + (
@@ -272,19 +270,6 @@ class Session:
                 raise SessionError(f"rig {self.rig.name!r} has no lidar {scan.sensor!r}")
 
 
-def _check_marker(path: Path) -> None:
-    try:
-        marker = json.loads((path / MARKER).read_text(encoding="utf-8"))
-        version = int(marker["format_version"])
-    except FileNotFoundError:
-        hint = "Make one with `lce-rig collect` or `lce-rig simulate`."
-        raise SessionError(f"{path} is no session: it has no {MARKER}", hint) from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SessionError(f"{path / MARKER} cannot be read: {error}") from None
-    if version > FORMAT_VERSION:
-        raise SessionError(f"{path} was made by a newer lce-rig (format {version})", "Update lce-rig.")
-
-
 def _take_lock(path: Path) -> WriterLock:
     try:
         return WriterLock(path / LOCK)
@@ -301,16 +286,3 @@ def _not_writable(path: Path, error: OSError, n_safe: int | None = None) -> Sess
         f"Make room or choose another disk and run the same command again: it goes on where it stopped.{safe}"
     )
     return SessionError(f"{path} cannot be written: {error.strerror or error}", hint)
-
-
-def _differing_keys(theirs: Rig, ours: Rig) -> list[str]:
-    """List the keys in which two profiles differ, with both values; the description may differ."""
-    a, b = (_flatten(yaml.safe_load(dump_rig(rig))) for rig in (theirs, ours))
-    keys = sorted(key for key in a.keys() | b.keys() if a.get(key) != b.get(key) and key != "description")
-    return [f"{key} {a.get(key, 'absent')} there, {b.get(key, 'absent')} here" for key in keys]
-
-
-def _flatten(value: Any, prefix: str = "") -> dict[str, Any]:
-    if not isinstance(value, dict):
-        return {prefix.removesuffix("."): value}
-    return {k: v for key, inner in value.items() for k, v in _flatten(inner, f"{prefix}{key}.").items()}

@@ -18,6 +18,11 @@ def jackknife_covariance(gradients: Array, hessians: Array, prior: Array) -> Arr
     takes every residual for independent, (1) sees what a whole group has in common. Dividing by H - H_k and not
     H corrects for the pull that each group has on its own residuals, which matters for few groups.
 
+    The mean of (1) is right but its inverse is too large, as that of any sample covariance with few samples:
+    for normal errors E[(F - 1) / (F - p - 2) cov^-1] is the inverse of the true covariance (2). Normalised errors
+    e^T cov^-1 e come out right, and few groups are not trusted too far, when (1) is multiplied by that factor;
+    below p + 4 groups it is held at its value there.
+
     Args:
         gradients: (F, p) half the gradient of each group's cost at the minimum.
         hessians: (F, p, p) half the Hessian of each (Gauss-Newton).
@@ -31,10 +36,11 @@ def jackknife_covariance(gradients: Array, hessians: Array, prior: Array) -> Arr
         1985; Bell, McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage
         samples", Survey Methodology, 2002 (CR3).
     """
-    n_groups = len(gradients)
+    n_groups, p = gradients.shape
     remaining = hessians.sum(axis=0) + prior - hessians
     steps = -(symmetric_inverse(remaining) @ gradients[..., None])[..., 0]
-    return np.asarray((n_groups - 1) / n_groups * steps.T @ steps)
+    correction = (n_groups - 1) / max(n_groups - p - 2, 2)  # equation (2)
+    return np.asarray(correction * (n_groups - 1) / n_groups * steps.T @ steps)
 
 
 def symmetric_inverse(H: Array) -> Array:

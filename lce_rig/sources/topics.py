@@ -42,8 +42,8 @@ def choose_topics(
         Sensor by topic; at least one camera channel and one LiDAR.
 
     Raises:
-        SourceError: a topic that was asked for is not there or of another type, or no picture or cloud is left;
-            the hint lists the topics that are there.
+        SourceError: a topic that was asked for is not there or of another type, or no picture or cloud is
+            left; the hint lists the topics that are there.
     """
     there = "topics there: " + (
         ", ".join(f"{t} ({m}, {n})" for t, (m, n) in sorted(topics.items())) or "none"

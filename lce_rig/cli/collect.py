@@ -1,0 +1,106 @@
+"""`lce-rig collect`: a session from recordings, unattended."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lce_rig.cli import show
+
+
+def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+    topics = {}
+    for value in values:
+        sensor, separator, topic = value.partition("=")
+        if not (sensor and separator and topic):
+            raise click.BadParameter(f"{value!r} is not SENSOR=/topic, such as cam=/camera/image_raw")
+        topics[sensor] = topic
+    return topics
+
+
+@click.command()
+@click.option("--rig", "rig_name", required=True, metavar="NAME|FILE", help="Rig profile: a name or a file.")
+@click.argument("session", type=click.Path(path_type=Path), default="session")
+@click.option(
+    "--from",
+    "paths",
+    required=True,
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="PATH",
+    help="A folder with img/ and pcd/, a ROS 1 bag, a ROS 2 bag or an mcap file; may be repeated.",
+)
+@click.option(
+    "--pair",
+    type=click.Choice(["auto", "stem", "order", "time"]),
+    default="auto",
+    show_default=True,
+    help="How a folder's pictures and clouds belong together: equal names, sorted order, nearest time.",
+)
+@click.option("--pair-tolerance", type=click.FloatRange(0), metavar="S", help="Largest difference in time of a pair.")
+@click.option("--topic", "topics", multiple=True, callback=_topics, metavar="SENSOR=/TOPIC", help="Topic of a sensor.")
+@click.option("--camera", help="Camera that a folder's pictures belong to, where the rig has several.")
+@click.option("--channel", help="Channel of it, such as events for pictures reconstructed from events.")
+@click.option("--lidar", help="LiDAR that a folder's clouds belong to, where the rig has several.")
+@click.option("--max-captures", type=click.IntRange(1), metavar="N", help="Never fill the session beyond N captures.")
+@click.option("--target", type=click.IntRange(1), metavar="N", help="Stop reading at N captures.")
+def collect(
+    rig_name: str,
+    session: Path,
+    paths: tuple[Path, ...],
+    pair: Any,
+    pair_tolerance: float | None,
+    topics: dict[str, str],
+    camera: str | None,
+    channel: str | None,
+    lidar: str | None,
+    max_captures: int | None,
+    target: int | None,
+) -> None:
+    """Build or continue SESSION (default: session/) from recordings.
+
+    Every pair of a folder becomes a capture. Bags are cut where the board stands still in both sensors and is
+    somewhere new. Run it again to continue: what is captured already is not captured twice.
+    """
+    from lce_rig.collect import CollectOptions
+    from lce_rig.collect import collect as fill
+    from lce_rig.rig import load_rig
+    from lce_rig.session import Session
+    from lce_rig.sources import SourceOptions, open_recording
+
+    rig = load_rig(rig_name)
+    options = SourceOptions(camera, channel, lidar, pair, pair_tolerance, topics)
+    recordings = [open_recording(path, rig, options) for path in paths]
+    with Session.resume(session, rig) as writer, show.progress_bar("collecting") as progress:
+        report = fill(
+            writer,
+            recordings,
+            CollectOptions(max_captures=max_captures, target=target),
+            lambda done, total, _message: progress(done, total),
+        )
+        n_captures = len(writer.captures)
+    _tell(report, session, n_captures)
+
+
+def _tell(report: Any, session: Path, n_captures: int) -> None:
+    """Say what became of everything that was read.
+
+    Raises:
+        SourceError: a recording could not be read to its end; what was captured before is kept.
+    """
+    for text in report.notes:
+        show.note(text)
+    for label, capture in report.duplicates.items():
+        show.note(f"{label}: duplicate of {capture}, left out")
+    for label, refusal in report.refused.items():
+        show.warn(f"{label}: {refusal.cause}: {refusal.action}")
+    if report.counts:
+        show.note("not captured: " + ", ".join(f"{n} x {why}" for why, n in report.counts.most_common()))
+    if report.n_missing:
+        show.warn(f"{report.n_missing} captures short of the target")
+    new = f"{len(report.captured)} new" + (f", {report.n_resumed} known already" if report.n_resumed else "")
+    show.note(f"{session}: {n_captures} captures ({new})")
+    for error in report.errors[:-1]:
+        show.warn(str(error))
+    if report.errors:
+        raise report.errors[-1]

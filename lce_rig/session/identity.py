@@ -1,0 +1,51 @@
+"""What makes a folder a session, and whose session it is."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lce_rig import __version__
+from lce_rig.core.errors import SessionError
+from lce_rig.rig import Rig, dump_rig
+
+FORMAT_VERSION = 1
+MARKER = "session.json"
+
+
+def marker_of(rig: Rig) -> bytes:
+    """Write the content of session.json."""
+    marker = {"format_version": FORMAT_VERSION, "rig": rig.name, "made_by": f"lce-rig {__version__}"}
+    return (json.dumps(marker, indent=1) + "\n").encode()
+
+
+def check_marker(path: Path) -> None:
+    """Make sure that a folder is a session this version reads.
+
+    Raises:
+        SessionError: it is none, or damaged, or made by a newer version.
+    """
+    try:
+        marker = json.loads((path / MARKER).read_text(encoding="utf-8"))
+        version = int(marker["format_version"])
+    except FileNotFoundError:
+        hint = "Make one with `lce-rig collect` or `lce-rig simulate`."
+        raise SessionError(f"{path} is no session: it has no {MARKER}", hint) from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SessionError(f"{path / MARKER} cannot be read: {error}") from None
+    if version > FORMAT_VERSION:
+        raise SessionError(f"{path} was made by a newer lce-rig (format {version})", "Update lce-rig.")
+
+
+def differing_keys(theirs: Rig, ours: Rig) -> list[str]:
+    """List the keys in which two profiles differ, with both values; the description may differ."""
+    a, b = (_flatten(yaml.safe_load(dump_rig(rig))) for rig in (theirs, ours))
+    keys = sorted(key for key in a.keys() | b.keys() if a.get(key) != b.get(key) and key != "description")
+    return [f"{key} {a.get(key, 'absent')} there, {b.get(key, 'absent')} here" for key in keys]
+
+
+def _flatten(value: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(value, dict):
+        return {prefix.removesuffix("."): value}
+    return {k: v for key, inner in value.items() for k, v in _flatten(inner, f"{prefix}{key}.").items()}

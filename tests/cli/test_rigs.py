@@ -1,0 +1,100 @@
+"""`lce-rig rigs` as a user runs it."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from lce_rig.cli.main import run
+from lce_rig.rig import load_rig
+
+
+def test_called_bare_it_lists_the_profiles(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["rigs"]) == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in ("rlfs", "rles", "sss", "davis (frames, events)"))
+    assert run(["rigs", "list"]) == 0
+    assert capsys.readouterr().out == out
+
+
+def test_the_list_for_machines_is_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["rigs", "list", "--json"]) == 0
+    rigs = {rig["name"]: rig for rig in json.loads(capsys.readouterr().out)["rigs"]}
+    assert rigs["rles"]["cameras"] == {"davis": ["frames", "events"]}
+
+
+def test_show_gives_the_figures_and_marks_what_is_not_default(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["rigs", "show", "rles"]) == 0
+    out = capsys.readouterr().out
+    assert all(text in out for text in ("davis/events", "9 x 6", "68 mm", "346x260"))
+    row = next(line for line in out.splitlines() if "calibration.edge_weight" in line)
+    assert "10" in row
+    assert "3" in row
+
+
+def test_show_prints_a_profile_that_loads_again(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "copy.yaml"
+    assert run(["rigs", "show", "rlfs", "--yaml"]) == 0
+    path.write_text(capsys.readouterr().out, encoding="utf-8")
+    assert load_rig(path) == load_rig("rlfs")
+    assert run(["rigs", "show", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["board"]["square_m"] == 0.07
+
+
+def test_check_exits_by_what_it_finds(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    assert run(["rigs", "new", "mine", "--from", "sss", "-o", str(path)]) == 0
+    assert run(["rigs", "check", str(path)]) == 0
+    assert "a valid profile of rig mine" in capsys.readouterr().out
+    path.write_text(path.read_text(encoding="utf-8").replace("fx_px", "fx_pix"), encoding="utf-8")
+    assert run(["rigs", "check", str(path)]) == 3
+    assert "cameras.cam.intrinsics.fx_pix: unknown key; did you mean fx_px?" in capsys.readouterr().err
+    assert run(["rigs", "check", str(path), "--json"]) == 3
+    found = json.loads(capsys.readouterr().out)
+    assert not found["is_valid"]
+    assert len(found["problems"]) == 1
+
+
+def test_check_warns_of_what_is_rarely_meant(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    assert (
+        run(["rigs", "new", "mine", "--from", "sss", "--set", "board.inner_corners=[6, 8]", "-o", str(path)])
+        == 0
+    )
+    assert run(["rigs", "check", str(path)]) == 0
+    assert "shorter side of the plate" in capsys.readouterr().err
+
+
+def test_new_writes_a_profile_and_never_over_another(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(["rigs", "new", "mine", "--from", "rlfs", "--set", "board.square_m=0.065"]) == 0
+    assert load_rig("mine.yaml").board.square_m == 0.065
+    before = Path("mine.yaml").read_bytes()
+    assert run(["rigs", "new", "mine"]) == 3
+    assert "exists already" in capsys.readouterr().err
+    assert Path("mine.yaml").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["--set", "board.square_m=70"], 3, "board.square_m: did you mean 0.070 m?"),
+        (["--set", "board.square_m"], 2, "KEY=VALUE"),
+        (["--from", "rlsf"], 3, "did you mean rlfs?"),
+        (["--from", "missing.yaml"], 3, "there is no such file"),
+    ],
+)
+def test_new_writes_nothing_where_something_is_wrong(
+    arguments: list[str],
+    code: int,
+    says: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(["rigs", "new", "mine", *arguments]) == code
+    assert says in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,72 @@
+"""Results to export."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lce_rig.core.geometry import Array, exp_so3, pose
+from lce_rig.core.results import Calibration, Certificate, Metrics, Refusal
+from lce_rig.rig import Rig, load_rig
+
+Make = Callable[..., Calibration]
+
+
+@pytest.fixture(scope="session")
+def rles() -> Rig:
+    return load_rig("rles")
+
+
+@pytest.fixture(scope="session")
+def three_sensor_rig() -> Rig:
+    """Two LiDARs, and three cameras with each kind of lens."""
+    data = load_rig("rles").model_dump()
+    data["name"] = "trio"
+    front, back = data["lidars"]["lidar"], dict(data["lidars"]["lidar"], frame="velodyne_back")
+    data["lidars"] = {"front": front, "back": back}
+    davis = data["cameras"]["davis"]
+    lens = dict(davis["intrinsics"], distortion=(-0.3, 0.1, 1e-3, -2e-5, 0.01, 0.02, -0.01, 0.003))
+    fish = dict(davis["intrinsics"], model="equidistant", distortion=(-0.05, -0.07, 0.09, -0.05))
+    data["cameras"]["left"] = dict(davis, intrinsics=lens, frame="left_link", optical_frame="left_optical")
+    data["cameras"]["fish"] = dict(davis, intrinsics=fish, frame="fish_link", optical_frame="fish_optical")
+    data["nominal_extrinsics"] = []
+    return Rig.model_validate(data)
+
+
+def calibration(T_cam_lidar: Array | None = None, **changes: Any) -> Calibration:
+    """Build a plausible result."""
+    sides = np.diag([1e-3, 1e-3, 2e-3, 1e-4, 2e-4, 1e-4])
+    mixing = np.eye(6) + 0.1 * np.ones((6, 6))
+    fields: dict[str, Any] = {
+        "camera": "davis",
+        "channel": "frames",
+        "lidar": "lidar",
+        "T_cam_lidar": some_pose() if T_cam_lidar is None else T_cam_lidar,
+        "cov": sides @ mixing @ sides,
+        "certificate": Certificate(True, 1.25e-9),
+        "metrics": Metrics(0.009, 0.0085, 0.2),
+        "n_captures": 4,
+        "n_detected": 3,
+        "captures_used": ("000000", "000002"),
+        "captures_refused": {
+            "000003": Refusal("calibrate", "12 cm off", "repeat it"),
+            "000001": Refusal("lidar", "2 rings on the board", "come 0.8 m closer – näher"),
+        },
+        "verdict": "pass",
+        "reasons": (),
+        "diagnostics": {"split_half_deg": 0.1, "b": 1 / 3},
+    }
+    return Calibration(**(fields | changes))
+
+
+def some_pose(
+    phi: tuple[float, ...] = (1.2, -1.3, 1.1), t: tuple[float, ...] = (0.12, -0.07, -0.08)
+) -> Array:
+    return pose(exp_so3(np.array(phi)), np.array(t))
+
+
+@pytest.fixture(scope="session")
+def make() -> Make:
+    """The builder of results; without arguments a plausible one of rig rles."""
+    return calibration

@@ -1,0 +1,277 @@
+"""Every export, read by programs that know nothing of how it was written."""
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from lce_rig.core.errors import LceRigError, ResultRefusedError, UsageError
+from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
+from lce_rig.core.results import Calibration
+from lce_rig.export import EXPORTS, load_exporter, write_exports
+from lce_rig.export.camera_info import read_camera_info
+from lce_rig.export.frames import T_BODY_OPTICAL, build_trees, check_tree
+from lce_rig.export.probes import check_pose, probe_points
+from lce_rig.export.urdf import read_urdf
+from lce_rig.rig import Rig
+
+Make = Callable[..., Calibration]
+in_one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
+
+
+def body_poses() -> Iterator[Any]:
+    """Poses of a camera's body on the LiDAR, with pitch at and near +-90 deg as well as anywhere."""
+    near = st.sampled_from([0.0, 1e-12, 1e-9, 1e-7, 1e-5]).flatmap(
+        lambda off: st.sampled_from([np.pi / 2 - off, off - np.pi / 2])
+    )
+    angle = st.floats(-np.pi, np.pi)
+    angles = st.tuples(angle, near | st.floats(-1.5, 1.5), angle)
+    return st.builds(
+        lambda rpy, t: pose(Rotation.from_euler("xyz", rpy).as_matrix(), np.array(t)),
+        angles,
+        st.tuples(*[st.floats(-2, 2)] * 3),
+    )
+
+
+@in_one_folder
+@given(T_lidar_body=body_poses())
+def test_every_format_survives_any_pose(rles: Rig, make: Make, tmp_path: Path, T_lidar_body: Array) -> None:
+    T_cam_lidar = invert(T_lidar_body @ T_BODY_OPTICAL)
+    paths = write_exports([make(T_cam_lidar)], rles, tmp_path)
+    assert {path.name for path in paths} == {
+        *("extrinsics.yaml", "rles.urdf", "camera_info_davis.yaml", "static_transforms.txt"),
+        *("camchain_lidar.yaml", "sensor_kit_calibration.yaml"),
+    }
+    import yourdfpy
+
+    robot = yourdfpy.URDF.load(str(tmp_path / "rles.urdf"), load_meshes=False, build_scene_graph=True)
+    read = robot.get_transform("velodyne", "davis_optical_frame")
+    np.testing.assert_allclose(read, T_cam_lidar, atol=1e-12)
+
+
+def test_extrinsics_agree_in_every_notation_and_the_worked_points_hold(
+    rles: Rig, make: Make, tmp_path: Path
+) -> None:
+    calibration = make()
+    (path,) = write_exports([calibration], rles, tmp_path, formats=["extrinsics"])
+    (pair,) = yaml.safe_load(path.read_text(encoding="utf-8"))["pairs"]
+    for name, wanted in (
+        ("T_cam_lidar", calibration.T_cam_lidar),
+        ("T_lidar_cam", np.linalg.inv(calibration.T_cam_lidar)),
+    ):
+        block = pair[name]
+        np.testing.assert_allclose(block["matrix"], wanted, atol=1e-12)
+        R = Rotation.from_quat(block["quaternion_xyzw"]).as_matrix()
+        np.testing.assert_allclose(R, wanted[:3, :3], atol=1e-12)
+        assert block["quaternion_wxyz"] == [block["quaternion_xyzw"][3], *block["quaternion_xyzw"][:3]]
+        assert block["translation_m"] == [row[3] for row in block["matrix"][:3]]
+    worked, back = pair["T_cam_lidar"]["worked_point"], pair["T_lidar_cam"]["worked_point"]
+    point = calibration.T_cam_lidar @ [*worked["p_lidar_m"], 1]
+    np.testing.assert_allclose(point[:3], worked["p_cam_m"], atol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.inv(calibration.T_cam_lidar) @ point, [*back["p_lidar_m"], 1], atol=1e-12
+    )
+    intrinsics = rles.cameras["davis"].to_intrinsics()
+    pixel, _ = cv2.projectPoints(
+        point[None, :3], np.zeros(3), np.zeros(3), intrinsics.matrix, np.array(intrinsics.distortion)
+    )
+    np.testing.assert_allclose(pixel.ravel(), worked["pixel"], atol=1e-6)
+    assert "takes points from the LiDAR's frame velodyne" in pair["T_cam_lidar"]["meaning"]
+    assert (
+        "takes points from the camera's optical frame davis_optical_frame" in pair["T_lidar_cam"]["meaning"]
+    )
+    np.testing.assert_array_equal(pair["covariance"]["matrix"], calibration.cov)
+
+
+def test_camera_info_projects_as_opencv_does_for_every_lens(
+    three_sensor_rig: Rig, make: Make, tmp_path: Path
+) -> None:
+    calibrations = [make(camera=name, lidar="front") for name in ("davis", "left", "fish")]
+    write_exports(calibrations, three_sensor_rig, tmp_path, formats=["camera_info"])
+    models = {"davis": ("plumb_bob", 5), "left": ("rational_polynomial", 8), "fish": ("equidistant", 4)}
+    for calibration in calibrations:
+        data = yaml.safe_load(
+            (tmp_path / f"camera_info_{calibration.camera}.yaml").read_text(encoding="utf-8")
+        )
+        assert list(data) == [
+            *("image_width", "image_height", "camera_name", "camera_matrix", "distortion_model"),
+            *("distortion_coefficients", "rectification_matrix", "projection_matrix"),
+        ]
+        assert (data["distortion_model"], data["distortion_coefficients"]["cols"]) == models[
+            calibration.camera
+        ]
+        K = np.reshape(data["camera_matrix"]["data"], (3, 3))
+        D = np.array(data["distortion_coefficients"]["data"])
+        points = transform(calibration.T_cam_lidar, probe_points(calibration, three_sensor_rig))
+        project = (
+            cv2.fisheye.projectPoints if data["distortion_model"] == "equidistant" else cv2.projectPoints
+        )
+        arguments = points[:, None, :], np.zeros(3), np.zeros(3), K, D
+        pixels = project(*arguments)[0].reshape(-1, 2)
+        wanted, _ = three_sensor_rig.cameras[calibration.camera].to_intrinsics().project(points)
+        np.testing.assert_allclose(pixels, wanted, atol=1e-6)
+
+
+def test_static_transforms_for_both_ros_versions_say_the_same(rles: Rig, make: Make, tmp_path: Path) -> None:
+    calibration = make()
+    (path,) = write_exports([calibration], rles, tmp_path, formats=["static_tf"])
+    text = path.read_text(encoding="utf-8")
+    number = r"(-?\d\S*)"
+    ros1 = re.findall(
+        rf"^rosrun tf2_ros static_transform_publisher {' '.join([number] * 7)} (\S+) (\S+)$", text, re.M
+    )
+    options = " ".join(rf"--{name} {number}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))
+    ros2 = re.findall(
+        rf"^ros2 run tf2_ros static_transform_publisher {options} --frame-id (\S+) --child-frame-id (\S+)$",
+        text,
+        re.M,
+    )
+    assert ros1 == ros2
+    assert [line[7:] for line in ros1] == [("velodyne", "davis_link"), ("davis_link", "davis_optical_frame")]
+    T = np.eye(4)
+    for line in ros1:
+        values = np.array(line[:7], dtype=float)
+        T = T @ pose(Rotation.from_quat(values[3:]).as_matrix(), values[:3])
+    np.testing.assert_allclose(T, np.linalg.inv(calibration.T_cam_lidar), atol=1e-12)
+
+
+def random_pose(seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    return pose(exp_so3(rng.normal(size=3)), rng.normal(size=3))
+
+
+@pytest.mark.parametrize("base", [None, "velodyne_back", "left_link"])
+def test_several_cameras_and_lidars_hang_in_one_tree_under_the_base(
+    three_sensor_rig: Rig, make: Make, tmp_path: Path, base: str | None
+) -> None:
+    rig = three_sensor_rig.model_copy(update={"base_frame": base})
+    pairs = [("davis", "front"), ("left", "front"), ("left", "back"), ("fish", "back")]
+    calibrations = [make(random_pose(i), camera=c, lidar=lidar) for i, (c, lidar) in enumerate(pairs)]
+    paths = write_exports(calibrations, rig, tmp_path)
+    assert [path.name for path in paths if path.suffix == ".urdf"] == ["trio.urdf"]
+    poses = read_urdf(tmp_path / "trio.urdf")
+    assert next(iter(poses)) == (base or "velodyne")
+    assert len(poses) == 8
+    for calibration in calibrations:
+        camera, lidar = rig.cameras[calibration.camera], rig.lidars[calibration.lidar]
+        T_cam_lidar = invert(poses[camera.optical_frame]) @ poses[lidar.frame]
+        np.testing.assert_allclose(T_cam_lidar, calibration.T_cam_lidar, atol=1e-12)
+
+
+def test_sensors_that_no_calibration_connects_get_a_urdf_each(
+    three_sensor_rig: Rig, make: Make, tmp_path: Path
+) -> None:
+    calibrations = [make(camera="davis", lidar="front"), make(camera="left", lidar="back")]
+    paths = write_exports(calibrations, three_sensor_rig, tmp_path, formats=["urdf"])
+    assert [path.name for path in paths] == ["trio.urdf", "trio-velodyne_back.urdf"]
+
+
+def test_a_loop_of_calibrations_stays_a_tree(three_sensor_rig: Rig, make: Make, tmp_path: Path) -> None:
+    pairs = [("davis", "front"), ("left", "front"), ("left", "back"), ("davis", "back")]
+    calibrations = [make(random_pose(i), camera=c, lidar=lidar) for i, (c, lidar) in enumerate(pairs)]
+    (tree,) = build_trees(calibrations, three_sensor_rig)
+    check_tree(tree.frames, [(joint.parent, joint.child) for joint in tree.joints])
+    assert write_exports(calibrations, three_sensor_rig, tmp_path)
+
+
+def test_of_two_channels_the_better_verdict_and_then_the_first_gives_the_place(rles: Rig, make: Make) -> None:
+    events = make(random_pose(1), channel="events")
+    for frames, wanted in ((make(), "frames"), (make(verdict="marginal"), "events")):
+        (tree,) = build_trees([events, frames], rles)
+        chosen = frames if wanted == "frames" else events
+        T_lidar_body = invert(chosen.T_cam_lidar) @ invert(T_BODY_OPTICAL)
+        np.testing.assert_allclose(tree.joints[0].T_parent_child, T_lidar_body)
+
+
+@pytest.mark.parametrize(
+    ("links", "joints", "says"),
+    [
+        (["a", "b", "a"], [("a", "b")], "defined twice"),
+        (["a", "b"], [("a", "c")], "not defined"),
+        (["a", "b", "c"], [("a", "c"), ("b", "c")], "two parents"),
+        (["a", "b", "c"], [("a", "b")], "several roots"),
+        (["a", "b"], [("a", "b"), ("b", "a")], "a loop"),
+        (["a", "b", "c"], [("b", "c"), ("c", "b")], "a loop"),
+        ([], [], "no links"),
+    ],
+)
+def test_what_is_no_tree_is_named(links: list[str], joints: list[tuple[str, str]], says: str) -> None:
+    with pytest.raises(LceRigError, match=says):
+        check_tree(links, joints)
+
+
+def test_a_result_that_failed_is_not_exported_and_removes_what_an_earlier_run_left(
+    rles: Rig, make: Make, tmp_path: Path
+) -> None:
+    write_exports([make()], rles, tmp_path)
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
+    failed = make(verdict="fail", reasons=("translation known to 80 mm only",))
+    with pytest.raises(ResultRefusedError, match="davis/frames and lidar failed") as caught:
+        write_exports([failed], rles, tmp_path)
+    assert "80 mm" in caught.value.hint
+    assert caught.value.exit_code == 7
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_a_forced_export_of_a_failed_result_says_so_in_every_file(
+    rles: Rig, make: Make, tmp_path: Path
+) -> None:
+    failed = make(verdict="fail", reasons=("sigma -- 80 mm\nand more",))
+    paths = write_exports([failed], rles, tmp_path, is_forced=True)
+    assert len(paths) == len(EXPORTS)
+    for path in paths:
+        head = path.read_text(encoding="utf-8")[:500]
+        assert "NOT FOR USE: the calibration of davis/frames and lidar failed" in head
+    assert read_urdf(tmp_path / "rles.urdf")
+    assert read_camera_info(tmp_path / "camera_info_davis.yaml") == rles.cameras["davis"].to_intrinsics()
+
+
+def test_the_same_result_gives_the_same_bytes(rles: Rig, make: Make, tmp_path: Path) -> None:
+    first = {path.name: path.read_bytes() for path in write_exports([make()], rles, tmp_path / "a")}
+    second = {path.name: path.read_bytes() for path in write_exports([make()], rles, tmp_path / "b")}
+    assert first == second
+
+
+@pytest.mark.parametrize("moved", [(2e-6, 0, 0, 0, 0, 0), (0, 0, 0, 0, 0, 1e-6), (np.nan, 0, 0, 0, 0, 0)])
+def test_a_pose_read_back_wrong_by_a_hair_is_noticed(rles: Rig, make: Make, moved: tuple[float, ...]) -> None:
+    from lce_rig.core.geometry import perturb
+
+    calibration = make()
+    check_pose(Path("x.yaml"), "T", calibration.T_cam_lidar, calibration, rles)
+    with pytest.raises(LceRigError, match="does not say what was calibrated"):
+        check_pose(Path("x.yaml"), "T", perturb(calibration.T_cam_lidar, np.array(moved)), calibration, rles)
+
+
+@pytest.mark.parametrize("name", sorted(EXPORTS))
+def test_digits_lost_on_the_way_to_the_file_are_noticed(
+    name: str, rles: Rig, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exporter = load_exporter(name)
+    module = __import__(exporter.__module__, fromlist=["write_atomically"])
+
+    def write_rounded(path: Path, text: str) -> None:
+        path.write_text(re.sub(r"(\d\.\d{4})\d+", r"\1", text), encoding="utf-8")
+
+    monkeypatch.setattr(module, "write_atomically", write_rounded)
+    with pytest.raises(LceRigError):
+        exporter([make()], rles, tmp_path)
+
+
+def test_a_result_of_another_rig_is_refused(rles: Rig, make: Make, tmp_path: Path) -> None:
+    for change in ({"camera": "cam"}, {"lidar": "other"}, {"channel": "depth"}):
+        with pytest.raises(LceRigError, match="which rig rles does not have"):
+            write_exports([make(**change)], rles, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_format_lists_the_known_ones(rles: Rig, make: Make, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no export format is called sdf"):
+        write_exports([make()], rles, tmp_path, formats=["sdf"])

@@ -1,0 +1,141 @@
+"""Profiles from and to files."""
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lce_rig.core.errors import ProfileError
+from lce_rig.rig import Rig, dump_rig, find_profile, load_rig, parse_rig, shipped_profiles
+
+RLFS = find_profile("rlfs").read_text(encoding="utf-8")
+
+
+def test_the_shipped_profiles_are_those_of_the_paper_and_named_as_their_files() -> None:
+    assert set(shipped_profiles()) == {"rlfs", "rles", "sss"}
+    assert all(load_rig(name).name == name for name in shipped_profiles())
+
+
+def test_no_shipped_profile_raises_a_doubt() -> None:
+    assert [load_rig(name).doubts() for name in shipped_profiles()] == [[], [], []]
+
+
+@pytest.mark.parametrize("name", ["rlfs", "rles", "sss"])
+def test_a_dumped_profile_reads_back_equal(name: str) -> None:
+    rig = load_rig(name)
+    assert parse_rig(dump_rig(rig)) == rig
+    assert dump_rig(parse_rig(dump_rig(rig))) == dump_rig(rig)
+
+
+@settings(max_examples=20)
+@given(
+    square_m=st.floats(0.02, 0.08),
+    focal_px=st.floats(300, 3000),
+    offset_s=st.floats(-1, 1),
+    tiny=st.floats(1e-12, 1e-5),
+    controls=st.dictionaries(
+        st.text("abc_", min_size=1, max_size=5),
+        st.booleans() | st.integers(-9, 9) | st.floats(-1, 1) | st.text(max_size=5),
+    ),
+)
+def test_any_profile_survives_a_round_trip_to_the_last_digit(
+    square_m: float,
+    focal_px: float,
+    offset_s: float,
+    tiny: float,
+    controls: dict[str, bool | int | float | str],
+) -> None:
+    data = load_rig("rlfs").model_dump()
+    data["board"]["square_m"] = square_m
+    data["cameras"]["cam"]["intrinsics"] |= {
+        "fx_px": focal_px,
+        "fy_px": focal_px,
+        "distortion": (tiny, -tiny, 0, 0),
+    }
+    data["lidars"]["lidar"]["timestamps"]["expected_offset_s"] = offset_s
+    data["lidars"]["lidar"]["driver"]["controls"] = controls
+    rig = Rig.model_validate(data)
+    again = parse_rig(dump_rig(rig))
+    assert again == rig
+    assert again.lidars["lidar"].driver.controls == controls
+
+
+def test_a_path_loads_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(RLFS.replace("name: rlfs", "name: mine"), encoding="utf-8")
+    assert load_rig(path).name == "mine"
+    assert load_rig(str(path)) == load_rig(path)
+
+
+def test_a_misspelt_name_lists_the_known_ones_and_the_nearest() -> None:
+    with pytest.raises(ProfileError) as caught:
+        load_rig("rlsf")
+    assert "did you mean rlfs? shipped profiles: rles, rlfs, sss" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["nothing.yaml", "no/such/rlfs"])
+def test_a_missing_file_is_named(name: str) -> None:
+    with pytest.raises(ProfileError, match="there is no such file"):
+        load_rig(name)
+
+
+def test_a_folder_is_no_profile(tmp_path: Path) -> None:
+    with pytest.raises(ProfileError, match="is a folder"):
+        load_rig(tmp_path)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
+def test_an_unreadable_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(RLFS, encoding="utf-8")
+    path.chmod(0)
+    with pytest.raises(ProfileError, match="cannot be read"):
+        load_rig(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "is empty"),
+        (b"# only a comment\n", "is empty"),
+        (b"\xff\xfe\x00", "is not UTF-8"),
+        (b"\x00", "not YAML"),
+        (b"- 1\n- 2\n", "a mapping of keys is expected, a list found"),
+        (b"PNG", "a mapping of keys is expected, a text found"),
+        (b"name: [1, 2", "mine.yaml:1: not YAML"),
+        (b"name: a\nboard:\n  x: 1\n  x: 2\n", "mine.yaml:4: board.x is given twice, first on line 3"),
+        (
+            b"name: !!python/object/apply:os.system [ls]\n",
+            "os.system has no place here",
+        ),
+        (b"a: &a [*a, *a]\n", "too deeply nested"),
+        (b"[" * 5000, "nested"),
+        (b"name: 2026-13-45\n", "mine.yaml:1: '2026-13-45' cannot be read"),
+    ],
+)
+def test_what_is_no_profile_is_refused_with_its_place(tmp_path: Path, content: bytes, says: str) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(content)
+    with pytest.raises(ProfileError) as caught:
+        load_rig(path)
+    assert says in str(caught.value)
+
+
+def test_nested_aliases_do_not_exhaust_the_memory() -> None:
+    levels = "".join(f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 10)}]\n" for i in range(1, 12))
+    with pytest.raises(ProfileError, match="too large"):
+        parse_rig(f"l0: &l0 [1]\n{levels}")
+
+
+@settings(max_examples=30)
+@given(st.integers(0, len(RLFS)), st.integers(0, 40), st.text(max_size=6))
+def test_any_damage_is_a_profile_error_or_harmless(start: int, length: int, inserted: str) -> None:
+    text = RLFS[:start] + inserted + RLFS[start + length :]
+    try:
+        rig = parse_rig(text)
+    except ProfileError as error:
+        assert str(error)
+    else:
+        assert parse_rig(dump_rig(rig)) == rig

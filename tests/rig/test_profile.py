@@ -1,0 +1,235 @@
+"""The schema: what a profile may say, and what it cannot mean."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from lce_rig.core.errors import ProfileError
+from lce_rig.core.geometry import exp_so3
+from lce_rig.rig import Rig, find_profile, load_rig, parse_rig
+
+RLFS = find_profile("rlfs").read_text(encoding="utf-8")
+
+
+def refusal(*edits: tuple[str, str]) -> str:
+    """Edit rlfs.yaml and return what is said about it."""
+    text = RLFS
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new, 1)
+    with pytest.raises(ProfileError) as caught:
+        parse_rig(text, "mine.yaml")
+    assert caught.value.exit_code == 3
+    return str(caught.value)
+
+
+def line_of(text: str) -> int:
+    return RLFS[: RLFS.index(text)].count("\n") + 1
+
+
+def test_shipped_profiles_carry_the_published_numbers() -> None:
+    rlfs, rles, sss = load_rig("rlfs"), load_rig("rles"), load_rig("sss")
+    assert rlfs.cameras["cam"].to_intrinsics().fx_px == 897.4566
+    assert rlfs.cameras["cam"].to_intrinsics().distortion == (-0.4398, 0.2329, -0.0011, 0.00020984, -0.0730)
+    assert (rlfs.board.to_board().width_m, rlfs.board.to_board().height_m) == (0.767, 0.626)
+    assert (rlfs.calibration.edge_weight, rles.calibration.edge_weight) == (3, 10)
+    assert rles.board.inner_corners == (9, 6)
+    assert [channel.kind for channel in rles.cameras["davis"].channels.values()] == ["frames", "events"]
+    assert sss.cameras["cam"].to_intrinsics().distortion == ()
+    assert sss.nominal("cam", "lidar") is None
+
+
+def test_nominal_pose_puts_the_lidars_forward_axis_before_the_camera() -> None:
+    entry = load_rig("rles").nominal("davis", "lidar")
+    assert entry is not None
+    np.testing.assert_allclose(entry.to_matrix()[:3, :3], [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(entry.to_matrix()[:3, 3], [0.126, -0.065, -0.080])
+
+
+def test_profile_cannot_be_changed() -> None:
+    with pytest.raises(ValidationError):
+        load_rig("rlfs").name = "other"  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key", "says"),
+    [
+        (
+            "square_m: 0.070",
+            "square_m: 70",
+            "board.square_m",
+            "did you mean 0.070 m? 70 looks like millimetres",
+        ),
+        (
+            "square_m: 0.070",
+            "square_m: 7",
+            "board.square_m",
+            "did you mean 0.070 m? 7 looks like centimetres",
+        ),
+        (
+            "width_m: 0.767",
+            "width_m: 767",
+            "board.width_m",
+            "did you mean 0.767 m? 767 looks like millimetres",
+        ),
+        ("square_m: 0.070", "square_m: -0.07", "board.square_m", "greater than 0"),
+        ("square_m: 0.070", "square_m: .nan", "board.square_m", "finite"),
+        ("square_m: 0.070", "square_m: yes", "board.square_m", "truth value"),
+        ("[8, 6]           #", "[8]   #", "board.inner_corners", "too few values"),
+        ("fx_px: 897.4566", "fx: 897.4566", "cameras.cam.intrinsics.fx", "did you mean fx_px?"),
+        ("cx_px: 635.4040", "cx_pix: 635", "cameras.cam.intrinsics.cx_pix", "did you mean cx_px?"),
+        ("fx_px: 897.4566", "fx_px: 0.897", "cameras.cam.intrinsics.fx_px", "implausible"),
+        ("cx_px: 635.4040", "cx_px: 1300", "cameras.cam.intrinsics.cx_px", "outside the picture"),
+        (
+            "-0.0730]",
+            "-0.0730, 1.0]",
+            "cameras.cam.intrinsics.distortion",
+            "6 coefficients given, radtan has 4, 5 or 8",
+        ),
+        ("[0.664, 0.664,", "[0.664, 0.864,", "nominal_extrinsics.0.quaternion_wxyz", "not a unit quaternion"),
+        (
+            "camera: cam",
+            "camera: kam",
+            "nominal_extrinsics.0.camera",
+            "no camera is called kam; there is cam",
+        ),
+        (
+            "frame: velodyne ",
+            "frame: camera_link ",
+            "cameras.cam.frame",
+            "used already by lidars.lidar.frame",
+        ),
+        ("clock: utc", "clock: gps", "lidars.lidar.timestamps.clock", "'gps' given"),
+        (
+            "reference: first_firing",
+            "reference: start",
+            "lidars.lidar.timestamps.reference",
+            "belongs to a camera",
+        ),
+        ("controls: {}", "controls: {gain: [1]}", "cameras.cam.driver.controls.gain", "a text, a number"),
+        ("format_version: 1", "format_version: 2", "format_version", "must be 1"),
+    ],
+)
+def test_each_mistake_is_named_with_its_line_and_key(old: str, new: str, key: str, says: str) -> None:
+    text = refusal((old, new))
+    position, _, message = text.partition(": ")
+    assert message.startswith(f"{key}: "), text
+    assert says in message
+    source, _, line = position.partition(":")
+    assert source == "mine.yaml"
+    assert RLFS.replace(old, new, 1).splitlines()[int(line) - 1].strip().split(":")[0].strip("- ") in key
+
+
+def test_pattern_that_is_larger_than_the_plate_is_refused_with_both_sizes() -> None:
+    text = refusal(("width_m: 0.767", "width_m: 0.3"))
+    assert (
+        "pattern of 9x7 squares of 70 mm is 0.63 x 0.49 m and does not fit on a plate 0.3 x 0.626 m" in text
+    )
+    assert f"mine.yaml:{line_of('board:')}: board:" in text
+
+
+def test_swapped_width_and_height_are_named() -> None:
+    assert "look swapped" in refusal(
+        ("width_m: 0.767", "width_m: 0.626"), ("height_m: 0.626", "height_m: 0.767")
+    )
+
+
+def test_squares_counted_for_inner_corners_are_named() -> None:
+    text = refusal(
+        ("[8, 6]", "[9, 7]"), ("width_m: 0.767", "width_m: 0.64"), ("height_m: 0.626", "height_m: 0.5")
+    )
+    assert "were squares counted where inner corners are wanted" in text
+
+
+def test_board_that_fits_both_ways_round_raises_a_doubt() -> None:
+    turned = find_profile("sss").read_text(encoding="utf-8").replace("[8, 6]", "[6, 8]")
+    assert any("shorter side of the plate" in doubt for doubt in parse_rig(turned).doubts())
+    assert not load_rig("sss").doubts()
+
+
+@pytest.mark.parametrize("size", ["[640, 360]", "[960, 540]", "[1920, 1080]", "[2560, 1440]"])
+def test_intrinsics_of_another_resolution_are_noticed(size: str) -> None:
+    assert "another resolution (about 1271x751)" in refusal(("[1280, 720]", size))
+
+
+def test_all_problems_are_listed_at_once_in_the_files_order() -> None:
+    text = refusal(
+        ("square_m: 0.070", "square_m: 70"), ("fx_px: 897.4566", "fx: 897"), ("rate_hz: 10", "rate_hz: 0")
+    )
+    lines = text.splitlines()
+    assert lines[0] == "mine.yaml: 3 problems"
+    assert [key in line for key, line in zip(("square_m", "rate_hz", "fx:"), lines[1:], strict=True)] == [
+        True
+    ] * 3
+
+
+def test_a_key_in_the_wrong_block_is_sent_to_the_right_one() -> None:
+    assert "it belongs into calibration" in refusal(("calibration:", "edge_weight: 3\ncalibration:"))
+
+
+def test_a_missing_block_is_named() -> None:
+    with pytest.raises(ProfileError, match=r"board: is missing"):
+        parse_rig("format_version: 1\nname: x\nlidars: {lidar: {}}\n")
+
+
+def rows(R: np.ndarray) -> str:
+    return str([[float(value) for value in row] for row in R])
+
+
+@settings(max_examples=10)
+@given(st.tuples(*[st.floats(-3, 3)] * 3))
+def test_every_way_to_write_a_nominal_rotation_gives_the_same_pose(phi: tuple[float, float, float]) -> None:
+    from scipy.spatial.transform import Rotation
+
+    rotation = Rotation.from_rotvec(phi)
+    wxyz = [float(value) for value in np.roll(rotation.as_quat(), 1)]
+    head, tail = RLFS.split("quaternion_wxyz: [0.664, 0.664, -0.242, 0.242]")
+    for text in (f"quaternion_wxyz: {wxyz}", f"matrix: {rows(rotation.as_matrix())}"):
+        entry = parse_rig(head + text + tail).nominal("cam", "lidar")
+        assert entry is not None
+        np.testing.assert_allclose(entry.to_matrix()[:3, :3], exp_so3(np.array(phi)), atol=1e-9)
+
+
+def test_roll_pitch_yaw_turn_about_fixed_axes() -> None:
+    text = RLFS.replace("quaternion_wxyz: [0.664, 0.664, -0.242, 0.242]", "rpy_deg: [90, 0, 90]")
+    entry = parse_rig(text).nominal("cam", "lidar")
+    assert entry is not None
+    # Rz(90) Rx(90): x turns to y; y turns to z, which Rz leaves.
+    np.testing.assert_allclose(entry.to_matrix()[:3, :2], [[0, 0], [1, 0], [0, 1]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "says"),
+    [
+        ("matrix: [[1, 0, 0], [0, 1, 0], [0, 0, 1.1]]", "not a rotation: R R^T"),
+        ("matrix: [[1, 0, 0], [0, 1, 0], [0, 0, -1]]", "mirroring"),
+        ("rpy_deg: [0, 0, 0]\n    matrix: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]", "rpy_deg and matrix given"),
+        ("tolerance_deg: 5.0", "none given"),
+    ],
+)
+def test_what_is_no_rotation_is_refused(rotation: str, says: str) -> None:
+    text = RLFS.replace("    tolerance_deg: 5.0\n", "")
+    text = text.replace("quaternion_wxyz: [0.664, 0.664, -0.242, 0.242]", rotation)
+    with pytest.raises(ProfileError) as caught:
+        parse_rig(text)
+    assert says in str(caught.value)
+
+
+def test_every_setting_is_documented() -> None:
+    def walk(model: type, seen: Callable[[str], bool]) -> None:
+        from lce_rig.rig.explaining import _model_within
+
+        for key, field in model.model_fields.items():  # type: ignore[attr-defined]
+            assert seen(key), f"docs/rig-profiles.md does not explain {key}"
+            inner = _model_within(field.annotation)
+            if inner is not None:
+                walk(inner, seen)
+
+    from pathlib import Path
+
+    text = (Path(__file__).parents[2] / "docs" / "rig-profiles.md").read_text(encoding="utf-8")
+    walk(Rig, lambda key: f"`{key}`" in text)

@@ -1,0 +1,174 @@
+"""Whatever happens to the disk or the process, captures made before are whole, and damage is named."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lce_rig.core.errors import SessionError
+from lce_rig.session import Session
+
+WRITER = """
+import sys, numpy as np
+from lce_rig.core.data import Image, Scan
+from lce_rig.rig import load_rig
+from lce_rig.session import Session
+session = Session.resume(sys.argv[1], load_rig("rlfs"))
+print("ready", flush=True)
+rng = np.random.default_rng(len(session.captures))
+while True:
+    image = Image("cam", "frames", 1, rng.integers(0, 256, (120, 160), dtype=np.uint8))
+    points = rng.normal(size=(5000, 3)).astype(np.float32)
+    scan = Scan("lidar", 1, points, points[:, 0].copy(), np.zeros(5000, np.int16))
+    print(session.add_capture([image], [scan], {}), flush=True)
+"""
+
+
+def test_a_writer_killed_at_any_moment_leaves_only_whole_captures(tmp_path):
+    path = tmp_path / "s"
+    promised: set[str] = set()
+    for k in range(6):
+        # The writer's standard output tells which captures it was promised before it died.
+        process = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        promised.add(process.stdout.readline().strip())
+        time.sleep(0.0031 * k)
+        process.send_signal(signal.SIGKILL)
+        promised.update(process.stdout.read().split())
+        process.stdout.close()
+        assert process.wait() == -signal.SIGKILL
+        captures = Session.open(path).captures
+        for capture in captures:
+            capture.check()
+            assert capture.image("cam", "frames").pixels.shape == (120, 160)
+        assert promised <= {c.name for c in captures}
+    assert len(promised) >= 6
+    Session.open(path, writable=True).close()
+    assert not list((path / "captures").glob(".new-*"))
+
+
+def test_what_a_killed_writer_left_behind_is_cleared(tmp_path, rig, samples):
+    with Session.create(tmp_path / "s", rig) as session:
+        session.add_capture(*samples(0), {})
+    draft = tmp_path / "s" / "captures" / ".new-000001"
+    draft.mkdir()
+    (draft / "cam.frames.png").write_bytes(b"half")
+    assert [c.name for c in Session.open(tmp_path / "s").captures] == ["000000"]
+    with Session.open(tmp_path / "s", writable=True) as session:
+        assert session.add_capture(*samples(1), {}) == "000001"
+    assert not draft.exists()
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", str(folder)], capture_output=True)
+    if mounted.returncode != 0:
+        pytest.skip("a small disk can only be mounted by root")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_full_disk_is_named_and_loses_nothing(small_disk, rig, samples):
+    session = Session.create(small_disk / "s", rig)
+    stored = []
+    with pytest.raises(SessionError, match="No space left") as caught:
+        for seed in range(200):
+            stored.append(session.add_capture(*samples(seed), {}))
+    session.close()
+    assert len(stored) > 3
+    assert f"The {len(stored)} captures before it are safe" in caught.value.hint
+    reopened = Session.open(small_disk / "s", writable=True)
+    for capture in reopened.captures:
+        capture.check()
+    assert [c.name for c in reopened.captures][: len(stored)] == stored
+    for entry in reopened.read_journal():
+        assert entry["event"] in ("created", "captured")
+    reopened.close()
+
+
+def test_a_file_that_may_not_grow_is_named_and_loses_nothing(tmp_path, rig, samples):
+    session = Session.create(tmp_path / "s", rig)
+    session.add_capture(*samples(0), {})
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
+    try:
+        with pytest.raises(SessionError, match="cannot be written"):
+            session.add_capture(*samples(1), {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert [p.name for p in (tmp_path / "s" / "captures").iterdir()] == ["000000"]
+    assert session.add_capture(*samples(1), {}) == "000001"
+
+
+def _tamper(session: Session, **changes: object) -> None:
+    path = session.captures[0].path / "meta.json"
+    manifest = json.loads(path.read_text())
+    manifest["files"][0].update(changes)
+    path.write_text(json.dumps(manifest))
+
+
+@pytest.mark.parametrize("name", ["../../rig.yaml", "/etc/passwd", "a/b.png", "..", ".hidden", "", "x\ny"])
+def test_names_that_point_outside_the_capture_are_refused(tmp_path, rig, samples, name):
+    session = Session.create(tmp_path / "s", rig)
+    session.add_capture(*samples(0), {})
+    _tamper(session, file=name)
+    with pytest.raises(SessionError, match="outside the capture's folder"):
+        session.captures[0].image("cam", "frames")
+
+
+def test_a_link_that_leads_outside_is_refused(tmp_path, rig, samples):
+    session = Session.create(tmp_path / "s", rig)
+    session.add_capture(*samples(0), {})
+    picture = session.captures[0].path / "cam.frames.png"
+    (tmp_path / "secret.png").write_bytes(picture.read_bytes())
+    picture.unlink()
+    os.symlink(tmp_path / "secret.png", picture)
+    with pytest.raises(SessionError, match="outside the capture's folder"):
+        session.captures[0].image("cam", "frames")
+
+
+@pytest.mark.parametrize("name", ["cam.frames.png", "lidar.pcd"])
+def test_every_damaged_byte_is_noticed_and_the_file_named(tmp_path, rig, samples, name):
+    session = Session.create(tmp_path / "s", rig)
+    session.add_capture(*samples(0), {})
+    session.add_capture(*samples(1), {})
+    file: Path = session.captures[0].path / name
+    whole = file.read_bytes()
+    for position in (0, 30, len(whole) // 2, len(whole) - 1):
+        file.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
+        with pytest.raises(SessionError, match=rf"capture 000000 is damaged: {name}"):
+            session.captures[0].check()
+    for damaged in (b"", whole[:-1], whole + b"x"):
+        file.write_bytes(damaged)
+        with pytest.raises(SessionError, match=rf"{name} has {len(damaged)} of {len(whole)} bytes"):
+            session.captures[0].check()
+    file.unlink()
+    with pytest.raises(SessionError, match=f"{name}: No such file"):
+        session.captures[0].check()
+    session.captures[1].check()
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format_version": 1, "files": [{}]}', "\xff"])
+def test_a_damaged_manifest_is_named(tmp_path, rig, samples, text):
+    session = Session.create(tmp_path / "s", rig)
+    session.add_capture(*samples(0), {})
+    (session.captures[0].path / "meta.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(SessionError, match="capture 000000 is damaged: meta.json"):
+        _ = session.captures[0].meta
+
+
+def test_what_a_capture_lacks_is_named_with_what_it_has(tmp_path, rig, samples):
+    session = Session.create(tmp_path / "s", rig)
+    session.add_capture(*samples(0), {})
+    with pytest.raises(SessionError, match=r"capture 000000 has nothing from top; it has cam\.frames, lidar"):
+        session.captures[0].scan("top")
+    with pytest.raises(SessionError, match="no capture '000007'"):
+        session.capture("000007")

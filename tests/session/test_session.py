@@ -1,0 +1,232 @@
+"""A session keeps what it was given, exactly, and lets nobody else write to it."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.errors import SessionError
+from lce_rig.rig import dump_rig, load_rig
+from lce_rig.session import Session
+
+
+def test_a_capture_comes_back_exactly_as_it_was_given(tmp_path, rig, samples):
+    images, scans = samples(1)
+    with Session.create(tmp_path / "s", rig) as session:
+        name = session.add_capture(images, scans, {"source": {"key": "k"}})
+    (capture,) = Session.open(tmp_path / "s").captures
+    image, scan = capture.image("cam", "frames"), capture.scan("lidar")
+    assert (name, capture.name, capture.meta) == ("000000", "000000", {"source": {"key": "k"}})
+    assert np.array_equal(image.pixels, images[0].pixels)
+    assert (image.stamp_ns, scan.stamp_ns, scan.host_ns) == (10**18 + 1, 10**18 + 1, 10**18 + 6)
+    for field in ("points", "intensity", "ring", "offset_ns"):
+        given, read = getattr(scans[0], field), getattr(scan, field)
+        assert given.dtype == read.dtype and np.array_equal(given, read), field
+
+
+def test_a_grey_picture_and_a_scan_without_times_come_back_too(tmp_path, rig):
+    grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    scan = Scan("lidar", None, np.ones((2, 3), np.float32), np.zeros(2, np.float32), np.zeros(2, np.int16))
+    session = Session.create(tmp_path / "s", rig)
+    session.add_capture([Image("cam", "frames", None, grey)], [scan], {})
+    capture = session.captures[0]
+    assert np.array_equal(capture.image("cam", "frames").pixels, grey)
+    assert capture.scan("lidar").offset_ns is None and capture.scan("lidar").stamp_ns is None
+    assert capture.has_image("cam", "frames") and not capture.has_image("cam", "events")
+
+
+@pytest.mark.parametrize("offsets", [[-5, 7], [0, 2**40], [0, 2**32 - 1]])
+def test_times_of_any_size_survive(tmp_path, rig, offsets):
+    scan = Scan("lidar", 0, np.ones((2, 3), np.float32), np.zeros(2, np.float32), np.zeros(2, np.int16),
+                np.array(offsets, dtype=np.int64))  # fmt: skip
+    session = Session.create(tmp_path / "s", rig)
+    session.add_capture([], [scan], {})
+    assert session.captures[0].scan("lidar").offset_ns.tolist() == offsets
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path, rig, samples):
+    def files(folder: Path) -> dict[str, bytes]:
+        with Session.create(folder, rig) as session:
+            session.add_capture(*samples(3), {"b": 1, "a": 2})
+        return {
+            str(p.relative_to(folder)): p.read_bytes()
+            for p in sorted(folder.rglob("*"))
+            if p.is_file() and p.name not in ("journal.jsonl", ".lock")
+        }
+
+    assert files(tmp_path / "one") == files(tmp_path / "two")
+
+
+def test_open3d_reads_the_same_cloud(tmp_path, rig, samples):
+    import open3d
+
+    _, scans = samples(4)
+    session = Session.create(tmp_path / "s", rig)
+    session.add_capture([], scans, {})
+    cloud = open3d.io.read_point_cloud(str(session.captures[0].path / "lidar.pcd"))
+    assert np.array_equal(np.asarray(cloud.points, dtype=np.float32), scans[0].points)
+
+
+def test_the_profile_is_frozen_in_the_session(tmp_path, rig):
+    Session.create(tmp_path / "s", rig).close()
+    assert Session.open(tmp_path / "s").rig == rig
+    assert load_rig(tmp_path / "s" / "rig.yaml") == rig
+
+
+def test_a_session_is_continued_after_the_last_capture(tmp_path, rig, samples):
+    for seed in range(3):
+        with Session.resume(tmp_path / "s", rig) as session:
+            session.add_capture(*samples(seed), {})
+    assert [c.name for c in session.captures] == ["000000", "000001", "000002"]
+
+
+def test_a_session_of_another_rig_is_refused_with_the_keys_that_differ(tmp_path, rig):
+    Session.create(tmp_path / "s", rig).close()
+    text = dump_rig(rig).replace("square_m: 0.07", "square_m: 0.06")
+    (tmp_path / "other.yaml").write_text(text)
+    with pytest.raises(SessionError, match=r"board\.square_m 0\.07 there, 0\.06 here"):
+        Session.resume(tmp_path / "s", load_rig(tmp_path / "other.yaml"))
+    with pytest.raises(SessionError, match=r"of rig 'rlfs', not of this rig 'rles'"):
+        Session.resume(tmp_path / "s", load_rig("rles"))
+    Session.resume(tmp_path / "s", rig).close()
+
+
+def test_only_one_writer_is_let_in_and_readers_always(tmp_path, rig, samples):
+    first = Session.create(tmp_path / "s", rig)
+    with pytest.raises(SessionError, match=f"written by process {os.getpid()}"):
+        Session.resume(tmp_path / "s", rig)
+    with pytest.raises(SessionError, match="reading only"):
+        Session.open(tmp_path / "s").add_capture(*samples(0), {})
+    first.close()
+    Session.resume(tmp_path / "s", rig).close()
+
+
+def test_a_lock_file_without_a_living_holder_is_no_lock(tmp_path, rig):
+    Session.create(tmp_path / "s", rig).close()
+    (tmp_path / "s" / ".lock").write_text("999999\n")
+    Session.resume(tmp_path / "s", rig).close()
+
+
+def test_folders_that_are_no_session_are_left_alone(tmp_path, rig):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(SessionError, match=r"not empty and no session: it holds notes\.txt"):
+        Session.create(tmp_path, rig)
+    with pytest.raises(SessionError, match="is no session"):
+        Session.open(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_a_session_whose_creation_was_cut_off_is_created_anew(tmp_path, rig):
+    Session.create(tmp_path / "s", rig).close()
+    (tmp_path / "s" / "session.json").unlink()
+    Session.resume(tmp_path / "s", rig).close()
+    assert Session.open(tmp_path / "s").captures == []
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", '{"format_version": "x"}', "\x00"])
+def test_a_damaged_marker_is_named(tmp_path, rig, text):
+    Session.create(tmp_path / "s", rig).close()
+    (tmp_path / "s" / "session.json").write_text(text)
+    with pytest.raises(SessionError, match=r"session\.json cannot be read"):
+        Session.open(tmp_path / "s")
+
+
+def test_sessions_of_a_newer_version_are_refused(tmp_path, rig):
+    Session.create(tmp_path / "s", rig).close()
+    (tmp_path / "s" / "session.json").write_text('{"format_version": 99}')
+    with pytest.raises(SessionError, match="newer lce-rig"):
+        Session.open(tmp_path / "s")
+
+
+def test_a_damaged_profile_is_a_session_error(tmp_path, rig):
+    Session.create(tmp_path / "s", rig).close()
+    (tmp_path / "s" / "rig.yaml").write_text("format_version: 1\nname: [")
+    with pytest.raises(SessionError, match=r"rig\.yaml"):
+        Session.open(tmp_path / "s")
+
+
+def test_sensors_that_the_rig_lacks_are_refused(tmp_path, rig, samples):
+    images, scans = samples(0)
+    session = Session.create(tmp_path / "s", rig)
+    with pytest.raises(SessionError, match=r"cam\.events"):
+        session.add_capture([Image("cam", "events", None, images[0].pixels)], scans, {})
+    with pytest.raises(SessionError, match="no lidar 'top'"):
+        session.add_capture(images, [Scan("top", None, scans[0].points, scans[0].intensity, scans[0].ring)], {})
+    with pytest.raises(SessionError, match="at most"):
+        session.add_capture(images * 2, scans, {})
+    assert session.captures == []
+
+
+def test_the_same_data_is_recognised_whatever_their_stamps(tmp_path, rig, samples):
+    images, scans = samples(5)
+    session = Session.create(tmp_path / "s", rig)
+    session.add_capture(*samples(4), {})
+    session.add_capture(images, scans, {})
+    again = Image("cam", "frames", 7, images[0].pixels.copy())
+    assert session.find_duplicate([again], scans) == "000001"
+    assert session.find_duplicate(*samples(6)) is None
+    session.close()
+    assert Session.open(tmp_path / "s").find_duplicate([again], scans) == "000001"
+
+
+def test_the_journal_is_appended_and_a_torn_line_is_skipped(tmp_path, rig):
+    session = Session.create(tmp_path / "s", rig)
+    with (tmp_path / "s" / "journal.jsonl").open("a") as file:
+        file.write('{"event": "tor')
+    session.journal("collected", captured=3)
+    assert [e["event"] for e in session.read_journal()] == ["created", "collected"]
+    assert session.read_journal()[-1]["captured"] == 3
+
+
+def test_other_things_among_the_captures_are_not_captures(tmp_path, rig, samples):
+    session = Session.create(tmp_path / "s", rig)
+    session.add_capture(*samples(0), {})
+    for name in ("backup", "00001x", ".hidden"):
+        (tmp_path / "s" / "captures" / name).mkdir()
+    assert [c.name for c in session.captures] == ["000000"]
+
+
+def test_numbers_of_removed_captures_are_not_used_for_others_in_between(tmp_path, rig, samples):
+    session = Session.create(tmp_path / "s", rig)
+    for seed in range(3):
+        session.add_capture(*samples(seed), {})
+    shutil.rmtree(session.captures[1].path)
+    assert session.add_capture(*samples(9), {}) == "000003"
+
+
+def test_cached_arrays_come_back_and_damage_counts_as_nothing(tmp_path, rig):
+    session = Session.create(tmp_path / "s", rig)
+    arrays = {"b": np.arange(6).reshape(2, 3), "a": np.array([1.5])}
+    assert session.store_cached("abc/000000", arrays, {"n": 3})
+    cached = session.load_cached("abc/000000")
+    assert cached is not None and cached.values == {"n": 3}
+    assert np.array_equal(cached.arrays["b"], arrays["b"]) and set(cached.arrays) == {"a", "b"}
+    assert session.load_cached("abc/000001") is None
+    file = tmp_path / "s" / "detections" / "abc" / "000000.npz"
+    whole = file.read_bytes()
+    for damaged in (b"", whole[:40], whole[: len(whole) // 2], b"no zip at all"):
+        file.write_bytes(damaged)
+        assert session.load_cached("abc/000000") is None
+    for key in ("../x", "a/../b", "/etc/x", "a//b", ".x"):
+        with pytest.raises(ValueError):
+            session.load_cached(key)
+
+
+def test_a_pickle_in_the_cache_is_not_loaded(tmp_path, rig):
+    session = Session.create(tmp_path / "s", rig)
+    session.store_cached("k/0", {"a": np.zeros(1)}, {})
+    evil = np.array([{"x": 1}], dtype=object)
+    np.savez(tmp_path / "s" / "detections" / "k" / "0.npz", a=evil, values_json=np.frombuffer(b"{}", np.uint8))
+    assert session.load_cached("k/0") is None
+
+
+def test_meta_that_is_no_json_is_refused_and_leaves_nothing(tmp_path, rig, samples):
+    session = Session.create(tmp_path / "s", rig)
+    with pytest.raises(SessionError, match="cannot be stored"):
+        session.add_capture(*samples(0), {"x": float("nan")})
+    assert list((tmp_path / "s" / "captures").iterdir()) == []
+    assert json.loads((tmp_path / "s" / "session.json").read_text())["rig"] == "rlfs"

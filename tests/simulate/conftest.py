@@ -1,0 +1,79 @@
+"""Small rigs and scenes that render fast."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array, exp_so3, pose
+from lce_rig.rig import Rig
+from lce_rig.simulate.backdrop import Backdrop, build_backdrop
+from lce_rig.simulate.room import Room, build_room
+
+FACING_LIDAR = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # x right, y up, print towards -x
+CAMERA_FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_world_cam looking along +x
+
+
+def make_rig(name: str = "small", **changes: Any) -> Rig:
+    """A VLP-16 and a DAVIS-sized camera side by side, with changes."""
+    camera = {
+        "resolution_px": (346, 260),
+        "intrinsics": {
+            "fx_px": 305.57, "fy_px": 305.62, "cx_px": 175.21, "cy_px": 125.49,
+            "distortion": (-0.3879, 0.2354, 0.00087, -0.00076, -0.1027),
+        },
+    }  # fmt: skip
+    extrinsic = {
+        "camera": "cam",
+        "lidar": "lidar",
+        "quaternion_wxyz": (0.5, 0.5, -0.5, 0.5),
+        "translation_m": (0.126, -0.065, -0.080),
+    }
+    profile: dict[str, Any] = {
+        "format_version": 1,
+        "name": name,
+        "board": {"inner_corners": (9, 6), "square_m": 0.068, "width_m": 0.8, "height_m": 0.6},
+        "lidars": {"lidar": {}},
+        "cameras": {"cam": camera},
+        "nominal_extrinsics": (extrinsic,),
+    }
+    return Rig.model_validate({**profile, **changes})
+
+
+def board_before_lidar(distance_m: float, *, roll_deg: float = 45.0, yaw_deg: float = 0.0) -> Array:
+    """T_world_board (4, 4) of a board at the LiDAR's height, straight ahead, facing it."""
+    turn = exp_so3(np.array([[0.0, np.radians(yaw_deg), 0.0], [0.0, 0.0, np.radians(roll_deg)]]))
+    return pose(FACING_LIDAR @ turn[0] @ turn[1], np.array([distance_m, 0.0, 1.0]))
+
+
+@pytest.fixture(scope="session")
+def board() -> Board:
+    return Board(cols=9, rows=6, square_m=0.068, width_m=0.8, height_m=0.6)
+
+
+@pytest.fixture(scope="session")
+def room() -> Room:
+    return build_room(0.0, np.random.default_rng(0))
+
+
+@pytest.fixture(scope="session")
+def T_world_lidar() -> Array:
+    return pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
+
+
+@pytest.fixture(scope="session")
+def T_world_cam() -> Array:
+    return pose(CAMERA_FORWARD, np.array([0.05, 0.1, 1.05]))
+
+
+LENSES = {
+    "radtan": Intrinsics(480.0, 481.0, 321.3, 238.2, 640, 480, "radtan", (-0.38, 0.2, 0.001, -0.0005, -0.05)),
+    "equidistant": Intrinsics(300.0, 301.0, 318.7, 241.4, 640, 480, "equidistant", (-0.05, -0.02, 0.01, -0.002)),
+}
+
+
+@pytest.fixture(scope="session", params=sorted(LENSES))
+def backdrop(request: pytest.FixtureRequest, room: Room, T_world_cam: Array) -> Backdrop:
+    return build_backdrop(room, T_world_cam, LENSES[request.param])

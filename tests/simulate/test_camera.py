@@ -1,0 +1,146 @@
+"""Rendered pictures agree with the lens model to a small part of a pixel, and their noise with its claims."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
+from lce_rig.simulate.backdrop import Backdrop, pixel_corner_rays, pixel_rays
+from lce_rig.simulate.camera import render_image
+from lce_rig.simulate.carriers import build_carrier
+from lce_rig.simulate.options import CameraNoise
+from lce_rig.simulate.room import Room
+from lce_rig.simulate.scene import Scene
+
+from .conftest import FACING_LIDAR, LENSES
+
+QUIET = replace(CameraNoise.none(), blur_px=0.6)
+
+
+def placed(distance_m: float, left_m: float, up_m: float, tilt_deg: float, roll_deg: float) -> Array:
+    turn = exp_so3(np.radians(np.array([[0.6 * tilt_deg, 0.8 * tilt_deg, 0.0], [0.0, 0.0, roll_deg]])))
+    return pose(FACING_LIDAR @ turn[0] @ turn[1], np.array([distance_m, left_m, 1.05 + up_m]))
+
+
+PLACEMENTS = [placed(1.5, 0.1, 0.0, 10, 45), placed(1.9, -0.4, 0.2, -30, 52), placed(2.4, 0.9, -0.2, 35, 38)]
+
+
+@pytest.mark.parametrize("T_world_board", PLACEMENTS, ids=["near", "middle", "side"])
+def test_corners_lie_where_the_truth_projects_them(
+    room: Room, board: Board, backdrop: Backdrop, T_world_board: Array
+) -> None:
+    import cv2
+
+    scene = Scene(room.raycaster, build_carrier("stand", board, T_world_board, np.random.default_rng(0)), board, T_world_board)
+    picture = render_image(scene, backdrop, QUIET, np.random.default_rng(0)).grey
+    corners_cam = transform(invert(backdrop.T_world_cam) @ T_world_board, board.corners())
+    truth, is_valid = backdrop.intrinsics.project(corners_cam)
+    assert is_valid.all()
+    start = truth.astype(np.float32).reshape(-1, 1, 2) + np.float32(0.3)
+    found = cv2.cornerSubPix(picture, start, (4, 4), (-1, -1), (3, 50, 1e-4)).reshape(-1, 2)
+    error = found - truth
+    assert np.sqrt(np.mean(error**2)) < 0.04
+    assert np.abs(error.mean(axis=0)).max() < 0.02
+
+
+def test_a_detector_finds_the_board_in_a_noisy_picture(room: Room, board: Board, backdrop: Backdrop) -> None:
+    import cv2
+
+    T = PLACEMENTS[0]
+    scene = Scene(room.raycaster, build_carrier("person", board, T, np.random.default_rng(0)), board, T)
+    picture = render_image(scene, backdrop, CameraNoise(), np.random.default_rng(0)).grey
+    is_found, corners = cv2.findChessboardCornersSB(picture, (board.cols, board.rows))
+    assert is_found
+    truth, _ = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam) @ T, board.corners()))
+    found = corners.reshape(-1, 2)
+    error = min((found - truth, found[::-1] - truth), key=lambda d: float(np.sum(d**2)))
+    assert np.sqrt(np.mean(error**2)) < 0.1
+
+
+@pytest.mark.parametrize("model", sorted(LENSES))
+def test_rays_through_pixels_project_back_onto_them(model: str) -> None:
+    lens = LENSES[model]
+    rays = pixel_rays(pixel_corner_rays(lens))
+    assert np.isfinite(rays).all()
+    v, u = np.mgrid[0 : lens.height_px, 0 : lens.width_px]
+    pixels, is_valid = lens.project(rays)
+    # Towards the radius where the polynomial folds back no ray is exact, and no board is ever placed there.
+    radius = np.hypot(rays[..., 0], rays[..., 1]) / rays[..., 2]
+    if model == "radtan":
+        is_valid &= radius < 0.8 * lens.max_radius
+    assert is_valid.mean() > 0.9
+    assert np.abs(pixels - np.stack([u, v], axis=-1))[is_valid].max() < 5e-4
+
+
+def test_the_outer_square_at_the_top_left_is_dark(room: Room, board: Board, backdrop: Backdrop) -> None:
+    T = placed(1.3, 0.0, 0.0, 0.0, 0.0)
+    picture = render_image(Scene(room.raycaster, [], board, T), backdrop, QUIET, np.random.default_rng(0)).grey
+    square = board.square_m
+    columns, rows = np.meshgrid(np.arange(board.cols + 1), np.arange(board.rows + 1))
+    middles = np.stack(
+        [(columns - board.cols / 2) * square, (board.rows / 2 - rows) * square, 0 * columns], axis=-1
+    )
+    pixels, _ = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam) @ T, middles.reshape(-1, 3)))
+    u, v = np.rint(pixels).astype(int).T
+    value = picture[v, u].reshape(columns.shape)
+    is_dark = (columns + rows) % 2 == 0
+    assert value[is_dark].max() < 80 < 120 < value[~is_dark].min()
+    assert (u[-1], v[-1]) > (u[0], v[0]), "the print reads from left to right, top to bottom"
+
+
+def test_noise_follows_shot_and_read_noise(room: Room, board: Board, backdrop: Backdrop) -> None:
+    scene = Scene(room.raycaster, [], board, PLACEMENTS[0])
+    noise = CameraNoise(blur_px=0.0, vignetting=0.0)
+    clean = replace(noise, full_well_e=float("inf"))
+    quiet = render_image(scene, backdrop, clean, np.random.default_rng(0)).pixels.astype(float)
+    noisy = render_image(scene, backdrop, noise, np.random.default_rng(1)).pixels.astype(float)
+    for tone in (40, 120, 160):
+        at = np.abs(quiet - tone) <= 2
+        linear = (tone / 255) ** 2.2
+        sigma = np.sqrt(linear * noise.full_well_e + noise.read_noise_e**2) / noise.full_well_e
+        slope = 255 / 2.2 * linear ** (1 / 2.2 - 1)
+        assert at.sum() > 300
+        assert (noisy - quiet)[at].std() == pytest.approx(slope * sigma, rel=0.15)
+
+
+def test_vignetting_darkens_the_corners_by_its_share(room: Room, board: Board, backdrop: Backdrop) -> None:
+    scene = Scene(room.raycaster, [], board, PLACEMENTS[0])
+    flat, dim = (
+        render_image(
+            scene, backdrop, replace(CameraNoise.none(), vignetting=share), np.random.default_rng(0)
+        ).pixels.astype(float)
+        for share in (0.0, 0.3)
+    )
+    corner = (slice(-3, None), slice(-3, None))
+    assert (dim[corner].mean() / flat[corner].mean()) ** 2.2 == pytest.approx(0.7, abs=0.05)
+    assert dim[238:242, 318:322].mean() == pytest.approx(flat[238:242, 318:322].mean(), abs=1.0)
+
+
+def test_a_larger_exposure_brightens_and_a_blur_softens(room: Room, board: Board, backdrop: Backdrop) -> None:
+    scene = Scene(room.raycaster, [], board, PLACEMENTS[0])
+
+    def seen(noise: CameraNoise) -> Array:
+        return render_image(scene, backdrop, noise, np.random.default_rng(0)).grey.astype(float)
+
+    sharp = seen(CameraNoise.none())
+    assert seen(replace(CameraNoise.none(), exposure=0.5)).mean() < 0.8 * sharp.mean()
+    soft = seen(replace(CameraNoise.none(), blur_px=2.0))
+    assert np.abs(np.diff(soft, axis=1)).max() < 0.5 * np.abs(np.diff(sharp, axis=1)).max()
+
+
+def test_the_same_seed_gives_the_same_picture(room: Room, board: Board, backdrop: Backdrop) -> None:
+    scene = Scene(room.raycaster, [], board, PLACEMENTS[1])
+    one, same, other = (
+        render_image(scene, backdrop, CameraNoise(), np.random.default_rng(seed)).pixels for seed in (4, 4, 5)
+    )
+    assert one.tobytes() == same.tobytes() != other.tobytes()
+
+
+def test_a_board_behind_the_camera_is_not_in_the_picture(room: Room, board: Board, backdrop: Backdrop) -> None:
+    empty = Scene(room.raycaster, [], board, placed(-40.0, 0.0, 0.0, 0.0, 0.0))
+    behind = Scene(room.raycaster, [], board, placed(-2.0, 0.0, 0.0, 0.0, 45.0))
+    pictures = [render_image(s, backdrop, CameraNoise.none(), np.random.default_rng(0)).grey for s in (empty, behind)]
+    change = np.abs(pictures[0].astype(int) - pictures[1])
+    assert change.max() < 40, "at most a faint shadow or mirror image"

@@ -1,0 +1,199 @@
+"""Simulated sessions: truth, placements, decoys and repeatability, for sensors mounted anyhow."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lce_rig.core.errors import LceRigError, ProfileError
+from lce_rig.core.geometry import Array, invert, rotation_angle, transform
+from lce_rig.rig import Rig
+from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures, truth_extrinsics
+from lce_rig.simulate.captures import LIDAR_MODELS
+
+from .conftest import make_rig
+
+N_CAPTURES = 6
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return make_rig()
+
+
+@pytest.fixture(scope="module")
+def captures(rig: Rig) -> list[SimulatedCapture]:
+    return list(simulate_captures(rig, n_captures=N_CAPTURES, seed=11))
+
+
+def corners_px(rig: Rig, camera: str, capture: SimulatedCapture) -> Array:
+    corners = transform(capture.T_cam_board[camera], rig.board.to_board().corners())
+    return rig.cameras[camera].to_intrinsics().project(corners)[0]
+
+
+def n_rings_on_board(rig: Rig, lidar: str, capture: SimulatedCapture) -> int:
+    board = rig.board.to_board()
+    scan = next(scan for scan in capture.scans if scan.sensor == lidar)
+    xyz = transform(invert(capture.T_lidar_board[lidar]), scan.points.astype(float))
+    inside = np.all(np.abs(xyz) < [board.width_m / 2, board.height_m / 2, 0.05], axis=1)
+    return int(np.sum(np.bincount(scan.ring[inside], minlength=16) >= 5))
+
+
+def test_truth_is_the_same_for_camera_and_lidar(rig: Rig, captures: list[SimulatedCapture]) -> None:
+    T_cam_lidar = truth_extrinsics(rig, 11)["cam", "lidar"]
+    for capture in captures:
+        assert np.allclose(capture.T_cam_board["cam"], T_cam_lidar @ capture.T_lidar_board["lidar"], atol=1e-12)
+
+
+def test_truth_differs_from_the_nominal_within_its_tolerance(rig: Rig) -> None:
+    entry = rig.nominal_extrinsics[0]
+    nominal = entry.to_matrix()
+    truths = [truth_extrinsics(rig, seed)["cam", "lidar"] for seed in range(20)]
+    angles = np.degrees([rotation_angle(T[:3, :3], nominal[:3, :3]) for T in truths])
+    shifts = np.array([np.linalg.norm(T[:3, 3] - nominal[:3, 3]) for T in truths])
+    assert angles.min() > 0.5 and angles.max() < entry.tolerance_deg
+    assert shifts.min() > 0.005 and shifts.max() < entry.tolerance_m
+    assert not np.allclose(truths[0], truths[1])
+
+
+def test_the_papers_simulated_rig_has_exactly_its_extrinsic() -> None:
+    rig = make_rig("sss")
+    assert np.allclose(truth_extrinsics(rig, 3)["cam", "lidar"], rig.nominal_extrinsics[0].to_matrix(), atol=1e-12)
+
+
+def test_every_board_is_in_the_picture_and_on_enough_rings(rig: Rig, captures: list[SimulatedCapture]) -> None:
+    lens = rig.cameras["cam"].to_intrinsics()
+    for capture in captures:
+        assert lens.is_inside(corners_px(rig, "cam", capture), 2.0).all()
+        assert n_rings_on_board(rig, "lidar", capture) >= 5
+        distance_m = np.linalg.norm(capture.T_cam_board["cam"][:3, 3])
+        assert 1.2 <= distance_m <= 4.0
+
+
+def test_boards_are_spread_and_tilted(rig: Rig, captures: list[SimulatedCapture]) -> None:
+    middles = np.array([corners_px(rig, "cam", capture).mean(axis=0) for capture in captures])
+    assert np.all(np.ptp(middles, axis=0) > [100, 50])
+    normals = np.array([capture.T_cam_board["cam"][:3, 2] for capture in captures])
+    angles = np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)))
+    assert angles.max() > 25
+
+
+def test_the_same_seed_gives_the_same_bytes_however_many_captures(rig: Rig, captures: list[SimulatedCapture]) -> None:
+    again = list(simulate_captures(rig, n_captures=2, seed=11))
+    for one, other in zip(captures, again, strict=False):
+        assert one.images[0].pixels.tobytes() == other.images[0].pixels.tobytes()
+        assert one.scans[0].points.tobytes() == other.scans[0].points.tobytes()
+        assert one.T_cam_board["cam"].tobytes() == other.T_cam_board["cam"].tobytes()
+    different = next(simulate_captures(rig, n_captures=1, seed=12))
+    assert different.scans[0].points.tobytes() != captures[0].scans[0].points.tobytes()
+
+
+def test_samples_carry_names_and_increasing_stamps(captures: list[SimulatedCapture]) -> None:
+    stamps = [capture.scans[0].stamp_ns or 0 for capture in captures]
+    assert np.all(np.diff(stamps) > 1_000_000_000)
+    for capture in captures:
+        image, scan = capture.images[0], capture.scans[0]
+        assert (image.sensor, image.channel, scan.sensor) == ("cam", "frames", "lidar")
+        assert image.pixels.shape == (260, 346, 3)
+        assert image.stamp_ns is not None and scan.stamp_ns is not None
+        assert image.stamp_ns - scan.stamp_ns == 50_000_000
+
+
+def nominal(camera: str, **rotation: Any) -> dict[str, Any]:
+    return {"camera": camera, "lidar": "lidar", "translation_m": (0.05, -0.08, -0.1), **rotation}
+
+
+MOUNTS: dict[str, dict[str, Any]] = {
+    # Rows are the camera's right, down and forward axes in the frame of the LiDAR.
+    "rear": {"matrix": ((0.0, 1.0, 0.0), (0.0, 0.0, -1.0), (-1.0, 0.0, 0.0))},
+    "upside down": {"matrix": ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))},
+    "on its side, looking left": {"matrix": ((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0))},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mount", sorted(MOUNTS))
+def test_cameras_mounted_anyhow_see_the_board(mount: str) -> None:
+    rotation = MOUNTS[mount]
+    if np.linalg.det(np.array(rotation["matrix"])) < 0:
+        rotation = {"matrix": tuple(tuple(-v for v in row) if k == 0 else row for k, row in enumerate(rotation["matrix"]))}
+    rig = make_rig(nominal_extrinsics=(nominal("cam", **rotation),))
+    for capture in simulate_captures(rig, n_captures=2, seed=0):
+        assert rig.cameras["cam"].to_intrinsics().is_inside(corners_px(rig, "cam", capture)).all()
+        assert n_rings_on_board(rig, "lidar", capture) >= 4
+
+
+def test_two_cameras_take_turns_as_the_one_the_board_is_placed_for() -> None:
+    one = make_rig()
+    cameras = {
+        "left": {**one.cameras["cam"].model_dump(), "frame": "left", "optical_frame": "left_optical"},
+        "rear": {**one.cameras["cam"].model_dump(), "frame": "rear", "optical_frame": "rear_optical"},
+    }
+    entries = (nominal("left", quaternion_wxyz=(0.5, 0.5, -0.5, 0.5)), nominal("rear", **MOUNTS["rear"]))
+    rig = make_rig(cameras=cameras, nominal_extrinsics=entries)
+    captures = list(simulate_captures(rig, n_captures=2, seed=0))
+    assert [capture.target for capture in captures] == [("left", "lidar"), ("rear", "lidar")]
+    for capture in captures:
+        assert [image.sensor for image in capture.images] == ["left", "rear"]
+        lens = rig.cameras[capture.target[0]].to_intrinsics()
+        assert lens.is_inside(corners_px(rig, capture.target[0], capture)).all()
+    assert set(truth_extrinsics(rig, 0)) == {("left", "lidar"), ("rear", "lidar")}
+
+
+def test_a_decoy_plate_of_the_boards_size_stands_still_beside_it(rig: Rig) -> None:
+    options = SimulationOptions(has_decoy_plate=True)
+    with_decoy, without = (
+        [capture.scans[0] for capture in simulate_captures(rig, n_captures=2, seed=2, options=o)]
+        for o in (options, SimulationOptions())
+    )
+    plates = []
+    for scan, plain in zip(with_decoy, without, strict=True):
+        azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+        near = np.hypot(scan.points[:, 0], scan.points[:, 1]) < 2.6
+        plain_near = np.hypot(plain.points[:, 0], plain.points[:, 1]) < 2.6
+        is_side = (np.abs(azimuth) > 35) & (np.abs(azimuth) < 95) & near & (scan.points[:, 2] > -0.5)
+        assert is_side.sum() > 150
+        assert np.sum(is_side) > np.sum(plain_near & (plain.points[:, 2] > -0.5)) - len(plain.points[plain_near]) + 150
+        plates.append(scan.points[is_side].mean(axis=0))
+    assert np.linalg.norm(plates[0] - plates[1]) < 0.05
+
+
+def test_walls_floor_and_furniture_surround_the_board(captures: list[SimulatedCapture]) -> None:
+    for capture in captures:
+        points = capture.scans[0].points
+        assert len(points) > 20_000
+        assert np.sum(np.abs(points[:, 2] + 1.0) < 0.05) > 500, "floor"
+        assert np.sum(np.linalg.norm(points[:, :2], axis=1) > 3.0) > 5000, "walls"
+        contrast = capture.images[0].grey.std()
+        assert contrast > 25
+
+
+def test_carriers_follow_the_rig_and_the_option(rig: Rig) -> None:
+    assert SimulationOptions.for_rig("rlfs").carrier == "stand"
+    assert SimulationOptions.for_rig("rles").carrier == "person"
+    counts = {}
+    for carrier in ("none", "stand", "person"):
+        options = SimulationOptions(carrier=carrier)  # type: ignore[arg-type]
+        capture = next(simulate_captures(rig, n_captures=1, seed=4, options=options))
+        xyz = transform(invert(capture.T_lidar_board["lidar"]), capture.scans[0].points.astype(float))
+        near = (np.linalg.norm(xyz, axis=1) < 1.0) & (np.abs(xyz[:, 2]) > 0.06)
+        counts[carrier] = int(near.sum())
+    assert counts["none"] < counts["stand"] < counts["person"]
+
+
+def test_a_lidar_nobody_can_simulate_is_named(rig: Rig) -> None:
+    odd = make_rig(lidars={"lidar": {"model": "OS1-64"}})
+    with pytest.raises(ProfileError, match=r"lidars\.lidar\.model: OS1-64"):
+        next(simulate_captures(odd, n_captures=1, seed=0))
+    assert "vlp16" in LIDAR_MODELS
+
+
+def test_a_rig_whose_lidar_cannot_see_what_the_camera_sees_is_refused() -> None:
+    ceiling = nominal("cam", matrix=((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
+    with pytest.raises(LceRigError, match="no place for the board"):
+        next(simulate_captures(make_rig(nominal_extrinsics=(ceiling,)), n_captures=1, seed=0))
+
+
+@pytest.mark.parametrize("changes", [{"noise_level": 0}, {"noise_level": 11}, {"distance_m": (3.0, 2.0)}])
+def test_options_that_cannot_be_meant_are_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(ValueError):
+        SimulationOptions(**changes)

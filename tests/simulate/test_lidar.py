@@ -1,0 +1,247 @@
+"""The simulated LiDAR keeps the VLP-16's laws and errs as it claims to."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.core.board import Board
+from lce_rig.core.data import Scan
+from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.simulate.carriers import build_carrier
+from lce_rig.simulate.lidar import VLP16, simulate_scan
+from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M, LidarNoise, SimulationOptions
+from lce_rig.simulate.room import Room
+from lce_rig.simulate.scene import PLATE, Raycaster, Scene, Surface
+from lce_rig.simulate.shapes import merge, rectangle
+
+from .conftest import board_before_lidar
+
+EXACT = LidarNoise.none()
+BEAM = replace(EXACT, divergence_rad=LidarNoise().divergence_rad, exit_size_m=LidarNoise().exit_size_m)
+FOOTPRINT_REACH_M = 0.010  # half the beam's exit plus half its divergence at 3 m, rounded up
+
+
+def scan_of(scene: Scene, T_world_lidar: Array, noise: LidarNoise, seed: int = 0, **changes: float) -> Scan:
+    return simulate_scan(scene, T_world_lidar, VLP16, noise, np.random.default_rng(seed), **changes)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def scene(room: Room, board: Board) -> Scene:
+    T = board_before_lidar(2.2, yaw_deg=20.0)
+    return Scene(room.raycaster, build_carrier("person", board, T, np.random.default_rng(3)), board, T)
+
+
+@pytest.fixture(scope="module")
+def exact(scene: Scene, T_world_lidar: Array) -> Scan:
+    return scan_of(scene, T_world_lidar, EXACT)
+
+
+def distance_to_surfaces(scene: Scene, points_world: Array) -> Array:
+    """Distance of each point from the nearest triangle, or from that triangle's plane if less."""
+    import open3d as o3d
+
+    plate = rectangle(scene.board.width_m, scene.board.height_m).moved(scene.T_world_board)
+    whole = merge([*(surface.mesh for surface in scene.surfaces), plate])
+    engine = o3d.t.geometry.RaycastingScene()
+    engine.add_triangles(o3d.core.Tensor(whole.vertices.astype(np.float32)), o3d.core.Tensor(whole.triangles))
+    nearest = engine.compute_closest_points(o3d.core.Tensor(points_world.astype(np.float32)))
+    distance = np.linalg.norm(nearest["points"].numpy() - points_world, axis=1)
+    assert distance.max() < 0.01
+    # Open3D's own distance is off by millimetres on long thin triangles: measure from the plane in float64.
+    a, b, c = np.moveaxis(whole.vertices[whole.triangles[nearest["primitive_ids"].numpy()]], 1, 0)
+    normal = np.cross(b - a, c - a)
+    off_plane = np.abs(np.einsum("nc,nc->n", normal, points_world - a)) / np.linalg.norm(normal, axis=1)
+    return np.minimum(distance, off_plane)
+
+
+def lasers(scan: Scan) -> np.ndarray:
+    return np.argsort(VLP16.rings)[scan.ring]
+
+
+def azimuths(scan: Scan) -> Array:
+    return np.arctan2(scan.points[:, 1], scan.points[:, 0], dtype=np.float64)
+
+
+def in_board(scene: Scene, T_world_lidar: Array, scan: Scan) -> Array:
+    return transform(invert(scene.T_world_board) @ T_world_lidar, scan.points.astype(float))
+
+
+def test_points_without_noise_lie_on_surfaces(scene: Scene, exact: Scan, T_world_lidar: Array) -> None:
+    points = transform(T_world_lidar, exact.points.astype(float))
+    assert len(points) > 25_000
+    assert distance_to_surfaces(scene, points).max() < 1e-3
+
+
+def test_firings_follow_the_manuals_timing_table(exact: Scan) -> None:
+    assert exact.offset_ns is not None
+    sequence_start = exact.offset_ns - 2_304 * lasers(exact)
+    assert np.all(sequence_start % 55_296 == 0)
+    assert np.all(np.diff(exact.offset_ns) > 0)
+    assert 0 <= exact.offset_ns.min() and exact.offset_ns.max() < 100_000_000
+
+
+def test_rings_have_the_beam_tables_elevations_and_vertical_offsets(exact: Scan) -> None:
+    expected = np.radians(np.arange(-15, 16, 2))
+    for ring in range(16):
+        points = exact.points[exact.ring == ring].astype(float)
+        height = points[:, 2] - VLP16.vertical_offsets_m[np.argsort(VLP16.rings)[ring]]
+        elevation = np.arctan2(height, np.hypot(points[:, 0], points[:, 1]))
+        assert np.abs(elevation - expected[ring]).max() < 1e-5
+
+
+def test_rotor_turns_clockwise_at_ten_hertz_from_a_random_phase(scene: Scene, T_world_lidar: Array) -> None:
+    starts = []
+    for seed in range(4):
+        scan = scan_of(scene, T_world_lidar, EXACT, seed)
+        assert scan.offset_ns is not None
+        start = azimuths(scan) + 2 * np.pi * scan.offset_ns / 1e8
+        start = np.mod(start, 2 * np.pi)
+        assert np.ptp(start) < 1e-5
+        starts.append(start.mean())
+    assert np.ptp(starts) > 1e-4
+    assert np.all((np.array(starts) <= np.pi) & (np.array(starts) > np.pi - VLP16.step_rad))
+
+
+def test_quantised_scans_step_by_two_millimetres_and_a_hundredth_of_a_degree(
+    scene: Scene, T_world_lidar: Array
+) -> None:
+    scan = scan_of(scene, T_world_lidar, replace(EXACT, is_quantised=True))
+    points = scan.points.astype(float)
+    points[:, 2] -= VLP16.vertical_offsets_m[lasers(scan)]
+    steps = np.linalg.norm(points, axis=1) / 0.002
+    assert np.abs(steps - np.rint(steps)).max() < 5e-3
+    steps = np.degrees(azimuths(scan)) / 0.01
+    assert np.abs(steps - np.rint(steps)).max() < 5e-3
+
+
+def test_mixed_pixels_occur_and_only_at_the_boards_border(board: Board, T_world_lidar: Array) -> None:
+    T = board_before_lidar(3.0)
+    behind = rectangle(6.0, 6.0).moved(board_before_lidar(3.3, roll_deg=0.0))
+    scene = Scene(Raycaster([Surface("wall", behind, PLATE, np.eye(4))]), [], board, T)
+    scan = scan_of(scene, T_world_lidar, BEAM)
+    depth = -in_board(scene, T_world_lidar, scan)
+    is_mixed = (depth[:, 2] > 0.01) & (depth[:, 2] < 0.29)
+    assert is_mixed.sum() >= 10
+    # Where the beam's axis crosses the board's plane, measured from the border.
+    points = scan.points[is_mixed].astype(float)
+    points[:, 2] -= VLP16.vertical_offsets_m[lasers(scan)][is_mixed]
+    origin = T_world_lidar[:3, 3] + np.outer(VLP16.vertical_offsets_m[lasers(scan)][is_mixed], [0, 0, 1])
+    ray = points / np.linalg.norm(points, axis=1, keepdims=True)
+    at = origin + ray * (3.0 / ray[:, :1])
+    xy = np.abs(transform(invert(T), at)[:, :2]) - [board.width_m / 2, board.height_m / 2]
+    to_border = np.abs(np.max(xy, axis=1))
+    assert to_border.max() < FOOTPRINT_REACH_M
+
+
+def test_an_exact_beam_gives_no_mixed_pixels(board: Board, T_world_lidar: Array) -> None:
+    T = board_before_lidar(3.0)
+    behind = rectangle(6.0, 6.0).moved(board_before_lidar(3.3, roll_deg=0.0))
+    scene = Scene(Raycaster([Surface("wall", behind, PLATE, np.eye(4))]), [], board, T)
+    depth = -in_board(scene, T_world_lidar, scan_of(scene, T_world_lidar, EXACT))[:, 2]
+    assert not np.any((depth > 0.001) & (depth < 0.299))
+
+
+@pytest.mark.parametrize("noise, growth_mm", [(EXACT, 0.0), (BEAM, 7.5), (replace(BEAM, edge_growth_m=0.005), 11.5)])
+def test_returns_reach_beyond_the_border_by_the_footprint_on_average(
+    board: Board, T_world_lidar: Array, noise: LidarNoise, growth_mm: float
+) -> None:
+    # Footprint at 3 m: half of 10 mm + 3 m * 3 mrad = 9.5 mm; the outermost 4 % of its energy are too weak.
+    scene = Scene(Raycaster(()), [], board, board_before_lidar(3.0, roll_deg=0.0))
+    step_m = 3.0 * VLP16.step_rad
+    growth = []
+    for seed in range(12):
+        scan = scan_of(scene, T_world_lidar, noise, seed)
+        across = in_board(scene, T_world_lidar, scan)[:, 0]
+        for ring in np.unique(scan.ring):
+            on_ring = across[scan.ring == ring]
+            if len(on_ring) > 10:
+                growth.append((np.ptp(on_ring) + step_m - board.width_m) / 2)
+    assert 1e3 * np.mean(growth) == pytest.approx(growth_mm, abs=1.0)
+
+
+def test_range_noise_has_the_sigma_it_claims(board: Board, T_world_lidar: Array) -> None:
+    scene = Scene(Raycaster(()), [], board, board_before_lidar(2.0, roll_deg=0.0))
+    noise = replace(EXACT, range_sigma_m=0.02)
+    error = in_board(scene, T_world_lidar, scan_of(scene, T_world_lidar, noise))[:, 2]
+    n = len(error)
+    assert n > 800
+    assert error.std() == pytest.approx(0.02, rel=4 / np.sqrt(2 * n))
+    assert abs(error.mean()) < 4 * 0.02 / np.sqrt(n)
+
+
+def test_laser_bias_shifts_each_ring_by_its_own_amount(board: Board, T_world_lidar: Array) -> None:
+    scene = Scene(Raycaster(()), [], board, board_before_lidar(2.0, roll_deg=0.0))
+    bias = 0.001 * np.arange(16.0)
+    scan = simulate_scan(scene, T_world_lidar, VLP16, EXACT, np.random.default_rng(0), laser_bias_m=bias)
+    plane = -in_board(scene, T_world_lidar, scan)[:, 2]
+    cosine = scan.points[:, 0] / np.linalg.norm(scan.points, axis=1)
+    assert np.abs(plane / cosine - bias[lasers(scan)]).max() < 1e-4
+
+
+def test_dark_squares_and_weak_returns_read_long(board: Board, T_world_lidar: Array) -> None:
+    T = board_before_lidar(1.5, roll_deg=0.0)
+    scene = Scene(Raycaster(()), [], board, T, print_reflectivity=0.2)
+    scan = scan_of(scene, T_world_lidar, replace(EXACT, dark_bias_m=0.01, weak_bias_m=0.03))
+    depth, is_dark = -in_board(scene, T_world_lidar, scan)[:, 2], scan.intensity < 30
+    assert 0.2 < is_dark.mean() < 0.5
+    assert np.median(depth[~is_dark]) == pytest.approx(0.0005, abs=2e-4)
+    assert np.median(depth[is_dark]) == pytest.approx(0.008 + 0.03 * (1 - 20 / 30), abs=1e-3)
+
+
+def test_dropouts_come_as_often_as_claimed(board: Board, room: Room, T_world_lidar: Array) -> None:
+    scene = Scene(room.raycaster, [], board, board_before_lidar(2.0))
+    whole = scan_of(scene, T_world_lidar, EXACT)
+    thinned = scan_of(scene, T_world_lidar, replace(EXACT, dropout=0.1))
+    assert len(thinned.points) / len(whole.points) == pytest.approx(0.9, abs=4 * np.sqrt(0.09 / len(whole.points)))
+
+
+def test_only_returns_between_the_range_limits_are_reported(scene: Scene, T_world_lidar: Array) -> None:
+    scan = scan_of(scene, T_world_lidar, LidarNoise(), min_range_m=2.5, max_range_m=4.0)
+    range_m = np.linalg.norm(scan.points, axis=1)
+    assert len(range_m) > 100
+    assert range_m.min() > 2.48 and range_m.max() < 4.02
+
+
+@pytest.mark.parametrize("level", [1, 4, 10])
+def test_noise_levels_are_the_papers(level: int, board: Board, T_world_lidar: Array) -> None:
+    scene = Scene(Raycaster(()), [], board, board_before_lidar(2.5))
+    noise = SimulationOptions(noise_level=level).lidar_noise
+    scan = scan_of(scene, T_world_lidar, replace(noise, dropout=0.0))
+    xyz = in_board(scene, T_world_lidar, scan)
+    inner = np.all(np.abs(xyz[:, :2]) < [0.3, 0.2], axis=1)
+    sigma = PAPER_RANGE_SIGMA_M[level - 1]
+    assert xyz[inner, 2].std() == pytest.approx(sigma, rel=0.15, abs=1e-3)
+
+
+def test_rim_noise_moves_points_near_the_border_and_no_others(board: Board, T_world_lidar: Array) -> None:
+    scene = Scene(Raycaster(()), [], board, board_before_lidar(2.5))
+    plain, rimmed = (scan_of(scene, T_world_lidar, replace(EXACT, rim_spread_rad=w)) for w in (0.0, 0.0015))
+    moved_m = np.linalg.norm(plain.points - rimmed.points, axis=1)
+    assert moved_m.max() == 0.0, "an infinitely thin beam has no rim"
+    plain, rimmed = (scan_of(scene, T_world_lidar, replace(BEAM, rim_spread_rad=w)) for w in (0.0, 0.0015))
+    moved_m = np.linalg.norm(plain.points - rimmed.points, axis=1)
+    xy = in_board(scene, T_world_lidar, plain)[:, :2]
+    inside_m = np.min([board.width_m / 2, board.height_m / 2] - np.abs(xy), axis=1)
+    is_rim = inside_m < BEAM.exit_size_m[0] + BEAM.divergence_rad[0] * 2.5
+    assert moved_m[inside_m > 0.02].max() < 1e-6
+    assert 1e-3 < moved_m[is_rim].mean() < 0.0015 * 2.6
+
+
+def test_the_same_seed_gives_the_same_bytes(scene: Scene, T_world_lidar: Array) -> None:
+    one, other = (scan_of(scene, T_world_lidar, LidarNoise(), 7) for _ in range(2))
+    assert one.points.tobytes() == other.points.tobytes()
+    assert one.intensity.tobytes() == other.intensity.tobytes()
+    assert scan_of(scene, T_world_lidar, LidarNoise(), 8).points.tobytes() != one.points.tobytes()
+
+
+def test_a_person_stands_behind_the_board_and_holds_its_border(
+    scene: Scene, exact: Scan, T_world_lidar: Array, board: Board
+) -> None:
+    xyz = in_board(scene, T_world_lidar, exact)
+    near = np.hypot(xyz[:, 0], xyz[:, 1]) < 0.9
+    body = near & (xyz[:, 2] < -0.03) & (xyz[:, 2] > -0.8)
+    assert body.sum() > 50
+    inside = np.all(np.abs(xyz[:, :2]) < [board.width_m / 2 - 0.05, board.height_m / 2 - 0.05], axis=1)
+    in_front = inside & (xyz[:, 2] > 2e-3) & (xyz[:, 2] < 0.3)
+    assert not in_front.any()
