@@ -26,8 +26,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import Certificate, Observation, Refusal
 from lce_rig.solvers.covariance import jackknife_covariance
 
-# Weights given by the user are in units of one capture with residuals of this size, which gives the prior on the
-# shift its scale.
+# Weights given by the user count in captures with residuals of this size, which sets the scale of the prior.
 NOMINAL_SIGMA_M = 0.01
 _PLANE_FREEDOMS = 3
 
@@ -86,8 +85,8 @@ def _agree(candidates: Sequence[CaptureCandidates], board: Board, options: Calib
     n_agreeing = 0 if consensus is None else len(consensus.observations)
     if consensus is None or n_agreeing < needed:
         raise NotEnoughDataError(
-            f"only {n_agreeing} of {len(candidates)} captures agree with one rigid extrinsic, {needed} are needed",
-            "check the board's size, the intrinsics and that pictures and scans are paired in time; add captures",
+            f"only {n_agreeing} of {len(candidates)} captures agree with one extrinsic, {needed} are needed",
+            "check the board's size, the intrinsics and the pairing of pictures with scans; add captures",
         )
     return consensus
 
@@ -95,17 +94,18 @@ def _agree(candidates: Sequence[CaptureCandidates], board: Board, options: Calib
 def _weights(
     options: CalibrateOptions, features: Sequence[CaptureFeatures], plane_sigma_m: float, edge_sigma_m: float
 ) -> Weights:
-    """Weigh by the options where they say so, else by likelihood.
+    """Weigh by the options where they give both weights, else by likelihood.
 
-    The camera's and the LiDAR's plane differ in three ways, by an offset and two tilts, however many points the
-    LiDAR's has; its ring ends err independently, by where their rays happen to fall. A capture's mean squares
-    therefore count 3 / sigma_plane^2 and M / sigma_edge^2, with M ring ends.
+    The camera's and the LiDAR's plane differ in three ways, by an offset and two tilts, however many points
+    the LiDAR's has; its ring ends err independently, by where their rays happen to fall. A capture's mean
+    squares therefore count 3 / sigma_plane^2 and M / sigma_edge^2, with M ring ends.
     """
     unit = 1 / NOMINAL_SIGMA_M**2
     n_ends = float(np.mean([len(f.edge_points) for f in features]))
-    by_options = options.plane_weight, options.edge_weight
-    plane = _PLANE_FREEDOMS / plane_sigma_m**2 if by_options[0] is None else by_options[0] * unit
-    edge = n_ends / edge_sigma_m**2 if by_options[1] is None else by_options[1] * unit
+    if options.plane_weight is None or options.edge_weight is None:
+        plane, edge = _PLANE_FREEDOMS / plane_sigma_m**2, n_ends / edge_sigma_m**2
+    else:
+        plane, edge = options.plane_weight * unit, options.edge_weight * unit
     has_shift = options.edge_shift == "free" and options.use_ptl
     return Weights(
         plane=plane if options.use_ptpl else 0.0,
@@ -179,5 +179,3 @@ def _diagnostics(
             "draw_spread_translation_m": float(draws.spread_translation_m[draws.best]),
         }
     return figures
-
-

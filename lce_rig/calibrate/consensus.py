@@ -26,6 +26,8 @@ CENTRE_TOLERANCE_M = 0.15
 _N_PROPOSALS = 400
 _N_REFINEMENTS = 10
 _MOVED_M = 0.1
+# Beyond this the picture alone rules the second pose out, whatever the errors of the camera model.
+_MAX_CHI2_GAP = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +91,9 @@ def find_consensus(candidates: Sequence[CaptureCandidates], board: Board) -> Con
         return None
     observations = tuple(_observation(candidates[k], pairs, chosen[k]) for k in agreeing)
     refused = {
-        candidates[k].capture: _explain(candidates[k], pairs, np.flatnonzero(pairs.capture == k), R_best, t_best)
+        candidates[k].capture: _explain(
+            candidates[k], pairs, np.flatnonzero(pairs.capture == k), R_best, t_best
+        )
         for k in np.flatnonzero(chosen < 0)
     }
     n_alternative = int(np.sum(pairs.pose[chosen[agreeing]] == 1))
@@ -97,8 +101,10 @@ def find_consensus(candidates: Sequence[CaptureCandidates], board: Board) -> Con
 
 
 def _camera_poses(item: CaptureCandidates) -> list[Array]:
-    alternative = item.image.T_cam_board_alternative
-    return [item.image.T_cam_board] + ([] if alternative is None else [alternative])
+    image = item.image
+    if image.T_cam_board_alternative is None or image.chi2_gap > _MAX_CHI2_GAP:
+        return [image.T_cam_board]
+    return [image.T_cam_board, image.T_cam_board_alternative]
 
 
 def _list_pairs(candidates: Sequence[CaptureCandidates]) -> _Pairs:
@@ -141,7 +147,7 @@ def _agreement(pairs: _Pairs) -> NDArray[np.float32]:
     is_level = np.abs(along[0] - along[1]) < height_tolerance
     agrees &= is_level & is_level.T
     agrees &= pairs.capture[:, None] != pairs.capture[None]
-    return agrees.astype(np.float32)
+    return np.asarray(agrees, dtype=np.float32)
 
 
 def _propose(pairs: _Pairs, agreement: NDArray[np.float32], scale_m: float) -> tuple[Array, Array] | None:
@@ -153,7 +159,10 @@ def _propose(pairs: _Pairs, agreement: NDArray[np.float32], scale_m: float) -> t
         return None
     directions = [
         np.stack([normals[i], normals[j], (centres[j] - centres[i]) / scale_m], axis=1)
-        for normals, centres in ((pairs.normal_cam, pairs.centre_cam), (pairs.normal_lidar, pairs.centre_lidar))
+        for normals, centres in (
+            (pairs.normal_cam, pairs.centre_cam),
+            (pairs.normal_lidar, pairs.centre_lidar),
+        )
     ]
     R = rotation_from_directions(directions[0], directions[1])
     middle_cam = (pairs.centre_cam[i] + pairs.centre_cam[j]) / 2
@@ -179,7 +188,7 @@ def _score(pairs: _Pairs, R: Array, t: Array) -> tuple[Array, Array]:
 
 
 def _refine(pairs: _Pairs, R: Array, t: Array, n_captures: int) -> tuple[Array, Array, NDArray[np.intp]]:
-    """Fit R and t to the agreeing pairs until they stay the same; also the pair of each capture, -1 for none."""
+    """Fit R and t to the agreeing pairs until they stay the same; also the pair of each capture, or -1."""
     chosen = np.full(n_captures, -1, dtype=np.intp)
     for _ in range(_N_REFINEMENTS):
         _, r2 = _score(pairs, R[None], t[None])
@@ -208,20 +217,22 @@ def _observation(item: CaptureCandidates, pairs: _Pairs, index: int) -> Observat
     return Observation(item.capture, image, item.lidar[pairs.candidate[index]])
 
 
-def _explain(
-    item: CaptureCandidates, pairs: _Pairs, rows: NDArray[np.intp], R: Array, t: Array
-) -> Refusal:
+def _explain(item: CaptureCandidates, pairs: _Pairs, rows: NDArray[np.intp], R: Array, t: Array) -> Refusal:
     """Say by how much the best pair of a capture misses the consensus."""
     if len(rows) == 0:
-        return Refusal("pair", "no place in the scan looks like the board", "move the board clear of other things")
+        return Refusal(
+            "pair", "no place in the scan looks like the board", "move the board clear of other things"
+        )
     angle, distance = (values[0, rows] for values in _misfit(pairs, R[None], t[None]))
     best = int(np.argmin((angle / NORMAL_TOLERANCE_RAD) ** 2 + (distance / CENTRE_TOLERANCE_M) ** 2))
     n = len(item.lidar)
     places = "the only place" if n == 1 else f"the best of {n} places"
     cause = (
-        f"{places} in the scan lies {100 * distance[best]:.0f} cm and {np.degrees(angle[best]):.0f} deg from where "
-        "the picture and the other captures put the board"
+        f"{places} in the scan lies {100 * distance[best]:.0f} cm and {np.degrees(angle[best]):.0f} deg from "
+        "where the picture and the other captures put the board"
     )
     if distance[best] > _MOVED_M:
         return Refusal("pair", cause, "hold the board still and clear of other things while capturing")
-    return Refusal("pair", cause, "come closer or tilt the board more, so that both sensors see its tilt well")
+    return Refusal(
+        "pair", cause, "come closer or tilt the board more, so that both sensors see its tilt well"
+    )

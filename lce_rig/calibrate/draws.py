@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.calibrate.problem import Problem
 from lce_rig.core.geometry import Array, pose, project_to_so3
@@ -27,7 +28,7 @@ class Draws:
         spread_rotation_rad, spread_translation_m: (S,) rms of the candidates about their mean.
     """
 
-    sizes: Array
+    sizes: NDArray[np.int_]
     T_mean: Array
     held_out_m: Array
     capture_held_out_m: Array
@@ -91,7 +92,12 @@ def draw_subsets(
 
 
 def _judge(
-    sizes: Array, T: Array, errors: Array, is_held_out: Array, n_solved: int, certified_share: float
+    sizes: NDArray[np.int_],
+    T: Array,
+    errors: Array,
+    is_held_out: Array,
+    n_solved: int,
+    certified_share: float,
 ) -> Draws:
     """Average held-out errors per size and capture, and candidates per size."""
     count = is_held_out.sum(axis=1)

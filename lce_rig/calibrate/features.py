@@ -88,17 +88,17 @@ def _onto_plane(points: Array, plane: Array, options: CalibrateOptions) -> Array
     if options.point_projection == "none":
         return points
     if options.point_projection == "normal":
-        return points - (points @ plane[:3] + plane[3])[:, None] * plane[:3]
+        return np.asarray(points - (points @ plane[:3] + plane[3])[:, None] * plane[:3])
     return _meet_plane(points, plane)
 
 
 def _meet_plane(points: Array, plane: Array) -> Array:
-    """Intersect the ray through each point (N, 3) with the plane; grazing rays move along the normal instead."""
+    """Intersect the ray through each point (N, 3) with the plane; where it grazes, project along the normal."""
     along = points @ plane[:3]
     is_grazing = -along < _GRAZING_COSINE * np.linalg.norm(points, axis=1)
     scale = -plane[3] / np.where(is_grazing, -1.0, along)
     straight = points - (along + plane[3])[:, None] * plane[:3]
-    return np.where(is_grazing[:, None], straight, points * scale[:, None])
+    return np.asarray(np.where(is_grazing[:, None], straight, points * scale[:, None]))
 
 
 def _ring_ends(lidar: LidarBoard, options: CalibrateOptions) -> tuple[Array, Array]:

@@ -17,8 +17,8 @@ KEPT_SHARE = 0.9
 def solve_planes(features: Sequence[CaptureFeatures], problem: Problem) -> Array:
     """Solve point-to-plane over all captures: T_cam_lidar (4, 4).
 
-    The start turns the LiDAR's normals onto the camera's; where its minimum is not certified the global one is
-    searched from everywhere.
+    The start turns the LiDAR's normals onto the camera's; where its minimum is not certified the global one
+    is searched from everywhere.
     """
     R_start = rotation_from_directions(
         np.array([f.normal for f in features]), np.array([f.lidar_normal for f in features])
@@ -36,7 +36,7 @@ def drop_uncertain(features: Sequence[CaptureFeatures], T_cam_lidar: Array) -> l
     """Mask the tenth of all plane terms with the largest propagated variance.
 
     The distance n . (R p + t) + d of a point inherits sigma^2 = (R p + t)^T cov_n (R p + t) from the camera's
-    normal. No capture loses more than half of its points, so that the filter thins and does not select captures.
+    normal. No capture loses more than half of its points: the filter thins captures and does not select them.
 
     Args:
         features: of all captures.

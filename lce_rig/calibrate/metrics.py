@@ -20,8 +20,8 @@ def capture_residual(
 ) -> CaptureResidual:
     """Measure how well one capture fits an extrinsic.
 
-    Points are taken as the LiDAR measured them; ring ends are moved along their rays onto the board's plane and
-    compared with the printed size, without half step or shift.
+    Points are taken as the LiDAR measured them; ring ends are moved along their rays onto the board's plane
+    and compared with the printed size, without half step or shift.
 
     Args:
         T_cam_lidar: (4, 4).

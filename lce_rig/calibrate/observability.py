@@ -60,7 +60,9 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
     Raises:
         NotEnoughDataError: a direction is left open; it is named.
     """
-    x = with_one(np.concatenate([vec_rotation(T_cam_lidar[:3, :3]), T_cam_lidar[:3, 3], np.zeros(problem.n_shift)]))
+    x = with_one(
+        np.concatenate([vec_rotation(T_cam_lidar[:3, :3]), T_cam_lidar[:3, 3], np.zeros(problem.n_shift)])
+    )
     # Three freedoms of a plane, each as good as that.
     planes = Weights(3 / PLANE_SIGMA_M**2, 0.0, problem.weights.shift_prior)
     _, hessians = linearise(problem, x, problem.associate(x[None])[0], planes)

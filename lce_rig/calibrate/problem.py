@@ -25,7 +25,6 @@ from lce_rig.solvers.registration import (
     eliminate_linear,
     linear_unknowns,
     residual_rows,
-    rotation_cost,
     vec_rotation,
     with_one,
 )
@@ -200,16 +199,13 @@ class Problem:
         edge = np.zeros((len(x), self.n_captures))
         ids = self.associate(x)
         squares = np.take_along_axis(
-            np.moveaxis(x @ np.swapaxes(self._edge_rows, 1, 2), 0, 0).transpose(1, 0, 2), ids[..., None], axis=2
+            np.moveaxis(x @ np.swapaxes(self._edge_rows, 1, 2), 0, 0).transpose(1, 0, 2),
+            ids[..., None],
+            axis=2,
         )[..., 0]
         squares = squares**2 * self._edge_weight
         np.add.at(edge.T, self.edge_capture, squares.T)
         return np.sqrt(plane), np.sqrt(edge)
-
-    def cost(self, selection: Array, solutions: Solutions) -> Array:
-        """Evaluate the cost (B,) at the solutions, with the linear unknowns at their best."""
-        Q, _ = eliminate_linear(self.moments(selection, solutions.edge_ids))
-        return rotation_cost(Q, solutions.R)
 
 
 def _board_coordinates(f: CaptureFeatures, size: int) -> Array:

@@ -180,7 +180,8 @@ def _read_as_floats(text: io.BytesIO, flat: np.dtype[Any]) -> NDArray[Any]:
     table = np.empty(len(values), dtype=flat)
     for k, name in enumerate(names):
         is_float = flat[name].kind == "f"
-        table[name] = values[:, k] if is_float else np.nan_to_num(values[:, k], posinf=0.0, neginf=0.0)
+        with np.errstate(invalid="ignore", over="ignore"):
+            table[name] = values[:, k] if is_float else np.nan_to_num(values[:, k], posinf=0.0, neginf=0.0)
     return table
 
 

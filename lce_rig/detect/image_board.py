@@ -1,13 +1,35 @@
 """The board in a picture: corners, both poses and figures, or why there is none."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
+from lce_rig.core.errors import ProfileError
+from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import ImageBoard, Refusal
-from lce_rig.detect.image_corners import find_corners
-from lce_rig.solvers.pnp import solve_planar_pose
+from lce_rig.detect.image_corners import find_grid, seen_grid
+from lce_rig.detect.image_quality import (
+    explain_absence,
+    explain_other_grid,
+    extent,
+    grid_quality,
+    quality_problem,
+)
+from lce_rig.detect.image_saddle import Crossings, fit_crossings
+from lce_rig.solvers.pnp import PlanarPose, solve_planar_pose
+
+Region = tuple[int, int, int, int]
+
+# The alternative pose is as good as the first where the difference of the costs could be noise (3 sigma).
+_AMBIGUOUS_CHI2 = 9.0
+# A part of the picture may be missing at its end (a cut-off readout); a larger difference is another mode.
+_CUT_FRACTION = 0.02
+# Corners that the finder misplaced, or that an artefact covers, at most.
+_MAX_MISPLACED = 0.08
+# The outer squares of a line that is not on the board are all alike.
+_MIN_OUTER_CONTRAST = 0.35
 
 
 def find_image_board(
@@ -15,25 +37,178 @@ def find_image_board(
     board: Board,
     intrinsics: Intrinsics,
     *,
-    region: tuple[int, int, int, int] | None = None,
-    max_reprojection_px: float = 1.5,
+    region: Region | None = None,
+    max_reprojection_px: float = 1.0,
+    min_contrast: float = 12.0,
+    min_sharpness: float = 1.5,
 ) -> ImageBoard | Refusal:
-    """Find the board's inner corners and its two possible poses in one picture."""
-    corners = find_corners(image.grey, board)
-    if corners is None:
-        return Refusal("image", f"no {board.cols}x{board.rows} inner corners seen", "show the whole board")
-    solved = solve_planar_pose(corners, board.corners(), intrinsics)
+    """Find the board's inner corners in one picture and T_cam_board in both its minima.
+
+    Corners are ordered as `Board.corners()` says. A pattern that is not symmetric under 180 deg is read with
+    the outer square at its top left black; a symmetric one with its top row up in the picture.
+
+    Args:
+        image: the picture.
+        board: the board as the profile describes it.
+        intrinsics: of the camera, at the picture's resolution.
+        region: (u0, v0, u1, v1) px to search first, from `region_around` the board in the last live picture;
+            the whole picture follows where it is not there.
+        max_reprojection_px: refuse where the corners' rms distance from the board's picture is larger.
+        min_contrast: refuse where black and white differ by fewer grey values.
+        min_sharpness: refuse where fewer edge widths fit into a square.
+
+    Raises:
+        ProfileError: the intrinsics belong to pictures of another size.
+    """
+    grey = crop_to_intrinsics(image, intrinsics)
+    crossings = _find_in_region(grey, board, region) or find_grid(grey, board)
+    if crossings is None:
+        return explain_absence(image, grey, board)
+    quality = grid_quality(grey, crossings)
+    outer_contrast, goes_on = extent(grey, crossings.grid_px)
+    if outer_contrast < _MIN_OUTER_CONTRAST or goes_on:
+        seen = seen_grid(grey)
+        return explain_other_grid(grey, board, crossings.grid_px if seen is None else seen)
+    problem = quality_problem(quality, min_contrast, min_sharpness)
+    if problem is not None:
+        return problem
+
+    solved, crossings = _solve(grey, crossings, board, intrinsics)
     if solved is None or solved.reprojection_px > max_reprojection_px:
-        return Refusal("image", "the corners fit no pose of the board", "check the intrinsics")
-    distance = float(np.linalg.norm(solved.T_cam_board[:3, 3]))
+        return _misfit(solved, quality, intrinsics, max_reprojection_px)
+    quality |= {"n_corners": float(crossings.is_fitted.sum()), "corner_rms_px": solved.reprojection_px}
     return ImageBoard(
-        corners_px=corners,
+        corners_px=crossings.grid_px.reshape(-1, 2),
         T_cam_board=solved.T_cam_board,
         cov=solved.cov,
         T_cam_board_alternative=solved.T_cam_board_alternative,
         chi2_gap=solved.chi2_gap,
-        is_ambiguous=solved.chi2_gap < 9.0,
+        is_ambiguous=solved.chi2_gap < _AMBIGUOUS_CHI2,
         reprojection_px=solved.reprojection_px,
         sigma_px=solved.sigma_px,
-        quality={"distance_m": distance},
+        quality=quality | _pose_quality(solved.T_cam_board),
     )
+
+
+def region_around(found: ImageBoard, image: Image, margin: float = 0.5) -> Region:
+    """Name the part of the next picture to search: the corners' box, larger by `margin` of its size.
+
+    Returns:
+        (u0, v0, u1, v1) px, within the picture.
+    """
+    height, width = image.pixels.shape[:2]
+    low, high = found.corners_px.min(axis=0), found.corners_px.max(axis=0)
+    reach = margin * (high - low).max() + 8
+    u0, v0 = np.maximum(np.floor(low - reach), 0).astype(int)
+    u1, v1 = np.minimum(np.ceil(high + reach) + 1, [width, height]).astype(int)
+    return int(u0), int(v0), int(u1), int(v1)
+
+
+def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:
+    """Return the grey picture at the size the intrinsics belong to.
+
+    Two harmless differences occur in recordings: a readout that ends a few lines early, and a canvas larger
+    than the sensor, blank beyond it (pictures reconstructed from events).
+
+    Raises:
+        ProfileError: any other size, naming both.
+    """
+    grey = image.grey
+    height, width = grey.shape
+    wanted_width, wanted_height = intrinsics.width_px, intrinsics.height_px
+    if (width, height) == (wanted_width, wanted_height):
+        return grey
+    missing_u, missing_v = 1 - width / wanted_width, 1 - height / wanted_height
+    if 0 <= missing_u <= _CUT_FRACTION and 0 <= missing_v <= _CUT_FRACTION:
+        return grey
+    if missing_u <= 0 and missing_v <= 0 and _is_blank_beyond(grey, wanted_width, wanted_height):
+        return grey[:wanted_height, :wanted_width]
+    hint = "use the intrinsics of this mode, or record in the mode the intrinsics were calibrated in"
+    if abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width:
+        hint += f"; if the picture is only scaled, multiply fx, fy, cx, cy by {width / wanted_width:.4g}"
+    raise ProfileError(
+        f"camera {image.sensor}, channel {image.channel}: the picture is {width}x{height} px, the profile's "
+        f"intrinsics belong to {wanted_width}x{wanted_height} px",
+        hint,
+    )
+
+
+def _is_blank_beyond(grey: NDArray[np.uint8], width_px: int, height_px: int) -> bool:
+    """Tell whether nothing but a smooth background lies right of and below the sensor's size."""
+    steps = np.abs(np.diff(grey.astype(np.int16), axis=1))
+    inside = np.percentile(steps[:height_px, : width_px - 1], 99)
+    beyond = np.concatenate([steps[height_px:].ravel(), steps[:height_px, width_px + 8 :].ravel()])
+    return bool(np.percentile(beyond, 99) <= max(0.3 * inside, 2.0))
+
+
+def _find_in_region(grey: NDArray[np.uint8], board: Board, region: Region | None) -> Crossings | None:
+    if region is None:
+        return None
+    u0, v0, u1, v1 = region
+    part = grey[max(v0, 0) : v1, max(u0, 0) : u1]
+    if min(part.shape) < 16:
+        return None
+    found = find_grid(np.ascontiguousarray(part), board)
+    return None if found is None else fit_crossings(grey, found.grid_px + [max(u0, 0), max(v0, 0)])
+
+
+def _solve(
+    grey: NDArray[np.uint8], crossings: Crossings, board: Board, intrinsics: Intrinsics
+) -> tuple[PlanarPose | None, Crossings]:
+    """Solve for the pose; corners far from the board's picture are looked for again where they should be.
+
+    A finder puts single corners onto an artefact now and then. Few of them are fitted again from where the
+    others put them; what cannot be fitted there takes that place and no longer counts in `n_corners`.
+    """
+    corners_board = board.corners()
+    solved = solve_planar_pose(crossings.grid_px.reshape(-1, 2), corners_board, intrinsics)
+    if solved is None:
+        return None, crossings
+    error_px = _errors(solved.T_cam_board, crossings, corners_board, intrinsics)
+    is_far = error_px > max(6.0 * float(np.median(error_px)), 0.5)
+    is_far |= ~crossings.is_fitted.ravel()
+    if not is_far.any() or is_far.mean() > _MAX_MISPLACED:
+        return solved, crossings
+
+    good = ~is_far
+    rest = solve_planar_pose(crossings.grid_px.reshape(-1, 2)[good], corners_board[good], intrinsics)
+    if rest is None:
+        return solved, crossings
+    predicted, _ = intrinsics.project(transform(rest.T_cam_board, corners_board))
+    starts = np.where(is_far[:, None], predicted, crossings.grid_px.reshape(-1, 2))
+    again = fit_crossings(grey, starts.reshape(crossings.grid_px.shape))
+    still_far = _errors(rest.T_cam_board, again, corners_board, intrinsics) > 6.0 * rest.reprojection_px
+    is_lost = (is_far & (still_far | ~again.is_fitted.ravel())).reshape(again.is_fitted.shape)
+    repaired = Crossings(
+        grid_px=np.where(is_lost[..., None], predicted.reshape(again.grid_px.shape), again.grid_px),
+        is_fitted=~is_lost,
+        contrast=again.contrast,
+        edge_sigma_px=again.edge_sigma_px,
+        noise=again.noise,
+    )
+    return solve_planar_pose(repaired.grid_px.reshape(-1, 2), corners_board, intrinsics), repaired
+
+
+def _errors(T_cam_board: Array, crossings: Crossings, corners_board: Array, intrinsics: Intrinsics) -> Array:
+    predicted, _ = intrinsics.project(transform(T_cam_board, corners_board))
+    return np.asarray(np.linalg.norm(predicted - crossings.grid_px.reshape(-1, 2), axis=1))
+
+
+def _pose_quality(T_cam_board: Array) -> dict[str, float]:
+    """Measure tilt_deg (print's normal against the line of sight) and distance_m."""
+    distance_m = float(np.linalg.norm(T_cam_board[:3, 3]))
+    cosine = abs(float(T_cam_board[:3, 2] @ T_cam_board[:3, 3])) / distance_m
+    return {"tilt_deg": float(np.degrees(np.arccos(min(cosine, 1.0)))), "distance_m": distance_m}
+
+
+def _misfit(
+    solved: PlanarPose | None, quality: dict[str, float], intrinsics: Intrinsics, max_reprojection_px: float
+) -> Refusal:
+    lens = f"{intrinsics.model} at {intrinsics.width_px}x{intrinsics.height_px} px"
+    action = f"check the camera's intrinsics ({lens}): model, distortion and resolution; is the print flat?"
+    if solved is None:
+        return Refusal("image", "the corners fit no pose of the board in front of the camera", action)
+    cause = (
+        f"corners fit the board to {solved.reprojection_px:.2f} px rms (at most {max_reprojection_px:.2f})"
+    )
+    return Refusal("image", cause, action)

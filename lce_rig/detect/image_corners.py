@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
-from lce_rig.detect.image_saddle import fit_crossings
+from lce_rig.detect.image_saddle import Crossings, fit_crossings, sample
 
 Grey = NDArray[np.uint8]
 
@@ -22,33 +22,35 @@ _SB_THOROUGH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
 
-def find_corners(grey: Grey, board: Board) -> Array | None:
-    """Find the inner corners, cheapest attempt first, and refine them to sub-pixel accuracy.
+def find_grid(grey: Grey, board: Board) -> Crossings | None:
+    """Find the inner corners, cheapest attempt first, and fit them to sub-pixel accuracy.
 
     Args:
         grey: (H, W).
         board: tells the number of inner corners.
 
     Returns:
-        (rows * cols, 2) px in the order of `Board.corners()`, or None.
+        The crossings, `grid_px` in the order of `Board.corners()`; None where no attempt finds that many.
     """
     for found in _attempts(grey, (board.cols, board.rows)):
         if found is not None:
-            corners = fit_crossings(grey, found.reshape(board.rows, board.cols, 2)).grid_px.reshape(-1, 2)
-            return order_corners(grey, corners, board)
+            return fit_crossings(grey, order_corners(grey, found, board).reshape(board.rows, board.cols, 2))
     return None
 
 
-def refine_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
-    """Move corners to the saddle points of the grey values, by `cv2.cornerSubPix`.
+def seen_grid(grey: Grey) -> Array | None:
+    """Find a checkerboard of any size of at least 5x4 inner corners, to say what is there instead.
 
-    The window reaches 40 % of the shortest side of the squares, so that it holds one corner only.
+    Returns:
+        (rows, cols, 2) px; which of the two is called rows means nothing. None where nothing is found.
     """
-    window = int(np.clip(0.4 * shortest_side_px(corners_px, board), 2, 15))
-    points = corners_px.astype(np.float32).reshape(-1, 1, 2)
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
-    refined = cv2.cornerSubPix(grey, points, (window, window), (-1, -1), criteria)
-    return np.asarray(refined, dtype=np.float64).reshape(-1, 2)
+    width = grey.shape[1]
+    scale = _SEARCH_PX / width if width > _WIDE_PX else 1.5
+    level = level_contrast(_resize(grey, scale))
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+    is_found, corners, meta = cv2.findChessboardCornersSBWithMeta(level, (5, 4), flags)
+    full = _to_full_scale(corners, scale) if is_found else None
+    return None if full is None else full.reshape(*meta.shape[:2], 2)
 
 
 def order_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
@@ -71,11 +73,9 @@ def order_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
         grid = grid[:, ::-1]
     turns = (0, 1, 2, 3) if board.rows == board.cols else (0, 2)
     candidates = [np.rot90(grid, turn) for turn in turns]
-    blackness = [black_top_left(grey, candidate) for candidate in candidates]
-    if max(blackness) - min(blackness) > 1e-6:
-        candidates = [
-            candidate for candidate, black in zip(candidates, blackness, strict=True) if black > 0
-        ] or candidates
+    if not board.is_symmetric or len(turns) == 4:
+        dark = [candidate for candidate in candidates if black_top_left(grey, candidate) > 0]
+        candidates = dark or candidates
     best = min(candidates, key=lambda candidate: candidate[0, :, 1].mean() - candidate[-1, :, 1].mean())
     return np.ascontiguousarray(best.reshape(-1, 2))
 
@@ -98,20 +98,6 @@ def square_values(grey: Grey, grid_px: Array) -> Array:
     return sample(grey, centres)
 
 
-def sample(grey: Grey, pixels: Array) -> Array:
-    """Interpolate grey values bilinearly at (..., 2) px; the border's value is kept beyond it."""
-    maps = np.asarray(pixels, dtype=np.float32).reshape(-1, 1, 2)
-    values = cv2.remap(grey.astype(np.float32), maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(values, dtype=np.float64).reshape(pixels.shape[:-1])
-
-
-def shortest_side_px(corners_px: Array, board: Board) -> float:
-    """Measure the shortest side of all squares between the corners, px."""
-    grid = corners_px.reshape(board.rows, board.cols, 2)
-    sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
-    return float(min(sides))
-
-
 def _attempts(grey: Grey, size: tuple[int, int]) -> Iterator[Array | None]:
     """Run the finders one after the other, cheapest first; the caller stops at the first success.
 
@@ -123,7 +109,9 @@ def _attempts(grey: Grey, size: tuple[int, int]) -> Iterator[Array | None]:
         yield _classic(grey, size, min(1.0, 1280 / width))
         yield _sector_based(grey, size, _SEARCH_PX / width, _SB)
         small = _resize(grey, _SEARCH_PX / width)
-        yield _to_full_scale(_sector_based(level_contrast(small), size, 1.0, _SB_THOROUGH), _SEARCH_PX / width)
+        yield _to_full_scale(
+            _sector_based(level_contrast(small), size, 1.0, _SB_THOROUGH), _SEARCH_PX / width
+        )
         return
     yield _classic(grey, size, 2.0)
     level = level_contrast(grey)

@@ -11,7 +11,7 @@ from lce_rig.core.geometry import Array
 # Reach of the fitted patch towards the neighbouring corners: less than half way, so that blurred edges of the
 # next corners stay outside.
 _REACH = 0.42
-_MAX_SAMPLES_PER_SIDE = 17
+_MAX_SAMPLES_PER_SIDE = 25
 _STEPS = 12
 _MIN_SIGMA_PX = 0.25
 
@@ -81,7 +81,8 @@ def fit_crossings(grey: NDArray[np.uint8], grid_px: Array) -> Crossings:
 
 def sample(grey: NDArray[np.uint8], pixels: Array) -> Array:
     """Interpolate grey values bilinearly at (..., 2) px; beyond the border its value is kept."""
-    maps = np.asarray(pixels, dtype=np.float32).reshape(-1, 1, 2)
+    # cv2.remap takes at most 32766 rows and columns.
+    maps = np.asarray(pixels, dtype=np.float32).reshape(-1, pixels.shape[-2], 2)
     values = cv2.remap(grey, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float64).reshape(pixels.shape[:-1])
 
@@ -106,7 +107,11 @@ def _fit(values: Array, a: Array, b: Array, height_px: Array) -> tuple[Array, Ar
     for _ in range(_STEPS):
         H = np.swapaxes(J, 1, 2) @ J
         diagonal = np.einsum("kii->ki", H)
-        damped = H + np.eye(8) * (damping[:, None] * diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-12)[:, None, :]
+        damped = (
+            H
+            + np.eye(8)
+            * (damping[:, None] * diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-12)[:, None, :]
+        )
         step = -np.linalg.solve(damped, np.swapaxes(J, 1, 2) @ residuals[..., None])[..., 0]
         candidate = p + step
         candidate[:, :4] = np.clip(candidate[:, :4], -1.0, 1.0)

@@ -21,6 +21,9 @@ from lce_rig.detect.lidar_template import (
 
 SURROUND_M = 0.20
 SIZE_PRIOR_M = 0.10
+SLACK_M = 0.05
+MIN_POINTS = 12
+EDGE_TOLERANCE_M = 0.012
 SETTLED_M = 0.01  # an outline that moves less leaves the returns inside it, and so the plane, as they are
 
 
@@ -96,11 +99,11 @@ def refine(
         plane: (4,) first guess.
         centre: (3,) m, the point of the plane the placement is counted from.
         placement: first guess of the outline.
-        limit_m: largest error of the outline.
+        limit_m: an outline that is worse by half is not improved further.
 
     Returns:
-        The beams about the plate and the outline among them, None where too few returns lie on the plane or
-        the outline does not fit.
+        The beams about the plate and the outline among them, with its error; None where too few returns lie
+        on the plane.
     """
     radius_m = float(np.hypot(*placement.half_m)) + SURROUND_M
     tolerance_m = 4.0 * scan.sigma_m + 0.01
@@ -119,14 +122,15 @@ def refine(
         height = points @ plane[:3] + plane[3]
         tolerance_m = 3.5 * 1.4826 * float(np.median(np.abs(height))) + 0.004
         view = view_plane(scan, plane, view.origin, radius_m, tolerance_m)
-        if len(view.chord_start) == 0:
+        registered = register(scan, view, placement)
+        if registered is None:
             return None
-        placement, centre = register(view, placement), view.origin
+        placement, centre = registered, view.origin
         if placement.error_m > 1.5 * limit_m:
-            return None
+            break
         if np.hypot(placement.u_m, placement.v_m) < SETTLED_M:
             break
-    return (view, placement) if placement.error_m <= limit_m else None
+    return view, placement
 
 
 def find_ring_ends(scan: OrderedScan, view: PlaneView, is_board: NDArray[np.bool_]) -> RingEnds:
@@ -216,7 +220,12 @@ def measure_size(
     cov = np.linalg.inv(information)
     freedom = max(1.0, float((weight > 0).sum()) - 5)
     chi2 = float((weight * (residual / sigma_m) ** 2).sum()) / freedom
-    size_sigma_m = 2 * np.sqrt(np.diag(cov)[3:] * max(1.0, chi2))
+    # Ends of rings at equal gaps share their phase: their steps do not average out.
+    common_m = float(np.median(step_m)) / np.sqrt(12) if len(step_m) else 0.0
+    size_sigma_m = np.hypot(2 * np.sqrt(np.diag(cov)[3:] * max(1.0, chi2)), common_m)
+    if np.abs(x[:2]).max() > SLACK_M or np.abs(x[3:]).max() > SLACK_M:
+        # The ends contradict each other: they say nothing about the size.
+        return placement, np.full(2, SIZE_PRIOR_M), target, step_m
     cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
     fitted = Placement(
         placement.u_m + float(cosine * x[0] - sine * x[1]),
@@ -230,7 +239,7 @@ def measure_size(
 
 def build_board(
     scan: OrderedScan, source: Scan, board: Board, view: PlaneView, placement: Placement, beam: Beam
-) -> LidarBoard:
+) -> LidarBoard | None:
     """Collect the returns inside the outline, keep the ring ends that are the board's own, and sum up.
 
     Args:
@@ -240,14 +249,21 @@ def build_board(
         view: beams about the board.
         placement: of the nominal rectangle.
         beam: light spot of the LiDAR.
+
+    Returns:
+        The board, None where hardly a return lies inside the outline.
     """
     distance_m = float(np.linalg.norm(view.origin))
     beyond_m = beam.half_width_m(distance_m)
     away, _ = signed_distance(placement.local(view.uv), placement.half_m)
-    is_board = view.is_on & (away <= beyond_m + 0.015)
-    ends = find_ring_ends(scan, view, is_board)
+    # A plate somewhat larger than it should be is to be measured, not cut to size.
+    ends = find_ring_ends(scan, view, view.is_on & (away <= beyond_m + SLACK_M))
     fitted, size_sigma_m, residual, step_m = measure_size(ends, view.uv, placement, beyond_m)
-    limit_m = step_m / 2 + 0.010 + 0.5 * beyond_m
+    away, _ = signed_distance(fitted.local(view.uv), fitted.half_m)
+    is_board = view.is_on & (away <= beyond_m + EDGE_TOLERANCE_M)
+    if is_board.sum() < MIN_POINTS:
+        return None
+    limit_m = step_m / 2 + EDGE_TOLERANCE_M + 0.5 * beyond_m
     is_good = ends.is_border & (np.abs(residual) <= limit_m)
     order = np.lexsort((ends.side, scan.ring[view.member[ends.beam]]))
     order = order[is_good[order]]
@@ -255,7 +271,7 @@ def build_board(
     points = scan.points[kept].astype(np.float64)
     height = points @ view.plane[:3] + view.plane[3]
     size_m = 2 * np.asarray(fitted.half_m)
-    size_sigma_m = np.hypot(size_sigma_m, beyond_m)
+    size_sigma_m = np.hypot(size_sigma_m, beyond_m)  # how much of the light spot counts is not known
     spec_m = np.array([board.width_m, board.height_m])
     weight = 1.0 / size_sigma_m**2
     incidence = np.arccos(np.clip(view.plane[3] / distance_m, 0.0, 1.0))
@@ -272,6 +288,7 @@ def build_board(
         "size_ratio": float((weight * size_m / spec_m).sum() / weight.sum()),
         "edge_rms_m": float(np.sqrt(np.mean(residual[is_good] ** 2))) if is_good.any() else float("nan"),
         "template_m": placement.error_m,
+        "beyond_share": float((view.is_on & (away > SLACK_M)).sum()) / max(1, len(kept)),
         "distance_m": distance_m,
         "incidence_deg": float(np.degrees(incidence)),
         "range_noise_m": scan.sigma_m,
@@ -285,7 +302,7 @@ def build_board(
         azimuth_step_rad=scan.step_rad,
         plane=view.plane,
         sigma_m=float(np.sqrt(np.mean(height**2))),
-        T_lidar_board=_pose_of(view, placement),
+        T_lidar_board=_pose_of(view, fitted),
         offset_ns=None if source.offset_ns is None else source.offset_ns[scan.index[kept]],
         quality=quality,
     )

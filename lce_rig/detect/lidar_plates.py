@@ -1,6 +1,6 @@
 """Plates of about the board's size: clusters of straight segments that lie in one plane."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,9 @@ class Plates:
         return Plates(*(getattr(self, field.name)[keep] for field in fields(self)))
 
 
-def propose_plates(scan: OrderedScan, segments: Segments, board: Board, n_plates: int = 10) -> tuple[Plates, Array]:
+def propose_plates(
+    scan: OrderedScan, segments: Segments, board: Board, n_plates: int = 10, is_any_size: bool = False
+) -> tuple[Plates, Array]:
     """Grow plates from pairs of neighbouring segments and keep different ones of plausible size.
 
     Each pair of parallel segments on neighbouring rings spans a plane. A plane takes all segments in reach
@@ -48,6 +50,7 @@ def propose_plates(scan: OrderedScan, segments: Segments, board: Board, n_plates
         segments: straight segments of all lengths.
         board: gives the reach.
         n_plates: the most plates to return.
+        is_any_size: whether to keep plates that cannot be the board.
 
     Returns:
         The plates, and the first and last return of their segments (K, M, 3) in m; NaN fills the rows up.
@@ -55,24 +58,48 @@ def propose_plates(scan: OrderedScan, segments: Segments, board: Board, n_plates
     diagonal_m = float(np.hypot(board.width_m, board.height_m))
     tolerance_m = 2.0 * scan.sigma_m + 0.01
     segments = segments.select(segments.lateral_m < tolerance_m)
-    first, second = _neighbours(segments, diagonal_m)
+    first, second = _neighbours(segments, diagonal_m, is_any_size)
     sums = _sums(segments)
     plates = _fit(np.repeat(np.arange(len(first)), 2), np.stack([first, second], 1).ravel(), segments, sums)
     is_kept = (plates.thickness_m < tolerance_m) & _faces_lidar(plates)
+    facing, is_blurred = _facing_planes(plates, segments, first, second, 3.0 * scan.sigma_m)
+    plates = replace(plates, plane=np.where(is_blurred[:, None], facing, plates.plane))
+    is_kept |= is_blurred
     row = column = first
-    for _ in range(N_ROUNDS):
+    for _ in range(2 * N_ROUNDS if is_blurred.any() else N_ROUNDS):
         row, column = _members(plates.select(is_kept), segments, 0.6 * diagonal_m, tolerance_m)
         plates = _fit(row, column, segments, sums)
         # The same members give the very same sums.
         is_kept = np.zeros(len(plates.centre), dtype=np.bool_)
         is_kept[np.unique(plates.centre[:, 0], return_index=True)[1]] = True
-        is_kept &= (plates.n_rings >= 2) & _faces_lidar(plates) & (plates.size_m[:, 0] < 1.5 * diagonal_m)
-    best = _different(plates, np.flatnonzero(is_kept & _is_plausible(plates, board)), board, n_plates)
+        is_kept &= (plates.n_rings >= 2) & _faces_lidar(plates) & (plates.size_m[:, 0] < 2.0 * diagonal_m)
+    if not is_any_size:
+        is_kept &= _is_plausible(plates, board)
+    best = _different(plates, np.flatnonzero(is_kept), board, n_plates)
     ends = [_ring_ends(scan, segments, column[row == k]) for k in best]
     padded = np.full((len(best), max((len(e) for e in ends), default=1), 3), np.nan)
     for k, e in enumerate(ends):
         padded[k, : len(e)] = e
     return plates.select(best), padded
+
+
+def _facing_planes(
+    plates: Plates, segments: Segments, first: Indices, second: Indices, blur_m: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Lay a plane (K, 4) through each pair's line, as square to the beam as can be, for pairs (K,) lost in noise.
+
+    Where the noise is as large as the distance between two rings, their plane is arbitrary; this one is near
+    enough to collect the rings beyond them.
+    """
+    direction = segments.direction[first]
+    away = segments.centre[second] - segments.centre[first]
+    away = away - np.einsum("ij,ij->i", away, direction)[:, None] * direction
+    is_blurred = np.linalg.norm(away, axis=1) < blur_m
+    along = np.einsum("ij,ij->i", plates.centre, direction)
+    normal = along[:, None] * direction - plates.centre
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-9)[:, None]
+    d = -np.einsum("ij,ij->i", normal, plates.centre)
+    return np.concatenate([normal, d[:, None]], axis=1), is_blurred
 
 
 def _ring_ends(scan: OrderedScan, segments: Segments, members: Indices) -> Array:
@@ -84,9 +111,10 @@ def _ring_ends(scan: OrderedScan, segments: Segments, members: Indices) -> Array
     return scan.points[np.concatenate([first, last])].astype(np.float64)
 
 
-def _neighbours(segments: Segments, diagonal_m: float) -> tuple[Indices, Indices]:
+def _neighbours(segments: Segments, diagonal_m: float, is_any_size: bool) -> tuple[Indices, Indices]:
     """List the pairs of board-like segments that can lie side by side on one plate."""
-    is_seed = (segments.length_m > 0.2 * diagonal_m) & (segments.length_m < 1.15 * diagonal_m)
+    max_length_m = (2.0 if is_any_size else 1.15) * diagonal_m
+    is_seed = (segments.length_m > 0.2 * diagonal_m) & (segments.length_m < max_length_m)
     distance = np.linalg.norm(segments.centre, axis=1)
     along_beam = np.einsum("ij,ij->i", segments.direction, segments.centre)
     is_seed &= np.abs(along_beam) < np.sin(MAX_INCIDENCE_RAD) * distance

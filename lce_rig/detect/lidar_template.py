@@ -11,6 +11,7 @@ from lce_rig.detect.lidar_segments import MAX_STEPS, Indices, OrderedScan
 
 N_ANGLES = 12
 CAP_M = 0.10
+MIN_ON_RING = 3  # returns that make a chord
 # What a beam says about the outline: it ends a chord, or should lie inside or outside.
 END, INSIDE, OUTSIDE, UNUSED = range(4)
 
@@ -27,7 +28,6 @@ class PlaneView:
         uv: (M, 2) where each beam pierces the plane, m.
         height_m: (M,) distance of each return from the plane, positive before it.
         tolerance_m: returns within it lie on the plane.
-        chord_start, chord_end: (C,) first and last member of the longest run on the plane of each ring.
     """
 
     plane: Array
@@ -37,8 +37,6 @@ class PlaneView:
     uv: Array
     height_m: Array
     tolerance_m: float
-    chord_start: Indices
-    chord_end: Indices
 
     @property
     def is_on(self) -> NDArray[np.bool_]:
@@ -72,7 +70,7 @@ class Placement:
 
 
 def view_plane(scan: OrderedScan, plane: Array, centre: Array, radius_m: float, tolerance_m: float) -> PlaneView:
-    """Pierce a plane by all beams that do so within a radius of a point, and find its chord on each ring.
+    """Pierce a plane by all beams that do so within a radius of a point.
 
     Args:
         scan: all returns.
@@ -95,8 +93,7 @@ def view_plane(scan: OrderedScan, plane: Array, centre: Array, radius_m: float, 
     near, pierced, height_m = near[is_near], pierced[is_near], along_normal[is_near] + d
     axes = plane_axes(normal)
     uv = pierced @ axes
-    start, end = _longest_runs(scan, near, uv, np.abs(height_m) <= tolerance_m)
-    return PlaneView(plane, axes, origin, near, uv, height_m, tolerance_m, start, end)
+    return PlaneView(plane, axes, origin, near, uv, height_m, tolerance_m)
 
 
 def plane_axes(normal: Array) -> Array:
@@ -112,39 +109,58 @@ def plane_axes(normal: Array) -> Array:
     return np.stack([level, upwards], axis=-1)
 
 
-def _longest_runs(
-    scan: OrderedScan, member: Indices, uv: Array, is_on: NDArray[np.bool_]
-) -> tuple[Indices, Indices]:
-    """Find the first and last beam of each ring's longest run on the plane, over gaps of a few firings."""
-    on = np.flatnonzero(is_on)
+def find_chords(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[Indices, Indices]:
+    """Find on each ring the run of returns from the plane that shares most with the placed rectangle.
+
+    Other runs of the ring belong to other things that happen to lie in the plane.
+
+    Args:
+        scan: all returns.
+        view: beams about the plate.
+        placement: where the board is thought to be.
+
+    Returns:
+        First and last beam of each run (C,), as indices into the view.
+    """
+    on = np.flatnonzero(view.is_on)
     if len(on) < 2:
         return on[:0], on[:0]
-    ring = scan.ring[member[on]]
-    turn = np.mod(np.diff(scan.azimuth[member[on]]), 2 * np.pi)
+    ring = scan.ring[view.member[on]]
+    turn = np.mod(np.diff(scan.azimuth[view.member[on]]), 2 * np.pi)
     is_cut = (np.diff(ring) != 0) | (turn > MAX_STEPS * scan.step_rad)
     start = np.concatenate([[0], np.flatnonzero(is_cut) + 1])
     end = np.append(start[1:], len(on)) - 1
-    length = np.linalg.norm(uv[on[end]] - uv[on[start]], axis=1)
-    order = np.lexsort((-length, ring[start]))
-    is_first = np.diff(ring[start][order], prepend=-1) != 0
-    best = order[is_first]
-    best = best[end[best] - start[best] >= 2]
+    is_inside = signed_distance(placement.local(view.uv[on]), placement.half_m)[0] < 0
+    n_inside = np.add.reduceat(is_inside.astype(np.intp), start)
+    order = np.lexsort((-n_inside, ring[start]))
+    best = order[np.diff(ring[start][order], prepend=-1) != 0]
+    best = best[n_inside[best] >= MIN_ON_RING]
     return on[start[best]], on[end[best]]
 
 
-def register(view: PlaneView, start: Placement) -> Placement:
+def register(scan: OrderedScan, view: PlaneView, start: Placement) -> Placement | None:
     """Find the placement of a rectangle, near a first guess, that the beams contradict least.
 
     The chords' ends should lie on the border, beams that return from the plane inside it, and beams that
     return from behind the plane outside.
 
     Args:
+        scan: all returns.
         view: beams about the plate.
         start: first guess; gives the size.
+
+    Returns:
+        The placement, None where no ring shows the plate.
     """
-    ends = view.uv[np.concatenate([view.chord_start, view.chord_end])]
+    first, last = find_chords(scan, view, start)
+    if len(first) == 0:
+        return None
+    ends = view.uv[np.concatenate([first, last])]
+    is_chord = np.zeros(len(view.uv) + 1, dtype=np.int8)
+    np.add.at(is_chord, first, 1)
+    np.add.at(is_chord, last + 1, -1)
     # Beams far from any border say the same as their neighbours: a sample is enough.
-    inside, outside = view.uv[view.is_on], view.uv[view.height_m < -view.tolerance_m]
+    inside, outside = view.uv[view.is_on & (np.cumsum(is_chord[:-1]) > 0)], view.uv[view.height_m < -view.tolerance_m]
     inside = inside[:: max(1, -(-len(inside) // 120))]
     outside = outside[:: max(1, -(-len(outside) // 120))]
     kind = np.repeat([END, INSIDE, OUTSIDE], [len(ends), len(inside), len(outside)])

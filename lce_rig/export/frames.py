@@ -126,7 +126,7 @@ def check_tree(links: Sequence[str], joints: Iterable[tuple[str, str]]) -> None:
     """Check that links and (parent, child) joints make one tree; no URDF parser at hand does so.
 
     Raises:
-        LceRigError: no link, a name twice, an unknown link, a link with two parents, no or several roots, or a loop.
+        LceRigError: no link, a name twice, an unknown link, two parents, several roots, or a loop.
     """
     if not links:
         raise LceRigError("no links")

@@ -55,8 +55,10 @@ def header(what: str, rig: Rig, calibrations: Sequence[Calibration]) -> list[str
     """List the lines every file begins with, as comments: what it is, by whom, whether to use it."""
     lines = [f"{what} of rig {rig.name}, written by {MADE_BY}"]
     for calibration in calibrations:
+        pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
+        deg, mm = calibration.sigma_rotation_deg, 1e3 * calibration.sigma_translation_m
+        lines.append(f"{pair}: {calibration.verdict}, standard deviation {deg:.3f} deg, {mm:.2f} mm")
         if calibration.verdict == "fail":
-            pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
             reasons = "; ".join(calibration.reasons) or "no reason given"
             lines.append(f"NOT FOR USE: the calibration of {pair} failed: {' '.join(reasons.split())}")
     return lines

@@ -82,7 +82,7 @@ def _unknown_key(path: KeyPath) -> _Problem:
     nearest = nearest or difflib.get_close_matches(key, valid, n=1)
     if nearest:
         return _Problem(path, f"unknown key; did you mean {nearest[0]}?", (*path[:-1], nearest[0]))
-    elsewhere = [block for block, name in _all_keys(Rig, "") if name == key]
+    elsewhere = [block for block, name in all_keys() if name == key]
     if elsewhere:
         return _Problem(path, f"unknown key here; it belongs into {elsewhere[0] or 'the top level'}")
     return _Problem(path, f"unknown key; known are {', '.join(valid)}")
@@ -119,10 +119,11 @@ def _model_within(annotation: Any) -> type[BaseModel] | None:
     return next((model for model in inner if model is not None), None)
 
 
-def _all_keys(model: type[BaseModel], block: str) -> Iterator[tuple[str, str]]:
+def all_keys(model: type[BaseModel] = Rig, block: str = "") -> Iterator[tuple[str, str]]:
+    """List every key of the schema as (block, key), names of sensors and places in lists shown as *."""
     for key, field in model.model_fields.items():
         yield block, key
         inner = _model_within(field.annotation)
         if inner is not None:
             name = "" if _is_model(field.annotation) else ".*"
-            yield from _all_keys(inner, f"{block}.{key}{name}".removeprefix("."))
+            yield from all_keys(inner, f"{block}.{key}{name}".removeprefix("."))

@@ -1,7 +1,9 @@
 """Profiles from and to YAML, found by name or by path."""
 
 import difflib
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import yaml
 from pydantic import ValidationError
@@ -97,6 +99,8 @@ def dump_rig(rig: Rig) -> str:
 class _Dumper(yaml.SafeDumper):
     """Block style, but short lists of numbers on one line; floats that read back as floats."""
 
-    def represent_sequence(self, tag, sequence, flow_style=None):  # type: ignore[no-untyped-def]
+    def represent_sequence(
+        self, tag: str, sequence: Iterable[Any], flow_style: bool | None = None
+    ) -> yaml.SequenceNode:
         is_flat = all(not isinstance(item, dict) for item in sequence)
         return super().represent_sequence(tag, sequence, flow_style=is_flat)

@@ -1,4 +1,6 @@
-"""A camera of any lens model: the board and its carrier before the backdrop, anti-aliased, blurred and noisy."""
+"""A camera of any lens model: board and carrier before the backdrop, anti-aliased, blurred and noisy."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,7 @@ from lce_rig.simulate.light import irradiance, reached
 from lce_rig.simulate.options import CameraNoise
 from lce_rig.simulate.scene import Hits, Scene
 
-_SUBPIXELS = 6  # samples a pixel along each axis wherever an edge runs through it
+_SUBPIXELS = 5  # samples a pixel along each axis wherever an edge runs through it
 _GAMMA = 1 / 2.2
 
 
@@ -100,41 +102,83 @@ def _paint_mirror_images(radiance: Array, scene: Scene, backdrop: Backdrop) -> N
     radiance[v[chosen], u[chosen]] += mirrors.weight[chosen] * (image - mirrors.image[chosen])
 
 
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """The part of a picture that board and carrier can touch, h by w pixels.
+
+    Attributes:
+        corner_rays: (h + 1, w + 1, 3) unit, world.
+        backdrop: (h, w, 3) linear radiance without them.
+        backdrop_range_m: (h, w) of what stands behind them.
+    """
+
+    corner_rays: Array
+    backdrop: Array
+    backdrop_range_m: Array
+
+
 def _paint_moving(radiance: Array, scene: Scene, backdrop: Backdrop) -> None:
     """Paint board and carrier over the backdrop (H, W, 3), in place, anti-aliased where an edge runs."""
     rows, cols = _region(scene, backdrop)
     if rows.stop <= rows.start or cols.stop <= cols.start:
         return
     corners = backdrop.corner_rays[rows.start : rows.stop + 1, cols.start : cols.stop + 1]
-    shape = (rows.stop - rows.start, cols.stop - cols.start)
-    rays = pixel_rays(corners).reshape(-1, 3)
-    hits = scene.cast_moving(backdrop.origin, rays)
-    behind = backdrop.range_m[rows, cols].ravel()
-    label = np.where(hits.range_m < behind, hits.surface, -1).astype(np.int32)
-    points = backdrop.origin + np.where(label >= 0, hits.range_m, 0.0)[:, None] * rays
-    on_board = label == scene.board_index
-    # Dark squares count as a surface of their own, so that edges of the print are found as edges.
-    label[np.flatnonzero(on_board)[scene.is_dark(points[on_board])]] += 1
-    picture = radiance[rows, cols]
-    seen = np.flatnonzero(label >= 0)
-    kept = Hits(hits.range_m[seen], hits.surface[seen], hits.normals[seen])
-    light = np.zeros((len(rays), 3))
-    light[seen] = irradiance(backdrop.lamps, points[seen], kept.normals, scene.occluders)
-    flat = picture.reshape(-1, 3).copy()
-    flat[seen] = scene.colour(kept, points[seen]) * light[seen]
+    window = _Window(corners, radiance[rows, cols].copy(), backdrop.range_m[rows, cols])
+    label, colour, light = _look_through_centres(scene, backdrop, window)
+    painted = np.where((label >= 0)[..., None], colour * light, window.backdrop)
 
-    grid = label.reshape(shape)
-    is_edge = _dilate(beside_changes(grid[1:] != grid[:-1], grid[:, 1:] != grid[:, :-1]))
-    is_carrier = (grid >= 0) & (grid < scene.board_index)
-    lights = [_spread(light.reshape(*shape, 3), mask) for mask in (is_carrier, grid >= scene.board_index)]
+    is_edge = _dilate(beside_changes(label[1:] != label[:-1], label[:, 1:] != label[:, :-1]))
+    is_carrier = (label >= 0) & (label < scene.board_index)
+    lights = (_spread(light, is_carrier), _spread(light, label >= scene.board_index))
     # Far from the carrier only the board can be met, which spares half the rays.
     near_carrier = _dilate(_dilate(is_carrier))
     for with_carrier in (False, True):
         v, u = np.nonzero(is_edge & (near_carrier == with_carrier))
         if len(v):
-            sampled = _resample(scene, backdrop, corners, picture, behind, lights, (v, u), with_carrier)
-            flat[v * shape[1] + u] = sampled
-    radiance[rows, cols] = flat.reshape(*shape, 3)
+            rays = sub_rays(corners, v, u, _SUBPIXELS)
+            painted[v, u] = _look_through(scene, backdrop.origin, window, lights, (v, u), rays, with_carrier)
+    radiance[rows, cols] = painted
+
+
+def _look_through_centres(
+    scene: Scene, backdrop: Backdrop, window: _Window
+) -> tuple[NDArray[np.int32], Array, Array]:
+    """Cast one ray a pixel: label (h, w) of what is seen, -1 the backdrop; its colour and light (h, w, 3)."""
+    shape = window.backdrop.shape
+    rays = pixel_rays(window.corner_rays).reshape(-1, 3)
+    hits = scene.cast_moving(backdrop.origin, rays)
+    label = np.where(hits.range_m < window.backdrop_range_m.ravel(), hits.surface, -1).astype(np.int32)
+    seen = np.flatnonzero(label >= 0)
+    kept = Hits(hits.range_m[seen], hits.surface[seen], hits.normals[seen])
+    points = reached(backdrop.origin, rays[seen], kept)
+    colour, light = np.zeros((len(rays), 3)), np.zeros((len(rays), 3))
+    colour[seen] = scene.colour(kept, points)
+    light[seen] = irradiance(backdrop.lamps, points, kept.normals, scene.occluders)
+    # Dark squares count as a surface of their own, so that edges of the print are found as edges.
+    label[seen] += (kept.surface == scene.board_index) & scene.is_dark(points)
+    return label.reshape(shape[:2]), colour.reshape(shape), light.reshape(shape)
+
+
+def _look_through(
+    scene: Scene,
+    origin: Array,
+    window: _Window,
+    lights: tuple[Array, Array],
+    pixels: tuple[NDArray[np.intp], NDArray[np.intp]],
+    rays: Array,
+    with_carrier: bool,
+) -> Array:
+    """Average what n rays (M, n, 3) a pixel see: (M, 3), lit as carrier and board are lit there."""
+    v, u = (np.repeat(index, rays.shape[1]) for index in pixels)
+    flat = rays.reshape(-1, 3)
+    hits = scene.cast_moving(origin, flat, with_carrier=with_carrier)
+    near = np.flatnonzero(hits.range_m < window.backdrop_range_m[v, u])
+    kept = Hits(hits.range_m[near], hits.surface[near], hits.normals[near])
+    on_carrier, on_board = (light[v[near], u[near]] for light in lights)
+    light = np.where((kept.surface == scene.board_index)[:, None], on_board, on_carrier)
+    samples = window.backdrop[v, u]
+    samples[near] = scene.colour(kept, reached(origin, flat[near], kept)) * light
+    return np.asarray(samples.reshape(rays.shape).mean(axis=1))
 
 
 def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -145,11 +189,11 @@ def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     out = down.copy()
     out[:, 1:] |= down[:, :-1]
     out[:, :-1] |= down[:, 1:]
-    return out
+    return np.asarray(out)
 
 
 def _spread(light: Array, mask: NDArray[np.bool_]) -> Array:
-    """Carry the light (H, W, 3) within a mask over its border, where samples of neighbouring pixels need it."""
+    """Carry the light (H, W, 3) within a mask over its border, for samples beyond it."""
     import cv2
 
     weight = mask.astype(np.float64)
@@ -159,39 +203,15 @@ def _spread(light: Array, mask: NDArray[np.bool_]) -> Array:
     return np.asarray(summed / np.maximum(total, 1e-9)[..., None])
 
 
-def _resample(
-    scene: Scene,
-    backdrop: Backdrop,
-    corners: Array,
-    picture: Array,
-    behind: Array,
-    lights: list[Array],
-    pixels: tuple[NDArray[np.intp], NDArray[np.intp]],
-    with_carrier: bool,
-) -> Array:
-    """Average many samples over each of some pixels (M,): board and carrier before the backdrop."""
-    v, u = pixels
-    n = _SUBPIXELS**2
-    rays = sub_rays(corners, v, u, _SUBPIXELS).reshape(-1, 3)
-    pixel = np.repeat(v * picture.shape[1] + u, n)
-    hits = scene.cast_moving(backdrop.origin, rays, with_carrier=with_carrier)
-    near = np.flatnonzero(hits.range_m < behind[pixel])
-    kept = Hits(hits.range_m[near], hits.surface[near], hits.normals[near])
-    points = backdrop.origin + kept.range_m[:, None] * rays[near]
-    on_carrier, on_board = (light.reshape(-1, 3)[pixel[near]] for light in lights)
-    light = np.where((kept.surface == scene.board_index)[:, None], on_board, on_carrier)
-    samples = picture.reshape(-1, 3)[pixel]
-    samples[near] = scene.colour(kept, points) * light
-    return np.asarray(samples.reshape(len(v), n, 3).mean(axis=1))
-
-
 def _expose(radiance: Array, noise: CameraNoise, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Turn linear radiance (H, W, 3) into a picture: vignetting, point spread, shot and read noise, gamma."""
     import cv2
 
     height, width = radiance.shape[:2]
     v, u = np.mgrid[0:height, 0:width]
-    radius2 = ((u - (width - 1) / 2) ** 2 + (v - (height - 1) / 2) ** 2) / (((width - 1) ** 2 + (height - 1) ** 2) / 4)
+    radius2 = ((u - (width - 1) / 2) ** 2 + (v - (height - 1) / 2) ** 2) / (
+        ((width - 1) ** 2 + (height - 1) ** 2) / 4
+    )
     linear = (radiance * (noise.exposure * (1 - noise.vignetting * radius2))[..., None]).astype(np.float32)
     if noise.blur_px > 0:
         linear = cv2.GaussianBlur(linear, (0, 0), noise.blur_px, borderType=cv2.BORDER_REPLICATE)

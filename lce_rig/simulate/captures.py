@@ -1,4 +1,4 @@
-"""A simulated session: the rig's true geometry, and captures of the board with everything it is hidden among."""
+"""A simulated session: the rig's true geometry, and captures of the board among its decoys."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -25,7 +25,9 @@ _CAPTURE_EVERY_NS = 4_000_000_000
 # Independent streams of random numbers, so that more captures or another camera change nothing else.
 _TRUTH, _ROOM, _LASERS, _START, _CAPTURE = range(5)
 # Camera optical axes (x right, y down, z forward) from the LiDAR's (x forward, y left, z up).
-_FORWARD = pose(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([0.0, -0.08, -0.08]))
+_FORWARD = pose(
+    np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([0.0, -0.08, -0.08])
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +68,9 @@ def truth_extrinsics(
 ) -> dict[tuple[str, str], Array]:
     """Draw the true T_cam_lidar (4, 4) of every camera and LiDAR.
 
-    The nominal extrinsics of the profile, each moved by a seeded few degrees and centimetres, so that nobody can
-    pass by handing back the nominal. Pairs without an entry follow from the others; a camera without any looks
-    along the first LiDAR's x axis.
+    The nominal extrinsics of the profile, each moved by a seeded few degrees and centimetres, so that nobody
+    can pass by handing back the nominal. Pairs without an entry follow from the others; a camera without any
+    looks along the first LiDAR's x axis.
 
     Args:
         rig: the profile.
@@ -136,7 +138,9 @@ def _set_stage(rig: Rig, seed: int, options: SimulationOptions) -> _Stage:
     T_world_sensor = {name: T_world_base @ T for name, T in _sensor_poses(rig, seed, options).items()}
     cameras = [name for name in rig.cameras if _frames_channel(rig, name)]
     if not cameras:
-        raise ProfileError(f"rig {rig.name}: no camera has a channel of kind frames", "Only frames can be simulated.")
+        raise ProfileError(
+            f"rig {rig.name}: no camera has a channel of kind frames", "Only frames can be simulated."
+        )
     sight = T_world_sensor[cameras[0]][:3, 2]
     room = build_room(
         float(np.arctan2(sight[1], sight[0])),

@@ -22,7 +22,9 @@ _SHIRTS = (
 )
 
 
-def build_carrier(carrier: Carrier, board: Board, T_world_board: Array, rng: np.random.Generator) -> list[Surface]:
+def build_carrier(
+    carrier: Carrier, board: Board, T_world_board: Array, rng: np.random.Generator
+) -> list[Surface]:
     """Build what carries the board at T_world_board (4, 4), standing on the floor z = 0 behind it."""
     if carrier == "stand":
         return _stand(board, T_world_board)
@@ -69,11 +71,7 @@ def _stand(board: Board, T_world_board: Array) -> list[Surface]:
     R = np.eye(4)
     R[:3, :3] = np.stack([back, side, [0.0, 0.0, 1.0]], axis=1)
     R[:3, 3] = [hub[0], hub[1], 0.13]
-    wheels = [
-        ellipsoid((x, y, 0.06), (0.055, 0.018, 0.06))
-        for x in (-0.15, 0.15)
-        for y in (-0.11, 0.11)
-    ]
+    wheels = [ellipsoid((x, y, 0.06), (0.055, 0.018, 0.06)) for x in (-0.15, 0.15) for y in (-0.11, 0.11)]
     R_floor = R.copy()
     R_floor[2, 3] = 0.0
     return [
@@ -109,9 +107,14 @@ def _body(size: float) -> dict[str, tuple[Mesh, Material | None]]:
         ellipsoid((0, 0, 1.36 * s), (0.10 * s, 0.215 * s, 0.12 * s)),
         ellipsoid((0, 0, 0.96 * s), (0.12 * s, 0.175 * s, 0.16 * s)),
     ]
-    head = [ellipsoid((0, 0, 1.63 * s), (0.10 * s, 0.078 * s, 0.12 * s)), cone((0, 0, 1.45 * s), (0, 0, 1.56 * s), 0.055)]
+    head = [
+        ellipsoid((0, 0, 1.63 * s), (0.10 * s, 0.078 * s, 0.12 * s)),
+        cone((0, 0, 1.45 * s), (0, 0, 1.56 * s), 0.055),
+    ]
     hair = [ellipsoid((0.018 * s, 0, 1.665 * s), (0.10 * s, 0.085 * s, 0.10 * s))]
-    legs = [limb((0, y, 0.90 * s), (0.02, 1.25 * y, 0.09 * s), 0.085 * s, 0.05 * s) for y in (-0.09 * s, 0.09 * s)]
+    legs = [
+        limb((0, y, 0.90 * s), (0.02, 1.25 * y, 0.09 * s), 0.085 * s, 0.05 * s) for y in (-0.09 * s, 0.09 * s)
+    ]
     shoes = [ellipsoid((-0.05, 1.3 * y, 0.04), (0.14, 0.05, 0.05)) for y in (-0.09 * s, 0.09 * s)]
     return {
         "torso": (merge(torso), None),

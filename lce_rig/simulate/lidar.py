@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.data import Scan
-from lce_rig.core.geometry import Array, transform
+from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.simulate.beams import Returns, receive
 from lce_rig.simulate.options import LidarNoise
-from lce_rig.simulate.scene import Hits, Scene
+from lce_rig.simulate.scene import Scene
 
 #: Fraction of a full diffuse return (reflectivity 1, normal incidence) below which nothing is detected ...
 _THRESHOLD = 0.04
@@ -63,16 +64,6 @@ VLP16 = LidarModel(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class _Returns:
-    """What each firing brings back: range, received energy (1 = full white return), hit surface."""
-
-    range_m: Array
-    energy: Array
-    reflectivity: Array
-    surface: NDArray[np.int32]
-
-
 def simulate_scan(
     scene: Scene,
     T_world_lidar: Array,
@@ -101,42 +92,47 @@ def simulate_scan(
         max_range_m: farther returns are not reported.
     """
     laser, offset_ns, azimuth_rad = _firings(model, rng)
-    directions = _directions(model.elevations_rad[laser], azimuth_rad)
     origins = np.zeros((len(laser), 3))
     origins[:, 2] = model.vertical_offsets_m[laser]
-    origins_world = transform(T_world_lidar, origins)
-    returns = _receive(scene, origins_world, directions @ T_world_lidar[:3, :3].T, noise)
+    directions = _directions(model.elevations_rad[laser], azimuth_rad)
+    origins_world, directions_world = transform(T_world_lidar, origins), directions @ T_world_lidar[:3, :3].T
+    returns = receive(scene, origins_world, directions_world, noise)
+    is_rim = _near_border(scene, origins_world, directions_world, returns, noise)
 
-    range_m = returns.range_m.copy()
-    intensity = np.clip(100.0 * returns.energy, 0.0, 255.0)
-    if laser_bias_m is not None:
-        range_m += laser_bias_m[laser]
-    range_m += noise.range_offset_m + noise.dark_bias_m * (1.0 - returns.reflectivity)
-    range_m += noise.weak_bias_m * np.clip(1.0 - intensity / 30.0, 0.0, 1.0)
-    range_m += noise.range_sigma_m * rng.standard_normal(len(range_m))
-    is_rim = _near_border(scene, origins_world, directions @ T_world_lidar[:3, :3].T, returns, noise)
+    bias_m = np.zeros(len(model.elevations_rad)) if laser_bias_m is None else laser_bias_m
+    range_m, intensity = _measure(returns, bias_m[laser], noise, rng)
     spread_rad = noise.rim_spread_rad * rng.uniform(-1.0, 1.0, len(range_m))
     azimuth_rad = azimuth_rad + np.where(is_rim, spread_rad, 0.0)
     if noise.is_quantised:
         azimuth_rad = np.rint(azimuth_rad / _AZIMUTH_STEP_RAD) * _AZIMUTH_STEP_RAD
-        range_m = np.rint(range_m / _RANGE_STEP_M) * _RANGE_STEP_M
-        intensity = np.rint(intensity)
-
+    is_lost = rng.random(len(range_m)) < noise.dropout
     threshold = _THRESHOLD * np.maximum(returns.range_m / _FULL_RANGE_M, 1.0) ** 2
-    keep = np.isfinite(range_m) & (returns.energy > threshold) & (rng.random(len(range_m)) >= noise.dropout)
+    keep = np.isfinite(range_m) & (returns.energy > threshold) & ~is_lost
     keep &= (range_m >= min_range_m) & (range_m <= max_range_m)
-    points = origins[keep] + range_m[keep, None] * _directions(
-        model.elevations_rad[laser[keep]], azimuth_rad[keep]
-    )
+    rays = _directions(model.elevations_rad[laser[keep]], azimuth_rad[keep])
     return Scan(
         sensor=sensor,
         stamp_ns=stamp_ns,
-        points=points.astype(np.float32),
+        points=(origins[keep] + range_m[keep, None] * rays).astype(np.float32),
         intensity=intensity[keep].astype(np.float32),
         ring=model.rings[laser[keep]],
         offset_ns=offset_ns[keep],
         host_ns=stamp_ns + model.period_ns,
     )
+
+
+def _measure(
+    returns: Returns, bias_m: Array, noise: LidarNoise, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Turn returns into measured ranges (N,) and intensities (N,), 100 for a white diffuse surface."""
+    intensity = np.clip(100.0 * returns.energy, 0.0, 255.0)
+    range_m = returns.range_m + bias_m + noise.range_offset_m
+    range_m += noise.dark_bias_m * (1.0 - returns.reflectivity)
+    range_m += noise.weak_bias_m * np.clip(1.0 - intensity / 30.0, 0.0, 1.0)
+    range_m += noise.range_sigma_m * rng.standard_normal(len(range_m))
+    if noise.is_quantised:
+        return np.rint(range_m / _RANGE_STEP_M) * _RANGE_STEP_M, np.rint(intensity)
+    return range_m, intensity
 
 
 def _firings(
@@ -165,114 +161,10 @@ def _directions(elevation_rad: Array, azimuth_rad: Array) -> Array:
     )
 
 
-def _receive(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) -> _Returns:
-    """Cast every beam's axis, and the whole footprint of the beams that touch more than one surface."""
-    hits = scene.cast(origins, directions)
-    returns = _echoes(scene, hits, origins, directions)
-    if max(*noise.divergence_rad, *noise.exit_size_m) == 0.0:
-        return returns
-    is_split = _touches_several(scene, hits, origins, directions, noise)
-    split = np.flatnonzero(is_split)
-    mixed = _mix(scene, origins[split], directions[split], noise)
-    out = [getattr(returns, name).copy() for name in ("range_m", "energy", "reflectivity", "surface")]
-    for whole, part in zip(out, (mixed.range_m, mixed.energy, mixed.reflectivity, mixed.surface), strict=True):
-        whole[split] = part
-    return _Returns(*out)
-
-
-def _echoes(scene: Scene, hits: Hits, origins: Array, directions: Array) -> _Returns:
-    is_hit = hits.surface >= 0
-    points = origins + np.where(is_hit, hits.range_m, 0.0)[:, None] * directions
-    reflectivity = scene.reflectivity(hits, points)
-    cosine = np.abs(np.einsum("nc,nc->n", hits.normals, directions))
-    return _Returns(hits.range_m, reflectivity * cosine, reflectivity, hits.surface)
-
-
-def _footprint(n_across: int, n_up: int) -> Array:
-    """Lay cells of equal energy over a beam: positions (K, 2) in half-widths, an ellipse of radius 1."""
-    across = (np.arange(n_across) + 0.5) / n_across * 2 - 1
-    up = (np.arange(n_up) + 0.5) / n_up * 2 - 1
-    cells = np.stack(np.meshgrid(across, up, indexing="ij"), axis=-1).reshape(-1, 2)
-    return np.asarray(cells[np.hypot(cells[:, 0], cells[:, 1]) <= 1.0])
-
-
-_PROBES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-_CELLS = _footprint(16, 8)
-
-
-def _sub_rays(origins: Array, directions: Array, cells: Array, noise: LidarNoise) -> tuple[Array, Array]:
-    """Spread beams (N, 3) into origins and unit directions (N, K, 3) through the footprint's cells."""
-    # A LiDAR mounted anyhow still turns about its own axis; world z serves as that axis to first order only,
-    # which is exact for an upright LiDAR and turns the footprint's ellipse a little for a tilted one.
-    across = np.cross([0.0, 0.0, 1.0], directions)
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
-    up = np.cross(directions, across)
-    size, spread = np.asarray(noise.exit_size_m) / 2, np.asarray(noise.divergence_rad) / 2
-    at = cells * (size + noise.edge_growth_m)
-    turn = cells * spread
-    sub_origins = origins[:, None] + at[:, 0, None] * across[:, None] + at[:, 1, None] * up[:, None]
-    sub = directions[:, None] + turn[:, 0, None] * across[:, None] + turn[:, 1, None] * up[:, None]
-    return sub_origins, sub / np.linalg.norm(sub, axis=-1, keepdims=True)
-
-
-def _touches_several(
-    scene: Scene, axis_hits: Hits, origins: Array, directions: Array, noise: LidarNoise
-) -> NDArray[np.bool_]:
-    """Find beams whose rim meets another surface than the axis, or the same one across a step in depth."""
-    sub_origins, sub_directions = _sub_rays(origins, directions, _PROBES, noise)
-    hits = scene.cast(sub_origins.reshape(-1, 3), sub_directions.reshape(-1, 3))
-    range_m, surface = hits.range_m.reshape(-1, 4), hits.surface.reshape(-1, 4)
-    is_other = np.any(surface != axis_hits.surface[:, None], axis=1)
-    with np.errstate(invalid="ignore"):
-        bend = np.abs(range_m[:, ::2] + range_m[:, 1::2] - 2 * axis_hits.range_m[:, None])
-    return np.asarray(is_other | np.any(bend > 0.03, axis=1))
-
-
-def _mix(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) -> _Returns:
-    """Blend a footprint's echoes closer together than the pulse; of the groups left, report the strongest."""
-    n, k = len(origins), len(_CELLS)
-    sub_origins, sub_directions = _sub_rays(origins, directions, _CELLS, noise)
-    flat_origins, flat_directions = sub_origins.reshape(-1, 3), sub_directions.reshape(-1, 3)
-    echo = _echoes(scene, scene.cast(flat_origins, flat_directions), flat_origins, flat_directions)
-    order = np.argsort(echo.range_m.reshape(n, k), axis=1, kind="stable")
-    range_m, energy, reflectivity, surface = (
-        np.take_along_axis(np.asarray(values).reshape(n, k), order, axis=1)
-        for values in (echo.range_m, echo.energy, echo.reflectivity, echo.surface)
-    )
-    is_hit = np.isfinite(range_m)
-    safe_range = np.where(is_hit, range_m, 0.0)
-    energy = np.where(is_hit, energy / k, 0.0)
-    with np.errstate(invalid="ignore"):
-        is_gap = np.diff(range_m, axis=1, prepend=range_m[:, :1]) > noise.pulse_m
-    group = np.cumsum(is_gap, axis=1) + k * np.arange(n)[:, None]
-
-    def total(values: Array) -> Array:
-        return np.bincount(group.ravel(), weights=values.ravel(), minlength=n * k).reshape(n, k)
-
-    # What reaches the receiver falls with the square of the range; the reported intensity does not.
-    power = total(energy / np.maximum(safe_range, 0.1) ** 2)
-    best = np.argmax(power, axis=1)
-    rows = np.arange(n)
-    sums = [total(energy), total(energy * safe_range), total(energy * reflectivity)]
-    best_energy, best_range, best_reflectivity = (values[rows, best] for values in sums)
-    is_best = (group - k * rows[:, None]) == best[:, None]
-    dominant = np.argmax(np.where(is_best, energy, -1.0), axis=1)
-    has_echo = best_energy > 0
-    scale = np.where(has_echo, best_energy, 1.0)
-    return _Returns(
-        np.where(has_echo, best_range / scale, np.inf),
-        best_energy,
-        best_reflectivity / scale,
-        np.where(has_echo, surface[rows, dominant], -1).astype(np.int32),
-    )
-
-
 def _near_border(
-    scene: Scene, origins: Array, directions: Array, returns: _Returns, noise: LidarNoise
+    scene: Scene, origins: Array, directions: Array, returns: Returns, noise: LidarNoise
 ) -> NDArray[np.bool_]:
     """Find returns from the board within one footprint of its border."""
-    from lce_rig.core.geometry import invert
-
     on_board = returns.surface == scene.board_index
     reach = np.where(on_board, returns.range_m, 0.0)
     xy = transform(invert(scene.T_world_board), origins + reach[:, None] * directions)[:, :2]

@@ -40,9 +40,7 @@ def ambient_light(normals: Array) -> Array:
     return np.asarray((0.85 + 0.15 * normals[:, 2:]) * _AMBIENT)
 
 
-def irradiance(
-    lamps: Array, points: Array, normals: Array, occluders: Raycaster | None = None
-) -> Array:
+def irradiance(lamps: Array, points: Array, normals: Array, occluders: Raycaster | None = None) -> Array:
     """Sum soft and lamp light (N, 3) at points (N, 3), lamps hidden by `occluders` left out."""
     share = lamp_light(lamps, points, normals)
     if occluders is not None:
@@ -75,8 +73,10 @@ class Mirrors:
     range_m: Array
 
 
-def static_radiance(room: Raycaster, lamps: Array, origin: Array, directions: Array) -> tuple[Array, Hits, Mirrors]:
-    """Compute what rays (N, 3) from `origin` see of the standing room: linear (N, 3), what they hit, mirrors."""
+def static_radiance(
+    room: Raycaster, lamps: Array, origin: Array, directions: Array
+) -> tuple[Array, Hits, Mirrors]:
+    """Compute what rays (N, 3) see of the standing room: linear (N, 3), what they hit, mirrors."""
     hits = room.cast(origin, directions)
     points = reached(origin, directions, hits)
     light = irradiance(lamps, points, hits.normals, room)
@@ -108,7 +108,7 @@ def mirror_weight(gloss: Array, normals: Array, directions: Array) -> Array:
     """Weigh the mirror image (N, 1) by Schlick's approximation of Fresnel's law.
 
     References:
-        C. Schlick, An inexpensive BRDF model for physically-based rendering, Computer Graphics Forum 13(3), 1994.
+        C. Schlick, An inexpensive BRDF model for physically-based rendering, CGF 13(3), 1994.
     """
     cosine = np.abs(np.einsum("nc,nc->n", normals, directions))
     return np.asarray((gloss * (0.12 + 0.88 * (1 - cosine) ** 5))[:, None])

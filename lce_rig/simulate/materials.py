@@ -1,7 +1,8 @@
 """What surfaces look like to a camera and to a LiDAR; the prints on them are functions of position."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,8 +61,9 @@ def albedo(material: Material, points: Array, normals: Array) -> Array:
     u = np.where(facing == 0, points[:, 1], points[:, 0])
     v = points[rows, np.where(facing == 2, 1, 2)]
     colour = np.asarray(material.colour)
-    shade = _PRINTS[material.pattern](u, v)
-    return np.clip(colour * shade, 0.0, 1.0) if shade.ndim == 2 else np.clip(colour * shade[:, None], 0.0, 1.0)
+    shade = np.asarray(_PRINTS[material.pattern](u, v))
+    tint = shade if shade.ndim == 2 else shade[:, None]
+    return np.asarray(np.clip(colour * tint, 0.0, 1.0))
 
 
 def _plain(u: Array, v: Array) -> Array:
@@ -79,7 +81,11 @@ def _wood(u: Array, v: Array) -> Array:
 
 def _tiles(u: Array, v: Array) -> Array:
     size_m, joint_m = 0.8, 0.006
-    each = 0.94 + 0.08 * _LATTICE[np.floor(u / size_m).astype(np.int64) % 64, np.floor(v / size_m).astype(np.int64) % 64]
+    each = (
+        0.94
+        + 0.08
+        * _LATTICE[np.floor(u / size_m).astype(np.int64) % 64, np.floor(v / size_m).astype(np.int64) % 64]
+    )
     stain = 0.82 + 0.2 * value_noise(0.9 * u + 7, 0.9 * v) + 0.06 * value_noise(25 * u, 25 * v)
     is_joint = (np.mod(u, size_m) < joint_m) | (np.mod(v, size_m) < joint_m)
     return np.where(is_joint, 0.45, each * np.minimum(stain, 1.05))
@@ -112,7 +118,7 @@ def _poster(u: Array, v: Array) -> Array:
     return np.where((y > 0.86)[:, None], np.array([0.55, 0.28, 0.12]), shade)
 
 
-_PRINTS: dict[str, Any] = {
+_PRINTS: dict[Pattern, Callable[[Array, Array], Array]] = {
     "plain": _plain,
     "tiles": _tiles,
     "panels": _panels,

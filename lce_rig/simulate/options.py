@@ -1,4 +1,4 @@
-"""What can be chosen about a simulated rig; every default is a figure measured on real recordings or a data sheet's."""
+"""What can be chosen about a simulated rig; defaults come from data sheets and real recordings."""
 
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -93,8 +93,8 @@ class SimulationOptions:
         tilt_deg: largest tilt of the board out of the direction to the camera.
         roll_deg: mean and half-width of the board's turn in its plane, 0 = upright, 45 = a diamond.
         has_decoy_plate: whether a blank plate of the board's size stands in the room.
-        truth_rotation_deg, truth_translation_m: how far the true extrinsic lies from the profile's nominal one;
-            never more than 0.8 of the tolerances that the profile gives.
+        truth_rotation_deg, truth_translation_m: how far the true extrinsic lies from the profile's nominal
+            one at most; never more than 0.8 of the tolerances that the profile gives.
         lidar_height_m: height of the LiDAR above the floor.
         print_reflectivity: of the dark squares at 905 nm (the ink of the paper's boards is bright there).
     """

@@ -8,6 +8,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
+from lce_rig.simulate.backdrop import lens_reach
 from lce_rig.simulate.lidar import LidarModel
 from lce_rig.simulate.options import SimulationOptions
 from lce_rig.simulate.room import Room
@@ -35,7 +36,13 @@ class View:
 
 
 def place_board(
-    view: View, board: Board, room: Room, options: SimulationOptions, index: int, rng: np.random.Generator, start: Array
+    view: View,
+    board: Board,
+    room: Room,
+    options: SimulationOptions,
+    index: int,
+    rng: np.random.Generator,
+    start: Array,
 ) -> Array:
     """Choose T_world_board (4, 4) for one capture.
 
@@ -70,13 +77,15 @@ def place_board(
     if fallback is None or most_rings < _FEWEST_RINGS:
         near, far = options.distance_m
         raise LceRigError(
-            f"no place for the board {near:g}-{far:g} m before camera {view.camera} is seen by LiDAR {view.lidar}",
+            f"no place for the board {near:g}-{far:g} m before {view.camera} is seen by {view.lidar}",
             "Check the nominal extrinsic of the profile, or let the board come nearer or go farther.",
         )
     return fallback
 
 
-def _candidate(view: View, options: SimulationOptions, where: Array, rng: np.random.Generator) -> Array | None:
+def _candidate(
+    view: View, options: SimulationOptions, where: Array, rng: np.random.Generator
+) -> Array | None:
     """Put the board's centre at a place in the picture and turn it about facing the camera."""
     # Evenly over the disc of all tilts: strong ones tell most about the extrinsic.
     tilt_rad = np.radians(options.tilt_deg) * np.sqrt(rng.uniform())
@@ -105,8 +114,10 @@ def _is_in_picture(view: View, board: Board, T_world_board: Array) -> bool:
     outer = middle + np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * np.append(reach, 0.0)
     T_cam_board = invert(view.T_world_cam) @ T_world_board
     pixels, is_valid = view.intrinsics.project(transform(T_cam_board, np.concatenate([pattern, outer])))
-    margin_px = 0.01 * view.intrinsics.width_px
-    return bool(np.all(is_valid & view.intrinsics.is_inside(pixels, margin_px)))
+    lens = view.intrinsics
+    offset = (pixels - [lens.cx_px, lens.cy_px]) / [lens.fx_px, lens.fy_px]
+    is_seen = is_valid & lens.is_inside(pixels, 0.01 * lens.width_px)
+    return bool(np.all(is_seen & (np.linalg.norm(offset, axis=-1) < 0.97 * lens_reach(lens))))
 
 
 def _stands_free(view: View, board: Board, room: Room, T_world_board: Array) -> bool:
@@ -133,10 +144,11 @@ def count_rings(view: View, board: Board, T_world_board: Array) -> int:
     spread = np.angle(np.exp(1j * (azimuth - azimuth[0])))
     n_steps = int(np.ceil(np.ptp(spread) / view.model.step_rad)) + 1
     across = azimuth[0] + spread.min() + view.model.step_rad * np.arange(n_steps)
-    elevation, around = (grid.ravel() for grid in np.meshgrid(view.model.elevations_rad, across, indexing="ij"))
+    elevation, around = (
+        grid.ravel() for grid in np.meshgrid(view.model.elevations_rad, across, indexing="ij")
+    )
     level = np.cos(elevation)
     rays = np.stack([level * np.cos(around), level * np.sin(around), np.sin(elevation)], axis=1)
     hits = scene.cast_board(view.T_world_lidar[:3, 3], rays @ view.T_world_lidar[:3, :3].T)
     returns = (hits.surface >= 0).reshape(len(view.model.elevations_rad), -1).sum(axis=1)
     return int(np.sum(returns >= _RETURNS_PER_RING))
-

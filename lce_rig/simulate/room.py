@@ -1,4 +1,4 @@
-"""The room the rig stands in: walls, floor, pillar, posters and furniture, which a detector must not take for the board."""
+"""The room the rig stands in, full of what a detector must not take for the board."""
 
 from dataclasses import dataclass
 
@@ -120,7 +120,9 @@ def _shell() -> list[_Part]:
     thick = 0.02
     skirting = [
         box((size[0], thick, 0.12), (middle[0], y, 0.06)) for y in (_LOW[1] + thick / 2, _HIGH[1] - thick / 2)
-    ] + [box((thick, size[1], 0.12), (x, middle[1], 0.06)) for x in (_LOW[0] + thick / 2, _HIGH[0] - thick / 2)]
+    ] + [
+        box((thick, size[1], 0.12), (x, middle[1], 0.06)) for x in (_LOW[0] + thick / 2, _HIGH[0] - thick / 2)
+    ]
     lamps = [box((1.2, 0.3, 0.04), (x, y, _HIGH[2] - 0.02)) for x, y in _LAMP_SPOTS]
     return [
         *(_part("wall", face, _WALL) for face in faces[:4]),
@@ -151,7 +153,9 @@ def _furniture() -> list[_Part]:
 
 
 def _posters() -> list[_Part]:
-    left, right, front, back = (np.array(v, dtype=np.float64) for v in ([0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0]))
+    left, right, front, back = (
+        np.array(v, dtype=np.float64) for v in ([0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0])
+    )
     return [
         _on_wall("window", (3.6, 1.9), np.array([8.93, 0.6, 1.7]), front, _WINDOW),
         _on_wall("poster", (0.9, 1.2), np.array([4.9, 3.39, 1.55]), left, _POSTER),

@@ -76,7 +76,9 @@ def ellipsoid(centre: Sequence[float] | Array, radii_m: Sequence[float]) -> Mesh
     polar, azimuth = np.meshgrid(
         np.linspace(0, np.pi, n_up + 1), np.linspace(0, 2 * np.pi, n_around + 1), indexing="ij"
     )
-    unit = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
+    unit = np.stack(
+        [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1
+    )
     unit = unit.reshape(-1, 3)
     normals = unit / np.asarray(radii_m)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -115,5 +117,7 @@ def limb(
 
 def _grid_triangles(n_down: int, n_across: int) -> NDArray[np.uint32]:
     index: NDArray[Any] = np.arange((n_down + 1) * (n_across + 1)).reshape(n_down + 1, n_across + 1)
-    a, b, c, d = (corner.ravel() for corner in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    a, b, c, d = (
+        corner.ravel() for corner in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:])
+    )
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]).astype(np.uint32)

@@ -99,7 +99,9 @@ def solve_globally(Q: Array, R_start: Array) -> tuple[Array, Certificates]:
     left = np.flatnonzero(~certificates.is_optimal)
     if len(left) == 0:
         return R, certificates
-    starts = np.concatenate([np.tile(cube_rotations(), (len(left), 1, 1)).reshape(len(left), 24, 3, 3), R[left, None]], 1)
+    starts = np.concatenate(
+        [np.tile(cube_rotations(), (len(left), 1, 1)).reshape(len(left), 24, 3, 3), R[left, None]], 1
+    )
     n = starts.shape[1]
     found, cost = minimise_on_so3(np.repeat(Q[left], n, axis=0), starts.reshape(-1, 3, 3))
     best = np.argmin(cost.reshape(-1, n), axis=1)

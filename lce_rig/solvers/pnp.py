@@ -5,7 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import Array, invert, perturb, pose, project_to_so3, rotation_angle, skew, transform
+from lce_rig.core.geometry import (
+    Array,
+    invert,
+    perturb,
+    pose,
+    project_to_so3,
+    rotation_angle,
+    skew,
+    transform,
+)
 
 _MAX_STEPS = 30
 _SAME_POSE_RAD = 1e-3

@@ -36,7 +36,11 @@ def residual_rows(normals: Array, anchors: Array, points: Array, nuisances: Arra
     batch = points.shape[:-1]
     lever = -(points[..., :, None] * normals[..., None, :]).reshape(*batch, N_ROTATION)
     offset = np.sum(normals * anchors, axis=-1, keepdims=True)
-    extra = np.zeros((*batch, 0)) if nuisances is None else np.broadcast_to(nuisances, (*batch, nuisances.shape[-1]))
+    extra = (
+        np.zeros((*batch, 0))
+        if nuisances is None
+        else np.broadcast_to(nuisances, (*batch, nuisances.shape[-1]))
+    )
     return np.concatenate([lever, -normals, extra, offset], axis=-1)
 
 
@@ -177,7 +181,9 @@ def _expand(Q: Array, R: Array) -> tuple[Array, Array, Array]:
     G[..., 3:6, 0], G[..., 6:9, 0] = c2, -c1
     G[..., 0:3, 1], G[..., 6:9, 1] = -c2, c0
     G[..., 0:3, 2], G[..., 3:6, 2] = c1, -c0
-    second_order = (A + np.swapaxes(A, -1, -2)) / 2 - np.trace(A, axis1=-2, axis2=-1)[..., None, None] * np.eye(3)
+    second_order = (A + np.swapaxes(A, -1, -2)) / 2 - np.trace(A, axis1=-2, axis2=-1)[
+        ..., None, None
+    ] * np.eye(3)
     hessian = np.swapaxes(G, -1, -2) @ (Q[..., :9, :9] @ G) + second_order
     return np.sum(z * y, axis=-1), gradient, hessian
 

@@ -134,15 +134,15 @@ def _times(
     is_last = settings.timestamps.reference == "last_firing"
     name = _find(fields, TIME_FIELDS)
     ticks = None if name is None else _ticks(cloud[name])
-    if ticks is None or name is None:
+    unit = None if ticks is None else _unit(ticks)
+    if ticks is None or unit is None:
         notes.append(
             "no time of each point" if name is None else f"field {name!r} carries no time of each point"
         )
         sweep_ns = round(1e9 / settings.rate_hz) if is_last else 0
         return None, None if stamp_ns is None else stamp_ns - sweep_ns
     first = ticks.min()
-    unit = _unit(float(ticks.max() - first), is_integer=cloud[name].dtype.kind in "iu")
-    if unit != ("ns" if cloud[name].dtype.kind in "iu" else "s"):
+    if unit != _usual_unit(ticks):
         notes.append(f"field {name!r} taken as {unit}")
     scale = NS_PER_UNIT[unit]
     offset_ns = np.rint((ticks - first) * scale).astype(np.int64)
@@ -171,9 +171,16 @@ def _ticks(values: NDArray[Any]) -> NDArray[Any] | None:
     return ticks if np.ptp(ticks) > 1000 * step else None
 
 
-def _unit(span: float, *, is_integer: bool) -> str:
+def _unit(ticks: NDArray[Any]) -> str | None:
+    """Tell the unit from how long the sweep lasts; None where it lasts longer than any, in any unit."""
+    span = float(ticks.max()) - float(ticks.min())
     for unit, scale in NS_PER_UNIT.items():
         if SWEEP_S[0] <= span * scale * 1e-9 <= SWEEP_S[1]:
             return unit
-    # A sector of a sweep may be shorter than any sweep: then the usual unit of the type it is.
-    return "ns" if is_integer else "s"
+    # A sector of a sweep may be shorter than any sweep: then it is the usual unit of the type.
+    usual = _usual_unit(ticks)
+    return usual if span * NS_PER_UNIT[usual] * 1e-9 < SWEEP_S[0] else None
+
+
+def _usual_unit(ticks: NDArray[Any]) -> str:
+    return "ns" if ticks.dtype.kind == "i" else "s"

@@ -25,6 +25,7 @@ class _Element:
     name: str
     count: int
     columns: list[tuple[str, str]] = field(default_factory=list)
+    has_list: bool = False
 
 
 def decode_ply(data: bytes) -> NDArray[Any]:
@@ -45,6 +46,8 @@ def decode_ply(data: bytes) -> NDArray[Any]:
     order = _ORDERS[encoding]
     n_rows_before, n_bytes_before = 0, 0
     for element in elements:
+        if element.has_list and "vertex" in (later.name for later in elements[elements.index(element) :]):
+            raise ValueError(f"its element {element.name!r} has a list, which this program does not read")
         dtype = np.dtype([(name, order + kind) for name, kind in element.columns])
         if element.name == "vertex":
             if encoding == "ascii":
@@ -72,11 +75,9 @@ def _split_header(data: bytes) -> tuple[str, list[_Element], bytes]:
         elif words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
             elements.append(_Element(words[1], int(words[2])))
         elif words[:1] == ["property"] and elements:
-            if words[1:2] == ["list"] and all(element.name != "vertex" for element in elements):
-                raise ValueError("it has lists before its vertices, which this program does not read")
-            if words[1:2] == ["list"] and elements[-1].name == "vertex":
-                raise ValueError("its vertices have list properties, which this program does not read")
-            if words[1:2] != ["list"]:
+            if words[1:2] == ["list"]:
+                elements[-1].has_list = True
+            else:
                 elements[-1].columns.append(_parse_property(words))
     if encoding not in _ORDERS:
         raise ValueError(f"its format is {encoding or 'missing'!r}; known are {', '.join(_ORDERS)}")

@@ -37,7 +37,11 @@ class Scenario:
 
 
 def simulate(
-    n: int, seed: int, scenario: Scenario | None = None, T_cam_lidar: np.ndarray = T_FORWARD, board: Board = BOARD
+    n: int,
+    seed: int,
+    scenario: Scenario | None = None,
+    T_cam_lidar: np.ndarray = T_FORWARD,
+    board: Board = BOARD,
 ) -> list[CaptureCandidates]:
     """Simulate n captures in which both sensors see the board."""
     scenario = scenario or Scenario()
@@ -100,7 +104,11 @@ def scan_board(
     azimuth = middle + phase + step * np.arange(-int(reach / step), int(reach / step) + 1)[None]
     elevation = np.radians(np.arange(-15, 16, 2))[:, None]
     rays = np.stack(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth],
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation) + 0 * azimuth,
+        ],
         axis=-1,
     )
     ranges = (R[:, 2] @ centre) / (rays @ R[:, 2])
@@ -110,7 +118,7 @@ def scan_board(
     first, last = is_hit.argmax(axis=1), is_hit.shape[1] - 1 - is_hit[:, ::-1].argmax(axis=1)
     lost = rng.random((16, 2)) < scenario.lost_share
     first, last = first + lost[:, 0], last - lost[:, 1]
-    rings = np.flatnonzero((is_hit.sum(axis=1) >= 8))
+    rings = np.flatnonzero(is_hit.sum(axis=1) >= 8)
     if len(rings) < 4:
         return None
     columns = np.arange(is_hit.shape[1])
@@ -118,7 +126,9 @@ def scan_board(
     is_hit[np.setdiff1d(np.arange(16), rings)] = False
     points = rays * (ranges + scenario.range_sigma_m * rng.standard_normal(ranges.shape))[..., None]
     plane, rms = fit_plane(points[is_hit])
-    in_plane = exp_so3(np.array([0, 0, scenario.template_sigma_rad * rng.standard_normal() + np.pi * rng.integers(2)]))
+    in_plane = exp_so3(
+        np.array([0, 0, scenario.template_sigma_rad * rng.standard_normal() + np.pi * rng.integers(2)])
+    )
     z = np.cross(R[:, 0], R[:, 1])
     template = pose(
         project_to_so3(np.column_stack([R[:, 0], R[:, 1], z])) @ in_plane,

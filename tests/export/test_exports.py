@@ -229,6 +229,7 @@ def test_a_forced_export_of_a_failed_result_says_so_in_every_file(
     assert len(paths) == len(EXPORTS)
     for path in paths:
         head = path.read_text(encoding="utf-8")[:500]
+        assert "davis/frames and lidar: fail, standard deviation" in head
         assert "NOT FOR USE: the calibration of davis/frames and lidar failed" in head
     assert read_urdf(tmp_path / "rles.urdf")
     assert read_camera_info(tmp_path / "camera_info_davis.yaml") == rles.cameras["davis"].to_intrinsics()
@@ -275,3 +276,28 @@ def test_a_result_of_another_rig_is_refused(rles: Rig, make: Make, tmp_path: Pat
 def test_an_unknown_format_lists_the_known_ones(rles: Rig, make: Make, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no export format is called sdf"):
         write_exports([make()], rles, tmp_path, formats=["sdf"])
+
+
+def test_kalibrs_chain_leads_from_each_camera_to_the_next(
+    three_sensor_rig: Rig, make: Make, tmp_path: Path
+) -> None:
+    names = ("davis", "left", "fish")
+    calibrations = [make(random_pose(i), camera=name, lidar="front") for i, name in enumerate(names)]
+    (path,) = write_exports(calibrations, three_sensor_rig, tmp_path, formats=["kalibr"])
+    chain = yaml.safe_load(path.read_text(encoding="utf-8"))
+    # Kalibr's radtan ends at p2: the camera with eight coefficients cannot be said in it.
+    assert list(chain) == ["cam0", "cam1"]
+    assert chain["cam1"]["distortion_model"] == "equidistant"
+    davis, fish = calibrations[0].T_cam_lidar, calibrations[2].T_cam_lidar
+    np.testing.assert_allclose(chain["cam1"]["T_cn_cnm1"], fish @ np.linalg.inv(davis), atol=1e-12)
+
+
+def test_autowares_file_gives_bodies_in_the_kits_frame(rles: Rig, make: Make, tmp_path: Path) -> None:
+    calibration = make()
+    (path,) = write_exports([calibration], rles, tmp_path, formats=["autoware"])
+    block = yaml.safe_load(path.read_text(encoding="utf-8"))["velodyne"]["davis_link"]
+    assert list(block) == ["x", "y", "z", "roll", "pitch", "yaw"]
+    x, y, z, *angles = block.values()
+    body = pose(Rotation.from_euler("xyz", angles).as_matrix(), np.array([x, y, z]))
+    optical_of_body = pose(Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]).as_matrix(), np.zeros(3))
+    np.testing.assert_allclose(body @ optical_of_body @ calibration.T_cam_lidar, np.eye(4), atol=1e-12)

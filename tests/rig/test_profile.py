@@ -1,6 +1,7 @@
 """The schema: what a profile may say, and what it cannot mean."""
 
-from collections.abc import Callable
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from pydantic import ValidationError
 
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import exp_so3
-from lce_rig.rig import Rig, find_profile, load_rig, parse_rig
+from lce_rig.rig import CalibrationSettings, QualitySettings, find_profile, load_rig, parse_rig
+from lce_rig.rig.explaining import all_keys
 
 RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 
@@ -219,17 +221,20 @@ def test_what_is_no_rotation_is_refused(rotation: str, says: str) -> None:
     assert says in str(caught.value)
 
 
+DOCUMENT = Path(__file__).parents[2] / "docs" / "rig-profiles.md"
+
+
 def test_every_setting_is_documented() -> None:
-    def walk(model: type, seen: Callable[[str], bool]) -> None:
-        from lce_rig.rig.explaining import _model_within
+    text = DOCUMENT.read_text(encoding="utf-8")
+    assert [key for _, key in all_keys() if f"`{key}`" not in text] == []
 
-        for key, field in model.model_fields.items():  # type: ignore[attr-defined]
-            assert seen(key), f"docs/rig-profiles.md does not explain {key}"
-            inner = _model_within(field.annotation)
-            if inner is not None:
-                walk(inner, seen)
 
-    from pathlib import Path
-
-    text = (Path(__file__).parents[2] / "docs" / "rig-profiles.md").read_text(encoding="utf-8")
-    walk(Rig, lambda key: f"`{key}`" in text)
+def test_documented_defaults_are_those_of_the_code() -> None:
+    documented: dict[str, float] = {}
+    for line in DOCUMENT.read_text(encoding="utf-8").splitlines():
+        keys, _, rest = line.removeprefix("| ").partition(" | ")
+        values = rest.partition(" | ")[0].split(", ")
+        documented |= dict(zip(re.findall(r"`(\w+)`", keys), values, strict=False))
+    for model in (QualitySettings, CalibrationSettings):
+        for key, field in model.model_fields.items():
+            assert float(documented[key]) == field.default, key

@@ -155,7 +155,9 @@ def test_sensors_that_the_rig_lacks_are_refused(tmp_path, rig, samples):
     with pytest.raises(SessionError, match=r"cam\.events"):
         session.add_capture([Image("cam", "events", None, images[0].pixels)], scans, {})
     with pytest.raises(SessionError, match="no lidar 'top'"):
-        session.add_capture(images, [Scan("top", None, scans[0].points, scans[0].intensity, scans[0].ring)], {})
+        session.add_capture(
+            images, [Scan("top", None, scans[0].points, scans[0].intensity, scans[0].ring)], {}
+        )
     with pytest.raises(SessionError, match="at most"):
         session.add_capture(images * 2, scans, {})
     assert session.captures == []
@@ -220,7 +222,9 @@ def test_a_pickle_in_the_cache_is_not_loaded(tmp_path, rig):
     session = Session.create(tmp_path / "s", rig)
     session.store_cached("k/0", {"a": np.zeros(1)}, {})
     evil = np.array([{"x": 1}], dtype=object)
-    np.savez(tmp_path / "s" / "detections" / "k" / "0.npz", a=evil, values_json=np.frombuffer(b"{}", np.uint8))
+    np.savez(
+        tmp_path / "s" / "detections" / "k" / "0.npz", a=evil, values_json=np.frombuffer(b"{}", np.uint8)
+    )
     assert session.load_cached("k/0") is None
 
 

@@ -12,8 +12,12 @@ from lce_rig.rig import Rig
 from lce_rig.simulate.backdrop import Backdrop, build_backdrop
 from lce_rig.simulate.room import Room, build_room
 
-FACING_LIDAR = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # x right, y up, print towards -x
-CAMERA_FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_world_cam looking along +x
+FACING_LIDAR = np.array(
+    [[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+)  # x right, y up, print towards -x
+CAMERA_FORWARD = np.array(
+    [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+)  # R_world_cam looking along +x
 
 
 def make_rig(name: str = "small", **changes: Any) -> Rig:
@@ -69,8 +73,10 @@ def T_world_cam() -> Array:
 
 
 LENSES = {
-    "radtan": Intrinsics(480.0, 481.0, 321.3, 238.2, 640, 480, "radtan", (-0.38, 0.2, 0.001, -0.0005, -0.05)),
-    "equidistant": Intrinsics(300.0, 301.0, 318.7, 241.4, 640, 480, "equidistant", (-0.05, -0.02, 0.01, -0.002)),
+    "radtan": Intrinsics(330.0, 331.0, 241.3, 178.2, 480, 360, "radtan", (-0.38, 0.2, 0.001, -0.0005, -0.05)),
+    "equidistant": Intrinsics(
+        300.0, 301.0, 238.7, 181.4, 480, 360, "equidistant", (-0.05, -0.02, 0.01, -0.002)
+    ),
 }
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
-from lce_rig.simulate.backdrop import Backdrop, pixel_corner_rays, pixel_rays
+from lce_rig.simulate.backdrop import Backdrop, lens_reach, pixel_corner_rays, pixel_rays
 from lce_rig.simulate.camera import render_image
 from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.options import CameraNoise
@@ -33,7 +33,12 @@ def test_corners_lie_where_the_truth_projects_them(
 ) -> None:
     import cv2
 
-    scene = Scene(room.raycaster, build_carrier("stand", board, T_world_board, np.random.default_rng(0)), board, T_world_board)
+    scene = Scene(
+        room.raycaster,
+        build_carrier("stand", board, T_world_board, np.random.default_rng(0)),
+        board,
+        T_world_board,
+    )
     picture = render_image(scene, backdrop, QUIET, np.random.default_rng(0)).grey
     corners_cam = transform(invert(backdrop.T_world_cam) @ T_world_board, board.corners())
     truth, is_valid = backdrop.intrinsics.project(corners_cam)
@@ -66,23 +71,26 @@ def test_rays_through_pixels_project_back_onto_them(model: str) -> None:
     assert np.isfinite(rays).all()
     v, u = np.mgrid[0 : lens.height_px, 0 : lens.width_px]
     pixels, is_valid = lens.project(rays)
-    # Towards the radius where the polynomial folds back no ray is exact, and no board is ever placed there.
-    radius = np.hypot(rays[..., 0], rays[..., 1]) / rays[..., 2]
-    if model == "radtan":
-        is_valid &= radius < 0.8 * lens.max_radius
-    assert is_valid.mean() > 0.9
-    assert np.abs(pixels - np.stack([u, v], axis=-1))[is_valid].max() < 5e-4
+    # Towards the radius where the polynomial folds back no ray is exact; no board is ever placed there.
+    offset = (np.stack([u, v], axis=-1) - [lens.cx_px, lens.cy_px]) / [lens.fx_px, lens.fy_px]
+    is_valid &= np.linalg.norm(offset, axis=-1) < 0.97 * lens_reach(lens)
+    assert is_valid.mean() > 0.8
+    assert np.abs(pixels - np.stack([u, v], axis=-1))[is_valid].max() < 2e-3
 
 
 def test_the_outer_square_at_the_top_left_is_dark(room: Room, board: Board, backdrop: Backdrop) -> None:
     T = placed(1.3, 0.0, 0.0, 0.0, 0.0)
-    picture = render_image(Scene(room.raycaster, [], board, T), backdrop, QUIET, np.random.default_rng(0)).grey
+    picture = render_image(
+        Scene(room.raycaster, [], board, T), backdrop, QUIET, np.random.default_rng(0)
+    ).grey
     square = board.square_m
     columns, rows = np.meshgrid(np.arange(board.cols + 1), np.arange(board.rows + 1))
     middles = np.stack(
         [(columns - board.cols / 2) * square, (board.rows / 2 - rows) * square, 0 * columns], axis=-1
     )
-    pixels, _ = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam) @ T, middles.reshape(-1, 3)))
+    pixels, _ = backdrop.intrinsics.project(
+        transform(invert(backdrop.T_world_cam) @ T, middles.reshape(-1, 3))
+    )
     u, v = np.rint(pixels).astype(int).T
     value = picture[v, u].reshape(columns.shape)
     is_dark = (columns + rows) % 2 == 0
@@ -115,7 +123,7 @@ def test_vignetting_darkens_the_corners_by_its_share(room: Room, board: Board, b
     )
     corner = (slice(-3, None), slice(-3, None))
     assert (dim[corner].mean() / flat[corner].mean()) ** 2.2 == pytest.approx(0.7, abs=0.05)
-    assert dim[238:242, 318:322].mean() == pytest.approx(flat[238:242, 318:322].mean(), abs=1.0)
+    assert dim[178:182, 238:242].mean() == pytest.approx(flat[178:182, 238:242].mean(), abs=1.0)
 
 
 def test_a_larger_exposure_brightens_and_a_blur_softens(room: Room, board: Board, backdrop: Backdrop) -> None:
@@ -138,9 +146,13 @@ def test_the_same_seed_gives_the_same_picture(room: Room, board: Board, backdrop
     assert one.tobytes() == same.tobytes() != other.tobytes()
 
 
-def test_a_board_behind_the_camera_is_not_in_the_picture(room: Room, board: Board, backdrop: Backdrop) -> None:
+def test_a_board_behind_the_camera_is_not_in_the_picture(
+    room: Room, board: Board, backdrop: Backdrop
+) -> None:
     empty = Scene(room.raycaster, [], board, placed(-40.0, 0.0, 0.0, 0.0, 0.0))
     behind = Scene(room.raycaster, [], board, placed(-2.0, 0.0, 0.0, 0.0, 45.0))
-    pictures = [render_image(s, backdrop, CameraNoise.none(), np.random.default_rng(0)).grey for s in (empty, behind)]
+    pictures = [
+        render_image(s, backdrop, CameraNoise.none(), np.random.default_rng(0)).grey for s in (empty, behind)
+    ]
     change = np.abs(pictures[0].astype(int) - pictures[1])
     assert change.max() < 40, "at most a faint shadow or mirror image"

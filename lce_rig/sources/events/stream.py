@@ -1,0 +1,127 @@
+"""What the readers of event files share: columns of events, and the account of what was lost on the way."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+NS_PER_US = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class EventColumns:
+    """Events as a reader finds them: not checked against a resolution, not yet put in order.
+
+    Attributes:
+        t_ns: (N,) int64 device time.
+        x, y: (N,) uint16 px.
+        polarity: (N,) bool, True where it became brighter.
+        host_ns: arrival of the first event at the host; None where unknown.
+    """
+
+    t_ns: NDArray[np.int64]
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    polarity: NDArray[np.bool_]
+    host_ns: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def select(self, keep: NDArray[Any] | slice) -> "EventColumns":
+        """Keep the events of a mask, an index or a slice."""
+        return EventColumns(self.t_ns[keep], self.x[keep], self.y[keep], self.polarity[keep], self.host_ns)
+
+
+def join(parts: list[EventColumns]) -> EventColumns:
+    """Put stretches of events one behind the other; host time is the first one's."""
+    if len(parts) == 1:
+        return parts[0]
+    return EventColumns(
+        np.concatenate([part.t_ns for part in parts]),
+        np.concatenate([part.x for part in parts]),
+        np.concatenate([part.y for part in parts]),
+        np.concatenate([part.polarity for part in parts]),
+        parts[0].host_ns,
+    )
+
+
+def join_small(stretches: Iterator[EventColumns], n_events: int) -> Iterator[EventColumns]:
+    """Join stretches until they hold at least `n_events`: small packets cost more to hand on than to read."""
+    parts: list[EventColumns] = []
+    n_held = 0
+    for stretch in stretches:
+        parts.append(stretch)
+        n_held += len(stretch)
+        if n_held >= n_events:
+            yield join(parts)
+            parts, n_held = [], 0
+    if parts:
+        yield join(parts)
+
+
+@dataclass
+class Findings:
+    """What was left out or repaired while reading: how many, and where first.
+
+    Attributes:
+        counts: how many by kind ("broken packets").
+        first: where the first of a kind was met and why.
+    """
+
+    counts: dict[str, int] = field(default_factory=dict)
+    first: dict[str, str] = field(default_factory=dict)
+
+    def add(self, kind: str, where: str = "", n: int = 1) -> None:
+        """Count n more of a kind; the place is kept of the first only."""
+        if n > 0:
+            self.first.setdefault(kind, where)
+            self.counts[kind] = self.counts.get(kind, 0) + n
+
+    def merge(self, other: "Findings") -> None:
+        """Take over what a more complete pass over the same recording found."""
+        for kind, count in other.counts.items():
+            if count >= self.counts.get(kind, 0):
+                self.counts[kind], self.first[kind] = count, other.first[kind]
+
+    def lines(self) -> list[str]:
+        """Say every finding in one line: "3 broken packets left out (first: message 17, 2.1 s in: ...)"."""
+        found = []
+        for kind in sorted(self.counts):
+            where = f" (first: {self.first[kind]})" if self.first[kind] else ""
+            found.append(f"{self.counts[kind]} {kind}{where}")
+        return found
+
+
+class EventStream(Protocol):
+    """One file or topic of events.
+
+    Attributes:
+        resolution_px: (width, height) that the file declares; None where it declares none.
+        notes: what was chosen or assumed on opening, in words.
+    """
+
+    @property
+    def resolution_px(self) -> tuple[int, int] | None:
+        """(width, height) that the file declares; None where it declares none."""
+        ...
+
+    @property
+    def notes(self) -> list[str]:
+        """What was chosen or assumed on opening, in words."""
+        ...
+
+    def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+        """Yield the events from the beginning, as they lie in the file; may be called again and again.
+
+        Raises:
+            SourceError: nothing more can be read for a reason the user can repair.
+        """
+        ...
+
+
+def seconds_in(t_ns: int, first_ns: int | None) -> str:
+    """Say how far into a recording a stamp lies: "2.125 s in"."""
+    return f"{(t_ns - (t_ns if first_ns is None else first_ns)) * 1e-9:.3f} s in"

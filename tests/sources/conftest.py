@@ -1,0 +1,135 @@
+"""Real bags of any kind, and small rooms for LiDARs to look at."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lce_rig.rig import Rig, load_rig
+
+Message = tuple[str, str, int, dict[str, Any]]
+"""Topic, type ("Image"), time of receipt in ns, fields."""
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return load_rig("rlfs")
+
+
+@pytest.fixture(scope="session")
+def room() -> np.ndarray:
+    """A sweep of 16 rings in a round room, firing order, structured with the usual fields."""
+    azimuth = np.linspace(np.pi, -np.pi, 360, endpoint=False)
+    elevation = np.radians(np.arange(-15, 16, 2))
+    cloud = np.zeros((360, 16), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"),
+                                       ("ring", "u2"), ("time", "f4")])  # fmt: skip
+    radius = 4 + np.sin(3 * azimuth)[:, None]
+    cloud["x"], cloud["y"] = radius * np.cos(azimuth)[:, None], radius * np.sin(azimuth)[:, None]
+    cloud["z"] = radius * np.tan(elevation)
+    cloud["intensity"], cloud["ring"] = 30, np.arange(16)
+    cloud["time"] = np.linspace(0, 0.1, 360)[:, None]
+    return cloud.ravel()
+
+
+def _typestore(kind: str) -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+
+
+def _build(store: Any, msgtype: str, fields: dict[str, Any]) -> Any:
+    """Build a message, its header from `stamp_ns`, its fields from plain values."""
+    types = store.types
+    fields = dict(fields)
+    stamp_ns = fields.pop("stamp_ns")
+    header_type = types["std_msgs/msg/Header"]
+    names = header_type.__dataclass_fields__
+    stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    header = header_type(**({"seq": 0} if "seq" in names else {}), stamp=stamp, frame_id="sensor")
+    if "fields" in fields:
+        point_field = types["sensor_msgs/msg/PointField"]
+        fields["fields"] = [
+            point_field(name=n, offset=o, datatype=d, count=c) for n, o, d, c in fields["fields"]
+        ]
+    return types[f"sensor_msgs/msg/{msgtype}"](header=header, **fields)
+
+
+@pytest.fixture
+def write_bag() -> Callable[[Path, str, Iterable[Message]], Path]:
+    """Write a bag: kind "ros1", "sqlite3" or "mcap"; returns the file, or the folder for ROS 2."""
+
+    def write(path: Path, kind: str, messages: Iterable[Message]) -> Path:
+        from rosbags.rosbag1 import Writer as Writer1
+        from rosbags.rosbag2 import StoragePlugin
+        from rosbags.rosbag2 import Writer as Writer2
+
+        store = _typestore(kind)
+        if kind == "ros1":
+            writer: Any = Writer1(path.with_suffix(".bag"))
+        else:
+            writer = Writer2(path, version=9, storage_plugin=StoragePlugin[kind.upper()])
+        with writer:
+            connections: dict[str, Any] = {}
+            for topic, msgtype, log_ns, fields in messages:
+                full = f"sensor_msgs/msg/{msgtype}"
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, full, typestore=store)
+                message = _build(store, msgtype, fields)
+                pack = store.serialize_ros1 if kind == "ros1" else store.serialize_cdr
+                writer.write(connections[topic], log_ns, pack(message, full))
+        return path.with_suffix(".bag") if kind == "ros1" else path
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def cloud_message() -> Callable[..., dict[str, Any]]:
+    """Lay a structured cloud out as a PointCloud2: point_step, row_step, byte order and height at will."""
+    codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+    def build(
+        cloud: np.ndarray,
+        stamp_ns: int,
+        *,
+        offsets: dict[str, int] | None = None,
+        point_step: int | None = None,
+        height: int = 1,
+        row_padding: int = 0,
+        is_bigendian: bool = False,
+    ) -> dict[str, Any]:
+        names = cloud.dtype.names
+        order = ">" if is_bigendian else "<"
+        formats = [np.dtype(order + cloud.dtype[n].str[1:]) for n in names]
+        packed = np.cumsum([0] + [f.itemsize for f in formats]).tolist()
+        places = [offsets[n] for n in names] if offsets else packed[:-1]
+        step = point_step or packed[-1]
+        out = np.zeros(
+            len(cloud), dtype={"names": names, "formats": formats, "offsets": places, "itemsize": step}
+        )
+        for name in names:
+            out[name] = cloud[name]
+        width = len(cloud) // height
+        rows = np.frombuffer(out.tobytes(), np.uint8).reshape(height, width * step)
+        rows = np.pad(rows, ((0, 0), (0, row_padding)), constant_values=255)
+        return {
+            "stamp_ns": stamp_ns, "height": height, "width": width, "is_bigendian": is_bigendian,
+            "fields": [(n, o, codes[cloud.dtype[n].str[1:]], 1) for n, o in zip(names, places, strict=True)],
+            "point_step": step, "row_step": rows.shape[1], "data": rows.ravel(), "is_dense": False,
+        }  # fmt: skip
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def image_message() -> Callable[..., dict[str, Any]]:
+    """Build an Image message from pixels."""
+
+    def build(pixels: np.ndarray, stamp_ns: int, encoding: str = "bgr8") -> dict[str, Any]:
+        height, width = pixels.shape[:2]
+        data = np.frombuffer(pixels.tobytes(), np.uint8)
+        return {"stamp_ns": stamp_ns, "height": height, "width": width, "encoding": encoding,
+                "is_bigendian": 0, "step": len(data) // height, "data": data}  # fmt: skip
+
+    return build
