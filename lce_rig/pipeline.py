@@ -6,13 +6,12 @@ session and the export layer touch files.
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from lce_rig import __version__
 from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate, CaptureCandidates
 from lce_rig.calibrate import calibrate as estimate_extrinsic
 from lce_rig.calibrate.consensus import find_consensus
@@ -33,6 +32,7 @@ from lce_rig.detect.detection import (
 from lce_rig.export.reference import Reference
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
+from lce_rig.verify.session_check import SessionCheck, check_session
 
 Progress = Callable[[int, int], None]
 CALIBRATION, OVERLAYS, DEBUG = "calibration", "overlays", "debug"
@@ -110,9 +110,13 @@ def detect_scan(rig: Rig, scan: Scan) -> LidarDetection:
 
 
 def _detection_digest(rig: Rig) -> str:
-    """Name the cache after everything a detection depends on beside the capture itself."""
-    settings = rig.model_dump_json(include={"board", "cameras", "lidars", "quality"})
-    return hashlib.sha256(f"{__version__} {settings}".encode()).hexdigest()[:12]
+    """Name the cache after everything a detection depends on beside the capture: the profile and the code."""
+    digest = hashlib.sha256(rig.model_dump_json(include={"board", "cameras", "lidars", "quality"}).encode())
+    package = Path(__file__).parent
+    for folder in ("core", "detect", "solvers"):
+        for source in sorted((package / folder).glob("*.py")):
+            digest.update(source.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def calibrate(
@@ -227,3 +231,28 @@ def write_results(session: Session, calibrations: list[Calibration], *, force: b
         remove_exports(folder)
         return [result]
     return [result, *write_exports(calibrations, session.rig, folder, is_forced=force)]
+
+
+def verify(
+    session: Session,
+    detections: Detections,
+    calibrations: Sequence[Calibration],
+    *,
+    folder: Path | None = None,
+    progress: Progress = _silent,
+) -> list[SessionCheck]:
+    """Hold extrinsics against every capture of a session, and draw the LiDAR into its pictures.
+
+    Args:
+        session: may be another one than the calibrations come from.
+        detections: of this session.
+        calibrations: as a rule from its result.json.
+        folder: for the pictures; the session's calibration/overlays/ where None. Several pairs get a folder each.
+        progress: called with (done, total) for each pair in turn.
+    """
+    base = folder or session.path / CALIBRATION / OVERLAYS
+    checks = []
+    for c in calibrations:
+        own = base if len(calibrations) == 1 else base / f"{c.camera}.{c.channel}.{c.lidar}"
+        checks.append(check_session(session, detections, c, own, progress))
+    return checks

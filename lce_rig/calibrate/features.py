@@ -93,7 +93,7 @@ def _onto_plane(points: Array, plane: Array, options: CalibrateOptions) -> Array
 
 
 def _meet_plane(points: Array, plane: Array) -> Array:
-    """Intersect the ray through each point (N, 3) with the plane; where it grazes, project along the normal."""
+    """Intersect the ray of each point (N, 3) with the plane; project along the normal where it grazes."""
     along = points @ plane[:3]
     is_grazing = -along < _GRAZING_COSINE * np.linalg.norm(points, axis=1)
     scale = -plane[3] / np.where(is_grazing, -1.0, along)

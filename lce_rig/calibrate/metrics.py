@@ -46,7 +46,7 @@ def capture_residual(
 
 
 def edge_distances(points_board: Array, board: Board) -> Array:
-    """Measure the distance in the board's plane of points (N, 3), frame board, from its nearest edge (N,) in m."""
+    """Measure in the board's plane how far points (N, 3), frame board, are from the nearest edge: (N,) m."""
     beyond = np.abs(points_board[:, :2]) - [board.width_m / 2, board.height_m / 2]
     to_side = np.hypot(beyond[:, 0], np.maximum(beyond[:, 1], 0))
     to_rail = np.hypot(beyond[:, 1], np.maximum(beyond[:, 0], 0))

@@ -34,8 +34,8 @@ class CalibrateOptions:
             normal as in the paper ("normal"), or not at all ("none").
         use_uncertainty: leave out the tenth of the plane terms with the largest propagated variance.
         use_ptpl, use_ptl: use point-to-plane, point-to-line terms in the refinement.
-        plane_weight, edge_weight: weights of the two terms; where either is None, both follow from the errors that
-            the captures themselves show.
+        plane_weight, edge_weight: weights of the two terms; where either is None, both follow from the errors
+            that the captures themselves show.
         half_step: move ring ends outwards by half an azimuth step, to where the edge is expected.
         edge_shift: "free": ring ends may lie beyond the printed size by a common distance, as the finite beam
             makes them; "off": they may not.

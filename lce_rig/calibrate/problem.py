@@ -2,7 +2,7 @@
 
 Per capture k the cost is
 
-    w_plane mean_i (n_k . (g_k - R p_i - t))^2 + w_edge mean_j (m_e(j) . (h_e(j) - R q_j - t) + d)^2        (1)
+    w_plane mean_i (n_k . (g_k - R p_i - t))^2 + w_edge mean_j (m_e(j) . (h_e(j) - R q_j - t) + d)^2     (1)
 
 over the board's plane (n_k, g_k) and edges (m_e, h_e) as the camera sees them, points p_i and ring ends q_j of
 the LiDAR, the edge e(j) nearest to each ring end, and the edge shift d by which ring ends appear beyond the
@@ -198,13 +198,9 @@ class Problem:
         plane = np.maximum(products @ self.plane.T, 0)
         edge = np.zeros((len(x), self.n_captures))
         ids = self.associate(x)
-        squares = np.take_along_axis(
-            np.moveaxis(x @ np.swapaxes(self._edge_rows, 1, 2), 0, 0).transpose(1, 0, 2),
-            ids[..., None],
-            axis=2,
-        )[..., 0]
-        squares = squares**2 * self._edge_weight
-        np.add.at(edge.T, self.edge_capture, squares.T)
+        residuals = np.moveaxis(x @ np.swapaxes(self._edge_rows, 1, 2), 1, 0)
+        chosen = np.take_along_axis(residuals, ids[..., None], axis=2)[..., 0]
+        np.add.at(edge.T, self.edge_capture, (chosen**2 * self._edge_weight).T)
         return np.sqrt(plane), np.sqrt(edge)
 
 

@@ -43,5 +43,34 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
     else:
         for checked in checks:
             show.print_table(_table(checked))
-            show.note(f"pictures: {checked.contact_sheet}")
+            show.print_lines(_summary(checked))
     exit_by_verdict(saved.calibrations)
+
+
+def _table(checked: Any) -> Any:
+    from rich.table import Table
+
+    table = Table(title=str(checked.pair), title_justify="left", pad_edge=False, box=None, header_style="bold")
+    for title in ("capture", "planes mm", "rms", "edges mm", "rms", "corners px"):
+        table.add_column(title, justify="left" if title == "capture" else "right")
+    table.add_column("")
+    for r in checked.residuals:
+        lengths = (r.plane_mean_m, r.plane_rms_m, r.edge_mean_m, r.edge_rms_m)
+        state = "" if r.capture in checked.used else "[dim]not used[/]"
+        cells = (*(f"{1000 * value:.1f}" for value in lengths), f"{r.reprojection_px:.2f}", state)
+        table.add_row(r.capture, *cells)
+    return table
+
+
+def _summary(checked: Any) -> list[str]:
+    lines = []
+    if checked.metrics is not None:
+        m = checked.metrics
+        lines.append(
+            f"mean over captures: planes {1000 * m.mpe_m:.1f} mm, edges {1000 * m.mee_m:.1f} mm, "
+            f"together {1000 * m.mge_m:.1f} mm; corners {m.reprojection_px:.2f} px"
+        )
+    lines.append(f"verdict: {checked.verdict}")
+    if checked.contact_sheet is not None:
+        lines.append(f"pictures: {checked.contact_sheet}")
+    return lines

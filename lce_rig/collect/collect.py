@@ -79,6 +79,7 @@ def collect(
     """
     collector = _Collector(session, options or CollectOptions(), progress or _silent)
     for recording in recordings:
+        collector.note(recording.notes)
         try:
             if isinstance(recording, PairedRecording):
                 collector.take_pairs(recording)

@@ -11,7 +11,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
-from lce_rig.detect.image_board import find_image_board
+from lce_rig.detect.image_board import find_image_board, region_around
 from lce_rig.detect.lidar_board import find_lidar_boards
 from lce_rig.detect.lidar_track import track_lidar_board
 from lce_rig.rig import Rig
@@ -93,18 +93,16 @@ class BoardWatcher:
         return Sighting(frame, images, lidars)
 
     def _find_in_image(self, image: Image, key: ImageKey, time_ns: int) -> ImageBoard | None:
+        last = self._seen.pop(key, None)
+        if last is None and not self._is_search_due(key, time_ns):
+            return None
+        region = None if last is None else region_around(last, image)
         intrinsics = self.rig.cameras[image.sensor].to_intrinsics()
-        found: ImageBoard | Refusal | None = None
-        if key in self._seen:
-            region = _region(self._seen[key].corners_px, image)
-            found = find_image_board(image, self._board, intrinsics, region=region)
-        if not isinstance(found, ImageBoard) and self._is_search_due(key, time_ns):
-            found = find_image_board(image, self._board, intrinsics)
-        if isinstance(found, ImageBoard):
-            self._seen[key] = found
-            return found
-        self._seen.pop(key, None)
-        return None
+        found = find_image_board(image, self._board, intrinsics, region=region)
+        if isinstance(found, Refusal):
+            return None
+        self._seen[key] = found
+        return found
 
     def _find_in_scan(self, scan: Scan, time_ns: int) -> list[LidarBoard]:
         tracked = (track_lidar_board(scan, self._board, old) for old in self._candidates.get(scan.sensor, []))
@@ -145,7 +143,7 @@ def find_still_moments(
         while len(window) > 2 and _span_s(window) - _step_s(window) >= options.window_s:
             window.popleft()
         is_full = len(window) > 2 and _span_s(window) >= options.window_s * 0.999
-        motion_m = _motion_m(window, board) if is_full else np.inf
+        motion_m = _motion_m(window, board, options.max_motion_m) if is_full else np.inf
         now_ns = sighting.frame.time_ns
         if motion_m <= options.max_motion_m:
             since_ns = since_ns if best is not None else now_ns
@@ -172,7 +170,7 @@ def _step_s(window: deque[Sighting]) -> float:
     return (window[1].frame.time_ns - window[0].frame.time_ns) * 1e-9
 
 
-def _motion_m(window: deque[Sighting], board: Board) -> float:
+def _motion_m(window: deque[Sighting], board: Board, max_motion_m: float) -> float:
     """Measure how far the board moved within a window.
 
     Corners tell of motion across the line of sight much better than poses do; planes tell of motion along it.
@@ -183,7 +181,7 @@ def _motion_m(window: deque[Sighting], board: Board) -> float:
         others = [s.images[key].corners_px for s in window if key in s.images]
         motions.append(max(_corner_motion_m(corners, reference.corners_px, board) for corners in others))
     lidar_motions = [
-        max(_plane_motion_m(candidate, sighting.lidars.get(lidar, [])) for sighting in window)
+        max(_plane_motion_m(candidate, sighting.lidars.get(lidar, []), max_motion_m) for sighting in window)
         for lidar, candidates in middle.lidars.items()
         for candidate in candidates
     ]
@@ -203,21 +201,14 @@ def _rms(difference: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(difference**2, axis=-1))))
 
 
-def _plane_motion_m(reference: LidarBoard, candidates: list[LidarBoard]) -> float:
-    """Measure by how much the plane of the nearest candidate passes by the reference's centre."""
+def _plane_motion_m(reference: LidarBoard, candidates: list[LidarBoard], max_motion_m: float) -> float:
+    """Measure by how much the plane of the nearest candidate passes by the reference's centre.
+
+    The centre itself is known along the board to a few centimetres only, and serves to tell plates apart.
+    """
     centre = reference.T_lidar_board[:3, 3]
     distances = [float(np.linalg.norm(c.T_lidar_board[:3, 3] - centre)) for c in candidates]
-    if not distances or min(distances) > 0.1:
+    if not distances or min(distances) > 0.1 + max_motion_m:
         return float("inf")
     plane = candidates[int(np.argmin(distances))].plane
     return float(abs(plane[:3] @ centre + plane[3]))
-
-
-def _region(corners_px: Array, image: Image) -> tuple[int, int, int, int]:
-    """Build the rectangle (left, top, right, bottom) about the corners, widened by half the board."""
-    low, high = corners_px.min(axis=0), corners_px.max(axis=0)
-    margin = 0.5 * (high - low)
-    height, width = image.pixels.shape[:2]
-    left, top = np.maximum(np.floor(low - margin), 0).astype(int)
-    right, bottom = np.minimum(np.ceil(high + margin), (width, height)).astype(int)
-    return int(left), int(top), int(right), int(bottom)

@@ -55,7 +55,8 @@ def _assign(rho: Array, z: Array) -> NDArray[np.int16]:
     seen, ring_of_seen = np.unique(ring, return_inverse=True)
     if len(seen) > MAX_RINGS or np.mean(is_left) > 0.1:
         raise SourceError(
-            f"no rings in the cloud: {len(seen)} elevations leave {100 * np.mean(is_left):.0f} % of its points over",
+            f"no rings in the cloud: {100 * np.mean(is_left):.0f} % of its points lie on none of the "
+            f"{len(seen)} elevations found",
             "give the cloud with its ring field, or in the frame of the LiDAR as its driver publishes it",
         )
     return ring_of_seen.astype(np.int16)
@@ -75,11 +76,11 @@ def _elevation_peaks(elevation: Array) -> Array:
     centres = low + (np.arange(len(counts)) + 0.5) * BIN_RAD
     weight = np.add.reduceat(np.append(counts, 0.0), bounds)[::2]
     moment = np.add.reduceat(np.append(counts * centres, 0.0), bounds)[::2]
-    return np.asarray(moment / weight)
+    return np.asarray(moment[weight > 0] / weight[weight > 0])
 
 
 def _nearest_line(rho: Array, z: Array, lines: Array) -> tuple[NDArray[np.intp], Array]:
-    """Find the line (slope, offset) nearest in z to each point, and the distance in m; lines in rising order."""
+    """Find the line (slope, offset) nearest in z to each point, and the distance in m; lines rise."""
     # An offset moves a point no further than to the neighbour of the line with the nearest slope.
     guess = np.searchsorted((lines[1:, 0] + lines[:-1, 0]) / 2, z / rho)
     nearest, miss = guess, np.abs(z - rho * lines[guess, 0] - lines[guess, 1])

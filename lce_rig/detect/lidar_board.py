@@ -23,7 +23,7 @@ def find_lidar_boards(
     max_range_m: float = 6.0,
     min_rings: int = 4,
     max_template_m: float = 0.025,
-    max_rms_m: float = 0.02,
+    max_rms_m: float = 0.012,
     beam: Beam | None = None,
 ) -> list[LidarBoard] | Refusal:
     """Find the plates of the board's size in a scan, best first.
@@ -54,7 +54,7 @@ def find_lidar_boards(
     segments = cut_segments(ordered, max_range_m)
     plates, ends = propose_plates(ordered, segments, board)
     limit_m = min(max_template_m + 1.5 * ordered.sigma_m, 0.06)
-    rms_limit_m = max(max_rms_m, 2.5 * ordered.sigma_m)
+    rms_limit_m = max_rms_m + 1.5 * ordered.sigma_m
     found: list[LidarBoard] = []
     misses: list[Refusal] = []
     for plane, origin, start in _screen(plates, ends, board, limit_m):
@@ -63,7 +63,7 @@ def find_lidar_boards(
             continue
         view, placement = refined
         if placement.error_m > limit_m:
-            misses.append(lidar_refusal.outline_misfit(view, placement, limit_m))
+            misses.append(lidar_refusal.outline_misfit(view, placement, limit_m, rms_limit_m))
             continue
         candidate = build_board(ordered, scan, board, view, placement, beam or Beam())
         if candidate is None:
@@ -71,7 +71,8 @@ def find_lidar_boards(
         if candidate.quality["n_rings"] < min_rings:
             misses.append(lidar_refusal.too_few_rings(candidate, min_rings))
         elif candidate.sigma_m > rms_limit_m:
-            misses.append(lidar_refusal.too_thick(candidate, rms_limit_m))
+            heights_m = candidate.points @ candidate.plane[:3] + candidate.plane[3]
+            misses.append(lidar_refusal.too_thick(heights_m, rms_limit_m))
         else:
             found.append(candidate)
     if found:
@@ -81,7 +82,9 @@ def find_lidar_boards(
     return lidar_refusal.no_plate(ordered, segments, board, min_range_m, max_range_m)
 
 
-def _screen(plates: Plates, ends: Array, board: Board, limit_m: float) -> list[tuple[Array, Array, Placement]]:
+def _screen(
+    plates: Plates, ends: Array, board: Board, limit_m: float
+) -> list[tuple[Array, Array, Placement]]:
     """Register the outline with the ends of each plate's segments and keep the plates it fits, best first."""
     if len(plates.centre) == 0:
         return []
@@ -90,7 +93,9 @@ def _screen(plates: Plates, ends: Array, board: Board, limit_m: float) -> list[t
     rank = sorted(range(len(placements)), key=lambda k: placements[k].error_m)
     # What fits far worse than the best plate is no rival of it.
     limit_m = min(limit_m, 3 * placements[rank[0]].error_m + 0.01)
-    return [(plates.plane[k], plates.centre[k], placements[k]) for k in rank if placements[k].error_m < limit_m]
+    return [
+        (plates.plane[k], plates.centre[k], placements[k]) for k in rank if placements[k].error_m < limit_m
+    ]
 
 
 def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
@@ -105,7 +110,7 @@ def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
 
 
 def _doubt(found: LidarBoard, board: Board) -> float:
-    """Rate a candidate in m: how badly the outline and the size fit, how little the rings show of it, what else is in its plane."""
+    """Rate a candidate in m: misfit of outline and size, what the rings cannot show, what else is in its plane."""
     q = found.quality
     doubt = q["template_m"] + 0.03 / q["n_rings"] + 0.15 * (q["width_sigma_m"] + q["height_sigma_m"])
     doubt += 0.05 * q["beyond_share"]

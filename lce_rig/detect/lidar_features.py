@@ -14,6 +14,7 @@ from lce_rig.detect.lidar_template import (
     Placement,
     PlaneView,
     plane_axes,
+    rate,
     register,
     signed_distance,
     view_plane,
@@ -86,7 +87,7 @@ def fit_plane_to_ranges(points: Array, start: Array, scale_m: float, n_rounds: i
         jacobian = -rays * (predicted**2)[:, None]
         hessian = (jacobian * weight[:, None]).T @ jacobian
         m = m + np.linalg.solve(hessian + 1e-9 * np.eye(3), jacobian.T @ (weight * residual))
-    return np.append(-m, 1.0) / np.linalg.norm(m)
+    return np.asarray(np.append(-m, 1.0) / np.linalg.norm(m))
 
 
 def refine(
@@ -99,7 +100,7 @@ def refine(
         plane: (4,) first guess.
         centre: (3,) m, the point of the plane the placement is counted from.
         placement: first guess of the outline.
-        limit_m: an outline that is worse by half is not improved further.
+        limit_m: largest error of an outline; what is far worse is not improved further.
 
     Returns:
         The beams about the plate and the outline among them, with its error; None where too few returns lie
@@ -111,6 +112,9 @@ def refine(
         centre = centre + plane_axes(plane[:3]) @ [placement.u_m, placement.v_m]
         placement = replace(placement, u_m=0.0, v_m=0.0)
         view = view_plane(scan, plane, centre, radius_m, tolerance_m)
+        error_m = rate(scan, view, placement)
+        if error_m > 2.0 * limit_m:
+            return view, replace(placement, error_m=error_m)
         distance, _ = signed_distance(placement.local(view.uv), placement.half_m)
         on = view.member[view.is_on & (distance < 0.0)]
         if len(on) < 10:
@@ -170,7 +174,9 @@ def _outwards(
     """Find the n-th return beyond each ring end and whether it is there: same ring, a few firings off."""
     other = np.clip(member + n * side.astype(np.intp), 0, len(scan.index) - 1)
     turn = np.abs(np.mod(scan.azimuth[other] - scan.azimuth[member] + np.pi, 2 * np.pi) - np.pi)
-    exists = (scan.ring[other] == scan.ring[member]) & (turn < (n + MAX_STEPS) * scan.step_rad) & (other != member)
+    exists = (
+        (scan.ring[other] == scan.ring[member]) & (turn < (n + MAX_STEPS) * scan.step_rad) & (other != member)
+    )
     return other, exists
 
 

@@ -103,12 +103,12 @@ def _facing_planes(
 
 
 def _ring_ends(scan: OrderedScan, segments: Segments, members: Indices) -> Array:
-    """List the ends (M, 3) of a plate's segments in m; segments a few returns apart on a ring count as one."""
+    """List the ends (M, 3) of a plate's segments in m; segments a few returns apart count as one."""
     start, end = segments.start[members], segments.end[members]
     is_joint = (start[1:] - end[:-1] <= MAX_JOINT) & (np.diff(segments.ring[members]) == 0)
     first = start[np.append(True, ~is_joint)]
     last = end[np.append(~is_joint, True)] - 1
-    return scan.points[np.concatenate([first, last])].astype(np.float64)
+    return np.asarray(scan.points[np.concatenate([first, last])], dtype=np.float64)
 
 
 def _neighbours(segments: Segments, diagonal_m: float, is_any_size: bool) -> tuple[Indices, Indices]:
@@ -137,7 +137,9 @@ def _sums(segments: Segments) -> Array:
     """Stack count, sum of p and sum of p p^T of each segment (S, 13)."""
     outer = segments.centre[:, :, None] * segments.centre[:, None, :]
     second = (segments.scatter + segments.count[:, None, None] * outer).reshape(-1, 9)
-    return np.concatenate([segments.count[:, None], segments.count[:, None] * segments.centre, second], axis=1)
+    return np.concatenate(
+        [segments.count[:, None], segments.count[:, None] * segments.centre, second], axis=1
+    )
 
 
 def _fit(row: Indices, column: Indices, segments: Segments, sums: Array) -> Plates:
@@ -167,7 +169,9 @@ def _fit(row: Indices, column: Indices, segments: Segments, sums: Array) -> Plat
     return Plates(plane, centre, n_rings, np.sqrt(12.0 * eigenvalues[:, [2, 1]]), np.sqrt(eigenvalues[:, 0]))
 
 
-def _members(plates: Plates, segments: Segments, reach_m: float, tolerance_m: float) -> tuple[Indices, Indices]:
+def _members(
+    plates: Plates, segments: Segments, reach_m: float, tolerance_m: float
+) -> tuple[Indices, Indices]:
     """List which segments lie in which plane, within reach of its centre: (plate, segment), rising."""
     row, column = _within_reach(plates.centre, segments.centre, reach_m)
     normal = plates.plane[row, :3]
@@ -181,7 +185,7 @@ def _members(plates: Plates, segments: Segments, reach_m: float, tolerance_m: fl
 
 
 def _within_reach(centres: Array, others: Array, reach_m: float, block: int = 32) -> tuple[Indices, Indices]:
-    """List the pairs (row, column) of points closer than the reach, a block of rows at a time for the cache."""
+    """List the pairs (row, column) of points closer than the reach, by blocks that fit the cache."""
     half_squared = np.einsum("ij,ij->i", others, others) / 2
     limit = (reach_m**2 - np.einsum("ij,ij->i", centres, centres)) / 2
     rows, columns = [], []

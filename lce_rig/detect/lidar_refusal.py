@@ -3,6 +3,7 @@
 import numpy as np
 
 from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Refusal
 from lce_rig.detect.lidar_plates import propose_plates
 from lce_rig.detect.lidar_segments import OrderedScan, Segments
@@ -10,6 +11,7 @@ from lce_rig.detect.lidar_template import Placement, PlaneView, signed_distance
 
 # Share of returns beyond the outline, in the board's plane, from which something touches the board.
 TOUCHING_SHARE = 0.10
+LAYER_M = 0.06  # half the depth in which returns may belong to one warped or moving sheet
 
 
 def no_returns(n_points: int, min_range_m: float) -> Refusal:
@@ -32,21 +34,38 @@ def too_few_rings(found: LidarBoard, min_rings: int) -> Refusal:
     )
 
 
-def too_thick(found: LidarBoard, limit_m: float) -> Refusal:
-    """Refuse a board whose returns scatter about its plane by more than the LiDAR's noise explains."""
+def too_thick(heights_m: Array, limit_m: float) -> Refusal:
+    """Refuse a board whose returns scatter about its plane by more than the LiDAR's noise explains.
+
+    Args:
+        heights_m: (N,) of the returns over the plane.
+        limit_m: largest rms of them.
+    """
+    low_m, high_m = np.percentile(heights_m, [2.5, 97.5])
     return Refusal(
         "lidar",
-        f"surface {100 * found.quality['thickness_m']:.0f} cm thick, rms {1000 * found.sigma_m:.0f} mm "
+        f"surface {100 * (high_m - low_m):.0f} cm thick, rms {1000 * np.sqrt(np.mean(heights_m**2)):.0f} mm "
         f"({1000 * limit_m:.0f} allowed): the board moved during the sweep or is not flat",
         "hold the board still, or put it on a stand",
     )
 
 
-def outline_misfit(view: PlaneView, placement: Placement, limit_m: float) -> Refusal:
-    """Refuse a plate whose outline is not the board's, because something touches it or parts are missing."""
+def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_limit_m: float) -> Refusal:
+    """Refuse a plate whose outline is not the board's: it is warped, something touches it, parts are hidden.
+
+    Args:
+        view: beams about the plate.
+        placement: where the outline fits best.
+        limit_m: largest error of an outline.
+        rms_limit_m: largest rms distance of the returns from the plane.
+    """
     distance, _ = signed_distance(placement.local(view.uv), placement.half_m)
     n_on = max(1, int((view.is_on & (distance <= 0)).sum()))
     beyond = int((view.is_on & (distance > 0.03)).sum()) / n_on
+    heights_m = view.height_m[(distance < -0.03) & (np.abs(view.height_m) < LAYER_M)]
+    is_one_sheet = len(heights_m) > 0.8 * max(1, int((distance < -0.03).sum()))
+    if is_one_sheet and np.sqrt(np.mean(heights_m**2)) > rms_limit_m:
+        return too_thick(heights_m, rms_limit_m)
     where = f"at {np.linalg.norm(view.origin):.1f} m"
     if beyond > TOUCHING_SHARE:
         return Refusal(

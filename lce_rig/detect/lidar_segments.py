@@ -124,8 +124,8 @@ def _by_azimuth(
 ) -> tuple[Indices, NDArray[np.int16], Floats]:
     """Sort the returns of each ring, given in order of firing, by azimuth; drop those of a second turn.
 
-    A sweep of slightly more than one turn shows the same directions twice, 0.1 s apart: mixed, they would tear
-    what moves into two. Clouds that are not in order of firing lose nothing.
+    A sweep of slightly more than one turn shows the same directions twice, 0.1 s apart: mixed, they would
+    tear what moves into two. Clouds that are not in order of firing lose nothing.
     """
     turn = _wrap(np.diff(azimuth, prepend=azimuth[:1]))
     is_start = np.diff(ring, prepend=ring[:1] - 1) != 0
@@ -162,7 +162,7 @@ def _azimuth_step(turn: Floats) -> float:
 def _range_noise(turn: Floats, range_m: Floats, ring: NDArray[np.int16]) -> float:
     """Estimate sigma of a range from its second differences along the rings, 0 on planes up to curvature.
 
-    The lower quartile of |r[i-1] - 2 r[i] + r[i+1]| / sqrt(6) is taken: edges and foliage spoil the upper part.
+    The lower quartile of |r[i-1] - 2 r[i] + r[i+1]| / sqrt(6) is taken: edges and foliage spoil the rest.
     """
     second = np.abs(range_m[:-2] - 2 * range_m[1:-1] + range_m[2:])
     is_plain = (ring[:-2] == ring[2:]) & (turn[1:-1] < 0.01) & (turn[2:] < 0.01)
@@ -170,7 +170,7 @@ def _range_noise(turn: Floats, range_m: Floats, ring: NDArray[np.int16]) -> floa
     if len(second) < 20:
         return 0.01
     quartile = float(np.partition(second, len(second) // 4)[len(second) // 4])
-    return max(quartile / (0.3186 * np.sqrt(6.0)), RANGE_NOISE_FLOOR_M)
+    return max(quartile / (0.3186 * float(np.sqrt(6.0))), RANGE_NOISE_FLOOR_M)
 
 
 def cut_segments(scan: OrderedScan, max_range_m: float, min_points: int = 4) -> Segments:

@@ -11,6 +11,7 @@ from lce_rig.detect.lidar_segments import MAX_STEPS, Indices, OrderedScan
 
 N_ANGLES = 12
 CAP_M = 0.10
+MAX_SAMPLES = 120
 MIN_ON_RING = 3  # returns that make a chord
 # What a beam says about the outline: it ends a chord, or should lie inside or outside.
 END, INSIDE, OUTSIDE, UNUSED = range(4)
@@ -69,7 +70,9 @@ class Placement:
         return np.asarray(offset @ np.array([[cosine, -sine], [sine, cosine]]))
 
 
-def view_plane(scan: OrderedScan, plane: Array, centre: Array, radius_m: float, tolerance_m: float) -> PlaneView:
+def view_plane(
+    scan: OrderedScan, plane: Array, centre: Array, radius_m: float, tolerance_m: float
+) -> PlaneView:
     """Pierce a plane by all beams that do so within a radius of a point.
 
     Args:
@@ -84,7 +87,9 @@ def view_plane(scan: OrderedScan, plane: Array, centre: Array, radius_m: float, 
     distance = float(np.linalg.norm(origin))
     # Coarse cone about the disc first: most returns are elsewhere.
     cosine = np.cos(np.arcsin(min(1.0, radius_m / max(distance, 1e-6))))
-    near = np.flatnonzero(scan.points @ origin.astype(np.float32) > np.float32(cosine * distance) * scan.range_m)
+    near = np.flatnonzero(
+        scan.points @ origin.astype(np.float32) > np.float32(cosine * distance) * scan.range_m
+    )
     points = scan.points[near].astype(np.float64)
     along_normal = points @ normal
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -152,23 +157,38 @@ def register(scan: OrderedScan, view: PlaneView, start: Placement) -> Placement 
     Returns:
         The placement, None where no ring shows the plate.
     """
-    first, last = find_chords(scan, view, start)
-    if len(first) == 0:
+    samples, kind = _samples(scan, view, start)
+    if not (kind == END).any():
         return None
-    ends = view.uv[np.concatenate([first, last])]
-    is_chord = np.zeros(len(view.uv) + 1, dtype=np.int8)
-    np.add.at(is_chord, first, 1)
-    np.add.at(is_chord, last + 1, -1)
-    # Beams far from any border say the same as their neighbours: a sample is enough.
-    inside, outside = view.uv[view.is_on & (np.cumsum(is_chord[:-1]) > 0)], view.uv[view.height_m < -view.tolerance_m]
-    inside = inside[:: max(1, -(-len(inside) // 120))]
-    outside = outside[:: max(1, -(-len(outside) // 120))]
-    kind = np.repeat([END, INSIDE, OUTSIDE], [len(ends), len(inside), len(outside)])
-    samples = np.concatenate([ends, inside, outside])
     guess = np.array([[[start.u_m, start.v_m, start.angle_rad]]])
     state, error_m = _search(guess, samples[None], kind[None], start.half_m, (0.04, 0.03, 0.03, 0.03))
     u_m, v_m, angle_rad = (float(x) for x in state[0])
     return Placement(u_m, v_m, angle_rad, start.half_m, float(error_m[0]))
+
+
+def rate(scan: OrderedScan, view: PlaneView, placement: Placement) -> float:
+    """Compute `Placement.error_m` of a placement as it stands; infinite where no ring shows the plate."""
+    samples, kind = _samples(scan, view, placement)
+    if not (kind == END).any():
+        return float("inf")
+    state = np.array([[[placement.u_m, placement.v_m, placement.angle_rad]]])
+    return float(_cost(state, samples[None], kind[None], placement.half_m)[0, 0])
+
+
+def _samples(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[Array, Indices]:
+    """Collect what beams say about the outline: points (M, 2) of the view and their kind (M,)."""
+    first, last = find_chords(scan, view, placement)
+    ends = view.uv[np.concatenate([first, last])]
+    bound = np.zeros(len(view.uv) + 1, dtype=np.int8)
+    bound[first] += 1
+    bound[last + 1] -= 1
+    is_inside = view.is_on & (np.cumsum(bound[:-1]) > 0)
+    inside, outside = view.uv[is_inside], view.uv[view.height_m < -view.tolerance_m]
+    # Beams far from any border say the same as their neighbours: a sample is enough.
+    inside = inside[:: max(1, -(-len(inside) // MAX_SAMPLES))]
+    outside = outside[:: max(1, -(-len(outside) // MAX_SAMPLES))]
+    kind = np.repeat([END, INSIDE, OUTSIDE], [len(ends), len(inside), len(outside)])
+    return np.concatenate([ends, inside, outside]), kind
 
 
 def register_ends(ends: Array, board: Board) -> list[Placement]:
@@ -192,7 +212,10 @@ def register_ends(ends: Array, board: Board) -> list[Placement]:
     best = np.argsort(cost, axis=1, kind="stable")[:, :2]
     starts = np.take_along_axis(starts, best[..., None], axis=1)
     state, error_m = _search(starts, samples, kind, half, (0.08, 0.06, 0.04, 0.03))
-    return [Placement(*map(float, x), half, float(e)) for x, e in zip(state, error_m, strict=True)]
+    return [
+        Placement(float(x[0]), float(x[1]), float(x[2]), half, float(e))
+        for x, e in zip(state, error_m, strict=True)
+    ]
 
 
 def signed_distance(local: Array, half: tuple[float, float]) -> tuple[Array, Array]:
@@ -205,15 +228,16 @@ def signed_distance(local: Array, half: tuple[float, float]) -> tuple[Array, Arr
     Returns:
         (...,) and (..., 2).
     """
-    over = np.abs(local) - half
-    is_outside = (over > 0).any(axis=-1)
-    outside = np.maximum(over, 0.0)
-    away = np.linalg.norm(outside, axis=-1)
-    distance = np.where(is_outside, away, over.max(axis=-1))
-    along_x = over[..., 0] > over[..., 1]
-    inner = np.stack([along_x, ~along_x], axis=-1).astype(np.float64)
-    gradient = np.where(is_outside[..., None], outside / np.maximum(away, 1e-12)[..., None], inner)
-    return distance, gradient * np.where(local < 0, -1.0, 1.0)
+    over_x, over_y = np.abs(local[..., 0]) - half[0], np.abs(local[..., 1]) - half[1]
+    out_x, out_y = np.maximum(over_x, 0.0), np.maximum(over_y, 0.0)
+    away = np.sqrt(out_x * out_x + out_y * out_y)
+    is_outside = away > 0
+    distance = np.where(is_outside, away, np.maximum(over_x, over_y))
+    scale = np.where(is_outside, away, 1.0)
+    gradient = np.empty_like(local)
+    gradient[..., 0] = np.copysign(np.where(is_outside, out_x, over_x > over_y) / scale, local[..., 0])
+    gradient[..., 1] = np.copysign(np.where(is_outside, out_y, over_x <= over_y) / scale, local[..., 1])
+    return distance, gradient
 
 
 def _search(

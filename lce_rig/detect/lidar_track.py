@@ -54,4 +54,6 @@ def track_lidar_board(
     for candidate in found:
         if candidate.plane[:3] @ previous.plane[:3] > MAX_TURN:
             return candidate
-    return Refusal("lidar", "the only plate near the board's last place is turned by over 45 deg", "move more slowly")
+    return Refusal(
+        "lidar", "the only plate near the board's last place is turned by over 45 deg", "move more slowly"
+    )

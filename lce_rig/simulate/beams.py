@@ -38,7 +38,7 @@ def receive(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) 
     """
     hits = scene.cast(origins, directions)
     returns = _echoes(scene, hits, origins, directions)
-    if max(*noise.divergence_rad, *noise.exit_size_m) == 0.0:
+    if max(*noise.divergence_rad, *noise.exit_size_m, noise.edge_growth_m) == 0.0:
         return returns
     is_split = _touches_several(scene, hits, origins, directions, noise)
     split = np.flatnonzero(is_split)

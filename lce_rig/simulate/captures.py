@@ -1,7 +1,7 @@
 """A simulated session: the rig's true geometry, and captures of the board among its decoys."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,7 +23,9 @@ LIDAR_MODELS = {"vlp16": VLP16}
 _FIRST_STAMP_NS = 1_700_000_000_000_000_000
 _CAPTURE_EVERY_NS = 4_000_000_000
 # Independent streams of random numbers, so that more captures or another camera change nothing else.
-_TRUTH, _ROOM, _LASERS, _START, _CAPTURE = range(5)
+# Streams of a session are [seed, _OF_SESSION, stream, ...], those of a capture [seed, index, stream, ...].
+_OF_SESSION = 1_000_000_007
+_TRUTH, _ROOM, _LASERS, _START, _PLACEMENT, _SCAN, _IMAGE = range(7)
 # Camera optical axes (x right, y down, z forward) from the LiDAR's (x forward, y left, z up).
 _FORWARD = pose(
     np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([0.0, -0.08, -0.08])
@@ -111,7 +113,7 @@ def _sensor_poses(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, 
     """Chain the perturbed nominal extrinsics into T_base_sensor, the base being the first LiDAR."""
     links: list[tuple[str, str, Array]] = []
     for index, entry in enumerate(rig.nominal_extrinsics):
-        rng = np.random.default_rng([seed, _TRUTH, index])
+        rng = np.random.default_rng([seed, _OF_SESSION, _TRUTH, index])
         angle_deg = min(options.truth_rotation_deg, 0.8 * entry.tolerance_deg) * rng.uniform(0.4, 1.0)
         shift_m = min(options.truth_translation_m, 0.8 * entry.tolerance_m) * rng.uniform(0.4, 1.0)
         axes = rng.standard_normal((2, 3))
@@ -144,14 +146,14 @@ def _set_stage(rig: Rig, seed: int, options: SimulationOptions) -> _Stage:
     sight = T_world_sensor[cameras[0]][:3, 2]
     room = build_room(
         float(np.arctan2(sight[1], sight[0])),
-        np.random.default_rng([seed, _ROOM]),
+        np.random.default_rng([seed, _OF_SESSION, _ROOM]),
         rig.board.to_board() if options.has_decoy_plate else None,
         options.lidar_height_m,
     )
     lenses = {name: rig.cameras[name].to_intrinsics() for name in cameras}
     models = {name: _lidar_model(rig, name) for name in rig.lidars}
     bias = {
-        name: _laser_bias(models[name], np.random.default_rng([seed, _LASERS, k]), options)
+        name: _laser_bias(models[name], np.random.default_rng([seed, _OF_SESSION, _LASERS, k]), options)
         for k, name in enumerate(rig.lidars)
     }
     views = [
@@ -169,12 +171,12 @@ def _frames_channel(rig: Rig, camera: str) -> str | None:
 
 
 def _lidar_model(rig: Rig, lidar: str) -> LidarModel:
-    given = rig.lidars[lidar].model
+    given, rate_hz = rig.lidars[lidar].model, rig.lidars[lidar].rate_hz
     model = LIDAR_MODELS.get("".join(c for c in given.lower() if c.isalnum()))
     if model is None:
         known = ", ".join(m.name for m in LIDAR_MODELS.values())
         raise ProfileError(f"lidars.{lidar}.model: {given} cannot be simulated", f"Known models: {known}.")
-    return model
+    return replace(model, period_ns=round(1e9 / rate_hz))
 
 
 def _laser_bias(model: LidarModel, rng: np.random.Generator, options: SimulationOptions) -> Array:
@@ -185,20 +187,35 @@ def _laser_bias(model: LidarModel, rng: np.random.Generator, options: Simulation
 
 def _capture(rig: Rig, stage: _Stage, seed: int, options: SimulationOptions, index: int) -> SimulatedCapture:
     board = rig.board.to_board()
-    rng = np.random.default_rng([seed, _CAPTURE, index])
+    rng = np.random.default_rng([seed, index, _PLACEMENT])
     view = stage.views[index % len(stage.views)]
-    start = np.random.default_rng([seed, _START]).random(3)
+    start = np.random.default_rng([seed, _OF_SESSION, _START]).random(3)
     T_world_board = place_board(view, board, stage.room, options, index // len(stage.views), rng, start)
     carrier = build_carrier(options.carrier, board, T_world_board, rng)
     scene = Scene(stage.room.raycaster, carrier, board, T_world_board, options.print_reflectivity)
     stamp_ns = _FIRST_STAMP_NS + index * _CAPTURE_EVERY_NS
-    scans = [
+    return SimulatedCapture(
+        index,
+        _take_images(
+            rig, stage, scene, options, stamp_ns + stage.models[view.lidar].period_ns // 2, [seed, index]
+        ),
+        _take_scans(rig, stage, scene, options, stamp_ns, [seed, index]),
+        {name: invert(stage.T_world_sensor[name]) @ T_world_board for name in rig.lidars},
+        {name: invert(stage.T_world_sensor[name]) @ T_world_board for name in rig.cameras},
+        (view.camera, view.lidar),
+    )
+
+
+def _take_scans(
+    rig: Rig, stage: _Stage, scene: Scene, options: SimulationOptions, stamp_ns: int, seeds: list[int]
+) -> list[Scan]:
+    return [
         simulate_scan(
             scene,
             stage.T_world_sensor[name],
             stage.models[name],
             options.lidar_noise,
-            np.random.default_rng([seed, _CAPTURE, index, 1, k]),
+            np.random.default_rng([*seeds, _SCAN, k]),
             laser_bias_m=stage.laser_bias_m[name],
             sensor=name,
             stamp_ns=stamp_ns,
@@ -207,23 +224,20 @@ def _capture(rig: Rig, stage: _Stage, seed: int, options: SimulationOptions, ind
         )
         for k, (name, settings) in enumerate(rig.lidars.items())
     ]
-    images = [
+
+
+def _take_images(
+    rig: Rig, stage: _Stage, scene: Scene, options: SimulationOptions, stamp_ns: int, seeds: list[int]
+) -> list[Image]:
+    return [
         render_image(
             scene,
             backdrop,
             options.camera,
-            np.random.default_rng([seed, _CAPTURE, index, 2, k]),
+            np.random.default_rng([*seeds, _IMAGE, k]),
             sensor=name,
             channel=_frames_channel(rig, name) or "frames",
-            stamp_ns=stamp_ns + stage.models[view.lidar].period_ns // 2,
+            stamp_ns=stamp_ns,
         )
         for k, (name, backdrop) in enumerate(stage.backdrops.items())
     ]
-    return SimulatedCapture(
-        index,
-        images,
-        scans,
-        {name: invert(stage.T_world_sensor[name]) @ T_world_board for name in rig.lidars},
-        {name: invert(stage.T_world_sensor[name]) @ T_world_board for name in rig.cameras},
-        (view.camera, view.lidar),
-    )

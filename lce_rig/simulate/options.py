@@ -20,7 +20,8 @@ class LidarNoise:
         dark_bias_m: how much longer a return of reflectivity 0 reads than one of reflectivity 1.
         weak_bias_m: how much longer the weakest returns read (intensity 0; none from intensity 30 on).
         rim_spread_rad: half-width of the azimuth error of points within a footprint of the board's border.
-        edge_growth_m: how much further the returns reach beyond the board's border than the beam explains.
+        edge_growth_m: how much wider the beam's rim is than divergence and exit explain; with it the returns
+            reach 9-10 mm beyond a board's border, as they do on real recordings.
         divergence_rad: full opening of the beam, horizontal and vertical.
         exit_size_m: size of the beam where it leaves the sensor, horizontal and vertical.
         pulse_m: surfaces nearer to each other than this blend into one return.
@@ -34,7 +35,7 @@ class LidarNoise:
     dark_bias_m: float = 0.001
     weak_bias_m: float = 0.010
     rim_spread_rad: float = 0.0
-    edge_growth_m: float = 0.0
+    edge_growth_m: float = 0.004
     divergence_rad: tuple[float, float] = (0.0030, 0.0015)
     exit_size_m: tuple[float, float] = (0.010, 0.010)
     pulse_m: float = 0.5
@@ -51,6 +52,7 @@ class LidarNoise:
             weak_bias_m=0.0,
             divergence_rad=(0.0, 0.0),
             exit_size_m=(0.0, 0.0),
+            edge_growth_m=0.0,
             dropout=0.0,
             is_quantised=False,
         )
@@ -125,7 +127,7 @@ class SimulationOptions:
             return self.lidar
         sigma_m = PAPER_RANGE_SIGMA_M[self.noise_level - 1]
         # The paper's simulator spreads points at the rim by 0.003 rad times the range, whatever the level.
-        quiet = replace(self.lidar, laser_sigma_m=0.0, dark_bias_m=0.0, weak_bias_m=0.0)
+        quiet = replace(self.lidar, laser_sigma_m=0.0, dark_bias_m=0.0, weak_bias_m=0.0, edge_growth_m=0.0)
         return replace(quiet, range_sigma_m=sigma_m, rim_spread_rad=0.0015)
 
     @classmethod

@@ -48,7 +48,10 @@ class Box:
         T = invert(self.T_lidar_box)
         direction, start = rays @ T[:3, :3].T, T[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
-            one, two = (-np.array(self.size_m) / 2 - start) / direction, (np.array(self.size_m) / 2 - start) / direction
+            one, two = (
+                (-np.array(self.size_m) / 2 - start) / direction,
+                (np.array(self.size_m) / 2 - start) / direction,
+            )
         near, far = np.minimum(one, two).max(axis=1), np.maximum(one, two).min(axis=1)
         return np.where((near > far) | (far < 0), np.inf, np.where(near > 0, near, far))
 
@@ -77,13 +80,19 @@ Shape = Plate | Box | Pillar
 
 
 def place(
-    distance_m: float, azimuth_deg: float = 0.0, roll_deg: float = 45.0, yaw_deg: float = 0.0, pitch_deg: float = 0.0,
+    distance_m: float,
+    azimuth_deg: float = 0.0,
+    roll_deg: float = 45.0,
+    yaw_deg: float = 0.0,
+    pitch_deg: float = 0.0,
     z_m: float = 0.0,
 ) -> Array:
     """Build T_lidar_board of a board that faces the LiDAR, then turned in its plane and tilted."""
     facing = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]) @ np.diag([-1.0, 1.0, 1.0])
     facing[:, 0] = np.cross(facing[:, 1], facing[:, 2])
-    tilt = exp_so3(np.array([0.0, np.radians(yaw_deg), 0.0])) @ exp_so3(np.array([np.radians(pitch_deg), 0.0, 0.0]))
+    tilt = exp_so3(np.array([0.0, np.radians(yaw_deg), 0.0])) @ exp_so3(
+        np.array([np.radians(pitch_deg), 0.0, 0.0])
+    )
     local = facing @ tilt @ exp_so3(np.array([0.0, 0.0, np.radians(roll_deg)]))
     about = exp_so3(np.array([0.0, 0.0, np.radians(azimuth_deg)]))
     return pose(about @ local, about @ np.array([distance_m, 0.0, z_m]))
@@ -141,12 +150,17 @@ def cast(
     """
     rng = np.random.default_rng(seed)
     azimuth = np.radians(start_deg - step_deg * (np.arange(int(360 / step_deg)) + rng.uniform()))
-    azimuth, ring = np.repeat(azimuth, len(elevations_deg)), np.tile(np.arange(len(elevations_deg)), len(azimuth))
+    azimuth, ring = (
+        np.repeat(azimuth, len(elevations_deg)),
+        np.tile(np.arange(len(elevations_deg)), len(azimuth)),
+    )
     elevation = np.radians(elevations_deg)[ring]
 
     def trace(shift_rad: float) -> tuple[Array, Array]:
         at = azimuth + shift_rad
-        rays = np.stack([np.cos(elevation) * np.cos(at), np.cos(elevation) * np.sin(at), np.sin(elevation)], axis=1)
+        rays = np.stack(
+            [np.cos(elevation) * np.cos(at), np.cos(elevation) * np.sin(at), np.sin(elevation)], axis=1
+        )
         return rays, np.min([shape.ranges(rays) for shape in shapes], axis=0)
 
     rays, range_m = trace(0.0)
@@ -157,7 +171,9 @@ def cast(
         over_edge = np.isfinite(range_m) & np.isfinite(other) & (np.abs(other - range_m) > 0.1)
         is_mixed = over_edge & (rng.uniform(size=len(range_m)) < mixed_share)
         weight = rng.uniform(0.2, 0.8, size=len(range_m))
-        range_m = np.where(is_mixed, weight * range_m + (1 - weight) * np.where(is_mixed, other, 0.0), range_m)
+        range_m = np.where(
+            is_mixed, weight * range_m + (1 - weight) * np.where(is_mixed, other, 0.0), range_m
+        )
     keep = np.isfinite(range_m) & (range_m < max_range_m)
     noisy = range_m[keep] + sigma_m * rng.standard_normal(int(keep.sum()))
     points = (rays[keep] * noisy[:, None]).astype(np.float32)

@@ -184,11 +184,21 @@ def test_carriers_follow_the_rig_and_the_option(rig: Rig) -> None:
     counts = {}
     for carrier in ("none", "stand", "person"):
         options = SimulationOptions(carrier=carrier)  # type: ignore[arg-type]
-        capture = next(simulate_captures(rig, n_captures=1, seed=4, options=options))
-        xyz = transform(invert(capture.T_lidar_board["lidar"]), capture.scans[0].points.astype(float))
-        near = (np.linalg.norm(xyz, axis=1) < 1.0) & (np.abs(xyz[:, 2]) > 0.06)
-        counts[carrier] = int(near.sum())
+        counts[carrier] = 0
+        for capture in simulate_captures(rig, n_captures=3, seed=4, options=options):
+            xyz = transform(invert(capture.T_lidar_board["lidar"]), capture.scans[0].points.astype(float))
+            near = (np.linalg.norm(xyz, axis=1) < 1.0) & (np.abs(xyz[:, 2]) > 0.06)
+            counts[carrier] += int(near.sum())
     assert counts["none"] < counts["stand"] < counts["person"]
+
+
+def test_a_lidar_at_twenty_hertz_takes_half_the_time_and_half_the_points(
+    captures: list[SimulatedCapture],
+) -> None:
+    fast = make_rig(lidars={"lidar": {"rate_hz": 20.0}})
+    scan = next(simulate_captures(fast, n_captures=1, seed=11)).scans[0]
+    assert scan.offset_ns is not None and scan.offset_ns.max() < 50_000_000
+    assert len(scan.points) == pytest.approx(len(captures[0].scans[0].points) / 2, rel=0.05)
 
 
 def test_a_lidar_nobody_can_simulate_is_named(rig: Rig) -> None:

@@ -248,7 +248,9 @@ def test_stamps_that_run_backwards_or_twice_are_left_out_and_counted(
 
 def test_a_clock_that_is_set_back_starts_again(tmp_path, rig, write_bag, stream):
     messages = [*stream(3)]
-    messages += [(t, m, log_ns + 3700 * 10**9, f) for t, m, log_ns, f in stream(3, t0_ns=T0_NS - 3600 * 10**9)]
+    hour_ns = 3600 * 10**9
+    earlier = stream(3, t0_ns=T0_NS - hour_ns)
+    messages += [(topic, msgtype, log_ns + 2 * hour_ns, f) for topic, msgtype, log_ns, f in earlier]
     recording = open_recording(write_bag(tmp_path / "bag", "ros1", messages), rig)
     images, scans = read(recording)
     assert (len(images), len(scans)) == (6, 6)

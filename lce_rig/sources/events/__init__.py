@@ -1,0 +1,56 @@
+"""Recordings of event cameras behind one door: `open_events` finds the reader for a path."""
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from lce_rig.core.errors import SourceError
+from lce_rig.sources.events.recording import EventRecording
+
+READERS = {
+    ".aedat4": "lce_rig.sources.events.aedat4:Aedat4Events",
+    ".bag": "lce_rig.sources.events.bag:BagEvents",
+    ".db3": "lce_rig.sources.events.bag:BagEvents",
+    ".mcap": "lce_rig.sources.events.bag:BagEvents",
+    ".raw": "lce_rig.sources.events.prophesee_raw:PropheseeEvents",
+    ".h5": "lce_rig.sources.events.hdf5:Hdf5Events",
+    ".hdf5": "lce_rig.sources.events.hdf5:Hdf5Events",
+    ".npz": "lce_rig.sources.events.npz:NpzEvents",
+    ".txt": "lce_rig.sources.events.text:TextEvents",
+    ".zip": "lce_rig.sources.events.text:TextEvents",
+}
+"""Reader by suffix; a folder is a ROS 2 bag. Imported when wanted."""
+
+__all__ = ["READERS", "EventRecording", "open_events"]
+
+
+def open_events(
+    path: Path | str,
+    *,
+    sensor: str = "events",
+    resolution: tuple[int, int] | None = None,
+    topic: str | None = None,
+) -> EventRecording:
+    """Open a recording of events.
+
+    Args:
+        path: an AEDAT4, Prophesee .raw, HDF5 (DSEC), text, zip or npz file, or a ROS 1 or ROS 2 bag.
+        sensor: name of the camera that its events are taken for.
+        resolution: (width, height) px of that camera; None takes the file's, or the extent of its events.
+        topic: of a bag; None takes the only one with events.
+
+    Raises:
+        SourceError: nothing is there, nothing that can be read, no events, or those of a camera of another
+            resolution.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise SourceError(f"{path} does not exist")
+    kind = ".mcap" if path.is_dir() else path.suffix.lower()
+    if kind not in READERS:
+        hint = f"Give a ROS 2 bag's folder or a file of one of these kinds: {', '.join(READERS)}."
+        raise SourceError(f"{path} is no recording of events this program reads", hint)
+    module, name = READERS[kind].split(":")
+    reader: Any = getattr(import_module(module), name)
+    stream = reader(path, topic) if name == "BagEvents" else reader(path)
+    return EventRecording(path, stream, sensor, resolution)

@@ -1,0 +1,106 @@
+"""Prophesee's .raw files: lines of text, then EVT2, EVT2.1 or EVT3 words up to the end.
+
+References:
+    https://docs.prophesee.ai/stable/data/file_formats/raw.html
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from lce_rig.core.errors import SourceError
+from lce_rig.sources.events.evt2 import Evt2Decoder
+from lce_rig.sources.events.stream import EventColumns, Findings
+from lce_rig.sources.events.word_codec import EVT3, WordDecoder
+
+_BLOCK_BYTES = 1 << 18
+_WORDS = {"2": "<u4", "21": "<u8", "3": "<u2"}
+# Where a file names its sensor but not its resolution.
+_RESOLUTION_PX = {
+    "gen31": (640, 480),
+    "gen3": (640, 480),
+    "genx320": (320, 320),
+    "gen4": (1280, 720),
+    "imx636": (1280, 720),
+    "imx646": (1280, 720),
+}
+
+
+class PropheseeEvents:
+    """Events of a .raw file; see `EventStream`."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the header.
+
+        Raises:
+            SourceError: it is no .raw file, or of another encoding.
+        """
+        self._path = path
+        self.notes: list[str] = []
+        with path.open("rb") as file:
+            header = _read_header(file)
+            self._begin = file.tell()
+        self._version = _version(path, header)
+        self._is_swapped = self._version == "21" and _field(header, "endianness") == "legacy"
+        self.resolution_px = _resolution(header)
+
+    def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+        """Yield the events of the file, block by block."""
+        dtype = np.dtype(_WORDS[self._version])
+        decoder: WordDecoder | Evt2Decoder = (
+            WordDecoder(EVT3) if self._version == "3" else Evt2Decoder(self._version == "21")
+        )
+        with self._path.open("rb") as file:
+            file.seek(self._begin)
+            while block := file.read(_BLOCK_BYTES):
+                n_torn = len(block) % dtype.itemsize
+                words = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
+                yield decoder.decode(words << 32 | words >> 32 if self._is_swapped else words)
+                if n_torn:
+                    findings.add("bytes of a torn last word left out", n=n_torn)
+        findings.add("events before the first stamp left out", n=decoder.n_untimed)
+        findings.add(f"words of no EVT{self._version} code passed over", n=decoder.n_unknown)
+
+
+def _read_header(file: BinaryIO) -> dict[str, str]:
+    """Read "% key value" lines, up to the first that is none or says "% end"."""
+    header: dict[str, str] = {}
+    while True:
+        begin = file.tell()
+        line = file.readline(4096)
+        if not line.startswith(b"% ") or not line.endswith(b"\n"):
+            file.seek(begin)
+            return header
+        key, _, value = line[2:].decode("utf-8", errors="replace").strip().partition(" ")
+        if key == "end":
+            return header
+        header[key] = value
+
+
+def _version(path: Path, header: dict[str, str]) -> str:
+    """Say which encoding the header names: "2", "21" or "3"."""
+    named = header.get("evt") or header.get("format", "").split(";")[0].upper().removeprefix("EVT")
+    version = named.replace(".0", "").replace(".", "").strip()
+    if version not in _WORDS:
+        said = f"encoding {named!r}" if named else "no encoding in its header"
+        raise SourceError(f"{path} has {said}, not EVT2, EVT2.1 or EVT3", "Is it a Prophesee .raw file?")
+    return version
+
+
+def _field(header: dict[str, str], key: str) -> str:
+    """Find "key=value" in the format line: "EVT3;height=720;width=1280"."""
+    found = re.search(rf"(?:^|;){key}=([^;]*)", header.get("format", ""))
+    return found[1] if found else ""
+
+
+def _resolution(header: dict[str, str]) -> tuple[int, int] | None:
+    if _field(header, "width") and _field(header, "height"):
+        return int(_field(header, "width")), int(_field(header, "height"))
+    if found := re.fullmatch(r"(\d+)x(\d+)", header.get("geometry", "")):
+        return int(found[1]), int(found[2])
+    generation = header.get("sensor_generation", "").replace(".", "")
+    sensor = f"{header.get('plugin_name', '')} {header.get('sensor_name', '')} gen{generation}".lower()
+    return next((size for name, size in _RESOLUTION_PX.items() if name in sensor), None)

@@ -1,0 +1,200 @@
+"""A recording of events: checked, in the order of time, with an account of what was wrong."""
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from lce_rig.core.data import Events
+from lce_rig.core.errors import SourceError
+from lce_rig.sources.events.order import in_time_order
+from lce_rig.sources.events.stream import EventColumns, EventStream, Findings, join
+
+# More events off the sensor than this are another sensor's; fewer are damage.
+_MAX_OFF_SHARE = 0.01
+_HOST_STRETCHES = 200
+
+
+class EventRecording:
+    """Events of one camera from one file or topic.
+
+    Iterating yields stretches of `Events` from the beginning, in the order of time, and holds only a few of them
+    in memory; it may be done again and again. `read` cuts out windows; windows that go forward in time are read
+    in one pass through the file.
+
+    Attributes:
+        path: the file or folder.
+        sensor: name of the camera.
+        resolution_px: (width, height).
+    """
+
+    def __init__(
+        self, path: Path, stream: EventStream, sensor: str, resolution_px: tuple[int, int] | None
+    ) -> None:
+        """Check the resolution, and that there are events.
+
+        Args:
+            path: the file or folder, for messages.
+            stream: its reader.
+            sensor: name of the camera.
+            resolution_px: (width, height) of the profile; None takes the file's.
+
+        Raises:
+            SourceError: no events, or those of a camera of another resolution.
+        """
+        self.path = path
+        self.sensor = sensor
+        self._stream = stream
+        self._findings = Findings()
+        self._assumed: list[str] = []
+        self._span_ns: tuple[int, int] | None = None
+        self._window = _Window(self)
+        if not any(len(stretch) for stretch in stream.stretches(self._findings)):
+            said = "; ".join(self._findings.lines())
+            raise SourceError(f"{path} holds no events" + (f": {said}" if said else ""))
+        self.resolution_px = self._settle_resolution(resolution_px)
+
+    @property
+    def notes(self) -> list[str]:
+        """What was assumed, repaired or left out so far, in words; grows while the recording is read."""
+        found = self._assumed + self._findings.lines()
+        return self._stream.notes + [f"{self.path.name}: {line}" for line in found]
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last stamp, device time; the first call reads the whole recording."""
+        if self._span_ns is None:
+            for _ in self:
+                pass
+        if self._span_ns is None:
+            raise SourceError(f"{self.path} holds no events that could be put in order")
+        return self._span_ns
+
+    @property
+    def duration_s(self) -> float:
+        """From the first event to the last; the first call reads the whole recording."""
+        first_ns, last_ns = self.span_ns
+        return (last_ns - first_ns) * 1e-9
+
+    def host_offset_ns(self) -> int | None:
+        """Find what to add to device stamps to come to the host's clock; None where arrivals are unknown.
+
+        The least difference among the first packets: the one that waited least.
+        """
+        delays = [
+            stretch.host_ns - int(stretch.t_ns[0])
+            for stretch in islice(self, _HOST_STRETCHES)
+            if stretch.host_ns is not None
+        ]
+        return min(delays, default=None)
+
+    def __iter__(self) -> Iterator[Events]:
+        """Yield the events from the beginning, in the order of time.
+
+        Raises:
+            SourceError: the stamps run back for good, or events lie off the sensor.
+        """
+        findings = Findings()
+        first_ns = last_ns = None
+        try:
+            for stretch in in_time_order(self.path, self._stream.stretches(findings), findings):
+                on_sensor = self._on_sensor(stretch, findings)
+                if len(on_sensor):
+                    first_ns = int(on_sensor.t_ns[0]) if first_ns is None else first_ns
+                    last_ns = int(on_sensor.t_ns[-1])
+                    yield self._to_events(on_sensor)
+        finally:
+            self._findings.merge(findings)
+        if first_ns is not None and last_ns is not None:
+            self._span_ns = first_ns, last_ns
+
+    def read(self, start_ns: int, end_ns: int) -> Events:
+        """Read the events with start_ns <= t < end_ns, device time; there may be none.
+
+        Raises:
+            SourceError: as iterating does.
+        """
+        return self._window.read(start_ns, end_ns)
+
+    def _to_events(self, columns: EventColumns) -> Events:
+        return Events(
+            self.sensor,
+            columns.t_ns,
+            columns.x,
+            columns.y,
+            columns.polarity,
+            *self.resolution_px,
+            columns.host_ns,
+        )
+
+    def _settle_resolution(self, profile_px: tuple[int, int] | None) -> tuple[int, int]:
+        file_px = self._stream.resolution_px
+        if profile_px and file_px and tuple(profile_px) != tuple(file_px):
+            raise SourceError(
+                f"{self.path}: its events are of a sensor of {_size(file_px)} pixels, "
+                f"camera {self.sensor!r} has {_size(profile_px)}",
+                "Is it another camera's recording? Else correct resolution_px in the profile.",
+            )
+        if profile_px or file_px:
+            return profile_px or file_px or (0, 0)
+        width = height = 0
+        for stretch in self._stream.stretches(Findings()):
+            if len(stretch):
+                width = max(width, int(stretch.x.max()) + 1)
+                height = max(height, int(stretch.y.max()) + 1)
+        self._assumed.append(f"declares no resolution; {width}x{height}, the extent of its events, is taken")
+        return width, height
+
+    def _on_sensor(self, stretch: EventColumns, findings: Findings) -> EventColumns:
+        width, height = self.resolution_px
+        right, bottom = int(stretch.x.max()), int(stretch.y.max())
+        if right < width and bottom < height:
+            return stretch
+        is_on = (stretch.x < width) & (stretch.y < height)
+        n_off = int(np.count_nonzero(~is_on))
+        if n_off > max(1, _MAX_OFF_SHARE * len(stretch)):
+            raise SourceError(
+                f"{self.path}: {n_off} of {len(stretch)} events lie off the sensor, up to column {right}, "
+                f"row {bottom}; camera {self.sensor!r} has {_size(self.resolution_px)} pixels",
+                "Is it another camera's recording? Else correct resolution_px in the profile.",
+            )
+        findings.add("events off the sensor left out", f"column {right}, row {bottom}", n_off)
+        return stretch.select(is_on)
+
+
+class _Window:
+    """The stretches that the last window touched, and the pass through the recording that goes on from there."""
+
+    def __init__(self, recording: EventRecording) -> None:
+        self._recording = recording
+        self._rest: Iterator[Events] = iter(())
+        self._kept: list[Events] = []
+        self._from_ns: int | None = None
+
+    def read(self, start_ns: int, end_ns: int) -> Events:
+        if self._from_ns is None or start_ns < self._from_ns:
+            self._rest, self._kept = iter(self._recording), []
+        self._from_ns = start_ns
+        self._kept = [stretch for stretch in self._kept if stretch.t_ns[-1] >= start_ns]
+        while not self._kept or self._kept[-1].t_ns[-1] < end_ns:
+            stretch = next(self._rest, None)
+            if stretch is None:
+                break
+            if stretch.t_ns[-1] >= start_ns:
+                self._kept.append(stretch)
+        return self._join([stretch.between(start_ns, end_ns) for stretch in self._kept])
+
+    def _join(self, parts: list[Events]) -> Events:
+        parts = [part for part in parts if len(part)]
+        empty = EventColumns(np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, bool))
+        columns = [EventColumns(p.t_ns, p.x, p.y, p.polarity, p.host_ns) for p in parts] or [empty]
+        joined = join(columns)
+        size = self._recording.resolution_px
+        return Events(
+            self._recording.sensor, joined.t_ns, joined.x, joined.y, joined.polarity, *size, joined.host_ns
+        )
+
+
+def _size(resolution_px: tuple[int, int]) -> str:
+    return f"{resolution_px[0]}x{resolution_px[1]}"

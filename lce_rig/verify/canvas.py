@@ -1,0 +1,181 @@
+"""Anti-aliased marks, colour scales and text on BGR pictures; sizes follow the picture's width."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.geometry import Array
+
+Picture = NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+# BGR. The marks differ in lightness and shape too, so that no pair needs hue to be told apart; magenta is in
+# no part of the turbo scale.
+WHITE: Colour = (255, 255, 255)
+BLACK: Colour = (0, 0, 0)
+INK: Colour = (235, 235, 235)
+FAINT: Colour = (150, 150, 150)
+PANEL: Colour = (38, 34, 32)
+MAGENTA: Colour = (235, 60, 255)
+ORANGE: Colour = (60, 160, 255)
+BLUE: Colour = (255, 180, 90)
+
+_SHIFT = 4  # cv2 takes sub-pixel coordinates in sixteenths
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+def enlarged(pixels: Picture, min_width_px: int = 960) -> tuple[Picture, int]:
+    """Make a BGR copy of a picture, enlarged by a whole factor to at least `min_width_px`.
+
+    Returns:
+        The copy (H, W, 3) and the factor; a pixel at u lies at (u + 0.5) factor - 0.5 in it.
+    """
+    bgr = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR) if pixels.ndim == 2 else pixels.copy()
+    factor = max(1, -(-min_width_px // bgr.shape[1]))
+    if factor > 1:
+        bgr = cv2.resize(bgr, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+    return np.asarray(bgr, dtype=np.uint8), factor
+
+
+def fitted(picture: Picture, width_px: int, height_px: int, colour: Colour = PANEL) -> Picture:
+    """Scale a picture to fit into a box, centred on plain colour."""
+    scale = min(width_px / picture.shape[1], height_px / picture.shape[0])
+    size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    box = panel(width_px, height_px, colour)
+    u, v = (width_px - size[0]) // 2, (height_px - size[1]) // 2
+    box[v : v + size[1], u : u + size[0]] = cv2.resize(picture, size, interpolation=how)
+    return box
+
+
+def panel(width_px: int, height_px: int, colour: Colour = PANEL) -> Picture:
+    """Make a plain picture."""
+    return np.full((height_px, width_px, 3), colour, dtype=np.uint8)
+
+
+def turbo(values: Array, low: float, high: float) -> NDArray[np.uint8]:
+    """Colour values (N,) on the turbo scale, clipped to low..high, (N, 3) BGR."""
+    level = np.clip((np.asarray(values) - low) / max(high - low, 1e-9), 0, 1)
+    grey = np.rint(255 * level).astype(np.uint8).reshape(-1, 1)
+    return np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_TURBO), dtype=np.uint8).reshape(-1, 3)
+
+
+def draw_discs(
+    picture: Picture, pixels: Array, colours: NDArray[np.uint8] | Colour, radius_px: float, rim: Colour | None = None
+) -> None:
+    """Draw anti-aliased discs at (N, 2) px, in order, each with a rim where asked for."""
+    table = np.broadcast_to(np.asarray(colours), (len(pixels), 3))
+    if rim is not None:
+        for centre in _fixed(pixels):
+            cv2.circle(picture, centre, _length(radius_px + 1.2), rim, -1, cv2.LINE_AA, _SHIFT)
+    for centre, colour in zip(_fixed(pixels), table.tolist(), strict=True):
+        cv2.circle(picture, centre, _length(radius_px), colour, -1, cv2.LINE_AA, _SHIFT)
+
+
+def draw_diamonds(picture: Picture, pixels: Array, colour: Colour, radius_px: float, rim: Colour = BLACK) -> None:
+    """Draw anti-aliased diamonds with a rim at (N, 2) px."""
+    shape = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]], dtype=np.float64)
+    for centre in pixels:
+        for reach, tone in ((radius_px + 2.0, rim), (radius_px, colour)):
+            corners = np.rint((centre + reach * shape) * 2**_SHIFT).astype(np.int32)
+            cv2.fillConvexPoly(picture, corners, tone, cv2.LINE_AA, _SHIFT)
+
+
+def draw_line(
+    picture: Picture, pixels: Array, colour: Colour, width_px: int = 2, casing: Colour | None = BLACK
+) -> None:
+    """Draw a polyline through (N, 2) px, interrupted where a pixel is NaN, cased to stand out anywhere."""
+    ends = np.flatnonzero(~np.isfinite(pixels).all(axis=1))
+    for part in np.split(pixels, ends):
+        part = part[np.isfinite(part).all(axis=1)]
+        if len(part) < 2:
+            continue
+        path = [np.rint(part * 2**_SHIFT).astype(np.int32).reshape(-1, 1, 2)]
+        if casing is not None:
+            cv2.polylines(picture, path, False, casing, width_px + 2, cv2.LINE_AA, _SHIFT)
+        cv2.polylines(picture, path, False, colour, width_px, cv2.LINE_AA, _SHIFT)
+
+
+def draw_text(
+    picture: Picture,
+    text: str,
+    left_px: float,
+    baseline_px: float,
+    height_px: float,
+    colour: Colour = INK,
+    align: float = 0.0,
+) -> None:
+    """Write one line of ASCII text whose capitals are `height_px` high; align 0 left, 0.5 centre, 1 right."""
+    scale = height_px / 22.0
+    left = left_px - align * text_width_px(text, height_px)
+    weight = max(1, round(height_px / 13))
+    origin = (round(left), round(baseline_px))
+    cv2.putText(picture, text, origin, _FONT, scale, colour, weight, cv2.LINE_AA)
+
+
+def text_width_px(text: str, height_px: float) -> float:
+    """Measure the width of a line of text."""
+    (width, _), _ = cv2.getTextSize(text, _FONT, height_px / 22.0, max(1, round(height_px / 13)))
+    return float(width)
+
+
+def wrapped(text: str, width_px: float, height_px: float) -> list[str]:
+    """Break text into lines that fit a width."""
+    lines: list[str] = []
+    for word in text.split():
+        if lines and text_width_px(f"{lines[-1]} {word}", height_px) <= width_px:
+            lines[-1] += f" {word}"
+        else:
+            lines.append(word)
+    return lines
+
+
+def draw_paragraph(
+    picture: Picture,
+    text: str,
+    left_px: float,
+    baseline_px: float,
+    width_px: float,
+    height_px: float,
+    colour: Colour = INK,
+) -> float:
+    """Write wrapped text and return the baseline of the line after it."""
+    for line in wrapped(text, width_px, height_px):
+        draw_text(picture, line, left_px, baseline_px, height_px, colour)
+        baseline_px += 1.9 * height_px
+    return baseline_px
+
+
+def draw_scale(
+    picture: Picture, box: tuple[int, int, int, int], low: float, high: float, unit: str, text_px: float
+) -> None:
+    """Draw a horizontal turbo scale into box (u, v, width, height) with ticks at round values below it."""
+    u, v, width, height = box
+    ramp = turbo(np.linspace(low, high, width), low, high)
+    picture[v : v + height, u : u + width] = ramp[None]
+    cv2.rectangle(picture, (u - 1, v - 1), (u + width, v + height), FAINT, 1)
+    for tick in round_ticks(low, high, max(2, int(width / (6 * text_px)))):
+        at = u + (tick - low) / (high - low) * (width - 1)
+        draw_line(picture, np.array([[at, v + height], [at, v + height + 5]]), INK, 1, None)
+        draw_text(picture, f"{tick:g} {unit}", at, v + height + 9 + 1.2 * text_px, text_px, INK, align=0.5)
+
+
+def round_ticks(low: float, high: float, n: int) -> Sequence[float]:
+    """Choose about n round values from low to high."""
+    raw = (high - low) / max(n, 1)
+    power = 10.0 ** np.floor(np.log10(max(raw, 1e-9)))
+    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw)
+    first = int(np.ceil(low / step - 1e-9))
+    last = int(np.floor(high / step + 1e-9))
+    return [float(index * step) for index in range(first, last + 1)]
+
+
+def _fixed(pixels: Array) -> list[list[int]]:
+    fixed: list[list[int]] = np.rint(np.asarray(pixels) * 2**_SHIFT).astype(np.int64).tolist()
+    return fixed
+
+
+def _length(radius_px: float) -> int:
+    return max(1, round(radius_px * 2**_SHIFT))

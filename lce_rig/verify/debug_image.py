@@ -1,0 +1,253 @@
+"""One picture a capture: what was seen in the camera and in the LiDAR, and why it was refused."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.geometry import Array, transform
+from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.verify import canvas
+from lce_rig.verify.canvas import BLACK, BLUE, FAINT, INK, MAGENTA, ORANGE, WHITE, Picture
+from lce_rig.verify.overlay import draw_image_board, range_limits
+
+_PANE_PX = 800
+_PANORAMA_PX = 190
+_TEXT_PX = 12
+_REPORT_PX = 168
+
+# Figures worth reading beside a picture, in this order, with how to write them.
+_IMAGE_FIGURES = {
+    "distance_m": "distance {:.2f} m",
+    "tilt_deg": "tilt {:.0f} deg",
+    "corner_rms_px": "corners {:.2f} px rms",
+    "square_px": "squares {:.0f} px",
+    "sharpness": "sharpness {:.1f}",
+    "contrast": "contrast {:.0f}",
+    "border_px": "{:.0f} px to the border",
+}
+_LIDAR_FIGURES = {
+    "distance_m": "distance {:.2f} m",
+    "n_rings": "{:.0f} rings",
+    "n_points": "{:.0f} points",
+    "thickness_m": "thickness {:.1f} mm",
+    "width_m": "width {:.0f} mm",
+    "height_m": "height {:.0f} mm",
+    "edge_rms_m": "edges {:.1f} mm rms",
+}
+
+
+def draw_debug(
+    image: Image | None,
+    scan: Scan | None,
+    image_result: ImageBoard | Refusal,
+    lidar_result: Sequence[LidarBoard] | Refusal,
+    *,
+    board: Board,
+    intrinsics: Intrinsics,
+    title: str,
+    chosen: int = 0,
+) -> Picture:
+    """Draw the camera's picture beside three views of the scan, with figures or cause and action below.
+
+    Args:
+        image: None where it could not be read.
+        scan: None where it could not be read.
+        image_result: the board in the picture or why there is none.
+        lidar_result: candidates, best first, or why there is none.
+        board: the board.
+        intrinsics: the camera.
+        title: one line above.
+        chosen: which candidate is used; it is the one drawn enlarged.
+
+    Returns:
+        (H, 1600, 3) uint8 BGR.
+    """
+    candidates = [] if isinstance(lidar_result, Refusal) else list(lidar_result)
+    view_px = _PANE_PX // 2
+    left = _camera_pane(image, image_result, board, intrinsics, _PANORAMA_PX + view_px)
+    points = np.zeros((0, 3)) if scan is None else np.asarray(scan.points, dtype=np.float64)
+    limits_m = (0.0, 10.0) if scan is None else range_limits(scan)
+    views = np.hstack(
+        [
+            _top_view(points, candidates, chosen, board, limits_m, view_px),
+            _board_view(points, candidates, chosen, board, view_px),
+        ]
+    )
+    right = np.vstack([_panorama(points, candidates, chosen, limits_m, _PANE_PX), views])
+    strip = canvas.panel(2 * _PANE_PX, 34)
+    canvas.draw_text(strip, title, 14, 23, 13, INK)
+    reports = np.hstack([_image_report(image_result), _lidar_report(lidar_result, chosen)])
+    return np.vstack([strip, np.hstack([left, right]), reports])
+
+
+def _camera_pane(
+    image: Image | None, result: ImageBoard | Refusal, board: Board, intrinsics: Intrinsics, height_px: int
+) -> Picture:
+    if image is None:
+        pane = canvas.panel(_PANE_PX, height_px, BLACK)
+        canvas.draw_text(pane, "no picture", _PANE_PX / 2, height_px / 2, 16, FAINT, align=0.5)
+        return pane
+    picture, factor = canvas.enlarged(image.pixels)
+    if isinstance(result, ImageBoard):
+        draw_image_board(picture, factor, result, board, intrinsics)
+        _draw_axes(picture, factor, result, board)
+    return canvas.fitted(picture, _PANE_PX, height_px, BLACK)
+
+
+def _draw_axes(picture: Picture, factor: int, found: ImageBoard, board: Board) -> None:
+    """Mark the first corner, its row (x) and its column (-y), so that a flipped order shows."""
+    grid = ((found.corners_px + 0.5) * factor - 0.5).reshape(board.rows, board.cols, 2)
+    unit = picture.shape[1] / 1000
+    canvas.draw_line(picture, grid[0], ORANGE, max(2, round(3 * unit)))
+    canvas.draw_line(picture, grid[:, 0], BLUE, max(2, round(3 * unit)))
+    canvas.draw_discs(picture, grid[0, :1], MAGENTA, 6 * unit, WHITE)
+    canvas.draw_text(picture, "x", *(grid[0, -1] + 8 * unit), 16 * unit, ORANGE)
+
+
+def _panorama(
+    points: Array, candidates: Sequence[LidarBoard], chosen: int, limits_m: tuple[float, float], width_px: int
+) -> Picture:
+    """Unroll the scan: azimuth from +180 deg at the left to -180, elevation from +20 deg to -20."""
+    pane = canvas.panel(width_px, _PANORAMA_PX, BLACK)
+
+    def place(points_lidar: Array) -> Array:
+        azimuth = np.arctan2(points_lidar[:, 1], points_lidar[:, 0])
+        elevation = np.degrees(np.arctan2(points_lidar[:, 2], np.hypot(points_lidar[:, 0], points_lidar[:, 1])))
+        u = (0.5 - azimuth / (2 * np.pi)) * (width_px - 1)
+        return np.stack([u, 26 + (20 - elevation) / 40 * (_PANORAMA_PX - 46)], axis=1)
+
+    ranges_m = np.linalg.norm(points, axis=1)
+    order = np.argsort(-ranges_m, kind="stable")
+    canvas.draw_discs(pane, place(points[order]), canvas.turbo(ranges_m[order], *limits_m), 0.9)
+    for index, found in enumerate(candidates):
+        pixels = place(found.points)
+        canvas.draw_discs(pane, pixels, MAGENTA if index == chosen else WHITE, 1.4)
+        centre = pixels.mean(axis=0)
+        _draw_number(pane, index, chosen, (float(centre[0]), float(pixels[:, 1].min() - 6)))
+    _label(pane, "LiDAR, unrolled")
+    for degrees in (135, 90, 45, 0, -45, -90, -135):
+        u = (0.5 - degrees / 360) * (width_px - 1)
+        canvas.draw_text(pane, f"{degrees}", u, _PANORAMA_PX - 5, 8, FAINT, align=0.5)
+    return pane
+
+
+def _top_view(
+    points: Array,
+    candidates: Sequence[LidarBoard],
+    chosen: int,
+    board: Board,
+    limits_m: tuple[float, float],
+    size_px: int,
+) -> Picture:
+    """Look down on the scan, x up and y left, with circles every metre or two."""
+    reach_m = 6.0
+    if candidates:
+        reach_m = max(3.0, 1.25 * max(float(np.linalg.norm(found.points.mean(axis=0)[:2])) for found in candidates))
+    scale = size_px / 2 / reach_m
+    pane = canvas.panel(size_px, size_px, BLACK)
+
+    def place(points_lidar: Array) -> Array:
+        return size_px / 2 - scale * points_lidar[:, [1, 0]]
+
+    step_m = 1 if reach_m <= 5 else 2
+    turn = np.linspace(0, 2 * np.pi, 90)
+    for radius_m in range(step_m, int(reach_m) + 1, step_m):
+        circle = radius_m * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        canvas.draw_line(pane, place(circle), (70, 70, 70), 1, None)
+        canvas.draw_text(pane, f"{radius_m} m", size_px / 2 + 3, size_px / 2 - scale * radius_m - 3, 8, FAINT)
+    near = points[np.abs(points[:, :2]).max(axis=1, initial=0) < reach_m]
+    colours = canvas.turbo(np.linalg.norm(near, axis=1), *limits_m)
+    canvas.draw_discs(pane, place(near), colours, 0.8)
+    for index, found in enumerate(candidates):
+        outline = transform(found.T_lidar_board, board.outline())[[0, 1, 2, 3, 0]]
+        canvas.draw_line(pane, place(outline), MAGENTA if index == chosen else WHITE, 2)
+        centre = place(found.points.mean(axis=0)[None])[0]
+        _draw_number(pane, index, chosen, (float(centre[0]) + 12, float(centre[1]) - 8))
+    middle = np.array([[size_px / 2, size_px / 2]])
+    canvas.draw_discs(pane, middle, WHITE, 4, BLACK)
+    _label(pane, "from above, x up")
+    return pane
+
+
+def _board_view(
+    points: Array, candidates: Sequence[LidarBoard], chosen: int, board: Board, size_px: int
+) -> Picture:
+    """Look at the chosen candidate face on: returns, ring ends and the outline laid over them."""
+    pane = canvas.panel(size_px, size_px, BLACK)
+    if chosen >= len(candidates):
+        canvas.draw_text(pane, "no board", size_px / 2, size_px / 2, 14, FAINT, align=0.5)
+        return pane
+    found = candidates[chosen]
+    centre = found.T_lidar_board[:3, 3]
+    # Seen from the LiDAR, up stays up: the axes are those of the room turned into the board's plane.
+    normal = found.plane[:3]
+    right = np.cross([0.0, 0.0, 1.0], normal)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, -np.cross(normal, right)], axis=1)
+    scale = size_px / (1.15 * np.hypot(board.width_m, board.height_m))
+
+    def place(points_lidar: Array) -> Array:
+        return np.asarray(size_px / 2 + scale * (points_lidar - centre) @ axes)
+
+    around = points[np.linalg.norm(points - centre, axis=1) < np.hypot(board.width_m, board.height_m)]
+    canvas.draw_discs(pane, place(around), (110, 110, 110), 1.5)
+    canvas.draw_line(pane, place(transform(found.T_lidar_board, board.outline())[[0, 1, 2, 3, 0]]), WHITE, 2)
+    canvas.draw_discs(pane, place(found.points), MAGENTA, 2.0)
+    canvas.draw_diamonds(pane, place(found.edge_points), ORANGE, 4.5)
+    _label(pane, f"candidate {chosen + 1} of {len(candidates)}, face on")
+    return pane
+
+
+def _draw_number(pane: Picture, index: int, chosen: int, at: tuple[float, float]) -> None:
+    canvas.draw_text(pane, f"{index + 1}", at[0], at[1], 12, MAGENTA if index == chosen else WHITE, align=0.5)
+
+
+def _label(pane: Picture, text: str) -> None:
+    pane[: 24, : round(canvas.text_width_px(text, 10)) + 16] = BLACK
+    canvas.draw_text(pane, text, 8, 16, 10, INK)
+
+
+def _image_report(result: ImageBoard | Refusal) -> Picture:
+    if isinstance(result, Refusal):
+        return _refusal("camera", result)
+    notes = ["pose ambiguous from the picture alone"] if result.is_ambiguous else []
+    return _figures("camera: board found", result.quality, _IMAGE_FIGURES, notes)
+
+
+def _lidar_report(result: Sequence[LidarBoard] | Refusal, chosen: int) -> Picture:
+    if isinstance(result, Refusal):
+        return _refusal("LiDAR", result)
+    rivals = len(result) - 1
+    notes = [f"{rivals} other plate{'s' if rivals > 1 else ''} of the board's size"] if rivals else []
+    quality = result[chosen].quality if chosen < len(result) else {}
+    return _figures("LiDAR: board found", quality, _LIDAR_FIGURES, notes)
+
+
+def _refusal(sensor: str, refusal: Refusal) -> Picture:
+    pane = canvas.panel(_PANE_PX, _REPORT_PX)
+    canvas.draw_text(pane, f"{sensor}: refused", 14, 28, _TEXT_PX + 2, ORANGE)
+    width_px = _PANE_PX - 120
+    canvas.draw_text(pane, "seen", 14, 58, _TEXT_PX, FAINT)
+    below = canvas.draw_paragraph(pane, refusal.cause, 90, 58, width_px, _TEXT_PX)
+    canvas.draw_text(pane, "do", 14, below + 8, _TEXT_PX, FAINT)
+    canvas.draw_paragraph(pane, refusal.action, 90, below + 8, width_px, _TEXT_PX, WHITE)
+    return pane
+
+
+def _figures(
+    heading: str, quality: Mapping[str, float], wanted: Mapping[str, str], notes: Sequence[str]
+) -> Picture:
+    pane = canvas.panel(_PANE_PX, _REPORT_PX)
+    canvas.draw_text(pane, heading, 14, 28, _TEXT_PX + 2, BLUE)
+    lines = [
+        text.format(quality[name] * (1000 if " mm" in text else 1))
+        for name, text in wanted.items()
+        if name in quality
+    ]
+    lines += notes
+    for index, line in enumerate(lines):
+        canvas.draw_text(pane, line, 14 + 260 * (index % 3), 62 + 26 * (index // 3), _TEXT_PX)
+    return pane

@@ -1,0 +1,182 @@
+"""The scan drawn into the camera's picture through an extrinsic, with the board as either sensor saw it."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.geometry import Array, transform
+from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.verify import canvas
+from lce_rig.verify.canvas import BLACK, FAINT, INK, MAGENTA, ORANGE, WHITE, Picture
+
+_FOLD_MARGIN = 0.9
+
+
+def draw_overlay(
+    image: Image,
+    scan: Scan,
+    intrinsics: Intrinsics,
+    T_cam_lidar: Array,
+    *,
+    lidar_board: LidarBoard | None,
+    image_board: ImageBoard | None,
+    board: Board,
+    residuals: Mapping[str, float | str],
+    title: str,
+) -> Picture:
+    """Draw a whole scan coloured by range into the picture, and what both sensors say of the board.
+
+    Points behind the image plane, and those that the distortion polynomial would fold back into the picture,
+    are not drawn; near points are drawn last.
+
+    Args:
+        image: the picture; small ones are enlarged to at least 960 px wide.
+        scan: points in frame lidar.
+        intrinsics: the camera.
+        T_cam_lidar: (4, 4) the extrinsic to judge.
+        lidar_board: its points and ring ends are marked; None draws the scan only.
+        image_board: its outline and corners are drawn; None draws none.
+        board: the board, for its outline.
+        residuals: figures by name with unit, such as {"plane (mm)": 4.2}, in the order to be shown.
+        title: one line above the picture.
+
+    Returns:
+        (H, W, 3) uint8 BGR, with a strip above and a legend below the picture.
+    """
+    picture, factor = canvas.enlarged(image.pixels)
+    unit = picture.shape[1] / 1000
+    low_m, high_m = range_limits(scan)
+    _draw_scan(picture, factor, scan, intrinsics, T_cam_lidar, (low_m, high_m), 1.6 * unit)
+    if image_board is not None:
+        draw_image_board(picture, factor, image_board, board, intrinsics)
+    if lidar_board is not None:
+        on_board = _to_picture(lidar_board.points, T_cam_lidar, intrinsics, factor)[0]
+        canvas.draw_discs(picture, on_board, MAGENTA, 1.9 * unit, WHITE)
+        ends = _to_picture(lidar_board.edge_points, T_cam_lidar, intrinsics, factor)[0]
+        canvas.draw_diamonds(picture, ends, ORANGE, 4.2 * unit)
+    return np.vstack(
+        [
+            _title_strip(title, picture.shape[1]),
+            picture,
+            _legend(picture.shape[1], (low_m, high_m), residuals, lidar_board is not None, image_board is not None),
+        ]
+    )
+
+
+def range_limits(scan: Scan) -> tuple[float, float]:
+    """Choose the ends of the range scale in m: the nearest point and the 95th percentile, at most 20 m."""
+    ranges_m = np.linalg.norm(scan.points, axis=1)
+    if not len(ranges_m):
+        return 0.0, 10.0
+    low_m = float(np.floor(ranges_m.min()))
+    return low_m, max(float(min(np.ceil(np.percentile(ranges_m, 95)), 20.0)), low_m + 2.0)
+
+
+def draw_image_board(
+    picture: Picture, factor: int, image_board: ImageBoard, board: Board, intrinsics: Intrinsics
+) -> None:
+    """Draw the board's outline at T_cam_board, bent as the lens bends it, and the corners as measured."""
+    corners = board.outline()
+    along = np.linspace(0, 1, 24)[:, None]
+    edges = [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    pixels, _ = intrinsics.project(transform(image_board.T_cam_board, np.concatenate(edges)))
+    unit = picture.shape[1] / 1000
+    canvas.draw_line(picture, (pixels + 0.5) * factor - 0.5, WHITE, max(1, round(2 * unit)))
+    at = (image_board.corners_px + 0.5) * factor - 0.5
+    canvas.draw_discs(picture, at, WHITE, 1.6 * unit, BLACK)
+
+
+def _to_picture(
+    points_lidar: Array, T_cam_lidar: Array, intrinsics: Intrinsics, factor: int
+) -> tuple[Array, Array]:
+    """Project points (N, 3) to pixels (M, 2) of the enlarged picture, with the ranges (M,) of those inside."""
+    points_camera = transform(T_cam_lidar, points_lidar)
+    pixels, _ = intrinsics.project(points_camera)
+    is_seen = intrinsics.is_inside(pixels, -0.5) & _is_before_fold(points_camera, intrinsics)
+    ranges_m = np.linalg.norm(points_lidar, axis=1)
+    return (pixels[is_seen] + 0.5) * factor - 0.5, ranges_m[is_seen]
+
+
+def _is_before_fold(points_camera: Array, intrinsics: Intrinsics) -> NDArray[np.bool_]:
+    """Tell which points lie clear of the radius where the distortion folds; close to it pixels hardly move."""
+    rho, z = np.hypot(points_camera[:, 0], points_camera[:, 1]), points_camera[:, 2]
+    if intrinsics.model == "equidistant":
+        return np.asarray(np.arctan2(rho, z) < _FOLD_MARGIN * intrinsics.max_radius)
+    return np.asarray((z > 0) & (rho < _FOLD_MARGIN * intrinsics.max_radius * z))
+
+
+def _draw_scan(
+    picture: Picture,
+    factor: int,
+    scan: Scan,
+    intrinsics: Intrinsics,
+    T_cam_lidar: Array,
+    limits_m: tuple[float, float],
+    radius_px: float,
+) -> None:
+    pixels, ranges_m = _to_picture(np.asarray(scan.points, dtype=np.float64), T_cam_lidar, intrinsics, factor)
+    order = np.argsort(-ranges_m, kind="stable")
+    canvas.draw_discs(picture, pixels[order], canvas.turbo(ranges_m[order], *limits_m), radius_px)
+
+
+def _title_strip(title: str, width_px: int) -> Picture:
+    text_px = 13 * width_px / 1000
+    strip = canvas.panel(width_px, round(2.6 * text_px))
+    canvas.draw_text(strip, title, text_px, 1.8 * text_px, text_px, INK)
+    return strip
+
+
+def _legend(
+    width_px: int,
+    limits_m: tuple[float, float],
+    residuals: Mapping[str, float | str],
+    has_lidar: bool,
+    has_image: bool,
+) -> Picture:
+    """Explain marks and colours and list the residuals, in columns below the picture."""
+    unit = width_px / 1000
+    text_px = 11 * unit
+    line_px = 2.1 * text_px
+    entries = [f"{name}  {_figure(value)}" for name, value in residuals.items()]
+    n_columns = 2 if len(entries) > 4 else 1
+    n_lines = max(4, -(-len(entries) // n_columns))
+    legend = canvas.panel(width_px, round((n_lines + 0.9) * line_px))
+    rows = [(0.95 + row) * line_px for row in range(n_lines)]
+
+    marks = []
+    if has_lidar:
+        marks += [("board, LiDAR points", "point"), ("board, ring ends", "end")]
+    if has_image:
+        marks += [("board outline, camera", "line"), ("corners, camera", "corner")]
+    for (name, kind), baseline in zip(marks, rows, strict=False):
+        _draw_mark(legend, kind, 24 * unit, baseline - 0.45 * text_px, unit)
+        canvas.draw_text(legend, name, 48 * unit, baseline, text_px)
+    canvas.draw_text(legend, "range from the LiDAR", 300 * unit, rows[0], text_px)
+    scale = (round(300 * unit), round(rows[0] + 0.7 * text_px), round(270 * unit), round(1.3 * text_px))
+    canvas.draw_scale(legend, scale, *limits_m, "m", text_px)
+    per_column = -(-len(entries) // n_columns)
+    for index, entry in enumerate(entries):
+        left = (630 + 185 * (index // max(per_column, 1))) * unit
+        canvas.draw_text(legend, entry, left, rows[index % max(per_column, 1)], text_px)
+    canvas.draw_line(legend, np.array([[605, 8], [605, 1e3 * legend.shape[0] / width_px - 8]]) * unit, FAINT, 1, None)
+    return legend
+
+
+def _figure(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.3g}"
+
+
+def _draw_mark(legend: Picture, kind: str, u: float, v: float, unit: float) -> None:
+    at = np.array([[u, v]])
+    if kind == "point":
+        canvas.draw_discs(legend, at, MAGENTA, 4 * unit, WHITE)
+    elif kind == "end":
+        canvas.draw_diamonds(legend, at, ORANGE, 6 * unit)
+    elif kind == "corner":
+        canvas.draw_discs(legend, at, WHITE, 3 * unit, BLACK)
+    else:
+        canvas.draw_line(legend, at + [[-12 * unit, 0], [12 * unit, 0]], WHITE, max(1, round(2 * unit)))

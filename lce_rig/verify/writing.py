@@ -1,0 +1,65 @@
+"""Pictures into a folder."""
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lce_rig.core.errors import SessionError
+from lce_rig.verify import canvas
+from lce_rig.verify.canvas import Picture
+from lce_rig.verify.contact_sheet import contact_sheet
+
+CONTACT_SHEET = "contact_sheet.png"
+_TILE_PX = 480
+
+
+def write_overlays(folder: Path, overlays: Iterable[tuple[str, Picture]]) -> list[Path]:
+    """Write one PNG per named picture and a contact sheet of them all.
+
+    Pictures are taken one at a time and only small copies are kept, so that a long session needs little memory.
+
+    Args:
+        folder: is made where it does not exist.
+        overlays: names (of captures) and BGR pictures.
+
+    Returns:
+        The files, the contact sheet last; none where there are no pictures.
+
+    Raises:
+        SessionError: a file cannot be written.
+    """
+    files: list[Path] = []
+    tiles: list[tuple[str, Picture]] = []
+    for name, picture in overlays:
+        files.append(write_picture(folder / f"{_file_name(name)}.png", picture))
+        height_px = round(picture.shape[0] * _TILE_PX / picture.shape[1])
+        tiles.append((name, canvas.fitted(picture, _TILE_PX, height_px)))
+    if tiles:
+        files.append(write_picture(folder / CONTACT_SHEET, contact_sheet(tiles, tile_width_px=_TILE_PX)))
+    return files
+
+
+def write_picture(path: Path, picture: Picture) -> Path:
+    """Write one PNG.
+
+    Raises:
+        SessionError: the file cannot be written.
+    """
+    is_encoded, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not is_encoded:
+        raise SessionError(f"{path}: a picture of shape {picture.shape} cannot be written as PNG")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(np.asarray(data).tobytes())
+    except OSError as error:
+        hint = "free space on the disk or choose another folder"
+        raise SessionError(f"{path}: cannot be written: {error.strerror}", hint) from error
+    return path
+
+
+def _file_name(name: str) -> str:
+    """Keep letters, digits, dot, dash and underscore of a name, so that it stays in its folder."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).lstrip(".") or "picture"

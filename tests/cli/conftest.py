@@ -1,0 +1,48 @@
+"""One simulated session that the verbs share; every test that writes copies it."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from lce_rig.cli.main import run
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one command line did."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def lce_rig(capsys):
+    """Run a command line in this process."""
+
+    def call(*words) -> Outcome:
+        capsys.readouterr()
+        code = run([str(word) for word in words])
+        captured = capsys.readouterr()
+        return Outcome(code, captured.out, captured.err)
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def simulated(tmp_path_factory) -> Path:
+    """A session of the rig rles with ten captures, detected once."""
+    session = tmp_path_factory.mktemp("simulated") / "session"
+    assert run(["simulate", "--rig", "rles", str(session), "--captures", "10", "--seed", "3"]) == 0
+    assert run(["check", str(session)]) == 0
+    return session
+
+
+@pytest.fixture
+def session(simulated, tmp_path) -> Path:
+    """A copy of the simulated session to write into."""
+    copy = tmp_path / "session"
+    shutil.copytree(simulated, copy)
+    return copy

@@ -1,0 +1,61 @@
+"""The command line as a whole: help, unknown words, exit codes."""
+
+import subprocess
+import sys
+
+import pytest
+
+from lce_rig import __version__
+from lce_rig.cli.main import COMMANDS
+
+
+def test_help_lists_every_verb_and_every_exit_code(lce_rig):
+    outcome = lce_rig("--help")
+    assert outcome.code == 0
+    assert all(f"  {verb} " in outcome.out for verb in COMMANDS)
+    assert "7 result refused" in outcome.out
+
+
+def test_help_imports_nothing_heavy():
+    script = (
+        "import sys; from lce_rig.cli.main import run; run(['--help']);"
+        "print([m for m in ('numpy', 'cv2', 'scipy', 'open3d', 'rich', 'pydantic') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().endswith("[]")
+
+
+@pytest.mark.parametrize("verb", COMMANDS)
+def test_every_verb_has_help(lce_rig, verb):
+    outcome = lce_rig(verb, "--help")
+    assert outcome.code == 0
+    assert "Usage: lce-rig " + verb in outcome.out
+
+
+def test_a_misspelt_verb_is_met_with_the_nearest_one(lce_rig):
+    outcome = lce_rig("calibrat")
+    assert outcome.code == 2
+    assert "Did you mean 'calibrate'?" in outcome.err
+
+
+def test_the_version_is_told(lce_rig):
+    assert lce_rig("--version").out == f"lce-rig {__version__}\n"
+
+
+def test_an_unknown_rig_exits_with_3_and_names_the_nearest(lce_rig, tmp_path):
+    outcome = lce_rig("simulate", "--rig", "rlf", tmp_path / "s")
+    assert outcome.code == 3
+    assert "did you mean rlfs?" in outcome.err
+
+
+@pytest.mark.parametrize("verb", ["check", "calibrate", "verify"])
+def test_a_folder_that_is_no_session_exits_with_4(lce_rig, tmp_path, verb):
+    outcome = lce_rig(verb, tmp_path)
+    assert outcome.code == 4
+    assert str(tmp_path) in outcome.err
+
+
+def test_the_module_runs_like_the_command():
+    words = [sys.executable, "-m", "lce_rig", "--version"]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert done.stdout == f"lce-rig {__version__}\n"

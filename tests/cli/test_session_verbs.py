@@ -1,0 +1,145 @@
+"""check, calibrate and verify on a simulated session, as a user types them."""
+
+import json
+
+import numpy as np
+
+
+def read(path):
+    return json.loads(path.read_text())
+
+
+def test_check_shows_a_row_a_capture_and_counts_the_usable_ones(lce_rig, simulated):
+    outcome = lce_rig("check", simulated)
+    assert outcome.code == 0
+    assert sum(line.startswith("0000") for line in outcome.out.splitlines()) == 10
+    assert "10 of 10 captures can be used" in outcome.err
+
+
+def test_check_gives_machines_every_figure_and_cause(lce_rig, simulated):
+    document = json.loads(lce_rig("check", simulated, "--json").out)
+    captures = document["pairs"][0]["captures"]
+    assert len(captures) == 10
+    assert captures["000000"]["is_usable"]
+    assert captures["000000"]["lidar"]["n_rings"] >= 4
+    assert captures["000000"]["image"]["distance_m"] > 1
+
+
+def test_calibrate_finds_the_simulated_truth_within_four_sigma(lce_rig, session):
+    outcome = lce_rig("calibrate", session, "--reference", session / "truth.json", "--json")
+    assert outcome.code == 0, outcome.err
+    pair = json.loads(outcome.out)["pairs"][0]
+    assert pair["egt_rotation_deg"] < min(4 * pair["sigma_rotation_deg"], 0.5)
+    assert pair["egt_translation_m"] < min(4 * pair["sigma_translation_m"], 0.02)
+    assert pair["certificate"]["is_optimal"]
+    T, truth = np.array(pair["T_cam_lidar"]), np.array(read(session / "truth.json")["T_cam_lidar"])
+    assert np.abs(T - truth).max() < 0.02
+
+
+def test_the_same_session_gives_the_same_bytes(lce_rig, session):
+    lce_rig("calibrate", session)
+    first = (session / "calibration" / "result.json").read_bytes()
+    lce_rig("calibrate", session)
+    assert (session / "calibration" / "result.json").read_bytes() == first
+
+
+def test_the_reference_never_enters_the_estimate(lce_rig, session):
+    plain = json.loads(lce_rig("calibrate", session, "--json").out)["pairs"][0]
+    wrong = np.array(read(session / "truth.json")["T_cam_lidar"])
+    wrong[:3, 3] += 1.0
+    (session / "wrong.json").write_text(json.dumps({"T_cam_lidar": wrong.tolist()}))
+    against = json.loads(lce_rig("calibrate", session, "--reference", session / "wrong.json", "--json").out)
+    against = against["pairs"][0]
+    assert against.pop("egt_translation_m") > 1.7
+    assert against.pop("egt_rotation_deg") < 1
+    assert plain.pop("egt_translation_m") is None
+    assert plain.pop("egt_rotation_deg") is None
+    assert plain == against
+
+
+def test_a_reference_that_is_no_rigid_transform_exits_with_4(lce_rig, session, tmp_path):
+    (tmp_path / "bad.json").write_text('{"T_cam_lidar": [[1, 2], [3, 4]]}')
+    outcome = lce_rig("calibrate", session, "--reference", tmp_path / "bad.json")
+    assert outcome.code == 4
+    assert "bad.json: T_cam_lidar" in outcome.err
+
+
+def test_every_export_stands_beside_the_result(lce_rig, session):
+    lce_rig("calibrate", session)
+    names = {path.name for path in (session / "calibration").iterdir()}
+    assert {"result.json", "extrinsics.yaml", "rles.urdf", "static_transforms.txt"} <= names
+    assert any(name.startswith("camera_info") for name in names)
+
+
+def test_verify_draws_every_capture_and_one_sheet(lce_rig, session):
+    assert lce_rig("verify", session).code == 4, "nothing was calibrated yet"
+    lce_rig("calibrate", session)
+    outcome = lce_rig("verify", session)
+    assert outcome.code == 0
+    assert "mean over captures" in outcome.out
+    pictures = sorted(path.name for path in (session / "calibration" / "overlays").iterdir())
+    assert pictures == [*(f"{k:06d}.png" for k in range(10)), "contact_sheet.png"]
+
+
+def test_verify_tells_a_wrong_extrinsic_by_its_residuals(lce_rig, session):
+    lce_rig("calibrate", session)
+    right = json.loads(lce_rig("verify", session, "--json").out)["pairs"][0]["metrics"]
+    path = session / "calibration" / "result.json"
+    result = read(path)
+    result["pairs"][0]["T_cam_lidar"][0][3] += 0.05
+    path.write_text(json.dumps(result))
+    wrong = json.loads(lce_rig("verify", session, "--json").out)["pairs"][0]["metrics"]
+    assert wrong["mee_m"] > right["mee_m"] + 0.01
+
+
+def test_a_nominal_extrinsic_far_off_fails_with_7_and_nothing_is_exported(lce_rig, session):
+    profile = session / "rig.yaml"
+    text = profile.read_text()
+    turned = text.replace("quaternion_wxyz: [0.5, 0.5, -0.5, 0.5]", "rpy_deg: [0.0, 0.0, 0.0]")
+    if turned == text:
+        import yaml
+
+        document = yaml.safe_load(text)
+        nominal = document["nominal_extrinsics"][0]
+        nominal.pop("quaternion_wxyz", None)
+        nominal["rpy_deg"] = [0.0, 0.0, 0.0]
+        turned = yaml.safe_dump(document)
+    profile.write_text(turned)
+    outcome = lce_rig("calibrate", session)
+    assert outcome.code == 7
+    assert "from the nominal extrinsic" in outcome.err
+    assert read(session / "calibration" / "result.json")["pairs"][0]["verdict"] == "fail"
+    assert not (session / "calibration" / "extrinsics.yaml").exists()
+    assert lce_rig("verify", session).code == 7
+    assert lce_rig("calibrate", session, "--force").code == 7
+    assert "NOT FOR USE" in (session / "calibration" / "extrinsics.yaml").read_text()
+
+
+def test_too_few_captures_exit_with_6_and_say_how_many_are_needed(lce_rig, session):
+    import shutil
+
+    for k in range(4, 10):
+        shutil.rmtree(session / "captures" / f"{k:06d}")
+    outcome = lce_rig("calibrate", session)
+    assert outcome.code == 6
+    assert "in 4 of 4 captures, at least 6 are needed" in outcome.err
+
+
+def test_a_damaged_capture_is_named_and_the_others_still_count(lce_rig, session):
+    (session / "captures" / "000004" / "lidar.pcd").write_bytes(b"# .PCD v0.7")
+    outcome = lce_rig("check", session)
+    assert outcome.code == 0
+    assert "9 of 10 captures can be used" in outcome.err
+    assert "000004: read:" in outcome.err
+    assert "lidar.pcd" in outcome.err
+
+
+def test_switched_off_terms_still_calibrate(lce_rig, session):
+    for switch in ("--no-ptl", "--no-uncertainty", "--no-half-step"):
+        assert lce_rig("calibrate", session, switch, "--draws", "5").code in (0, 7), switch
+
+
+def test_simulating_into_a_session_that_exists_exits_with_4(lce_rig, session):
+    outcome = lce_rig("simulate", "--rig", "rles", session, "--captures", "1")
+    assert outcome.code == 4
+    assert "session already" in outcome.err

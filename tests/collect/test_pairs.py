@@ -1,0 +1,153 @@
+"""Folders of pairs become captures, each once, and whatever is wrong with one spoils no other."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from lce_rig.collect import CollectOptions, collect
+from lce_rig.core.errors import SourceError
+from lce_rig.core.pcd import encode_pcd
+from lce_rig.rig import load_rig
+from lce_rig.session import Session
+from lce_rig.sources import open_recording
+
+N_PAIRS = 5
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Pictures and clouds of noise in rings."""
+    path = tmp_path / "recording"
+    (path / "img").mkdir(parents=True)
+    (path / "pcd").mkdir()
+    rng = np.random.default_rng(0)
+    for k in range(N_PAIRS):
+        pixels = rng.integers(0, 256, (360, 640), dtype=np.uint8)
+        cv2.imwrite(str(path / "img" / f"{k:05d}.png"), pixels)
+        cloud = np.zeros(
+            4000, dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"), ("ring", "u2")]
+        )
+        cloud["x"], cloud["y"] = rng.normal(4, 1, 4000), rng.normal(0, 1, 4000)
+        cloud["ring"] = np.arange(4000) % 16
+        cloud["z"] = np.hypot(cloud["x"], cloud["y"]) * np.tan(np.radians(cloud["ring"] * 2.0 - 15))
+        (path / "pcd" / f"{k:05d}.pcd").write_bytes(encode_pcd(cloud))
+    return path
+
+
+def run(session, folder, rig, **options):
+    return collect(session, [open_recording(folder, rig)], CollectOptions(**options))
+
+
+def test_every_pair_becomes_a_capture_and_a_second_run_adds_none(tmp_path, folder, rig):
+    with Session.create(tmp_path / "s", rig) as session:
+        report = run(session, folder, rig)
+    assert report.captured == [f"{k:06d}" for k in range(N_PAIRS)]
+    assert report.notes == ["recording: 5 pairs, paired by equal file names", "no time of each point"]
+    with Session.resume(tmp_path / "s", rig) as session:
+        again = run(session, folder, rig)
+    assert (again.captured, again.n_resumed, again.duplicates) == ([], N_PAIRS, {})
+    assert [e["event"] for e in session.read_journal()][-1] == "collected"
+
+
+def test_the_same_data_in_another_file_is_a_duplicate(tmp_path, folder, rig):
+    pixels = cv2.imread(str(folder / "img" / "00003.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(folder / "img" / "00007.bmp"), pixels)
+    (folder / "pcd" / "00007.pcd").write_bytes((folder / "pcd" / "00003.pcd").read_bytes())
+    with Session.create(tmp_path / "s", rig) as session:
+        report = run(session, folder, rig)
+    assert report.duplicates == {"00007.bmp + 00007.pcd": "000003"} and len(report.captured) == N_PAIRS
+
+
+def test_damaged_files_are_refused_with_their_cause_and_the_rest_is_captured(tmp_path, folder, rig):
+    os.truncate(folder / "img" / "00001.png", 5000)
+    os.truncate(folder / "pcd" / "00002.pcd", 5000)
+    with Session.create(tmp_path / "s", rig) as session:
+        report = run(session, folder, rig)
+    assert len(report.captured) == N_PAIRS - 2 and not report.errors
+    causes = {label: refusal.cause for label, refusal in report.refused.items()}
+    assert "00001.png: it is a truncated PNG" in causes["00001.png + 00001.pcd"]
+    assert "00002.pcd: it is truncated" in causes["00002.png + 00002.pcd"]
+    assert {refusal.stage for refusal in report.refused.values()} == {"read"}
+
+
+def test_a_folder_of_which_nothing_can_be_read_is_an_error_that_names_the_first_file(tmp_path, folder, rig):
+    for path in (folder / "pcd").iterdir():
+        os.truncate(path, 0)
+    with (
+        Session.create(tmp_path / "s", rig) as session,
+        pytest.raises(SourceError, match=r"pcd/00000\.pcd: it is empty"),
+    ):
+        run(session, folder, rig)
+
+
+def test_the_cap_is_kept_and_what_is_left_out_is_counted(tmp_path, folder, rig):
+    with Session.create(tmp_path / "s", rig) as session:
+        report = run(session, folder, rig, max_captures=2, target=3)
+        assert len(session.captures) == 2 and report.n_missing == 1
+        assert "3 pairs left out: the session is full (2)" in report.notes
+        assert len(run(session, folder, rig).captured) == 3
+
+
+def test_pictures_of_another_size_are_said(tmp_path, folder, rig):
+    cv2.imwrite(str(folder / "img" / "00002.png"), np.zeros((480, 640), np.uint8))
+    with Session.create(tmp_path / "s", rig) as session:
+        report = run(session, folder, rig)
+    assert "camera cam: pictures of 640x480 where the profile says 640x360" in report.notes
+
+
+def test_progress_tells_of_every_pair(tmp_path, folder, rig):
+    told = []
+    with Session.create(tmp_path / "s", rig) as session:
+        collect(session, [open_recording(folder, rig)], progress=lambda *step: told.append(step))
+    assert [(done, total) for done, total, _ in told] == [(k + 1, N_PAIRS) for k in range(N_PAIRS)]
+    assert told[0][2] == "00000.png + 00000.pcd captured as 000000"
+
+
+COLLECTOR = """
+import sys
+from lce_rig.collect import collect
+from lce_rig.rig import load_rig
+from lce_rig.session import Session
+from lce_rig.sources import open_recording
+rig = load_rig("rlfs")
+with Session.resume(sys.argv[1], rig) as session:
+    recording = open_recording(sys.argv[2], rig)
+    print("ready", flush=True)
+    collect(session, [recording])
+"""
+
+
+def test_killed_runs_end_up_with_the_same_captures_as_one_that_was_not(tmp_path, folder):
+    rig = load_rig("rlfs")
+    with Session.create(tmp_path / "whole", rig) as whole:
+        run(whole, folder, rig)
+    path = tmp_path / "killed"
+    n_before = []
+    for k in range(3):
+        command = [sys.executable, "-c", COLLECTOR, str(path), str(folder)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        time.sleep(0.01 + 0.015 * k)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        n_before.append(len(Session.open(path).captures))
+    with Session.resume(path, rig) as session:
+        run(session, folder, rig)
+    contents = [sorted(c.content_sha256 for c in s.captures) for s in (whole, session)]
+    assert contents[0] == contents[1] and n_before == sorted(n_before)
+
+
+@pytest.mark.dataset
+def test_a_recording_by_others_becomes_a_session(tmp_path, recordings):
+    rig = load_rig("rlfs")
+    with Session.create(tmp_path / "s", rig) as session:
+        report = run(session, recordings / "rlfs01", rig)
+    assert len(report.captured) == 18 and not report.refused and not report.duplicates
+    assert "no ring field: rings told from elevations" in report.notes
+    assert Session.open(tmp_path / "s").captures[17].scan("lidar").ring.max() == 15

@@ -1,0 +1,40 @@
+"""Following the board from scan to scan."""
+
+import numpy as np
+from scans import BOARD, board_plate, cast, person, place, room
+
+from lce_rig.core.results import LidarBoard, Refusal
+from lce_rig.detect.lidar_board import find_lidar_boards
+from lce_rig.detect.lidar_features import Beam
+from lce_rig.detect.lidar_track import track_lidar_board
+
+BEAM = Beam(0.0, 0.0)
+
+
+def view(T, seed=0):
+    return cast([board_plate(T), *person(T, 0.2), *room(13.0)], sigma_m=0.008, seed=seed)
+
+
+def test_board_in_motion_is_followed_through_every_scan():
+    board = find_lidar_boards(view(place(2.5, 170)), BOARD, beam=BEAM)[0]
+    for k in range(1, 12):
+        T = place(2.5 - 0.04 * k, 170 + 1.5 * k, 45 + 2 * k, 3 * k)
+        board = track_lidar_board(view(T, seed=k), BOARD, board, beam=BEAM)
+        assert isinstance(board, LidarBoard)
+        assert np.linalg.norm(board.T_lidar_board[:3, 3] - T[:3, 3]) < 0.03
+
+
+def test_tracking_finds_what_the_full_search_finds():
+    scan = view(place(2.2, 40, 30, 20))
+    full = find_lidar_boards(scan, BOARD, beam=BEAM)[0]
+    tracked = track_lidar_board(scan, BOARD, full, beam=BEAM)
+    np.testing.assert_allclose(tracked.T_lidar_board, full.T_lidar_board, atol=5e-3)
+    np.testing.assert_allclose(tracked.plane, full.plane, atol=5e-3)
+    assert len(tracked.points) > 0.97 * len(full.points)
+
+
+def test_board_that_left_is_reported_lost():
+    board = find_lidar_boards(view(place(2.5, 40)), BOARD, beam=BEAM)[0]
+    refusal = track_lidar_board(view(place(2.5, 200)), BOARD, board, beam=BEAM)
+    assert isinstance(refusal, Refusal)
+    assert refusal.cause.startswith("lost near its last place")

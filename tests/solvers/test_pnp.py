@@ -1,0 +1,132 @@
+"""Poses of a planar board from one picture, judged by truth, by Monte Carlo and by symmetry."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array, difference, exp_so3, perturb, pose, rotation_angle, transform
+from lce_rig.solvers.pnp import PlanarPose, mirror_tilt, refine_pose, solve_planar_pose
+
+BOARD = Board(cols=9, rows=6, square_m=0.068, width_m=0.8, height_m=0.6)
+RADTAN = Intrinsics(
+    349.57, 349.18, 172.49, 126.24, 346, 260, "radtan", (-0.36503, 0.18361, 0.00070794, 0.00010983, 0.0)
+)
+FISHEYE = Intrinsics(
+    1176.93, 1177.72, 962.275, 612.725, 1920, 1208, "equidistant", (-0.054, -0.0784, 0.096, -0.0515)
+)
+CAMERAS = pytest.mark.parametrize("camera", [RADTAN, FISHEYE], ids=["radtan", "fisheye"])
+FACING = np.diag([1.0, -1.0, -1.0])
+
+
+def looking(tilt_deg: float, about_deg: float, roll_deg: float, centre: tuple[float, float, float]) -> Array:
+    """Place the board at `centre` in the camera, its print tilted against the camera's axis."""
+    about, roll = np.radians([about_deg, roll_deg])
+    tilt = exp_so3(np.radians(tilt_deg) * np.array([np.cos(about), np.sin(about), 0.0]))
+    return pose(tilt @ FACING @ exp_so3(np.array([0.0, 0.0, roll])), np.array(centre))
+
+
+def seen(T: Array, camera: Intrinsics, sigma_px: float = 0.0, seed: int = 0) -> Array:
+    pixels, is_valid = camera.project(transform(T, BOARD.corners()))
+    assert is_valid.all()
+    return pixels + sigma_px * np.random.default_rng(seed).standard_normal(pixels.shape)
+
+
+def solve(corners: Array, camera: Intrinsics) -> PlanarPose:
+    solved = solve_planar_pose(corners, BOARD.corners(), camera)
+    assert solved is not None
+    return solved
+
+
+@CAMERAS
+@given(
+    tilt_deg=st.floats(0, 65),
+    about_deg=st.floats(-180, 180),
+    roll_deg=st.floats(-180, 180),
+    x=st.floats(-0.3, 0.3),
+    y=st.floats(-0.25, 0.25),
+    z=st.floats(1.2, 5.0),
+)
+def test_exact_corners_give_the_exact_pose(
+    camera: Intrinsics, tilt_deg: float, about_deg: float, roll_deg: float, x: float, y: float, z: float
+) -> None:
+    T = looking(tilt_deg, about_deg, roll_deg, (x, y, z))
+    solved = solve(seen(T, camera), camera)
+    assert solved.reprojection_px < 1e-4
+    assert np.abs(difference(solved.T_cam_board, T)).max() < 1e-4
+
+
+@CAMERAS
+@pytest.mark.parametrize(("tilt_deg", "z_m"), [(40.0, 1.5), (25.0, 2.5)])
+def test_the_covariance_is_what_monte_carlo_scatters(camera: Intrinsics, tilt_deg: float, z_m: float) -> None:
+    T, sigma_px, n = looking(tilt_deg, 30, 40, (0.2, -0.1, z_m)), 0.15, 400
+    runs = [solve(seen(T, camera, sigma_px, seed), camera) for seed in range(n)]
+    errors = np.array([difference(run.T_cam_board, T) for run in runs])
+    predicted = np.sqrt(np.mean([np.diag(run.cov) for run in runs], axis=0))
+    ratio = predicted / np.sqrt(np.mean(errors**2, axis=0))
+    # A standard deviation of 400 samples is itself known to 3.5 %.
+    assert np.all((ratio > 0.9) & (ratio < 1.1)), ratio
+    chi2 = np.array([e @ np.linalg.solve(run.cov, e) for e, run in zip(errors, runs, strict=True)])
+    assert 0.91 < np.mean(chi2 < 12.59) < 0.985  # 95 % of chi2 with 6 degrees of freedom
+    assert np.median([run.sigma_px for run in runs]) == pytest.approx(sigma_px, rel=0.05)
+
+
+@CAMERAS
+def test_both_minima_of_a_far_board_are_found_and_the_better_one_is_returned(camera: Intrinsics) -> None:
+    T = looking(20, 75, 10, (0.1, 0.05, 4.0 if camera is RADTAN else 9.0))
+    solved = solve(seen(T, camera, 0.2, 1), camera)
+    other = solved.T_cam_board_alternative
+    assert other is not None
+    corners, points = seen(T, camera, 0.2, 1), BOARD.corners()
+    again, cost_other = refine_pose(other, corners, points, camera)
+    assert np.abs(difference(again, other)).max() < 1e-5
+    _, cost = refine_pose(solved.T_cam_board, corners, points, camera)
+    assert cost <= cost_other
+    assert solved.chi2_gap == pytest.approx((cost_other - cost) / solved.sigma_px**2, rel=1e-6)
+    assert rotation_angle(other[:3, :3], solved.T_cam_board[:3, :3]) > np.radians(20)
+
+
+def test_no_minimum_is_lower_than_the_one_found_from_any_of_many_starts() -> None:
+    rng = np.random.default_rng(5)
+    for trial in range(12):
+        T = looking(rng.uniform(3, 40), rng.uniform(-180, 180), rng.uniform(-180, 180), (0.1, 0, 3.5))
+        corners = seen(T, RADTAN, 0.4, trial)
+        solved = solve(corners, RADTAN)
+        best = 54 * solved.reprojection_px**2
+        for _ in range(12):
+            start = perturb(T, np.concatenate([rng.normal(0, 0.05, 3), rng.normal(0, 0.6, 3)]))
+            assert refine_pose(start, corners, BOARD.corners(), RADTAN)[1] > best * (1 - 1e-6)
+
+
+def test_a_board_whose_minima_cannot_be_told_apart_has_a_small_gap_and_a_near_one_a_large_gap() -> None:
+    far = solve(seen(looking(8, 40, 0, (0.0, 0.0, 5.0)), RADTAN, 0.3, 3), RADTAN)
+    near = solve(seen(looking(30, 40, 0, (0.0, 0.0, 1.2)), RADTAN, 0.1, 3), RADTAN)
+    assert far.chi2_gap < 9.0
+    assert near.chi2_gap > 1000.0
+
+
+@given(tilt_deg=st.floats(1, 60), about_deg=st.floats(-180, 180), z=st.floats(0.5, 6.0))
+def test_mirroring_the_tilt_twice_changes_nothing_and_once_keeps_the_centre(
+    tilt_deg: float, about_deg: float, z: float
+) -> None:
+    T, centre = looking(tilt_deg, about_deg, 20, (0.2, 0.1, z)), np.zeros(3)
+    once = mirror_tilt(T, centre)
+    assert np.allclose(once[:3, 3], T[:3, 3], atol=1e-12)
+    assert np.linalg.det(once[:3, :3]) == pytest.approx(1.0)
+    assert np.allclose(mirror_tilt(once, centre), T, atol=1e-9)
+
+
+@CAMERAS
+def test_the_pose_does_not_depend_on_the_order_of_the_corners(camera: Intrinsics) -> None:
+    corners = seen(looking(30, 10, 20, (0.1, 0.1, 2.0)), camera, 0.2, 4)
+    order = np.random.default_rng(0).permutation(len(corners))
+    shuffled = solve_planar_pose(corners[order], BOARD.corners()[order], camera)
+    assert shuffled is not None
+    assert np.allclose(shuffled.T_cam_board, solve(corners, camera).T_cam_board, atol=1e-7)
+
+
+def test_corners_outside_the_lens_model_give_no_pose() -> None:
+    corners = seen(looking(20, 0, 0, (0, 0, 2)), RADTAN) + [4000.0, 0.0]
+    assert solve_planar_pose(corners, BOARD.corners(), RADTAN) is None
