@@ -128,14 +128,20 @@ class Trainer:
 
 def parse_options(arguments: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder of checkpoint.pt and reconstruction.onnx")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder of checkpoint.pt and reconstruction.onnx"
+    )
     parser.add_argument("--minutes", type=float, default=120.0, help="training time, counted over all runs")
     parser.add_argument("--updates", type=int, default=0, help="stop after so many updates (0: time alone)")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--batch", type=int, default=6, help="scenes at a time; 128 fills a GPU")
-    parser.add_argument("--crop-px", type=int, default=80, help="side of the simulated pictures, multiple of 4")
+    parser.add_argument(
+        "--crop-px", type=int, default=80, help="side of the simulated pictures, multiple of 4"
+    )
     parser.add_argument("--unroll", type=int, default=8, help="windows gradients run back through")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     return parser.parse_args(arguments)

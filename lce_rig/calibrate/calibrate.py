@@ -15,7 +15,7 @@ from lce_rig.calibrate.draws import Draws, draw_subsets
 from lce_rig.calibrate.estimate import CalibrationEstimate, CaptureResidual
 from lce_rig.calibrate.features import CaptureFeatures, extract_features
 from lce_rig.calibrate.initial import drop_uncertain, solve_planes
-from lce_rig.calibrate.metrics import capture_residual, summarise
+from lce_rig.calibrate.metrics import capture_residual, error_to_reference, summarise
 from lce_rig.calibrate.observability import describe_weakest, linearise, require_observable
 from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates
 from lce_rig.calibrate.outliers import reject_outliers
@@ -131,19 +131,21 @@ def _report(
         capture_residual(T, observation, board, float(error))
         for observation, error in zip(observations, held_out, strict=True)
     ]
-    certificates = solution.certificates
+    certificates, metrics = solution.certificates, summarise(residuals)
     return CalibrationEstimate(
         T_cam_lidar=T,
         cov=cov[:6, :6],
         certificate=Certificate(bool(certificates.is_optimal[0]), float(certificates.relative_gap[0])),
-        metrics=summarise(residuals),
+        metrics=metrics,
         used=tuple(f.capture for f in features),
         refused=dict(sorted(refused.items())),
         observations={observation.capture: observation for observation in observations},
         residuals=tuple(residuals),
         held_out_m=float(np.mean(held_out)),
         weak_direction=describe_weakest(cov[:6, :6], features),
-        diagnostics=_diagnostics(problem, solution, cov, draws, consensus),
+        # The paper's code counts every ring end twice, which halves its mean.
+        diagnostics=_diagnostics(problem, solution, cov, draws, consensus)
+        | {"paper_mee_m": metrics.mee_m / 2},
     )
 
 
@@ -171,10 +173,13 @@ def _diagnostics(
         figures["edge_shift_m"] = float(solution.linear[0, 3])
         figures["edge_shift_sigma_m"] = float(np.sqrt(cov[6, 6]))
     if draws is not None:
+        offset = error_to_reference(draws.T_mean[draws.best], solution.T[0])
         figures |= {
             "best_subset_size": float(draws.sizes[draws.best]),
             "n_solved": float(draws.n_solved),
             "certified_share": draws.certified_share,
+            "draw_mean_offset_deg": offset[0],
+            "draw_mean_offset_m": offset[1],
             "draw_spread_rotation_deg": float(np.degrees(draws.spread_rotation_rad[draws.best])),
             "draw_spread_translation_m": float(draws.spread_translation_m[draws.best]),
         }

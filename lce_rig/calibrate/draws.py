@@ -61,11 +61,11 @@ def draw_subsets(
         progress: called with (subsets done, subsets in all).
 
     Returns:
-        The draws; None where fewer than four captures leave none out.
+        The draws; None without any, or where fewer than four captures leave none out.
     """
     n = problem.n_captures
     sizes = np.arange(MIN_SUBSET, n)
-    if len(sizes) == 0:
+    if len(sizes) == 0 or n_draws == 0:
         return None
     rng = np.random.default_rng(seed)
     order = np.argsort(rng.random((len(sizes) * n_draws, n)), axis=1)

@@ -34,6 +34,8 @@ def match_candidates(candidates: CaptureCandidates, board: Board, T_cam_lidar: A
         turn_m = arm_m * np.linalg.norm(normal - T_cam_board[:3, 2])
         return float(np.hypot(turn_m, np.linalg.norm(centre - T_cam_board[:3, 3])))
 
-    pose_index, lidar_index = min(itertools.product(range(len(poses)), range(len(candidates.lidar))), key=misfit)
+    pose_index, lidar_index = min(
+        itertools.product(range(len(poses)), range(len(candidates.lidar))), key=misfit
+    )
     image = replace(candidates.image, T_cam_board=poses[pose_index])
     return Observation(candidates.capture, image, candidates.lidar[lidar_index])

@@ -36,9 +36,9 @@ def capture_residual(
     edge = edge_distances(ends_board, board)
     return CaptureResidual(
         capture=observation.capture,
-        plane_mean_m=float(plane.mean()),
+        plane_mean_m=_mean(plane),
         plane_rms_m=_rms(plane),
-        edge_mean_m=float(edge.mean()),
+        edge_mean_m=_mean(edge),
         edge_rms_m=_rms(edge),
         held_out_m=held_out_m,
         reprojection_px=observation.image.reprojection_px,
@@ -55,9 +55,11 @@ def edge_distances(points_board: Array, board: Board) -> Array:
 
 def summarise(residuals: Sequence[CaptureResidual]) -> Metrics:
     """Average per-capture residuals: MPE, MEE (mean distances) and the rms corner residual."""
+    # A scan may show the board without any usable end of a ring.
+    edges = np.array([r.edge_mean_m for r in residuals])
     return Metrics(
-        mpe_m=float(np.mean([r.plane_mean_m for r in residuals])),
-        mee_m=float(np.mean([r.edge_mean_m for r in residuals])),
+        mpe_m=_mean(np.array([r.plane_mean_m for r in residuals])),
+        mee_m=_mean(edges[np.isfinite(edges)]),
         reprojection_px=_rms(np.array([r.reprojection_px for r in residuals])),
     )
 
@@ -68,5 +70,9 @@ def error_to_reference(T_cam_lidar: Array, T_reference: Array) -> tuple[float, f
     return float(np.degrees(angle)), float(np.linalg.norm(T_cam_lidar[:3, 3] - T_reference[:3, 3]))
 
 
+def _mean(values: Array) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
 def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    return float(np.sqrt(_mean(values**2)))

@@ -61,6 +61,8 @@ def _poses_of(capture: Capture, session: Session) -> list[tuple[ImageKey, Array]
     stored = capture.meta.get("T_cam_board")
     found: list[tuple[ImageKey, Array]] = []
     for camera, channel in capture.image_keys:
+        if camera not in session.rig.cameras:
+            continue
         if isinstance(stored, dict):
             pose = np.array(stored.get(f"{camera}.{channel}", []), dtype=np.float64)
             if pose.shape == (4, 4):

@@ -135,6 +135,8 @@ class Intrinsics:
         step = 1e-6
         for _ in range(20):
             error = self._distort(guess) - xy
+            if np.all(np.abs(error) < 1e-13):
+                break
             col_x = (self._distort(guess + [step, 0]) - self._distort(guess - [step, 0])) / (2 * step)
             col_y = (self._distort(guess + [0, step]) - self._distort(guess - [0, step])) / (2 * step)
             det = col_x[..., 0] * col_y[..., 1] - col_y[..., 0] * col_x[..., 1]

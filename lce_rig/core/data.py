@@ -99,13 +99,16 @@ class Events:
     def between(self, start_ns: int, end_ns: int) -> "Events":
         """Cut out the events with start_ns <= t < end_ns, without copying."""
         first, last = np.searchsorted(self.t_ns, (start_ns, end_ns))
-        cut = slice(int(first), int(last))
+        return self.select(slice(int(first), int(last)))
+
+    def select(self, keep: NDArray[Any] | slice) -> "Events":
+        """Keep the events of a mask, an index or a slice, in their order."""
         return Events(
             self.sensor,
-            self.t_ns[cut],
-            self.x[cut],
-            self.y[cut],
-            self.polarity[cut],
+            self.t_ns[keep],
+            self.x[keep],
+            self.y[keep],
+            self.polarity[keep],
             self.width_px,
             self.height_px,
             self.host_ns,

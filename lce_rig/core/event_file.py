@@ -1,4 +1,4 @@
-"""Events as one plain file and back: a NumPy archive of columns, t_us x y polarity, readable with numpy alone."""
+"""Events as one plain file and back: a NumPy archive of columns t_us, x, y, polarity."""
 
 import io
 import zipfile

@@ -17,7 +17,6 @@ Grey = NDArray[np.uint8]
 # squares of 10 to 60 px.
 _WIDE_PX = 700
 _SEARCH_PX = 640
-_SB = cv2.CALIB_CB_NORMALIZE_IMAGE
 _SB_THOROUGH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
@@ -32,14 +31,21 @@ def find_grid(grey: Grey, board: Board) -> Crossings | None:
     Returns:
         The crossings, `grid_px` in the order of `Board.corners()`; None where no attempt finds that many.
     """
-    for found in _attempts(grey, (board.cols, board.rows)):
+    seen = seen_grid(grey)
+    if seen is not None and seen.shape[:2] == (board.cols, board.rows):
+        seen = seen.swapaxes(0, 1)
+    if seen is not None and seen.shape[:2] == (board.rows, board.cols):
+        attempts = iter([seen.reshape(-1, 2)])
+    else:
+        attempts = _attempts(grey, (board.cols, board.rows), is_other_seen=seen is not None)
+    for found in attempts:
         if found is not None:
             return fit_crossings(grey, order_corners(grey, found, board).reshape(board.rows, board.cols, 2))
     return None
 
 
 def seen_grid(grey: Grey) -> Array | None:
-    """Find a checkerboard of any size of at least 5x4 inner corners, to say what is there instead.
+    """Find a checkerboard of any size of at least 5x4 inner corners, in about 30 ms.
 
     Returns:
         (rows, cols, 2) px; which of the two is called rows means nothing. None where nothing is found.
@@ -98,24 +104,24 @@ def square_values(grey: Grey, grid_px: Array) -> Array:
     return sample(grey, centres)
 
 
-def _attempts(grey: Grey, size: tuple[int, int]) -> Iterator[Array | None]:
+def _attempts(grey: Grey, size: tuple[int, int], is_other_seen: bool) -> Iterator[Array | None]:
     """Run the finders one after the other, cheapest first; the caller stops at the first success.
 
-    The list is fixed, not timed, so that the same picture gives the same answer on any machine. What was found
-    by which attempt on the recordings behind this order stands in docs/benchmarks.md.
+    The list is fixed, not timed, so that the same picture gives the same answer on any machine. The classic
+    finder takes seconds to fit one size into the squares of another: it is left out where another size was seen.
     """
     width = grey.shape[1]
     if width > _WIDE_PX:
-        yield _classic(grey, size, min(1.0, 1280 / width))
-        yield _sector_based(grey, size, _SEARCH_PX / width, _SB)
-        small = _resize(grey, _SEARCH_PX / width)
-        yield _to_full_scale(
-            _sector_based(level_contrast(small), size, 1.0, _SB_THOROUGH), _SEARCH_PX / width
-        )
+        scale = _SEARCH_PX / width
+        if not is_other_seen:
+            yield _classic(grey, size, min(1.0, 1280 / width))
+        level = level_contrast(_resize(grey, scale))
+        yield _to_full_scale(_sector_based(level, size, 1.0, _SB_THOROUGH), scale)
         return
-    yield _classic(grey, size, 2.0)
     level = level_contrast(grey)
-    yield _classic(level, size, 2.0)
+    if not is_other_seen:
+        yield _classic(grey, size, 2.0)
+        yield _classic(level, size, 2.0)
     yield _sector_based(level, size, 1.5, _SB_THOROUGH)
     yield _sector_based(level, size, 1.0, _SB_THOROUGH)
 

@@ -4,15 +4,16 @@ import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
-from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Refusal
 from lce_rig.detect import lidar_refusal
 from lce_rig.detect.lidar_features import Beam, build_board, refine
-from lce_rig.detect.lidar_plates import Plates, propose_plates
+from lce_rig.detect.lidar_plates import propose_plates, screen_plates
 from lce_rig.detect.lidar_segments import cut_segments, order_scan
-from lce_rig.detect.lidar_template import Placement, plane_axes, register_ends
 
 MAX_CANDIDATES = 4
+# A plate with as many rings and as little else in its plane is not outdone by plates that fit far worse.
+CLEAR_RINGS = 6
+CLEAR_SHARE = 0.05
 
 
 def find_lidar_boards(
@@ -51,13 +52,16 @@ def find_lidar_boards(
     ordered = order_scan(scan, min_range_m)
     if len(ordered.index) == 0:
         return lidar_refusal.no_returns(len(scan.points), min_range_m)
-    segments = cut_segments(ordered, max_range_m)
+    segments = cut_segments(ordered, max_range_m, 2.0 * float(np.hypot(board.width_m, board.height_m)))
     plates, ends = propose_plates(ordered, segments, board)
     limit_m = min(max_template_m + 1.5 * ordered.sigma_m, 0.06)
     rms_limit_m = max_rms_m + 1.5 * ordered.sigma_m
     found: list[LidarBoard] = []
     misses: list[Refusal] = []
-    for plane, origin, start in _screen(plates, ends, board, limit_m):
+    rival_m = limit_m
+    for plane, origin, start in screen_plates(plates, ends, board, limit_m):
+        if start.error_m > rival_m:
+            break
         refined = refine(ordered, plane, origin, start, limit_m)
         if refined is None:
             continue
@@ -75,27 +79,16 @@ def find_lidar_boards(
             misses.append(lidar_refusal.too_thick(heights_m, rms_limit_m))
         else:
             found.append(candidate)
+            if (
+                candidate.quality["n_rings"] >= CLEAR_RINGS
+                and candidate.quality["beyond_share"] < CLEAR_SHARE
+            ):
+                rival_m = min(rival_m, 2 * start.error_m + 0.005)
     if found:
         return _distinct(found, board)
     if misses:
         return misses[0]
-    return lidar_refusal.no_plate(ordered, segments, board, min_range_m, max_range_m)
-
-
-def _screen(
-    plates: Plates, ends: Array, board: Board, limit_m: float
-) -> list[tuple[Array, Array, Placement]]:
-    """Register the outline with the ends of each plate's segments and keep the plates it fits, best first."""
-    if len(plates.centre) == 0:
-        return []
-    relative = ends - plates.centre[:, None]
-    placements = register_ends(relative @ plane_axes(plates.plane[:, :3]), board)
-    rank = sorted(range(len(placements)), key=lambda k: placements[k].error_m)
-    # What fits far worse than the best plate is no rival of it.
-    limit_m = min(limit_m, 3 * placements[rank[0]].error_m + 0.01)
-    return [
-        (plates.plane[k], plates.centre[k], placements[k]) for k in rank if placements[k].error_m < limit_m
-    ]
+    return lidar_refusal.no_plate(ordered, board, limit_m, min_range_m, max_range_m)
 
 
 def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
@@ -110,7 +103,7 @@ def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
 
 
 def _doubt(found: LidarBoard, board: Board) -> float:
-    """Rate a candidate in m: misfit of outline and size, what the rings cannot show, what else is in its plane."""
+    """Rate a candidate in m: misfit of outline and size, what no ring shows, what else is in its plane."""
     q = found.quality
     doubt = q["template_m"] + 0.03 / q["n_rings"] + 0.15 * (q["width_sigma_m"] + q["height_sigma_m"])
     doubt += 0.05 * q["beyond_share"]

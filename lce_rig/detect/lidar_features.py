@@ -62,7 +62,7 @@ class RingEnds:
     is_border: NDArray[np.bool_]
 
 
-def fit_plane_to_ranges(points: Array, start: Array, scale_m: float, n_rounds: int = 4) -> Array:
+def fit_plane_to_ranges(points: Array, start: Array, scale_m: float, n_rounds: int = 3) -> Array:
     """Fit a plane to ranges: minimise sum rho_T(r_i - 1 / (m . u_i)) over m, n = -m / |m|, d = 1 / |m|.
 
     The beams' directions u_i are exact and the noise lies along them. Orthogonal least squares would turn the

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.detect.lidar_segments import MAX_INCIDENCE_RAD, Indices, OrderedScan, Segments
+from lce_rig.detect.lidar_template import Placement, plane_axes, register_ends
 
 MAX_PAIRS = 600
 N_ROUNDS = 2
@@ -86,7 +87,7 @@ def propose_plates(
 def _facing_planes(
     plates: Plates, segments: Segments, first: Indices, second: Indices, blur_m: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Lay a plane (K, 4) through each pair's line, as square to the beam as can be, for pairs (K,) lost in noise.
+    """Lay a plane (K, 4) through each pair's line, square to the beam, for pairs (K,) lost in noise.
 
     Where the noise is as large as the distance between two rings, their plane is arbitrary; this one is near
     enough to collect the rings beyond them.
@@ -174,10 +175,13 @@ def _members(
 ) -> tuple[Indices, Indices]:
     """List which segments lie in which plane, within reach of its centre: (plate, segment), rising."""
     row, column = _within_reach(plates.centre, segments.centre, reach_m)
-    normal = plates.plane[row, :3]
-    offset = np.einsum("ij,ij->i", normal, segments.centre[column]) + plates.plane[row, 3]
-    scatter = segments.scatter[column] / segments.count[column, None, None]
-    variance = np.einsum("ij,ijk,ik->i", normal, scatter, normal)
+    normal = plates.plane[:, :3]
+    offset = np.einsum("ij,ij->i", normal[row], segments.centre[column]) + plates.plane[row, 3]
+    is_near = np.abs(offset) < tolerance_m
+    row, column, offset = row[is_near], column[is_near], offset[is_near]
+    outer = (normal[:, :, None] * normal[:, None, :]).reshape(-1, 9)
+    scatter = segments.scatter.reshape(-1, 9) / segments.count[:, None]
+    variance = np.einsum("ij,ij->i", outer[row], scatter[column])
     is_member = offset * offset + variance < tolerance_m**2
     row, column = row[is_member], column[is_member]
     # Number the plates that still have members without gaps.
@@ -225,3 +229,19 @@ def _different(plates: Plates, candidates: Indices, board: Board, n_plates: int)
         offset = np.abs(plates.plane[rank, :3] @ plates.centre[best] + plates.plane[rank, 3])
         rank = rank[(apart > 0.3 * np.hypot(long_m, short_m)) | (cosine < 0.95) | (offset > 0.05)]
     return np.array(chosen, dtype=np.intp)
+
+
+def screen_plates(
+    plates: Plates, ends: Array, board: Board, limit_m: float
+) -> list[tuple[Array, Array, Placement]]:
+    """Register the outline with the ends of each plate's segments and keep the plates it fits, best first."""
+    if len(plates.centre) == 0:
+        return []
+    relative = ends - plates.centre[:, None]
+    placements = register_ends(relative @ plane_axes(plates.plane[:, :3]), board)
+    rank = sorted(range(len(placements)), key=lambda k: placements[k].error_m)
+    # What fits far worse than the best plate is no rival of it.
+    limit_m = min(limit_m, 3 * placements[rank[0]].error_m + 0.01)
+    return [
+        (plates.plane[k], plates.centre[k], placements[k]) for k in rank if placements[k].error_m < limit_m
+    ]

@@ -1,16 +1,22 @@
 """Say why no board was found in a scan: the nearest miss, with its figure and what to do."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Refusal
-from lce_rig.detect.lidar_plates import propose_plates
-from lce_rig.detect.lidar_segments import OrderedScan, Segments
-from lce_rig.detect.lidar_template import Placement, PlaneView, signed_distance
+from lce_rig.detect.lidar_plates import propose_plates, screen_plates
+from lce_rig.detect.lidar_segments import OrderedScan, cut_segments
+from lce_rig.detect.lidar_template import Placement, PlaneView, signed_distance, view_plane
 
 # Share of returns beyond the outline, in the board's plane, from which something touches the board.
 TOUCHING_SHARE = 0.10
+SCATTER_M = 0.02  # by how much more than the LiDAR's noise a moving board's returns may scatter to be named
+MAX_SIZE_MISFIT = (
+    0.75  # sum of |log| of the ratios of long and short side up to which a plate is worth naming
+)
 LAYER_M = 0.06  # half the depth in which returns may belong to one warped or moving sheet
 
 
@@ -83,24 +89,41 @@ def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_li
 
 
 def no_plate(
-    scan: OrderedScan, segments: Segments, board: Board, min_range_m: float, max_range_m: float
+    scan: OrderedScan, board: Board, limit_m: float, min_range_m: float, max_range_m: float
 ) -> Refusal:
-    """Refuse a scan in which no plate has the board's size, naming the plate that comes nearest to it."""
+    """Refuse a scan in which no plate is the board, naming what comes nearest to it.
+
+    The search is repeated for plates of any size and of returns that scatter more than the LiDAR's do.
+
+    Args:
+        scan: all returns.
+        board: what was looked for.
+        limit_m: largest error of an outline.
+        min_range_m: from where it was looked for.
+        max_range_m: up to where.
+    """
+    coarse = replace(scan, sigma_m=scan.sigma_m + SCATTER_M)
+    plates, ends = propose_plates(coarse, cut_segments(coarse, max_range_m), board, is_any_size=True)
+    for plane, centre, placement in screen_plates(plates, ends, board, limit_m):
+        radius_m = float(np.hypot(*placement.half_m))
+        view = view_plane(scan, plane, centre, radius_m, LAYER_M)
+        distance, _ = signed_distance(placement.local(view.uv), placement.half_m)
+        heights_m = view.height_m[(distance < -0.03) & view.is_on]
+        if len(heights_m) > 0.8 * (distance < -0.03).sum() and np.std(heights_m) > 2.0 * scan.sigma_m + 0.008:
+            return too_thick(heights_m, 2.0 * scan.sigma_m + 0.008)
     board_m = np.array([max(board.width_m, board.height_m), min(board.width_m, board.height_m)])
-    plates, _ = propose_plates(scan, segments, board, n_plates=3, is_any_size=True)
     wanted = f"{board.width_m:.2f} x {board.height_m:.2f} m"
-    if len(plates.plane):
-        misfit = np.abs(np.log(np.maximum(plates.size_m, 1e-2) / board_m)).sum(axis=1)
-        misfit[plates.n_rings < 3] += 1.0
+    misfit = np.abs(np.log(np.maximum(plates.size_m, 1e-2) / board_m)).sum(axis=1)
+    misfit[plates.n_rings < 3] += 1.0
+    if len(misfit) and misfit.min() < MAX_SIZE_MISFIT:
         best = int(np.argmin(misfit))
-        if misfit[best] < 0.75:
-            length_m, width_m = plates.size_m[best]
-            return Refusal(
-                "lidar",
-                f"the plate nearest to the board's size is {length_m:.2f} x {width_m:.2f} m, at "
-                f"{np.linalg.norm(plates.centre[best]):.1f} m; the board is {wanted}",
-                "check width_m and height_m of the board in the rig profile, or show the whole board",
-            )
+        return Refusal(
+            "lidar",
+            f"the plate nearest to the board's size is {plates.size_m[best, 0]:.2f} x "
+            f"{plates.size_m[best, 1]:.2f} m, at {np.linalg.norm(plates.centre[best]):.1f} m; "
+            f"the board is {wanted}",
+            "check width_m and height_m of the board in the rig profile, or show the whole board",
+        )
     return Refusal(
         "lidar",
         f"no plate of the board's size ({wanted}) between {min_range_m:g} and {max_range_m:g} m",

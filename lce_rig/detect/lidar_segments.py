@@ -173,7 +173,9 @@ def _range_noise(turn: Floats, range_m: Floats, ring: NDArray[np.int16]) -> floa
     return max(quartile / (0.3186 * float(np.sqrt(6.0))), RANGE_NOISE_FLOOR_M)
 
 
-def cut_segments(scan: OrderedScan, max_range_m: float, min_points: int = 4) -> Segments:
+def cut_segments(
+    scan: OrderedScan, max_range_m: float, max_length_m: float = np.inf, min_points: int = 4
+) -> Segments:
     """Cut the rings at gaps and jumps, then at bends, and keep the straight pieces.
 
     A run whose returns leave its chord is cut where they leave it most, as a polyline is simplified.
@@ -181,6 +183,7 @@ def cut_segments(scan: OrderedScan, max_range_m: float, min_points: int = 4) -> 
     Args:
         scan: all returns.
         max_range_m: runs whose first return is farther are dropped.
+        max_length_m: longer pieces are dropped: walls hold most of a scan's returns.
         min_points: runs with fewer returns are dropped.
 
     References:
@@ -198,7 +201,8 @@ def cut_segments(scan: OrderedScan, max_range_m: float, min_points: int = 4) -> 
             break
         worst, distance = _worst_from_chord(scan, start, end)
         is_straight = distance <= tolerance_m
-        done.append(np.stack([start[is_straight], end[is_straight]]))
+        is_short = np.linalg.norm(scan.points[end - 1] - scan.points[start], axis=1) <= max_length_m
+        done.append(np.stack([start[is_straight & is_short], end[is_straight & is_short]]))
         bent = ~is_straight
         start, middle, end = start[bent], worst[bent], end[bent]
         start, end = np.concatenate([start, middle]), np.concatenate([middle, end])
@@ -240,11 +244,11 @@ def _describe(scan: OrderedScan, start: Indices, end: Indices) -> Segments:
     count = (end - start).astype(np.float64)
     begins = np.cumsum(end - start) - (end - start)
     member = np.repeat(start - begins, end - start) + np.arange(int(count.sum()))
-    points = scan.points[member].astype(np.float64)
-    centre = np.add.reduceat(points, begins) / count[:, None]
-    spread = points - np.repeat(centre, end - start, axis=0)
+    points = scan.points[member]
+    centre = np.add.reduceat(points, begins, dtype=np.float64) / count[:, None]
+    spread = points - np.repeat(centre.astype(np.float32), end - start, axis=0)
     products = spread[:, [0, 0, 0, 1, 1, 2]] * spread[:, [0, 1, 2, 1, 2, 2]]
-    scatter = np.add.reduceat(products, begins)[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    scatter = np.add.reduceat(products, begins, dtype=np.float64)[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
     chord = scan.points[end - 1].astype(np.float64) - scan.points[start]
     length_m = np.linalg.norm(chord, axis=1)
     direction = chord / np.maximum(length_m, 1e-9)[:, None]

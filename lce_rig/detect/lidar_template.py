@@ -11,7 +11,7 @@ from lce_rig.detect.lidar_segments import MAX_STEPS, Indices, OrderedScan
 
 N_ANGLES = 12
 CAP_M = 0.10
-MAX_SAMPLES = 120
+MAX_SAMPLES = 64
 MIN_ON_RING = 3  # returns that make a chord
 # What a beam says about the outline: it ends a chord, or should lie inside or outside.
 END, INSIDE, OUTSIDE, UNUSED = range(4)

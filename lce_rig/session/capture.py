@@ -229,8 +229,12 @@ class Capture:
                 f"capture {self.name}: {MANIFEST} names the file {name!r} outside the capture's folder",
                 f"Nothing outside {self.path} is read. Remove this capture if you did not make it yourself.",
             )
-        _ = entry["bytes"], entry["sha256"], entry["stamp_ns"], entry["host_ns"]
-        _ = (entry["camera"], entry["channel"]) if entry["kind"] == "image" else entry["lidar"]
+        sensors = [entry["camera"], entry["channel"]] if entry["kind"] == "image" else [entry["lidar"]]
+        stamps = [entry["stamp_ns"], entry["host_ns"]]
+        if not all(isinstance(sensor, str) for sensor in [*sensors, entry["sha256"]]):
+            raise TypeError
+        if not all(stamp is None or isinstance(stamp, int) for stamp in [*stamps, entry["bytes"]]):
+            raise TypeError
 
     def _entry(self, **wanted: str) -> dict[str, Any]:
         for entry in self._manifest["files"]:

@@ -91,7 +91,8 @@ class SimulationOptions:
         noise_level: 1..10, the paper's simulated sets: the range noise of `PAPER_RANGE_SIGMA_M` and noise on
             points near the board's rim instead of `lidar.range_sigma_m`; None for `lidar` as it is.
         lidar, camera: the sensors' errors.
-        distance_m: range of the board's distance from the camera.
+        distance_m: range of the board's distance from the camera; where the LiDAR would see less than four
+            fifths of the plate, no board is placed (a diamond of 1 m nearer than about 1.4 m).
         tilt_deg: largest tilt of the board out of the direction to the camera.
         roll_deg: mean and half-width of the board's turn in its plane, 0 = upright, 45 = a diamond.
         has_decoy_plate: whether a blank plate of the board's size stands in the room.

@@ -18,6 +18,7 @@ _ATTEMPTS = 400
 _WANTED_RINGS = 7
 _FEWEST_RINGS = 4
 _RETURNS_PER_RING = 6
+_WANTED_SHARE = 0.8
 # Powers of 1/g with g^4 = g + 1: each column's multiples fill 0..1 evenly, and so do all three together.
 # M. Roberts, The unreasonable effectiveness of quasirandom sequences, 2018.
 _SPREAD = (1 / 1.2207440846057596) ** np.arange(1, 4)
@@ -66,6 +67,8 @@ def place_board(
         where = np.mod(even + wander * rng.uniform(-0.5, 0.5, 3), 1.0)
         T_world_board = _candidate(view, options, where, rng)
         if T_world_board is None or not _is_in_picture(view, board, T_world_board):
+            continue
+        if seen_share(view, board, T_world_board) < _WANTED_SHARE:
             continue
         if not _stands_free(view, board, room, T_world_board):
             continue
@@ -134,6 +137,17 @@ def _stands_free(view: View, board: Board, room: Room, T_world_board: Array) -> 
         return False
     eyes = [view.T_world_cam[:3, 3], view.T_world_lidar[:3, 3]]
     return not any(room.raycaster.is_blocked(outline, eye).any() for eye in eyes)
+
+
+def seen_share(view: View, board: Board, T_world_board: Array) -> float:
+    """Measure which share of the plate's height lies within the LiDAR's vertical field, 0..1."""
+    outline = transform(invert(view.T_world_lidar) @ T_world_board, board.outline())
+    elevation = np.arctan2(outline[:, 2], np.hypot(outline[:, 0], outline[:, 1]))
+    lasers = view.model.elevations_rad
+    margin_rad = np.ptp(lasers) / (len(lasers) - 1) / 2
+    top, bottom = elevation.max(), elevation.min()
+    seen = min(top, lasers.max() + margin_rad) - max(bottom, lasers.min() - margin_rad)
+    return float(np.clip(seen / (top - bottom), 0.0, 1.0))
 
 
 def count_rings(view: View, board: Board, T_world_board: Array) -> int:

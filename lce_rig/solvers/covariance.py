@@ -14,14 +14,13 @@ def jackknife_covariance(gradients: Array, hessians: Array, prior: Array) -> Arr
 
         cov = (F - 1) / F sum_k (H - H_k)^-1 g_k g_k^T (H - H_k)^-1,   H = sum_k H_k + prior             (1)
 
-    No model of the noise enters, and errors within a group may be correlated in any way; unlike s^2 H^-1, which
-    takes every residual for independent, (1) sees what a whole group has in common. Dividing by H - H_k and not
-    H corrects for the pull that each group has on its own residuals, which matters for few groups.
+    No model of the noise enters, and errors within a group may be correlated in any way; unlike s^2 H^-1,
+    which takes every residual for independent, (1) sees what a whole group has in common. Dividing by H - H_k
+    and not H corrects for the pull that each group has on its own residuals, which matters for few groups.
 
-    The mean of (1) is right but its inverse is too large, as that of any sample covariance with few samples:
-    for normal errors E[(F - 1) / (F - p - 2) cov^-1] is the inverse of the true covariance (2). Normalised errors
-    e^T cov^-1 e come out right, and few groups are not trusted too far, when (1) is multiplied by that factor;
-    below p + 4 groups it is held at its value there.
+    The inverse of a covariance from few samples is too large: for normal errors in p unknowns it averages
+    (F - 1) / (F - p - 2) times the true inverse (2). Multiplied by that factor, (1) gives normalised errors
+    e^T cov^-1 e of the right size; below p + 4 groups the factor is held at (F - 1) / 2.
 
     Args:
         gradients: (F, p) half the gradient of each group's cost at the minimum.

@@ -65,9 +65,10 @@ def solve_planar_pose(corners_px: Array, corners_board: Array, intrinsics: Intri
     first = refine_pose(start, corners_px, corners_board, intrinsics)
     centre_board = corners_board.mean(axis=0)
     second = refine_pose(mirror_tilt(first[0], centre_board), corners_px, corners_board, intrinsics)
-    # Starting over from the mirrored refined pose reaches a first minimum that a poor homography missed.
-    if second[1] < first[1]:
-        third = refine_pose(mirror_tilt(second[0], centre_board), corners_px, corners_board, intrinsics)
+    # A poor homography may lead to neither minimum; mirroring the second one back shows whether it did.
+    back = mirror_tilt(second[0], centre_board)
+    if second[1] < first[1] and rotation_angle(back[:3, :3], first[0][:3, :3]) > 0.2:
+        third = refine_pose(back, corners_px, corners_board, intrinsics)
         first = third if third[1] < first[1] else first
     (T, cost), (T_other, cost_other) = sorted((first, second), key=lambda minimum: minimum[1])
     if not np.isfinite(cost):
@@ -115,7 +116,7 @@ def refine_pose(
             continue
         gain = cost - new_cost
         T, residuals, J, cost, damping = T_new, new_residuals, new_J, new_cost, damping / 10
-        if gain < 1e-10 * cost + 1e-20:
+        if gain < 1e-9 * cost + 1e-20:
             break
     return T, cost
 

@@ -4,10 +4,10 @@ The cost over a rotation R, a translation t and further linear unknowns s (nuisa
 
     f(R, t, s) = sum_i w_i (n_i . (g_i - R p_i - t) + c_i . s)^2                                     (1)
 
-With x = [vec R; t; s; 1] every residual is a_i . x, hence f = x^T M x with one moment matrix M = sum w a a^T (2),
-whatever the number of points; sets of captures are sums of matrices. The linear unknowns minimise (1) in closed
-form for every R, which leaves f = z^T Q z over z = [vec R; 1] (3), minimised on SO(3) by Newton's method.
-vec stacks columns. Every function takes leading batch axes.
+With x = [vec R; t; s; 1] every residual is a_i . x, hence f = x^T M x with one moment matrix
+M = sum w a a^T (2), whatever the number of points; sets of captures are sums of matrices. The linear unknowns
+minimise (1) in closed form for every R, which leaves f = z^T Q z over z = [vec R; 1] (3), minimised on SO(3)
+by Newton's method. vec stacks columns. Every function takes leading batch axes.
 """
 
 from typing import Any
@@ -189,7 +189,7 @@ def _expand(Q: Array, R: Array) -> tuple[Array, Array, Array]:
 
 
 def _newton_step(hessian: Array, gradient: Array, damping: Array) -> tuple[Array, NDArray[Any]]:
-    """Solve for the damped step (B, 3), at most 1 rad long, and tell where the Hessian is positive definite."""
+    """Solve for the damped step (B, 3), at most 1 rad long, and tell where the Hessian is positive."""
     H = hessian + damping[:, None, None] * np.eye(3)
     row_0, row_1, row_2 = H[:, 0], H[:, 1], H[:, 2]
     adjugate = np.stack([np.cross(row_1, row_2), np.cross(row_2, row_0), np.cross(row_0, row_1)], axis=-1)

@@ -74,6 +74,11 @@ class BagFile:
                 digest.update(f"{file.name} {size}".encode() + head + stream.read(_FINGERPRINT_BYTES))
         return digest.hexdigest()
 
+    def unmerged_journals(self) -> list[Path]:
+        """List write-ahead journals of sqlite that a recorder left behind when it was killed."""
+        journals = (file.with_name(file.name + "-wal") for file in self._files())
+        return [journal for journal in journals if journal.exists() and journal.stat().st_size > 0]
+
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Yield the messages of some topics in the order the recorder received them.
 

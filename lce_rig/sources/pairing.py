@@ -36,7 +36,7 @@ class Pairing:
 def natural_order(name: str) -> list[tuple[int, int, str]]:
     """Give a sort key that puts "scan2" before "scan10"."""
     return [
-        (0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name) if part
+        (0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part
     ]
 
 
@@ -83,18 +83,24 @@ def pair_names(
                 "file names are no times, so that pairs cannot be found by time", "Try --pair order."
             )
         return _require_pairs(_by_time(times[0], times[1], tolerance_s))
-    n_possible = min(len(images), len(clouds))
-    by_stem = _by_stem(images, clouds)
-    if len(by_stem.pairs) >= MOSTLY * n_possible:
-        return by_stem
-    by_time = None
+    return _choose(images, clouds, times, tolerance_s)
+
+
+def _choose(
+    images: Sequence[str],
+    clouds: Sequence[str],
+    times: tuple[NDArray[np.int64] | None, NDArray[np.int64] | None],
+    tolerance_s: float,
+) -> Pairing:
+    candidates = [_by_stem(images, clouds)]
     if times[0] is not None and times[1] is not None:
-        by_time = _by_time(times[0], times[1], tolerance_s)
-        if len(by_time.pairs) >= MOSTLY * n_possible:
-            return by_time
+        candidates.append(_by_time(times[0], times[1], tolerance_s))
+    for pairing in candidates:
+        if len(pairing.pairs) >= MOSTLY * min(len(images), len(clouds)):
+            return pairing
     if len(images) == len(clouds):
         return _by_order(images, clouds)
-    best = by_stem if by_time is None or len(by_stem.pairs) >= len(by_time.pairs) else by_time
+    best = max(candidates, key=lambda pairing: len(pairing.pairs))
     if best.pairs:
         return best
     raise SourceError(

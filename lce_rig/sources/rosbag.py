@@ -55,6 +55,9 @@ class BagRecording:
         self._targets = choose_topics(path, self._bag.topics, rig, options, self.notes)
         self.n_samples = sum(self._bag.topics[topic][1] for topic in self._targets)
         self.key = self._bag.fingerprint()
+        for journal in self._bag.unmerged_journals():
+            hint = "its last messages are not read; opening the bag once with sqlite3 merges them"
+            self.notes.append(f"{journal.name} lies beside the bag: {hint}")
         if self._bag.damage:
             self.notes.append(f"{path.name}: damaged ({self._bag.damage}); read as far as it goes")
 

@@ -51,35 +51,39 @@ def choose_topics(
     asked = _parse_overrides(rig, options)
     chosen: dict[str, Target] = {}
     for target, profile_topic in _targets(rig):
-        topic = asked.get(target, profile_topic)
-        if (
-            topic is not None
-            and topic not in topics
-            and f"{topic}/compressed" in topics
-            and target not in asked
-        ):
-            topic = f"{topic}/compressed"
-        if topic is None or topic not in topics:
+        topic = _find_topic(target, asked.get(target), profile_topic, topics)
+        if topic is None:
             if target in asked:
-                raise SourceError(f"{path}: no topic {topic} for {target}", there)
+                raise SourceError(f"{path}: no topic {asked[target]} for {target}", there)
             continue
         msgtype, count = topics[topic]
-        if msgtype not in target.types:
-            if target in asked or target.channel is None:
-                wanted = " or ".join(sorted(target.types))
-                raise SourceError(f"{path}: {topic} for {target} is {msgtype}, not {wanted}", there)
-            notes.append(f"{path.name}: {topic} is {msgtype} and is not read")
-            continue
-        if topic in chosen:
+        if msgtype in target.types and topic not in chosen:
+            chosen[topic] = target
+            notes.append(f"{path.name}: {target} from {topic} ({count} messages)")
+        elif topic in chosen:
             raise SourceError(f"{path}: {topic} is asked for both {chosen[topic]} and {target}", there)
-        chosen[topic] = target
-        notes.append(f"{path.name}: {target} from {topic} ({count} messages)")
+        elif target in asked or target.channel is None:
+            wanted = " or ".join(sorted(target.types))
+            raise SourceError(f"{path}: {topic} for {target} is {msgtype}, not {wanted}", there)
+        else:
+            notes.append(f"{path.name}: {topic} is {msgtype} and is not read")
     for is_camera, what in ((True, "picture"), (False, "cloud")):
         if all((target.channel is not None) != is_camera for target in chosen.values()):
             topic, target = _only_candidate(path, topics, rig, is_camera, there, what)
             chosen[topic] = target
             notes.append(f"{path.name}: {target} from {topic}, the only topic with {what}s")
     return chosen
+
+
+def _find_topic(
+    target: Target, asked: str | None, profile_topic: str | None, topics: Mapping[str, tuple[str, int]]
+) -> str | None:
+    """Name the topic of a sensor if it is in the bag; a recorder may have kept the compressed one only."""
+    if asked is not None:
+        return asked if asked in topics else None
+    candidates = [] if profile_topic is None else [profile_topic, f"{profile_topic}/compressed"]
+    n_candidates = 1 if target.channel is None else 2
+    return next((topic for topic in candidates[:n_candidates] if topic in topics), None)
 
 
 def _targets(rig: Rig) -> list[tuple[Target, str | None]]:

@@ -44,7 +44,9 @@ class Pixels:
         self.off = (threshold * mismatch).to(device)
         self.on = (threshold * mismatch * torch.exp(0.15 * normal(*one))).to(device)
         self.floor = (0.01 * 8 ** uniform(*one)).to(device)  # dark current, as light
-        self.response = torch.where(uniform(*one) < 0.5, torch.ones(one), 0.35 + 0.65 * uniform(*one)).to(device)
+        self.response = torch.where(uniform(*one) < 0.5, torch.ones(one), 0.35 + 0.65 * uniform(*one)).to(
+            device
+        )
         self.leak = (0.02 * uniform(*one) ** 2 * threshold).to(device)
         most = torch.where(uniform(*one) < 0.3, 1 + 4 * uniform(*one), torch.full(one, 50.0))
         self.most = most.floor().to(device)  # what the refractory period lets through per interval
@@ -97,21 +99,30 @@ class EventStream:
 
     Half of the scenes are cut into windows of constant time, half into windows of roughly constant event
     count (0.05 to 1 event per pixel), as the runtime does; movement pauses and turns.
+
+    Args:
+        n: scenes.
+        size_px: side of the pictures.
+        seed: of everything random.
+        device: where it is computed.
+        fronts: (N, 2, T, T) what is held in front of the background; None draws it.
     """
 
-    def __init__(self, n: int, size_px: int, seed: int, device: torch.device) -> None:
+    def __init__(
+        self, n: int, size_px: int, seed: int, device: torch.device, fronts: Tensor | None = None
+    ) -> None:
         self._generator = torch.Generator().manual_seed(seed)
         self._noise = torch.Generator(device).manual_seed(seed)
-        self._scenes = Scenes(n, size_px, self._generator, device)
+        self.scenes = Scenes(n, size_px, self._generator, device, fronts)
         self._pixels = Pixels(n, size_px, self._generator, device)
         self._device, self._n = device, n
         uniform = torch.rand(3, n, generator=self._generator)
         self._pace = (0.006 * 40 ** uniform[0]).to(device)  # path per window; about 30 px per unit
         self._target_rate = (0.05 * 20 ** uniform[1]).to(device)  # events per pixel and window
         self._is_counted = (uniform[2] < 0.5).to(device)
-        self._path = (torch.rand(n, generator=self._generator) * 100).to(device)
+        self.path = (torch.rand(n, generator=self._generator) * 100).to(device)
         self._pause_left = torch.zeros(n, device=device)
-        picture = self._scenes.picture(self._path)
+        picture = self.scenes.picture(self.path)
         self._mean = picture.mean((1, 2, 3), keepdim=True)
         self._std = picture.std((1, 2, 3), keepdim=True)
         self._pixels.start(picture)
@@ -128,8 +139,8 @@ class EventStream:
         step = self._next_step()
         voxels = torch.zeros(self._n, N_BINS, *self._seen.shape[2:], device=self._device)
         for interval in range(N_INTERVALS):
-            self._path = self._path + step / N_INTERVALS
-            picture = self._scenes.picture(self._path)
+            self.path = self.path + step / N_INTERVALS
+            picture = self.scenes.picture(self.path)
             early, late = self._pixels.expose(picture, self._noise)
             voxels[:, interval] += early[:, 0]
             voxels[:, interval + 1] += late[:, 0]

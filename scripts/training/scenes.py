@@ -46,7 +46,9 @@ class MovingPlanes:
         wave = torch.sin(self.frequency * path[:, None, None] + self.phase_rad).mean(1)
         shift = self.offset_px + self.reach_px * wave[:, 0:2]
         angle = self.angle_rad + wave[:, 2] * self.reach_px[:, 0] / self.size_px
-        scale = self.texels_per_px * (1 + 0.4 * wave[:, 3] * (self.reach_px[:, 0] / self.size_px).clamp(max=1))
+        scale = self.texels_per_px * (
+            1 + 0.4 * wave[:, 3] * (self.reach_px[:, 0] / self.size_px).clamp(max=1)
+        )
         tilt = self.tilt * (1 + wave[:, 4:6])
         unit = scale * 2 / TEXTURE_PX
         c, s = unit * angle.cos(), unit * angle.sin()
@@ -75,13 +77,22 @@ class Scenes:
         size_px: side of the square crop.
         generator: source of every random number (on the CPU, so that devices agree).
         device: where pictures are rendered.
+        fronts: (N, 2, T, T) reflectance and cover of what is held in front; None draws them.
     """
 
-    def __init__(self, n: int, size_px: int, generator: torch.Generator, device: torch.device) -> None:
+    def __init__(
+        self,
+        n: int,
+        size_px: int,
+        generator: torch.Generator,
+        device: torch.device,
+        fronts: Tensor | None = None,
+    ) -> None:
         def uniform(*shape: int) -> Tensor:
             return torch.rand(*shape, generator=generator)
 
-        fronts = torch.stack([foreground(generator) for _ in range(n)])
+        if fronts is None:
+            fronts = torch.stack([foreground(generator) for _ in range(n)])
         backs = torch.stack([clutter(generator, int(uniform(1) * 25)) for _ in range(n)])[:, None]
         front_reach = size_px * (0.15 + 0.6 * uniform(n))
         # In 40 % of the scenes the camera stands and only the board moves.

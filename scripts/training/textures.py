@@ -45,7 +45,9 @@ def clutter(generator: torch.Generator, n_shapes: int) -> Tensor:
     half = TEXTURE_PX / 2
     for _ in range(n_shapes):
         u, v = _turned(
-            _uniform(generator, 0, math.pi), _uniform(generator, -half, half), _uniform(generator, -half, half)
+            _uniform(generator, 0, math.pi),
+            _uniform(generator, -half, half),
+            _uniform(generator, -half, half),
         )
         a = 2 + 40 * _uniform(generator, 0, 1) ** 2
         b = 2 + 40 * _uniform(generator, 0, 1) ** 2
@@ -60,7 +62,14 @@ def checkerboard(generator: torch.Generator) -> tuple[Tensor, Tensor]:
     cols = int(_uniform(generator, 4, 10))
     rows = int(_uniform(generator, 3, 8))
     square = min(_uniform(generator, 12, 34), 0.92 * TEXTURE_PX / (max(cols, rows) + 0.5))
-    u, v = X_TEXEL / square + cols / 2, Y_TEXEL / square + rows / 2
+    return draw_checkerboard(generator, cols, rows, square)
+
+
+def draw_checkerboard(
+    generator: torch.Generator, cols: int, rows: int, square_texels: float
+) -> tuple[Tensor, Tensor]:
+    """Draw cols x rows squares in the middle of the texture: reflectance and cover, (T, T) each."""
+    u, v = X_TEXEL / square_texels + cols / 2, Y_TEXEL / square_texels + rows / 2
     dark, light = _uniform(generator, 0.03, 0.2), _uniform(generator, 0.55, 1.0)
     is_light = (torch.floor(u) + torch.floor(v)) % 2 == 0
     is_pattern = (u >= 0) & (u < cols) & (v >= 0) & (v < rows)

@@ -30,12 +30,12 @@ def rms_deg_mm(errors):
 
 
 def test_thirty_captures_reach_a_few_hundredths_of_a_degree_and_say_so():
-    errors, nees = errors_over_seeds(Scenario(range_sigma_m=0.02, corner_sigma_px=0.3), 30, 12)
+    errors, nees = errors_over_seeds(Scenario(range_sigma_m=0.02, corner_sigma_px=0.3), 30, 8)
     rotation_deg, translation_mm = rms_deg_mm(errors)
     assert rotation_deg < 0.06
     assert translation_mm < 3.0
-    # 6 expected; 12 samples of chi square with 6 degrees average within 3 standard errors of 1.0.
-    assert 3.0 < nees.mean() < 9.0
+    # 6 expected; 8 samples of chi square with 6 degrees average within 3 standard errors of 1.2.
+    assert 2.4 < nees.mean() < 9.7
 
 
 def test_ten_captures_are_not_trusted_too_far():
@@ -114,9 +114,7 @@ def test_a_board_that_moved_between_the_sensors_is_refused_with_its_figures():
     moved = captures[4].lidar[0]
     shift = np.array([0.06, 0.0, 0.0])
     plane = moved.plane - np.append(np.zeros(3), moved.plane[:3] @ shift)
-    lidar = replace(
-        moved, points=moved.points + shift, edge_points=moved.edge_points + shift, plane=plane
-    )
+    lidar = replace(moved, points=moved.points + shift, edge_points=moved.edge_points + shift, plane=plane)
     spoilt = [replace(item, lidar=[lidar]) if k == 4 else item for k, item in enumerate(captures)]
     estimate = calibrate(spoilt, BOARD, FAST)
     assert set(estimate.refused) == {"000004"}
@@ -130,7 +128,7 @@ def test_a_board_that_moved_between_the_sensors_is_refused_with_its_figures():
 def test_too_few_captures_are_refused_with_their_number():
     with pytest.raises(NotEnoughDataError, match="2 captures"):
         calibrate(simulate(2, 0), BOARD, FAST)
-    with pytest.raises(NotEnoughDataError, match="5 captures .* 6 are needed"):
+    with pytest.raises(NotEnoughDataError, match=r"5 captures .* 6 are needed"):
         calibrate(simulate(5, 0), BOARD, replace(FAST, min_captures=6))
 
 

@@ -1,4 +1,4 @@
-"""The right pairs are found among decoys, wrong detections and ambiguous poses, however the sensors are mounted."""
+"""The right pairs are found among decoys, misdetections and ambiguous poses, however sensors are mounted."""
 
 from dataclasses import replace
 
@@ -30,7 +30,12 @@ def somewhere_else(seed, T_cam_lidar=T_FORWARD):
 
 @pytest.mark.parametrize(
     ("mounting", "turn_deg"),
-    [("forward", (0, 0, 0)), ("rear", (0, 0, 180)), ("upside down", (180, 0, 0)), ("on its side", (0, 20, 95))],
+    [
+        ("forward", (0, 0, 0)),
+        ("rear", (0, 0, 180)),
+        ("upside down", (180, 0, 0)),
+        ("on its side", (0, 20, 95)),
+    ],
 )
 def test_the_extrinsic_is_found_however_the_lidar_is_mounted(mounting, turn_deg):
     R_turn = exp_so3(np.radians(np.array(turn_deg, dtype=float)))

@@ -270,14 +270,13 @@ def test_board_that_is_part_of_a_larger_surface_is_refused():
     assert "touches another surface" in refusal.cause
 
 
-def test_torn_board_is_refused_for_its_thickness():
+def test_bent_board_is_refused_for_its_thickness():
     T = place(2.0, 30)
     scan = cast([board_plate(T), *ROOM], sigma_m=0.005)
     local = transform(invert(T), scan.points)
     on = (np.abs(local) < [0.4, 0.33, 0.02]).all(axis=1)
-    # Every other ring 5 cm nearer.
-    local[on, 2] += np.where(scan.ring[on] % 2 == 0, 0.025, -0.025)
-    torn = Scan("lidar", 0, transform(T, local).astype(np.float32), scan.intensity, scan.ring)
-    refusal = find(torn)
+    local[on, 2] += 0.08 * (local[on, 0] / (BOARD.width_m / 2)) ** 2
+    bent = Scan("lidar", 0, transform(T, local).astype(np.float32), scan.intensity, scan.ring)
+    refusal = find(bent)
     assert isinstance(refusal, Refusal)
     assert "thick" in refusal.cause

@@ -60,7 +60,7 @@ def _build(store: Any, msgtype: str, fields: dict[str, Any]) -> Any:
 def write_bag() -> Callable[[Path, str, Iterable[Message]], Path]:
     """Write a bag: kind "ros1", "sqlite3" or "mcap"; returns the file, or the folder for ROS 2."""
 
-    def write(path: Path, kind: str, messages: Iterable[Message]) -> Path:
+    def write(path: Path, kind: str, messages: Iterable[Message], compression: str = "") -> Path:
         from rosbags.rosbag1 import Writer as Writer1
         from rosbags.rosbag2 import StoragePlugin
         from rosbags.rosbag2 import Writer as Writer2
@@ -70,6 +70,12 @@ def write_bag() -> Callable[[Path, str, Iterable[Message]], Path]:
             writer: Any = Writer1(path.with_suffix(".bag"))
         else:
             writer = Writer2(path, version=9, storage_plugin=StoragePlugin[kind.upper()])
+        if compression and kind == "ros1":
+            writer.set_compression(writer.CompressionFormat[compression])
+        elif compression:
+            from rosbags.rosbag2 import CompressionFormat, CompressionMode
+
+            writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
         with writer:
             connections: dict[str, Any] = {}
             for topic, msgtype, log_ns, fields in messages:

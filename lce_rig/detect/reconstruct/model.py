@@ -82,7 +82,9 @@ class ReconstructionModel:
         except Exception as error:  # onnxruntime raises classes of its own, one for each status
             raise self._refused(f"a step of {width} x {height} px fails: {_first_line(error)}") from error
         expected = (1, 1, height + rows, width + cols)
-        if picture.shape != expected or any(a.shape != b.shape for a, b in zip(states, following, strict=True)):
+        if picture.shape != expected or any(
+            a.shape != b.shape for a, b in zip(states, following, strict=True)
+        ):
             raise self._refused(f"a step of {width} x {height} px gives a picture of shape {picture.shape}")
         return picture[0, 0, :height, :width], tuple(following)
 
@@ -127,7 +129,9 @@ def _load(path: Path | None, name: str, n_threads: int) -> Any:
         path_or_bytes: Any = (resources.files("lce_rig") / "models" / "reconstruction.onnx").read_bytes()
     else:
         if not path.is_file():
-            raise ProfileError(f"reconstruction model {name}: no such file", "leave the key out for the shipped one")
+            raise ProfileError(
+                f"reconstruction model {name}: no such file", "leave the key out for the shipped one"
+            )
         path_or_bytes = str(path)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = n_threads
@@ -136,4 +140,6 @@ def _load(path: Path | None, name: str, n_threads: int) -> Any:
     try:
         return onnxruntime.InferenceSession(path_or_bytes, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # see step
-        raise ProfileError(f"reconstruction model {name}: no ONNX file: {_first_line(error)}", _EXPECTED) from error
+        raise ProfileError(
+            f"reconstruction model {name}: no ONNX file: {_first_line(error)}", _EXPECTED
+        ) from error

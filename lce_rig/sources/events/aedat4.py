@@ -90,8 +90,8 @@ class Aedat4Events:
                     try:
                         yield _decode_packet(file.read(size))
                     except Exception as error:  # A damaged packet fails in any way: lz4, zstd, struct, sizes.
-                        what = str(error) or type(error).__name__
-                        findings.add("broken packets left out", f"packet {n_packets} at byte {position}: {what}")
+                        where = f"packet {n_packets} at byte {position}: {str(error) or type(error).__name__}"
+                        findings.add("broken packets left out", where)
                 position += 8 + size
                 n_packets += 1
 
@@ -154,7 +154,7 @@ def _decode_packet(data: bytes) -> EventColumns:
 
 def _decompress(data: bytes) -> bytes:
     if data[:4] == _LZ4_MAGIC:
-        from lz4.frame import decompress as decompress_lz4
+        from lz4.frame import decompress as decompress_lz4  # type: ignore[import-untyped]
 
         return bytes(decompress_lz4(data))
     if data[:4] == _ZSTD_MAGIC:

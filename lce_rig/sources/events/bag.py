@@ -42,7 +42,9 @@ class BagEvents:
         """Yield the events, one or several messages at a time."""
         decoder = PacketDecoder()
         last_number: int | None = None
+        first_ns: int | None = None
         for index, message in _messages(self._bag, self._topic, findings):
+            first_ns = message.log_ns if first_ns is None else first_ns
             try:
                 if self._is_array:
                     header, events = decode_event_array(message.data, message.encoding)
@@ -53,7 +55,8 @@ class BagEvents:
                 self._check_size(packet.header)
                 yield from decoder.decode(packet)
             except ValueError as error:
-                findings.add("broken packets left out", _where(index, message, error))
+                where = f"message {index}, received {seconds_in(message.log_ns, first_ns)}: {error}"
+                findings.add("broken packets left out", where)
                 continue
             if last_number is not None and packet.number > last_number + 1:
                 lost = packet.number - last_number - 1
@@ -116,10 +119,6 @@ def _messages(bag: BagFile, topic: str, findings: Findings) -> Iterator[tuple[in
             return
         yield index, message
         index += 1
-
-
-def _where(index: int, message: RawMessage, error: ValueError) -> str:
-    return f"message {index}, received {seconds_in(message.log_ns, None)}: {error}"
 
 
 def _choose_topic(bag: BagFile, asked: str | None) -> str:

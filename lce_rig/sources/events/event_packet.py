@@ -93,6 +93,7 @@ class PacketDecoder:
         self._compressed = WordDecoder(LIBCAER_CMP)
         self._waiting: list[EventPacket] = []
         self._n_waiting_bytes = 0
+        self._n_trigger_packets = 0
 
     def decode(self, packet: EventPacket) -> Iterator[EventColumns]:
         """Yield what is decoded by now: small EVT3 packets are decoded together, later.
@@ -115,7 +116,9 @@ class PacketDecoder:
         elif packet.encoding == "libcaer_cmp":
             self._compressed.start_packet()
             yield _shift(self._compressed.decode(packet.words("u2").astype(np.uint16)), packet)
-        elif packet.encoding != "trigger":
+        elif packet.encoding == "trigger":
+            self._n_trigger_packets += 1
+        else:
             raise ValueError(f"encoding {packet.encoding!r} is none of {', '.join(ENCODINGS)}")
 
     def finish(self) -> Iterator[EventColumns]:
@@ -128,9 +131,12 @@ class PacketDecoder:
             yield EventColumns(events.t_ns, events.x, events.y, events.polarity, host_ns)
 
     def account(self, findings: Findings) -> None:
-        """Say what could not be decoded inside packets."""
+        """Say what was passed over, and what could not be decoded inside packets."""
+        findings.add("packets of triggers passed over", n=self._n_trigger_packets)
         findings.add("events before the first stamp left out", n=self._evt3.n_untimed)
-        findings.add("words of no known code passed over", n=self._evt3.n_unknown + self._compressed.n_unknown)
+        findings.add(
+            "words of no known code passed over", n=self._evt3.n_unknown + self._compressed.n_unknown
+        )
 
 
 def _shift(events: EventColumns, packet: EventPacket) -> EventColumns:
@@ -147,7 +153,7 @@ def _decode_mono(packet: EventPacket) -> EventColumns:
 
 
 def decode_triggers(packets: list[EventPacket]) -> Triggers:
-    """Decode packets of encoding "trigger", whose layout is mono's with the input's number in place of y."""
+    """Decode packets of encoding "trigger": mono's layout, with the input's number in place of y."""
     parts = [_split_mono(packet) for packet in packets]
     empty = (np.empty(0, np.int64), np.empty(0, np.uint32), np.empty(0, bool))
     t_ns, upper, is_set = (np.concatenate(column) for column in zip(*([empty] + parts), strict=True))
@@ -171,5 +177,3 @@ def _decode_libcaer(packet: EventPacket) -> EventColumns:
     t_ns = packet.time_base_ns + (t_us + wraps * _LIBCAER_WRAP_US) * NS_PER_US
     x, y = (where >> 17).astype(np.uint16), ((where >> 2) & 0x7FFF).astype(np.uint16)
     return EventColumns(t_ns, x, y, (where >> 1 & 1).astype(bool), packet.header.stamp_ns)
-
-

@@ -24,7 +24,7 @@ class Evt2Decoder:
 
     Attributes:
         has_vectors: EVT2.1, whose events carry 32 pixels each.
-        n_untimed: events met before any stamp, left out.
+        n_untimed: words with events met before any stamp, left out.
         n_unknown: words of no known code, passed over.
     """
 
@@ -42,8 +42,8 @@ class Evt2Decoder:
         high, timed_from = self._high_parts(code, upper)
         emitting = np.flatnonzero(code <= _ON)
         n_untimed = int(np.searchsorted(emitting, timed_from))
-        skipped, emitting = emitting[:n_untimed], emitting[n_untimed:]
-        self.n_untimed += int(np.bitwise_count(vector[skipped]).sum()) if self.has_vectors else len(skipped)
+        self.n_untimed += n_untimed
+        emitting = emitting[n_untimed:]
         event = upper[emitting]
         t_us = (high[emitting] << 6) | ((event >> 22) & 0x3F)
         x = ((event >> 11) & 0x7FF).astype(np.uint16)
@@ -64,12 +64,14 @@ class Evt2Decoder:
             wraps = np.cumsum(values + _MAX_STEP_BACK < np.concatenate(([first], values[:-1])))
             values += (wraps + (before >> _HIGH_BITS)) << _HIGH_BITS
             self._high = int(values[-1])
-        return np.repeat(np.concatenate(([before], values)), np.diff(at, prepend=0, append=len(code))), timed_from
+        lengths = np.diff(at, prepend=0, append=len(code))
+        return np.repeat(np.concatenate(([before], values)), lengths), timed_from
 
 
 def _expand(columns: EventColumns, vector: NDArray[np.uint32]) -> EventColumns:
     """Make one event of every bit that is set; bit i is the pixel x + i."""
-    flat = np.flatnonzero(np.unpackbits(vector.astype("<u4").view(np.uint8), bitorder="little"))
+    flags = np.unpackbits(vector.astype("<u4").view(np.uint8), bitorder="little").view(np.bool_)
+    flat = np.flatnonzero(flags)
     word, bit = flat >> 5, flat & 31
     x = columns.x[word] + bit.astype(np.uint16)
     return EventColumns(columns.t_ns[word], x, columns.y[word], columns.polarity[word])

@@ -5,6 +5,8 @@ References:
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +36,7 @@ class Hdf5Events:
             if missing:
                 raise SourceError(
                     f"{path} has no events/{missing[0]}; it has {_list_names(file)}",
-                    "Events are read as DSEC lays them out: events/t, events/x, events/y, events/p, t_offset.",
+                    "Events are read as DSEC lays them out: events/t, events/x, events/y, events/p.",
                 )
             lengths = {name: len(column) for name, column in zip(_COLUMNS, columns, strict=True)}
             self._n_events = min(lengths.values())
@@ -69,14 +71,12 @@ class Hdf5Events:
 
 def _open(path: Path) -> Any:
     try:
-        import h5py
+        import h5py  # type: ignore[import-untyped]
     except ImportError:
         raise SourceError(f"{path}: h5py is not installed", 'pip install "lce-rig[events]"') from None
-    try:
-        # Registers the compression filters (blosc, zstd) that event files use.
-        import hdf5plugin  # noqa: F401
-    except ImportError:
-        pass
+    # Registers the compression filters (blosc, zstd) that event files use.
+    with suppress(ImportError):
+        import_module("hdf5plugin")
     try:
         return h5py.File(path, "r")
     except OSError as error:

@@ -1,7 +1,7 @@
 """The few fields that event messages begin with, read from ROS 1's and ROS 2's serialisation.
 
-rosbags' deserialiser makes one object an event and cannot parse every definition found in bags; the messages are
-few and fixed, so they are read by hand.
+rosbags' deserialiser makes one object an event and cannot parse every definition found in bags; the messages
+are few and fixed, so they are read by hand.
 
 References:
     http://wiki.ros.org/msg

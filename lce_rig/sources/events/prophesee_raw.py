@@ -7,9 +7,10 @@ References:
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.events.evt2 import Evt2Decoder
@@ -57,8 +58,10 @@ class PropheseeEvents:
             file.seek(self._begin)
             while block := file.read(_BLOCK_BYTES):
                 n_torn = len(block) % dtype.itemsize
-                words = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
-                yield decoder.decode(words << 32 | words >> 32 if self._is_swapped else words)
+                words: NDArray[Any] = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
+                if self._is_swapped:
+                    words = words.view("<u4").reshape(-1, 2)[:, ::-1].copy().view("<u8").ravel()
+                yield decoder.decode(words)
                 if n_torn:
                     findings.add("bytes of a torn last word left out", n=n_torn)
         findings.add("events before the first stamp left out", n=decoder.n_untimed)

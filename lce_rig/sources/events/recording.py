@@ -9,7 +9,7 @@ import numpy as np
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.events.order import in_time_order
-from lce_rig.sources.events.stream import EventColumns, EventStream, Findings, join
+from lce_rig.sources.events.stream import NO_EVENTS, EventColumns, EventStream, Findings, join
 
 # More events off the sensor than this are another sensor's; fewer are damage.
 _MAX_OFF_SHARE = 0.01
@@ -19,9 +19,9 @@ _HOST_STRETCHES = 200
 class EventRecording:
     """Events of one camera from one file or topic.
 
-    Iterating yields stretches of `Events` from the beginning, in the order of time, and holds only a few of them
-    in memory; it may be done again and again. `read` cuts out windows; windows that go forward in time are read
-    in one pass through the file.
+    Iterating yields stretches of `Events` from the beginning, in the order of time, and holds only a few of
+    them in memory; it may be done again and again. `read` cuts out windows; windows that go forward in time
+    are read in one pass through the file.
 
     Attributes:
         path: the file or folder.
@@ -103,7 +103,7 @@ class EventRecording:
                 if len(on_sensor):
                     first_ns = int(on_sensor.t_ns[0]) if first_ns is None else first_ns
                     last_ns = int(on_sensor.t_ns[-1])
-                    yield self._to_events(on_sensor)
+                    yield self.to_events(on_sensor)
         finally:
             self._findings.merge(findings)
         if first_ns is not None and last_ns is not None:
@@ -117,7 +117,8 @@ class EventRecording:
         """
         return self._window.read(start_ns, end_ns)
 
-    def _to_events(self, columns: EventColumns) -> Events:
+    def to_events(self, columns: EventColumns) -> Events:
+        """Say whose events they are."""
         return Events(
             self.sensor,
             columns.t_ns,
@@ -164,7 +165,7 @@ class EventRecording:
 
 
 class _Window:
-    """The stretches that the last window touched, and the pass through the recording that goes on from there."""
+    """The stretches that the last window touched, and the pass through the recording that goes on there."""
 
     def __init__(self, recording: EventRecording) -> None:
         self._recording = recording
@@ -186,14 +187,8 @@ class _Window:
         return self._join([stretch.between(start_ns, end_ns) for stretch in self._kept])
 
     def _join(self, parts: list[Events]) -> Events:
-        parts = [part for part in parts if len(part)]
-        empty = EventColumns(np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, bool))
-        columns = [EventColumns(p.t_ns, p.x, p.y, p.polarity, p.host_ns) for p in parts] or [empty]
-        joined = join(columns)
-        size = self._recording.resolution_px
-        return Events(
-            self._recording.sensor, joined.t_ns, joined.x, joined.y, joined.polarity, *size, joined.host_ns
-        )
+        columns = [EventColumns(p.t_ns, p.x, p.y, p.polarity, p.host_ns) for p in parts if len(p)]
+        return self._recording.to_events(join(columns or [NO_EVENTS]))
 
 
 def _size(resolution_px: tuple[int, int]) -> str:

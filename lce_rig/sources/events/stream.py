@@ -35,6 +35,11 @@ class EventColumns:
         return EventColumns(self.t_ns[keep], self.x[keep], self.y[keep], self.polarity[keep], self.host_ns)
 
 
+NO_EVENTS = EventColumns(
+    np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.bool_)
+)
+
+
 def join(parts: list[EventColumns]) -> EventColumns:
     """Put stretches of events one behind the other; host time is the first one's."""
     if len(parts) == 1:
@@ -122,6 +127,6 @@ class EventStream(Protocol):
         ...
 
 
-def seconds_in(t_ns: int, first_ns: int | None) -> str:
+def seconds_in(t_ns: int, first_ns: int) -> str:
     """Say how far into a recording a stamp lies: "2.125 s in"."""
-    return f"{(t_ns - (t_ns if first_ns is None else first_ns)) * 1e-9:.3f} s in"
+    return f"{(t_ns - first_ns) * 1e-9:.3f} s in"

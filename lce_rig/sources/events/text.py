@@ -34,7 +34,8 @@ class TextEvents:
         with _open(path) as file:
             first = file.readline(4096).split()
         self._has_size = len(first) == 2 and all(word.isdigit() for word in first)
-        if not self._has_size and _parse_line(b" ".join(first)) is None and not b"".join(first).startswith(b"#"):
+        is_comment = bool(first) and first[0].startswith(b"#")
+        if not self._has_size and not is_comment and _parse_line(b" ".join(first)) is None:
             raise SourceError(
                 f"{path} is no text of events: its first line is neither a size nor an event",
                 'Expected "width height", then lines "t x y polarity" with t in seconds.',

@@ -1,9 +1,8 @@
-"""Streams of 16-bit words, 4 bits of code and 12 of payload: Prophesee's EVT3 and the ROS driver's libcaer_cmp.
+"""Streams of 16-bit words, 4 bits of code and 12 of payload: Prophesee's EVT3, the ROS driver's libcaer_cmp.
 
 Both are state machines: words set the time, the row (or column) and a polarity; others emit events from that
-state. Here a whole block is decoded at once. What a word sets holds until the next of its kind, which is a
-repeat; and an event is a vector of events with only its first bit set, so that both kinds expand alike and keep
-their order.
+state. Here a whole block is decoded at once: what a word sets is repeated up to the next of its kind, and a
+single event is a vector with one bit, so that both expand alike and keep their order.
 
 References:
     https://docs.prophesee.ai/stable/data/encoding_formats/evt3.html
@@ -91,11 +90,12 @@ class WordDecoder:
         payload = words & np.uint16(0xFFF)
         self.n_unknown += int(self._tables["unknown"][code].sum())
         width = self._tables["width"][code]
-        emitting = np.flatnonzero(width)
+        emitting = np.flatnonzero(width > 0)
         t_us, is_timed = self._times(code, payload, emitting)
         line = self._lines(code, payload, emitting)
-        start, polarity, bits = self._spans(code, payload, emitting, width[emitting])
-        word, bit = _expand(bits)
+        is_vector = code[emitting] != self.layout.single
+        start, polarity, bits = self._spans(code, payload, emitting, is_vector)
+        word, bit = _expand(bits, is_vector)
         if not is_timed.all():
             keep = is_timed[word]
             self.n_untimed += int(np.count_nonzero(~keep))
@@ -155,7 +155,7 @@ class WordDecoder:
         code: NDArray[np.uint8],
         payload: NDArray[np.uint16],
         emitting: NDArray[np.intp],
-        width: NDArray[np.uint8],
+        is_vector: NDArray[np.bool_],
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.uint16]]:
         """Give first coordinate, polarity and bits (M,) of every emitting word."""
         words = payload[emitting]
@@ -163,10 +163,9 @@ class WordDecoder:
         polarity = (words >> 11).astype(bool)
         bits = np.ones(len(words), np.uint16)
         at_base = np.flatnonzero(code == self.layout.base)
-        is_vector = code[emitting] != self.layout.single
         if len(at_base) or is_vector.any():
             vectors = emitting[is_vector]
-            steps = width[is_vector].astype(np.int64)
+            steps = self._tables["width"][code[vectors]].astype(np.int64)
             base = payload[at_base]
             # Every vector moves the base on by its width, until a word sets it anew.
             moved = np.concatenate(([0], np.cumsum(steps)))
@@ -201,8 +200,17 @@ def _held(at: NDArray[np.intp], values: NDArray[np.generic], initial: int, n: in
     return np.repeat(filled, lengths)
 
 
-def _expand(bits: NDArray[np.uint16]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """List word and place of every bit that is set, in order."""
-    flat = np.unpackbits(bits.astype("<u2").view(np.uint8), bitorder="little")
-    at = np.flatnonzero(flat)
-    return at >> 4, at & 15
+def _expand(
+    bits: NDArray[np.uint16], is_vector: NDArray[np.bool_]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """List word and place of every event, in order: each single's one, and a vector's bits that are set."""
+    vectors = np.flatnonzero(is_vector)
+    # Vectors alone are unpacked: 16 places a word are many where nearly all events are single.
+    flags = np.unpackbits(bits[vectors].astype("<u2").view(np.uint8), bitorder="little").view(np.bool_)
+    at = np.flatnonzero(flags)
+    n_events = np.ones(len(bits), np.intp)
+    n_events[vectors] = np.bincount(at >> 4, minlength=len(vectors))
+    word = np.repeat(np.arange(len(bits)), n_events)
+    bit = np.zeros(len(word), np.intp)
+    bit[is_vector[word]] = at & 15
+    return word, bit

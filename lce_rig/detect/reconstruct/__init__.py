@@ -1,0 +1,16 @@
+"""Pictures from events: voxel grids, the recurrent network, the event map, and pictures at any stamp."""
+
+from lce_rig.detect.reconstruct.model import ReconstructionModel
+from lce_rig.detect.reconstruct.reconstructor import ReconstructionOptions, Reconstructor
+from lce_rig.detect.reconstruct.voxels import event_map, normalise_voxels, voxel_grid
+from lce_rig.detect.reconstruct.windows import WindowOptions
+
+__all__ = [
+    "ReconstructionModel",
+    "ReconstructionOptions",
+    "Reconstructor",
+    "WindowOptions",
+    "event_map",
+    "normalise_voxels",
+    "voxel_grid",
+]

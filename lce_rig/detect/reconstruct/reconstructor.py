@@ -1,0 +1,300 @@
+"""Pictures from an event stream, at any time asked for."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from lce_rig.core.data import Events, Image
+from lce_rig.core.errors import SourceError, UsageError
+from lce_rig.core.results import Refusal
+from lce_rig.detect.reconstruct.filters import hot_pixels, without_background_activity, without_pixels
+from lce_rig.detect.reconstruct.imagers import EventImager, MapImager, NetworkImager
+from lce_rig.detect.reconstruct.intensity import IntensityScale
+from lce_rig.detect.reconstruct.model import States
+from lce_rig.detect.reconstruct.voxels import FloatArray
+from lce_rig.detect.reconstruct.windows import WindowOptions, WindowRule, active_share, window_rule
+
+# A window emptier than this is judged together with the one before it: too few events make noise, not edges.
+_MIN_FILL = 0.5
+# Nothing happens in a longer silence: it is passed over in one stride, states kept.
+_LONGEST_SILENCE_NS = 2_000_000_000
+_HOT_PIXEL_PERIOD_NS = 500_000_000
+_SHARE_MEMORY = 0.8
+
+
+@dataclass(frozen=True)
+class ReconstructionOptions:
+    """How events become pictures.
+
+    Attributes:
+        method: "network" (recurrent reconstruction) or "map" (polarity sums, for comparison).
+        windows: how the stream is cut.
+        n_warm_up: windows of the network before its pictures count.
+        is_filtered: leave out hot pixels and background activity.
+        channel: the channel that pictures are said to come from.
+        n_threads: threads of onnxruntime.
+    """
+
+    method: Literal["network", "map"] = "network"
+    windows: WindowOptions = field(default_factory=WindowOptions)
+    n_warm_up: int = 12
+    is_filtered: bool = True
+    channel: str = "events"
+    n_threads: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """A stretch of the stream and the states before it."""
+
+    start_ns: int
+    events: Events
+    states: States
+
+
+class Reconstructor:
+    """Runs over one event stream; its recurrent state spans the whole stream.
+
+    Windows are cut by the events alone, so that neither the batches in which events arrive nor the stamps
+    asked for change what the network has seen: a picture at a stamp is a side step from the running state
+    with the events up to the stamp.
+
+    Args:
+        model: ONNX file; None takes the one shipped with the package.
+        options: method, windows, filters.
+
+    Raises:
+        ProfileError: the model cannot be used.
+        SourceError: onnxruntime is not installed.
+    """
+
+    def __init__(
+        self, model: Path | None = None, options: ReconstructionOptions = ReconstructionOptions()
+    ) -> None:
+        self.options = options
+        self._imager: EventImager = (
+            MapImager()
+            if options.method == "map"
+            else NetworkImager(model, options.n_warm_up, options.n_threads)
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the stream."""
+        self.n_steps = 0
+        self._scale = IntensityScale()
+        self._share = 1.0
+        self._first_ns: int | None = None
+        self._previous: _Window | None = None
+        self._current: _Window | None = None
+        self._hot: np.ndarray | None = None
+        self._n_by_pixel: np.ndarray | None = None
+        self._counted_since_ns = 0
+
+    @property
+    def is_warm(self) -> bool:
+        """Whether enough of the stream has been seen for pictures to count."""
+        return self.n_steps >= self._imager.n_warm_up
+
+    def step(self, events: Events, start_ns: int | None = None, end_ns: int | None = None) -> FloatArray:
+        """Advance by a window of the caller's choice and give its picture, (H, W), arbitrary scale.
+
+        Args:
+            events: the window's events; following windows must follow in time.
+            start_ns, end_ns: its bounds; None takes the first and the last event's stamp.
+        """
+        if start_ns is None:
+            start_ns = int(events.t_ns[0]) if len(events) else 0
+        if end_ns is None:
+            end_ns = int(events.t_ns[-1]) + 1 if len(events) else start_ns
+        if self._current is None:
+            self._begin(events)
+        assert self._current is not None
+        self._current = _Window(start_ns, events, self._current.states)
+        return self._commit(end_ns)
+
+    def to_grey(self, picture: FloatArray) -> np.ndarray:
+        """Map a picture of `step` to uint8, (H, W), with percentiles smoothed over the steps so far."""
+        return self._scale.to_grey(picture)
+
+    def reconstruct(
+        self, batches: Iterable[Events], stamps_ns: Sequence[int] | None = None, every_ns: int | None = None
+    ) -> Iterator[Image | Refusal]:
+        """Give one picture, or the reason for none, for every stamp, in the order of the stamps.
+
+        Args:
+            batches: the stream from its beginning, in time order, cut anywhere.
+            stamps_ns: when pictures are wanted, never decreasing, the events' clock.
+            every_ns: in place of stamps: one picture every so many ns from the first event on.
+
+        Raises:
+            SourceError: the batches are of different sensors or go back in time.
+            UsageError: neither or both of stamps_ns and every_ns, or stamps out of order.
+        """
+        self.reset()
+        if (stamps_ns is None) == (every_ns is None):
+            raise UsageError("either stamps_ns or every_ns says when pictures are wanted")
+        if stamps_ns is not None and np.any(np.diff(np.asarray(stamps_ns, dtype=np.int64)) < 0):
+            raise UsageError("stamps at which pictures are wanted must not decrease")
+        if every_ns is not None and every_ns <= 0:
+            raise UsageError(f"a picture every {every_ns} ns makes no sense")
+        waiting = iter(stamps_ns) if stamps_ns is not None else None
+        stamp: int | None = None
+        last_ns: int | None = None
+        for batch in batches:
+            if not len(batch):
+                continue
+            self._take(batch, last_ns)
+            last_ns = int(batch.t_ns[-1])
+            if waiting is None:
+                assert every_ns is not None and self._first_ns is not None
+                waiting = count(self._first_ns + every_ns, every_ns)
+            stamp = next(waiting, None) if stamp is None else stamp
+            while stamp is not None and stamp <= last_ns:
+                yield self._picture_at(stamp)
+                stamp = next(waiting, None)
+            self._advance(last_ns)
+        if stamps_ns is not None and waiting is not None:
+            yield from (_too_late(late, last_ns) for late in _with_first(stamp, waiting))
+
+    def _begin(self, events: Events) -> None:
+        self._first_ns = int(events.t_ns[0]) if len(events) else 0
+        self._counted_since_ns = self._first_ns
+        states = self._imager.initial_states(events.height_px, events.width_px)
+        self._current = _Window(self._first_ns, events, states)
+        self._n_by_pixel = np.zeros(events.height_px * events.width_px, np.int64)
+
+    def _take(self, batch: Events, last_ns: int | None) -> None:
+        """Append a batch to the current window."""
+        if self._current is None:
+            self._begin(batch)
+            return
+        pending = self._current.events
+        size, expected = (batch.width_px, batch.height_px), (pending.width_px, pending.height_px)
+        if size != expected:
+            raise SourceError(
+                f"{batch.sensor}: events of {size[0]} x {size[1]} px follow events of {expected[0]} x {expected[1]}",
+                "name one sensor's stream",
+            )
+        if last_ns is not None and int(batch.t_ns[0]) < last_ns:
+            back_s = (last_ns - int(batch.t_ns[0])) / 1e9
+            raise SourceError(
+                f"{batch.sensor}: events go back in time by {back_s:.6f} s", "sort the recording"
+            )
+        self._current = replace(self._current, events=_joined(pending, batch))
+
+    def _rule(self) -> WindowRule:
+        assert self._current is not None
+        events = self._current.events
+        return window_rule(self.options.windows, events.height_px, events.width_px, self._share)
+
+    def _advance(self, until_ns: int) -> None:
+        """Take every step whose window is complete by then."""
+        while self._current is not None:
+            events = self._current.events
+            if len(events) and int(events.t_ns[0]) - self._current.start_ns > _LONGEST_SILENCE_NS:
+                self._current = replace(self._current, start_ns=int(events.t_ns[0]))
+            end_ns = self._rule().end(events, self._current.start_ns)
+            if end_ns is None or end_ns > until_ns:
+                return
+            self._commit(end_ns)
+
+    def _commit(self, end_ns: int) -> FloatArray:
+        """Close the current window and step; what is left of its events begins the next."""
+        assert self._current is not None
+        window = self._current
+        events = self._filtered(window.events.between(window.start_ns, end_ns))
+        picture, states = self._imager.picture(events, window.start_ns, end_ns, window.states)
+        self._scale.follow(picture)
+        self._share = _SHARE_MEMORY * self._share + (1 - _SHARE_MEMORY) * active_share(events)
+        self._previous = replace(window, events=events)
+        last_ns = int(window.events.t_ns[-1]) + 1 if len(window.events) else end_ns
+        self._current = _Window(end_ns, window.events.between(end_ns, max(last_ns, end_ns)), states)
+        self.n_steps += 1
+        return picture
+
+    def _filtered(self, events: Events) -> Events:
+        if not self.options.is_filtered or not len(events):
+            return events
+        assert self._n_by_pixel is not None
+        index = events.y.astype(np.intp) * events.width_px + events.x
+        self._n_by_pixel += np.bincount(index, minlength=len(self._n_by_pixel))
+        last_ns = int(events.t_ns[-1])
+        if last_ns - self._counted_since_ns >= _HOT_PIXEL_PERIOD_NS:
+            counts = np.minimum(self._n_by_pixel, 65535).astype(np.uint16)
+            self._hot = hot_pixels(counts.reshape(events.height_px, events.width_px))
+            self._n_by_pixel[:] = 0
+            self._counted_since_ns = last_ns
+        return self._cleaned(events)
+
+    def _cleaned(self, events: Events) -> Events:
+        if not self.options.is_filtered:
+            return events
+        if self._hot is not None:
+            events = without_pixels(events, self._hot)
+        return without_background_activity(events)
+
+    def _picture_at(self, stamp_ns: int) -> Image | Refusal:
+        assert self._first_ns is not None
+        if stamp_ns <= self._first_ns:
+            return _too_early(stamp_ns, self._first_ns)
+        self._advance(stamp_ns)
+        if not self.is_warm:
+            seen_s = (stamp_ns - self._first_ns) / 1e9
+            return Refusal(
+                "read",
+                f"{self.n_steps} windows of events ({seen_s:.2f} s) precede the picture, "
+                f"the network needs {self._imager.n_warm_up} to settle",
+                "keep the board or the camera moving for a second before the first capture",
+            )
+        window = self._current
+        assert window is not None
+        events = self._cleaned(window.events.between(window.start_ns, stamp_ns))
+        is_thin = self._rule().fill(len(events), stamp_ns - window.start_ns) < _MIN_FILL
+        if is_thin and self._previous is not None:
+            events = _joined(self._previous.events, events)
+            window = self._previous
+        picture, _ = self._imager.picture(events, window.start_ns, stamp_ns, window.states)
+        return Image(events.sensor, self.options.channel, stamp_ns, self._scale.to_grey(picture))
+
+
+def _joined(first: Events, second: Events) -> Events:
+    if not len(first) or not len(second):
+        return second if not len(first) else first
+    return replace(
+        first,
+        t_ns=np.concatenate([first.t_ns, second.t_ns]),
+        x=np.concatenate([first.x, second.x]),
+        y=np.concatenate([first.y, second.y]),
+        polarity=np.concatenate([first.polarity, second.polarity]),
+    )
+
+
+def _with_first(first: int | None, rest: Iterator[int]) -> Iterator[int]:
+    if first is not None:
+        yield first
+    yield from rest
+
+
+def _too_early(stamp_ns: int, first_ns: int) -> Refusal:
+    gap_s = (first_ns - stamp_ns) / 1e9
+    return Refusal(
+        "read",
+        f"the picture is asked for {gap_s:.3f} s before the first event",
+        "check that both sensors' clocks agree, or start the event camera first",
+    )
+
+
+def _too_late(stamp_ns: int, last_ns: int | None) -> Refusal:
+    if last_ns is None:
+        return Refusal("read", "the recording holds no events", "check the events' topic and the camera")
+    gap_s = (stamp_ns - last_ns) / 1e9
+    return Refusal(
+        "read",
+        f"the picture is asked for {gap_s:.3f} s after the last event",
+        "check that both sensors' clocks agree, or record events to the end",
+    )

@@ -1,0 +1,47 @@
+"""Detections survive the way into arrays and back."""
+
+import numpy as np
+import pytest
+
+from lce_rig.core.results import Refusal
+from lce_rig.detect.detection import Detections, Pair, from_arrays, to_arrays
+from tests.calibrate.boards import simulate
+
+
+def assert_same(a, b):
+    assert vars(a).keys() == vars(b).keys()
+    for name, value in vars(a).items():
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(value, getattr(b, name))
+            assert value.dtype == getattr(b, name).dtype
+        else:
+            assert value == getattr(b, name)
+
+
+def test_boards_of_both_sensors_come_back_as_they_were():
+    item = simulate(1, seed=0)[0]
+    assert_same(item.image, from_arrays(to_arrays(item.image)))
+    boards = from_arrays(to_arrays(list(item.lidar)))
+    assert len(boards) == 1
+    assert_same(item.lidar[0], boards[0])
+
+
+def test_a_refusal_comes_back_as_it_was():
+    refusal = Refusal("lidar", "2 rings on the board", "come 0.8 m closer")
+    assert from_arrays(to_arrays(refusal)) == refusal
+
+
+def test_arrays_that_are_no_detection_are_refused():
+    with pytest.raises(ValueError, match="not a detection"):
+        from_arrays({"head": np.frombuffer(b'{"items": 3}', dtype=np.uint8)})
+    with pytest.raises(ValueError, match="not a detection"):
+        from_arrays({})
+
+
+def test_a_pair_shares_the_captures_that_hold_samples_of_both_sensors():
+    refusal = Refusal("image", "no board", "show it")
+    images = {("cam", "frames"): {"000000": refusal, "000001": refusal}, ("cam", "events"): {"000002": refusal}}
+    detections = Detections(images, {"lidar": {"000001": [], "000003": []}})
+    assert detections.pairs == [Pair("cam", "frames", "lidar")]
+    assert detections.captures(detections.pairs[0]) == ["000001"]
+    assert detections.of(detections.pairs[0], "000001") == (refusal, [])

@@ -1,0 +1,304 @@
+"""The board in a picture, judged on rendered boards with exact truth, damaged pictures and recordings."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image
+from lce_rig.core.errors import ProfileError
+from lce_rig.core.geometry import Array, difference, exp_so3, pose, rotation_angle, transform
+from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.detect.image_board import find_image_board, region_around
+from lce_rig.detect.image_saddle import fit_crossings
+
+ASYMMETRIC = Board(cols=9, rows=6, square_m=0.068, width_m=0.8, height_m=0.6)
+SYMMETRIC = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)
+TALL = Board(cols=5, rows=7, square_m=0.095, width_m=0.61, height_m=0.85, pattern_offset_m=(0.002, 0.0))
+DAVIS = Intrinsics(349.57, 349.18, 172.49, 126.24, 346, 260, "radtan", (-0.365, 0.1836, 0.0007, 0.0001, 0.0))
+WIDE = Intrinsics(897.5, 896.8, 635.4, 375.3, 1280, 720, "radtan", (-0.4398, 0.2329, -0.0011, 0.0002, -0.073))
+FISHEYE = Intrinsics(590.0, 590.0, 480.0, 305.0, 960, 604, "equidistant", (-0.054, -0.0784, 0.096, -0.0515))
+
+
+def looking(tilt_deg: float, about_deg: float, roll_deg: float, centre: tuple[float, float, float]) -> Array:
+    """Place the board at `centre`; roll 0 shows the print upright."""
+    about, roll = np.radians([about_deg, roll_deg])
+    tilt = exp_so3(np.radians(tilt_deg) * np.array([np.cos(about), np.sin(about), 0.0]))
+    upright = np.diag([1.0, -1.0, -1.0]) @ exp_so3(np.array([0.0, 0.0, roll]))
+    return pose(tilt @ upright, np.array(centre))
+
+
+def draw(
+    board: Board,
+    camera: Intrinsics,
+    T_cam_board: Array,
+    *,
+    black: float = 40,
+    white: float = 200,
+    blur_px: float = 0.7,
+    noise: float = 2.0,
+    seed: int = 0,
+) -> NDArray[np.uint8]:
+    """Render the board on plain grey, 4 x 4 rays a pixel, with Gaussian blur and noise."""
+    n, width, height = 4, camera.width_px, camera.height_px
+    off = (np.arange(n) + 0.5) / n - 0.5
+    outline, _ = camera.project(transform(T_cam_board, board.outline()))
+    u0, v0 = np.maximum(np.nanmin(outline, axis=0).astype(int) - 12, 0)
+    u1, v1 = np.minimum(np.nanmax(outline, axis=0).astype(int) + 13, [width, height])
+    u, v = (np.arange(u0, u1)[:, None] + off).ravel(), (np.arange(v0, v1)[:, None] + off).ravel()
+    # Rays change smoothly: every fourth is exact, those between are interpolated linearly.
+    gu, gv = np.arange(u0 - 1, u1 + 5, 4.0), np.arange(v0 - 1, v1 + 5, 4.0)
+    coarse = camera.unproject(np.stack(np.meshgrid(gu, gv), axis=-1))
+    maps = np.meshgrid(((u - gu[0]) / 4), (v - gv[0]) / 4)
+    rays = np.stack([_interpolate(coarse[..., axis], *maps) for axis in range(3)], axis=-1)
+    R, t = T_cam_board[:3, :3], T_cam_board[:3, 3]
+    on_plane = (rays * ((R[:, 2] @ t) / (rays @ R[:, 2]))[..., None] - t) @ R
+    x, y = on_plane[..., 0], on_plane[..., 1]
+    column = np.floor((x - board.pattern_offset_m[0]) / board.square_m + (board.cols + 1) / 2)
+    row = np.floor((board.rows + 1) / 2 - (y - board.pattern_offset_m[1]) / board.square_m)
+    is_square = (column >= 0) & (column <= board.cols) & (row >= 0) & (row <= board.rows)
+    is_plate = (np.abs(x) < board.width_m / 2) & (np.abs(y) < board.height_m / 2)
+    # The convention: the outer square at the top left is black.
+    value = np.where(is_plate, np.where(is_square & ((column + row) % 2 == 0), black, white), 110.0)
+    picture = np.full((height, width), 110.0)
+    picture[v0:v1, u0:u1] = value.reshape(v1 - v0, n, u1 - u0, n).mean(axis=(1, 3))
+    picture = cv2.GaussianBlur(picture, (0, 0), blur_px)
+    noisy = picture + np.random.default_rng(seed).normal(0, noise, picture.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def _interpolate(table: Array, u: Array, v: Array) -> Array:
+    # cv2.remap rounds its weights to 1/32; rays need more.
+    i, j = np.floor(u).astype(int), np.floor(v).astype(int)
+    a, b = u - i, v - j
+    top = (1 - a) * table[j, i] + a * table[j, i + 1]
+    bottom = (1 - a) * table[j + 1, i] + a * table[j + 1, i + 1]
+    return np.asarray((1 - b) * top + b * bottom)
+
+
+def picture(pixels: NDArray[np.uint8], channel: str = "frames") -> Image:
+    return Image("cam", channel, None, pixels)
+
+
+def found(pixels: NDArray[np.uint8], board: Board, camera: Intrinsics) -> ImageBoard:
+    result = find_image_board(picture(pixels), board, camera)
+    assert isinstance(result, ImageBoard), result
+    return result
+
+
+def refused(pixels: NDArray[np.uint8], board: Board, camera: Intrinsics) -> Refusal:
+    result = find_image_board(picture(pixels), board, camera)
+    assert isinstance(result, Refusal)
+    assert result.stage == "image"
+    assert result.action
+    return result
+
+
+CASES = [
+    pytest.param(ASYMMETRIC, DAVIS, looking(30, 20, 45, (0.05, 0.0, 1.6)), id="davis-near"),
+    pytest.param(ASYMMETRIC, DAVIS, looking(35, -60, 130, (-0.2, 0.1, 3.0)), id="davis-far"),
+    pytest.param(SYMMETRIC, WIDE, looking(25, 80, 40, (0.3, -0.1, 2.2)), id="wide"),
+    pytest.param(TALL, FISHEYE, looking(30, 10, -35, (-0.5, 0.1, 2.4)), id="fisheye"),
+]
+
+
+@pytest.mark.parametrize(("board", "camera", "T"), CASES)
+def test_corners_are_found_in_order_to_a_twentieth_of_a_pixel(board: Board, camera: Intrinsics, T: Array) -> None:
+    result = found(draw(board, camera, T), board, camera)
+    truth, _ = camera.project(transform(T, board.corners()))
+    error = result.corners_px - truth
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.05
+    assert np.abs(error.mean(axis=0)).max() < 0.01
+    normalised = np.linalg.solve(np.linalg.cholesky(result.cov), difference(result.T_cam_board, T))
+    assert normalised @ normalised < 22.5  # chi2 of 6 degrees of freedom, 99.9 %
+    assert result.quality["distance_m"] == pytest.approx(np.linalg.norm(T[:3, 3]), rel=0.01)
+    assert result.quality["n_corners"] == board.cols * board.rows
+
+
+@pytest.mark.parametrize("roll_deg", range(0, 360, 45))
+def test_the_black_corner_square_tells_how_an_asymmetric_board_is_turned(roll_deg: int) -> None:
+    T = looking(20, 70, roll_deg, (0.0, 0.0, 1.7))
+    result = found(draw(ASYMMETRIC, DAVIS, T), ASYMMETRIC, DAVIS)
+    assert np.degrees(rotation_angle(result.T_cam_board[:3, :3], T[:3, :3])) < 1.0
+
+
+@pytest.mark.parametrize("roll_deg", [0, 40, 140, 180, 220, 320])
+def test_a_symmetric_board_is_read_with_its_top_row_up(roll_deg: int) -> None:
+    T = looking(20, 70, roll_deg, (0.0, 0.0, 2.0))
+    result = found(draw(SYMMETRIC, WIDE, T), SYMMETRIC, WIDE)
+    assert result.T_cam_board[1, 1] < 0  # board y points up, camera y down
+    assert result.T_cam_board[2, 2] < 0  # the print faces the camera
+    half_turn = T @ pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    apart = [np.degrees(rotation_angle(result.T_cam_board[:3, :3], R[:3, :3])) for R in (T, half_turn)]
+    assert min(apart) < 1.0
+
+
+def test_fitted_crossings_beat_corner_sub_pix_on_small_noisy_squares() -> None:
+    ours, theirs = [], []
+    for seed in range(6):
+        T = looking(30, 40 * seed, 30 + 20 * seed, (0.0, 0.0, 2.6))
+        pixels = draw(ASYMMETRIC, DAVIS, T, black=90, white=160, noise=4, seed=seed)
+        truth, _ = DAVIS.project(transform(T, ASYMMETRIC.corners()))
+        start = truth + np.random.default_rng(seed).uniform(-0.5, 0.5, truth.shape)
+        fit = fit_crossings(pixels, start.reshape(6, 9, 2))
+        assert fit.is_fitted.all()
+        ours.append(fit.grid_px.reshape(-1, 2) - truth)
+        points = start.astype(np.float32).reshape(-1, 1, 2)
+        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+        theirs.append(cv2.cornerSubPix(pixels, points, (4, 4), (-1, -1), criteria).reshape(-1, 2) - truth)
+    rms_ours, rms_theirs = (np.sqrt(np.mean(np.square(errors))) for errors in (ours, theirs))
+    assert rms_ours < 0.08
+    assert rms_ours < 0.6 * rms_theirs
+
+
+def test_a_board_of_ten_grey_values_contrast_in_event_pictures_is_found() -> None:
+    T = looking(25, 30, 45, (0.0, 0.0, 1.8))
+    pixels = draw(ASYMMETRIC, DAVIS, T, black=105, white=135, noise=2.5)
+    assert found(pixels, ASYMMETRIC, DAVIS).quality["contrast"] == pytest.approx(30, abs=6)
+
+
+def test_the_region_of_the_last_picture_gives_the_same_corners() -> None:
+    first = found(draw(SYMMETRIC, WIDE, looking(25, 80, 40, (0.3, 0, 2.2))), SYMMETRIC, WIDE)
+    moved = picture(draw(SYMMETRIC, WIDE, looking(25, 80, 42, (0.34, 0, 2.2))))
+    region = region_around(first, moved)
+    assert region[2] - region[0] < 1000
+    tracked = find_image_board(moved, SYMMETRIC, WIDE, region=region)
+    whole = find_image_board(moved, SYMMETRIC, WIDE)
+    assert isinstance(tracked, ImageBoard) and isinstance(whole, ImageBoard)
+    assert np.abs(tracked.corners_px - whole.corners_px).max() < 0.03
+
+
+def test_a_board_that_left_the_region_is_found_in_the_whole_picture() -> None:
+    pixels = draw(SYMMETRIC, WIDE, looking(25, 80, 40, (0.5, 0, 2.2)))
+    result = find_image_board(picture(pixels), SYMMETRIC, WIDE, region=(0, 0, 200, 200))
+    assert isinstance(result, ImageBoard)
+
+
+@pytest.mark.parametrize("step", [(-1, 0), (1, 0), (0, 1), (-1, -1), (1, 1)])
+@pytest.mark.parametrize(("board", "camera", "T"), CASES[::2])
+def test_wrong_inner_corners_are_named_with_those_seen(
+    board: Board, camera: Intrinsics, T: Array, step: tuple[int, int]
+) -> None:
+    wrong = replace(board, cols=board.cols + step[0], rows=board.rows + step[1])
+    cause = refused(draw(board, camera, T), wrong, camera).cause
+    assert cause == f"{wrong.cols}x{wrong.rows} inner corners wanted, {board.cols}x{board.rows} seen"
+
+
+def test_a_board_cut_off_by_the_border_is_said_to_be() -> None:
+    pixels = draw(SYMMETRIC, WIDE, looking(5, 0, 5, (1.3, 0.0, 1.8)))
+    assert "cut off by the right border" in refused(pixels, SYMMETRIC, WIDE).cause
+
+
+def test_dark_bright_empty_and_blurred_pictures_are_refused_with_their_figures() -> None:
+    T = looking(20, 30, 40, (0, 0, 1.8))
+    noise = np.random.default_rng(0).normal(0, 2, (260, 346))
+    assert "too dark" in refused(np.clip(10 + noise, 0, 255).astype(np.uint8), ASYMMETRIC, DAVIS).cause
+    assert "overexposed" in refused(np.full((260, 346), 255, np.uint8), ASYMMETRIC, DAVIS).cause
+    assert "contrast too low" in refused(np.clip(140 + noise, 0, 255).astype(np.uint8), ASYMMETRIC, DAVIS).cause
+    blurred = refused(draw(ASYMMETRIC, DAVIS, T, blur_px=9.0), ASYMMETRIC, DAVIS)
+    assert "blurred" in blurred.cause
+    assert "hold the board still" in blurred.action
+    stripes = np.where(np.arange(346) // 20 % 2, 200, 40).astype(np.uint8)
+    assert "no board" in refused(np.tile(stripes, (260, 1)), ASYMMETRIC, DAVIS).cause
+
+
+def test_an_empty_event_picture_asks_for_motion() -> None:
+    grey = np.clip(140 + np.random.default_rng(0).normal(0, 3, (260, 346)), 0, 255).astype(np.uint8)
+    result = find_image_board(picture(grey, "events"), ASYMMETRIC, DAVIS)
+    assert isinstance(result, Refusal) and "move the board" in result.action
+
+
+def test_intrinsics_of_another_resolution_are_refused_naming_both_sizes() -> None:
+    pixels = cv2.resize(draw(ASYMMETRIC, DAVIS, looking(20, 30, 40, (0, 0, 1.8))), (692, 520))
+    with pytest.raises(ProfileError, match="692x520 px.*346x260 px") as raised:
+        find_image_board(picture(pixels), ASYMMETRIC, DAVIS)
+    assert "by 2" in raised.value.hint
+
+
+def test_a_blank_margin_beyond_the_sensor_and_a_readout_cut_short_change_nothing() -> None:
+    pixels = draw(ASYMMETRIC, DAVIS, looking(20, 30, 40, (0, 0, 1.8)))
+    padded = np.full((480, 640), 128, np.uint8)
+    padded[:260, :346] = pixels
+    for variant in (padded, pixels[:258]):
+        corners = found(variant, ASYMMETRIC, DAVIS).corners_px
+        assert np.allclose(corners, found(pixels, ASYMMETRIC, DAVIS).corners_px, atol=1e-6)
+
+
+def test_intrinsics_of_another_lens_are_refused_by_the_misfit_of_the_corners() -> None:
+    pixels = draw(SYMMETRIC, WIDE, looking(30, 40, 40, (-0.5, 0.15, 1.2)))
+    wrong = replace(WIDE, distortion=(0.3, 0.0, 0.0, 0.0))
+    refusal = refused(pixels, SYMMETRIC, wrong)
+    assert "px rms" in refusal.cause
+    assert "intrinsics" in refusal.action and "1280x720" in refusal.action
+
+
+def test_the_same_picture_gives_the_same_bytes() -> None:
+    pixels = draw(ASYMMETRIC, DAVIS, looking(20, 30, 40, (0, 0, 1.8)))
+    first, second = found(pixels, ASYMMETRIC, DAVIS), found(pixels.copy(), ASYMMETRIC, DAVIS)
+    assert first.corners_px.tobytes() == second.corners_px.tobytes()
+    assert first.T_cam_board.tobytes() == second.T_cam_board.tobytes()
+
+
+def _recording(folder: Path) -> tuple[Board, Intrinsics, list[Path]]:
+    params = json.loads((folder / "params.json").read_text())
+    spec, K = params["board"], params["K"]
+    offset = tuple(spec.get("pattern_offset_m", (0.0, 0.0)))
+    cols, rows = spec["inner_corners"]
+    board = Board(cols, rows, spec["square_m"], spec["width_m"], spec["height_m"], (offset[0], offset[1]))
+    model = "equidistant" if "model" in params else "radtan"
+    size = params["image_size"]
+    camera = Intrinsics(K[0][0], K[1][1], K[0][2], K[1][2], *size, model=model, distortion=tuple(params["D"]))
+    return board, camera, sorted((folder / "img").iterdir())
+
+
+def _find(path: Path, board: Board, camera: Intrinsics) -> ImageBoard | Refusal:
+    return find_image_board(picture(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)), board, camera)
+
+
+@pytest.mark.dataset
+@pytest.mark.parametrize(
+    ("name", "at_least", "median_px"),
+    [
+        ("rlfs01", 18, 0.1),
+        ("sss_noise15mm", 20, 0.05),
+        ("acfr_vlp16", 10, 0.2),
+        ("rles01_lf", 19, 0.08),
+        ("rles01_le", 36, 0.3),
+        ("rles02_lf", 55, 0.12),
+        ("rles02_le", 55, 0.25),
+    ],
+)
+def test_boards_of_recordings_are_found(recordings: Path, name: str, at_least: int, median_px: float) -> None:
+    board, camera, paths = _recording(recordings / name)
+    results = [_find(path, board, camera) for path in paths]
+    boards = [result for result in results if isinstance(result, ImageBoard)]
+    assert len(boards) >= at_least
+    assert np.median([result.reprojection_px for result in boards]) < median_px
+
+
+@pytest.mark.dataset
+def test_frames_and_event_pictures_agree_on_how_the_board_is_turned(recordings: Path) -> None:
+    board, camera, paths = _recording(recordings / "rles02_lf")
+    angles = []
+    for path in paths:
+        twin = recordings / "rles02_le" / "img" / path.name
+        pair = [_find(one, board, camera) for one in (path, twin) if one.exists()]
+        if len(pair) == 2 and all(isinstance(one, ImageBoard) for one in pair):
+            R = [one.T_cam_board[:3, :3] for one in pair if isinstance(one, ImageBoard)]
+            angles.append(np.degrees(rotation_angle(*R)))
+    assert len(angles) > 50
+    assert max(angles) < 10  # the board is hand-held and moves a little between the two
+
+
+@pytest.mark.dataset
+def test_nearly_empty_event_pictures_are_refused(recordings: Path) -> None:
+    for name in ("rles01_le", "rles02_le"):
+        board, camera, paths = _recording(recordings / name)
+        result = _find(paths[0], board, camera)
+        assert isinstance(result, Refusal) and "contrast" in result.cause
