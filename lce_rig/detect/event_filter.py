@@ -2,7 +2,7 @@
 
 References:
     T. Delbruck, Frame-free dynamic digital vision, 2008: an event is noise unless a neighbour supports it.
-    Y. Hu, S.-C. Liu, T. Delbruck, v2e: from video frames to realistic DVS events, 2021: a sensor's noise.
+    Y. Hu, S.-C. Liu, T. Delbruck, v2e: from video frames to realistic DVS events, 2021.
 """
 
 from dataclasses import dataclass
@@ -61,8 +61,8 @@ def without_pixels(events: Events, pixels: NDArray[np.bool_]) -> Events:
 class BackgroundActivityFilter:
     """Leaves out events that no neighbour supports; consecutive stretches are filtered as one.
 
-    Time is cut into slices. An event stays where one of the eight pixels around it fired in the same slice or in
-    the one before, that is within one to two slices' length: images of counts instead of a search by event.
+    Time is cut into slices. An event stays where one of the eight pixels around it fired in the same slice or
+    in the one before, that is within one to two slices' length: images of counts, not a search by event.
 
     Attributes:
         slice_ns: length of a slice.

@@ -1,0 +1,174 @@
+"""Small encoders for the formats that cameras and drivers write: one event after the other, as the papers say."""
+
+import struct
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+
+from lce_rig.core.data import Events
+
+Event = tuple[int, int, int, bool]
+"""t_us, x, y, polarity."""
+
+
+def listed(events: Events) -> list[Event]:
+    t_us = events.t_ns // 1000
+    return list(
+        zip(t_us.tolist(), events.x.tolist(), events.y.tolist(), events.polarity.tolist(), strict=True)
+    )
+
+
+def random_events(
+    n: int, seed: int, size: tuple[int, int] = (346, 260), start_us: int = 0, step_us: int = 20
+) -> Events:
+    """Events in order, some with equal stamps, neighbours in runs so that vectors have something to pack."""
+    rng = np.random.default_rng(seed)
+    t_us = start_us + np.cumsum(rng.integers(0, step_us, n) * (rng.random(n) < 0.4))
+    x, y = rng.integers(0, size[0], n), rng.integers(0, size[1], n)
+    in_run = rng.random(n) < 0.5
+    for i in range(1, n):
+        if in_run[i]:
+            t_us[i:] -= t_us[i] - t_us[i - 1]
+            x[i], y[i] = min(x[i - 1] + rng.integers(1, 4), size[0] - 1), y[i - 1]
+    polarity = rng.random(n) < 0.5
+    return Events(
+        "events", t_us * 1000, x.astype(np.uint16), y.astype(np.uint16), polarity, *size
+    )
+
+
+def evt2(events: Iterable[Event]) -> bytes:
+    words, high = [], -1
+    for t, x, y, p in events:
+        if t >> 6 != high:
+            high = t >> 6
+            words.append(8 << 28 | high & 0xFFFFFFF)
+        words.append(int(p) << 28 | (t & 0x3F) << 22 | x << 11 | y)
+    return struct.pack(f"<{len(words)}I", *words)
+
+
+def evt21(events: Sequence[Event]) -> bytes:
+    words, high = [], -1
+    for (t, x, y, p), mask in _spans(events, 32):
+        if t >> 6 != high:
+            high = t >> 6
+            words.append(8 << 60 | (high & 0xFFFFFFF) << 32)
+        words.append(int(p) << 60 | (t & 0x3F) << 54 | x << 43 | y << 32 | mask)
+    return struct.pack(f"<{len(words)}Q", *words)
+
+
+def evt3(events: Sequence[Event], with_vectors: bool = True) -> bytes:
+    """Prophesee's EVT3; runs in a row become a base and vectors of 12 and 8."""
+    words: list[int] = []
+    high = low = row = -1
+    for (t, x, y, p), mask in _spans(events, 20 if with_vectors else 1):
+        if t >> 12 != high:
+            high = t >> 12
+            words.append(8 << 12 | high & 0xFFF)
+            low = -1
+        if t & 0xFFF != low:
+            low = t & 0xFFF
+            words.append(6 << 12 | low)
+        if y != row:
+            row = y
+            words.append(y)
+        if mask == 1:
+            words.append(2 << 12 | int(p) << 11 | x)
+        else:
+            words.append(3 << 12 | int(p) << 11 | x)
+            words.append(4 << 12 | mask & 0xFFF)
+            if mask >> 12:
+                words.append(5 << 12 | mask >> 12)
+    return struct.pack(f"<{len(words)}H", *words)
+
+
+def libcaer_cmp(events: Sequence[Event], base_us: int) -> bytes:
+    """The ROS driver's compressed DAVIS events; runs in a column become a base and vectors of 8."""
+    words: list[int] = []
+    high = low = column = -1
+    swapped = [(t, y, x, p) for t, x, y, p in events]
+    for (t, y, x, p), mask in _spans(swapped, 16):
+        t -= base_us
+        if t >> 12 != high:
+            high = t >> 12
+            words.append(high)
+            low = -1
+        if t & 0xFFF != low:
+            low = t & 0xFFF
+            words.append(1 << 12 | low)
+        if x != column:
+            column = x
+            words.append(2 << 12 | x)
+        if mask == 1:
+            words.append(3 << 12 | int(p) << 11 | y)
+        else:
+            words += [4 << 12 | int(p) << 11 | y, 5 << 12 | mask & 0xFF, 5 << 12 | mask >> 8]
+    return struct.pack(f"<{len(words)}H", *words)
+
+
+def libcaer(events: Iterable[Event], base_us: int) -> bytes:
+    return b"".join(
+        struct.pack("<II", x << 17 | y << 2 | int(p) << 1 | 1, (t - base_us) & 0x7FFFFFFF)
+        for t, x, y, p in events
+    )
+
+
+def mono(events: Iterable[Event], base_ns: int) -> bytes:
+    return b"".join(
+        struct.pack("<Q", int(p) << 63 | y << 48 | x << 32 | (t * 1000 - base_ns)) for t, x, y, p in events
+    )
+
+
+def packet(
+    payload: bytes,
+    encoding: str,
+    *,
+    is_ros1: bool,
+    number: int = 0,
+    base_ns: int = 0,
+    stamp_ns: int = 0,
+    size: tuple[int, int] = (346, 260),
+) -> bytes:
+    """An event_camera_msgs/EventPacket."""
+    message = b"" if is_ros1 else b"\0\1\0\0"
+
+    def add(kind: str, value: int) -> None:
+        nonlocal message
+        if not is_ros1:
+            message += bytes(-(len(message) - 4) % struct.calcsize(kind))
+        message += struct.pack(f"<{kind}", value)
+
+    def add_text(text: str) -> None:
+        nonlocal message
+        data = text.encode() + (b"" if is_ros1 else b"\0")
+        add("I", len(data))
+        message += data
+
+    if is_ros1:
+        add("I", number)
+    add("I", stamp_ns // 10**9)
+    add("I", stamp_ns % 10**9)
+    add_text("camera")
+    add("I", size[1])
+    add("I", size[0])
+    add("Q", number)
+    add("Q", base_ns)
+    add_text(encoding)
+    add("B", 0)
+    add("I", len(payload))
+    return message + payload
+
+
+def _spans(events: Sequence[Event], width: int) -> Iterator[tuple[Event, int]]:
+    """Gather events of one stamp, row and polarity whose columns rise within `width` into a mask."""
+    i = 0
+    while i < len(events):
+        t, x, y, p = events[i]
+        mask, last = 1, x
+        i += 1
+        while i < len(events):
+            t2, x2, y2, p2 = events[i]
+            if (t2, y2, p2) != (t, y, p) or not last < x2 < x + width:
+                break
+            mask, last = mask | 1 << (x2 - x), x2
+            i += 1
+        yield (t, x, y, p), mask
