@@ -79,12 +79,13 @@ def _detect_one(
     session: Session, capture: Capture, sensor: tuple[str, str] | str, digest: str
 ) -> ImageDetection | LidarDetection:
     name = ".".join(sensor) if isinstance(sensor, tuple) else sensor
-    key = f"{digest}/{capture.name}.{name}"
-    cached = session.load_cached(key)
-    if cached is not None:
-        with suppress(ValueError):
-            return from_arrays(cached.arrays)
     try:
+        # The content is part of the key: a capture removed and another collected in its place has the same name.
+        key = f"{digest}/{capture.name}-{capture.content_sha256[:12]}.{name}"
+        cached = session.load_cached(key)
+        if cached is not None:
+            with suppress(ValueError):
+                return from_arrays(cached.arrays)
         if isinstance(sensor, tuple):
             detection: ImageDetection | LidarDetection = detect_image(session.rig, capture.image(*sensor))
         else:

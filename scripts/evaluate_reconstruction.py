@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Judge a reconstruction network on held-out simulated checkerboards: found or not, and corners against truth.
+"""Judge a reconstruction network on held-out simulated checkerboards: found, and corners against truth.
 
     python scripts/evaluate_reconstruction.py [--model build/training/reconstruction.onnx] [--scenes 40]
 

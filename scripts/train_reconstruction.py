@@ -41,7 +41,7 @@ class Progress:
 
 
 class Trainer:
-    """Truncated back-propagation through time over simulated windows, with a running average of the weights."""
+    """Truncated back-propagation through time over simulated windows; weights are averaged too."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options

@@ -69,7 +69,7 @@ def decode_events(data: bytes, sensor: str, resolution_px: tuple[int, int] | Non
     size = columns.get("resolution_px")
     if size is not None:
         resolution_px = int(size[0]), int(size[1])
-    width, height = resolution_px or (int(x.max(initial=-1)) + 1, int(y.max(initial=-1)) + 1)
+    width, height = resolution_px or ((int(x.max()) + 1, int(y.max()) + 1) if len(x) else (0, 0))
     host = columns.get("host_ns")
     host_ns = None if host is None else int(host)
     x, y = x.astype(np.uint16), y.astype(np.uint16)

@@ -17,6 +17,8 @@ Grey = NDArray[np.uint8]
 # squares of 10 to 60 px.
 _WIDE_PX = 700
 _SEARCH_PX = 640
+# A grid of another size with this share of the wanted corners is another board, not a part of the board.
+_OTHER_BOARD = 0.6
 _SB_THOROUGH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
@@ -35,9 +37,11 @@ def find_grid(grey: Grey, board: Board) -> Crossings | None:
     if seen is not None and seen.shape[:2] == (board.cols, board.rows):
         seen = seen.swapaxes(0, 1)
     if seen is not None and seen.shape[:2] == (board.rows, board.cols):
-        attempts = iter([seen.reshape(-1, 2)])
+        attempts: Iterator[Array | None] = iter([seen.reshape(-1, 2)])
     else:
-        attempts = _attempts(grey, (board.cols, board.rows), is_other_seen=seen is not None)
+        n_seen = 0 if seen is None else seen.shape[0] * seen.shape[1]
+        is_other_seen = n_seen >= _OTHER_BOARD * board.rows * board.cols
+        attempts = _attempts(grey, (board.cols, board.rows), is_other_seen)
     for found in attempts:
         if found is not None:
             return fit_crossings(grey, order_corners(grey, found, board).reshape(board.rows, board.cols, 2))
@@ -60,12 +64,12 @@ def seen_grid(grey: Grey) -> Array | None:
 
 
 def order_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
-    """Sort a grid of corners as `Board.corners()` does: row by row from the top left as the print is looked at.
+    """Sort a grid of corners as `Board.corners()` does, row by row from the print's top left.
 
     A finder may start at any of the grid's ends. A camera looks at the front of the print, so the order that
-    turns from rows to columns clockwise in the picture (v points down) is the one that is not mirrored. Where the
-    pattern is not symmetric under 180 deg, the outer square at the top left is black by convention; where it is,
-    the order with its top row up in the picture is taken.
+    turns from rows to columns clockwise in the picture (v points down) is the one that is not mirrored. Where
+    the pattern is not symmetric under 180 deg, the outer square at the top left is black by convention; where
+    it is, the order with its top row up in the picture is taken.
 
     Args:
         grey: (H, W) the picture, whose squares tell black from white.
@@ -108,7 +112,7 @@ def _attempts(grey: Grey, size: tuple[int, int], is_other_seen: bool) -> Iterato
     """Run the finders one after the other, cheapest first; the caller stops at the first success.
 
     The list is fixed, not timed, so that the same picture gives the same answer on any machine. The classic
-    finder takes seconds to fit one size into the squares of another: it is left out where another size was seen.
+    finder takes seconds to fit one size into the squares of another: it is left out where another was seen.
     """
     width = grey.shape[1]
     if width > _WIDE_PX:

@@ -70,15 +70,15 @@ def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
     outer = [_alternation(value[1, 1:-1], sign[1, 1:-1]) / inner for value, sign in sides]
     beyond = [_alternation(value[0, 1:-1], sign[0, 1:-1]) / inner for value, sign in sides]
     steps = [np.diff(value[0, 1:-1]) * sign[0, 2:-1] for value, sign in sides]
-    is_beyond = any(
-        ratio > 0.5 and bool(np.all(step > 0)) for ratio, step in zip(beyond, steps, strict=True)
-    )
+    is_beyond = any(ratio > 0.5 and bool(np.all(step > 0)) for ratio, step in zip(beyond, steps, strict=True))
     return min(outer), is_beyond
 
 
 def _widened(grid_px: Array) -> Array:
     """Extrapolate one more line of corners on every side."""
-    wide = np.concatenate([2 * grid_px[:, :1] - grid_px[:, 1:2], grid_px, 2 * grid_px[:, -1:] - grid_px[:, -2:-1]], axis=1)
+    wide = np.concatenate(
+        [2 * grid_px[:, :1] - grid_px[:, 1:2], grid_px, 2 * grid_px[:, -1:] - grid_px[:, -2:-1]], axis=1
+    )
     return np.concatenate([2 * wide[:1] - wide[1:2], wide, 2 * wide[-1:] - wide[-2:-1]])
 
 
@@ -116,7 +116,7 @@ def explain_absence(image: Image, grey: NDArray[np.uint8], board: Board) -> Refu
     return Refusal(
         "image",
         f"no board: {wanted} inner corners wanted, none seen (median grey {dark:.0f})",
-        "show the whole print, unobstructed; inner corners are where four squares meet, one less than squares",
+        "show the whole print, uncovered; inner corners are where four squares meet, one less than squares",
     )
 
 
@@ -157,11 +157,13 @@ def quality_problem(
 ) -> Refusal | None:
     """Judge the figures of a grid that was found; None where they will do."""
     if quality["contrast"] < min_contrast:
-        cause = f"contrast too low: black and white differ by {quality['contrast']:.0f} grey values ({min_contrast:.0f} needed)"
+        cause = f"contrast too low: black and white differ by {quality['contrast']:.0f} grey values"
+        cause += f" ({min_contrast:.0f} needed)"
         action = "move the board faster" if quality["mean_grey"] > 60 else "expose longer or add light"
         return Refusal("image", cause, action)
     if quality["sharpness"] < min_sharpness:
-        cause = f"too blurred: edges {quality['edge_width_px']:.1f} px wide on squares of {quality['square_px']:.1f} px"
+        cause = f"too blurred: edges {quality['edge_width_px']:.1f} px wide on squares of"
+        cause += f" {quality['square_px']:.1f} px"
         return Refusal("image", cause, "hold the board still, expose shorter, come closer, focus the lens")
     return None
 

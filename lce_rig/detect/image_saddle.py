@@ -40,7 +40,7 @@ def fit_crossings(grey: NDArray[np.uint8], grid_px: Array) -> Crossings:
 
     (a, b) are coordinates along the sides of the squares at the corner; f1 = (a - a0) - alpha (b - b0) and
     f2 = (b - b0) - beta (a - a0) vanish on the two edges; g(x) = tanh(0.85 x) is within 2 % of the
-    profile erf(x / sqrt 2) of an edge under Gaussian blur. The two blurs are separate because motion blurs one more.
+    profile erf(x / sqrt 2) of an edge under Gaussian blur. The two blurs are separate: motion blurs one more.
 
     Unlike `cv2.cornerSubPix`, whose window must be square and hold one corner, the patch follows the squares
     down to the few pixels of tilted and far ones.
@@ -83,7 +83,7 @@ def sample(grey: NDArray[np.uint8], pixels: Array) -> Array:
     """Interpolate grey values bilinearly at (..., 2) px; beyond the border its value is kept."""
     # cv2.remap takes at most 32766 rows and columns.
     maps = np.asarray(pixels, dtype=np.float32).reshape(-1, pixels.shape[-2], 2)
-    values = cv2.remap(grey, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    values = cv2.remap(grey, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float64).reshape(pixels.shape[:-1])
 
 
@@ -93,7 +93,7 @@ def _sides(grid_px: Array) -> tuple[Array, Array]:
 
 
 def _fit(values: Array, a: Array, b: Array, height_px: Array) -> tuple[Array, Array]:
-    """Fit all patches (K, n) at once: parameters (K, 8) a0 b0 alpha beta m c log s1 log s2, residuals (K, n)."""
+    """Fit all patches (K, n): parameters (K, 8) a0 b0 alpha beta m c log(s1) log(s2), residuals (K, n)."""
     count = len(values)
     mean = values.mean(axis=1)
     swing = ((values - mean[:, None]) * np.sign(a * b)).mean(axis=1)

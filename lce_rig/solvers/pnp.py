@@ -44,9 +44,9 @@ class PlanarPose:
 def solve_planar_pose(corners_px: Array, corners_board: Array, intrinsics: Intrinsics) -> PlanarPose | None:
     """Find T_cam_board and the second local minimum of the reprojection error.
 
-    A homography gives the first start. Mirroring the board's tilt in the line of sight gives the second: under
-    weak perspective both draw the same picture, which is why the cost of a plane has two minima. Either start
-    is refined by Levenberg-Marquardt in distorted pixels, so that any camera model is treated alike.
+    A homography gives the first start. Mirroring the board's tilt in the line of sight gives the second:
+    under weak perspective both draw the same picture, which is why the cost of a plane has two minima. Either
+    start is refined by Levenberg-Marquardt in distorted pixels, so that any camera model is treated alike.
 
     Args:
         corners_px: (N, 2) measured, N >= 4.
@@ -95,7 +95,7 @@ def refine_pose(
     """Minimise the reprojection error from a start by Levenberg-Marquardt.
 
     Returns:
-        T_cam_board (4, 4) at the minimum and the cost there in px^2; infinite where the start projects nowhere.
+        T_cam_board (4, 4) at the minimum and its cost in px^2, infinite where the start projects nowhere.
     """
     T, damping = T_cam_board, 1e-4
     residuals, J = _residuals_and_jacobian(T, corners_px, corners_board, intrinsics)

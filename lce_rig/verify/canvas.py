@@ -57,13 +57,19 @@ def panel(width_px: int, height_px: int, colour: Colour = PANEL) -> Picture:
 
 def turbo(values: Array, low: float, high: float) -> NDArray[np.uint8]:
     """Colour values (N,) on the turbo scale, clipped to low..high, (N, 3) BGR."""
+    if len(values) == 0:
+        return np.zeros((0, 3), dtype=np.uint8)
     level = np.clip((np.asarray(values) - low) / max(high - low, 1e-9), 0, 1)
     grey = np.rint(255 * level).astype(np.uint8).reshape(-1, 1)
     return np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_TURBO), dtype=np.uint8).reshape(-1, 3)
 
 
 def draw_discs(
-    picture: Picture, pixels: Array, colours: NDArray[np.uint8] | Colour, radius_px: float, rim: Colour | None = None
+    picture: Picture,
+    pixels: Array,
+    colours: NDArray[np.uint8] | Colour,
+    radius_px: float,
+    rim: Colour | None = None,
 ) -> None:
     """Draw anti-aliased discs at (N, 2) px, in order, each with a rim where asked for."""
     table = np.broadcast_to(np.asarray(colours), (len(pixels), 3))
@@ -74,7 +80,9 @@ def draw_discs(
         cv2.circle(picture, centre, _length(radius_px), colour, -1, cv2.LINE_AA, _SHIFT)
 
 
-def draw_diamonds(picture: Picture, pixels: Array, colour: Colour, radius_px: float, rim: Colour = BLACK) -> None:
+def draw_diamonds(
+    picture: Picture, pixels: Array, colour: Colour, radius_px: float, rim: Colour = BLACK
+) -> None:
     """Draw anti-aliased diamonds with a rim at (N, 2) px."""
     shape = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]], dtype=np.float64)
     for centre in pixels:
@@ -178,4 +186,5 @@ def _fixed(pixels: Array) -> list[list[int]]:
 
 
 def _length(radius_px: float) -> int:
-    return max(1, round(radius_px * 2**_SHIFT))
+    length: int = round(radius_px * 2**_SHIFT)
+    return max(1, length)

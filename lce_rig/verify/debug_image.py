@@ -104,7 +104,8 @@ def _draw_axes(picture: Picture, factor: int, found: ImageBoard, board: Board) -
     canvas.draw_line(picture, grid[0], ORANGE, max(2, round(3 * unit)))
     canvas.draw_line(picture, grid[:, 0], BLUE, max(2, round(3 * unit)))
     canvas.draw_discs(picture, grid[0, :1], MAGENTA, 6 * unit, WHITE)
-    canvas.draw_text(picture, "x", *(grid[0, -1] + 8 * unit), 16 * unit, ORANGE)
+    left, baseline = grid[0, -1] + 8 * unit
+    canvas.draw_text(picture, "x", float(left), float(baseline), 16 * unit, ORANGE)
 
 
 def _panorama(
@@ -115,7 +116,9 @@ def _panorama(
 
     def place(points_lidar: Array) -> Array:
         azimuth = np.arctan2(points_lidar[:, 1], points_lidar[:, 0])
-        elevation = np.degrees(np.arctan2(points_lidar[:, 2], np.hypot(points_lidar[:, 0], points_lidar[:, 1])))
+        elevation = np.degrees(
+            np.arctan2(points_lidar[:, 2], np.hypot(points_lidar[:, 0], points_lidar[:, 1]))
+        )
         u = (0.5 - azimuth / (2 * np.pi)) * (width_px - 1)
         return np.stack([u, 26 + (20 - elevation) / 40 * (_PANORAMA_PX - 46)], axis=1)
 
@@ -145,7 +148,9 @@ def _top_view(
     """Look down on the scan, x up and y left, with circles every metre or two."""
     reach_m = 6.0
     if candidates:
-        reach_m = max(3.0, 1.25 * max(float(np.linalg.norm(found.points.mean(axis=0)[:2])) for found in candidates))
+        reach_m = max(
+            3.0, 1.25 * max(float(np.linalg.norm(found.points.mean(axis=0)[:2])) for found in candidates)
+        )
     scale = size_px / 2 / reach_m
     pane = canvas.panel(size_px, size_px, BLACK)
 
@@ -206,7 +211,7 @@ def _draw_number(pane: Picture, index: int, chosen: int, at: tuple[float, float]
 
 
 def _label(pane: Picture, text: str) -> None:
-    pane[: 24, : round(canvas.text_width_px(text, 10)) + 16] = BLACK
+    pane[:24, : round(canvas.text_width_px(text, 10)) + 16] = BLACK
     canvas.draw_text(pane, text, 8, 16, 10, INK)
 
 

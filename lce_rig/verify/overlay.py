@@ -62,7 +62,9 @@ def draw_overlay(
         [
             _title_strip(title, picture.shape[1]),
             picture,
-            _legend(picture.shape[1], (low_m, high_m), residuals, lidar_board is not None, image_board is not None),
+            _legend(
+                picture.shape[1], (low_m, high_m), residuals, lidar_board is not None, image_board is not None
+            ),
         ]
     )
 
@@ -93,7 +95,7 @@ def draw_image_board(
 def _to_picture(
     points_lidar: Array, T_cam_lidar: Array, intrinsics: Intrinsics, factor: int
 ) -> tuple[Array, Array]:
-    """Project points (N, 3) to pixels (M, 2) of the enlarged picture, with the ranges (M,) of those inside."""
+    """Project points (N, 3) to pixels (M, 2) of the enlarged picture, with the ranges (M,) of those in it."""
     points_camera = transform(T_cam_lidar, points_lidar)
     pixels, _ = intrinsics.project(points_camera)
     is_seen = intrinsics.is_inside(pixels, -0.5) & _is_before_fold(points_camera, intrinsics)
@@ -102,7 +104,7 @@ def _to_picture(
 
 
 def _is_before_fold(points_camera: Array, intrinsics: Intrinsics) -> NDArray[np.bool_]:
-    """Tell which points lie clear of the radius where the distortion folds; close to it pixels hardly move."""
+    """Tell which points lie clear of the radius where the distortion folds; near it pixels hardly move."""
     rho, z = np.hypot(points_camera[:, 0], points_camera[:, 1]), points_camera[:, 2]
     if intrinsics.model == "equidistant":
         return np.asarray(np.arctan2(rho, z) < _FOLD_MARGIN * intrinsics.max_radius)
@@ -162,7 +164,9 @@ def _legend(
     for index, entry in enumerate(entries):
         left = (630 + 185 * (index // max(per_column, 1))) * unit
         canvas.draw_text(legend, entry, left, rows[index % max(per_column, 1)], text_px)
-    canvas.draw_line(legend, np.array([[605, 8], [605, 1e3 * legend.shape[0] / width_px - 8]]) * unit, FAINT, 1, None)
+    canvas.draw_line(
+        legend, np.array([[605, 8], [605, 1e3 * legend.shape[0] / width_px - 8]]) * unit, FAINT, 1, None
+    )
     return legend
 
 

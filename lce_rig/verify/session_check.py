@@ -53,7 +53,9 @@ class SessionCheck:
             "channel": self.pair.channel,
             "lidar": self.pair.lidar,
             "verdict": self.verdict,
-            "metrics": None if self.metrics is None else {**asdict(self.metrics), "mge_m": self.metrics.mge_m},
+            "metrics": None
+            if self.metrics is None
+            else {**asdict(self.metrics), "mge_m": self.metrics.mge_m},
             "captures": {r.capture: _figures(r, self.used) for r in self.residuals},
             "pictures": [str(path) for path in self.pictures],
         }
@@ -85,7 +87,9 @@ def check_session(
     """
     pair = Pair(calibration.camera, calibration.channel, calibration.lidar)
     if pair not in detections.pairs:
-        raise SessionError(f"{session.path} holds no captures of {pair}", "The result belongs to another session.")
+        raise SessionError(
+            f"{session.path} holds no captures of {pair}", "The result belongs to another session."
+        )
     names = detections.captures(pair)
     residuals: list[CaptureResidual] = []
     tiles: list[tuple[str, Picture]] = []
@@ -93,7 +97,9 @@ def check_session(
     for done, name in enumerate(names, start=1):
         observation = _observe(session.rig, detections, pair, name, calibration)
         if observation is not None:
-            residuals.append(capture_residual(calibration.T_cam_lidar, observation, session.rig.board.to_board()))
+            residuals.append(
+                capture_residual(calibration.T_cam_lidar, observation, session.rig.board.to_board())
+            )
         picture = _draw(session.capture(name), session.rig, calibration, observation, residuals)
         if picture is not None:
             path = folder / f"{name}.png"
@@ -106,7 +112,13 @@ def check_session(
         write_picture(sheet, contact_sheet(tiles))
     metrics = summarise(residuals) if residuals else None
     return SessionCheck(
-        pair, calibration.verdict, tuple(residuals), metrics, calibration.captures_used, tuple(pictures), sheet
+        pair,
+        calibration.verdict,
+        tuple(residuals),
+        metrics,
+        calibration.captures_used,
+        tuple(pictures),
+        sheet,
     )
 
 
@@ -157,6 +169,10 @@ def _legend(residual: CaptureResidual | None, calibration: Calibration) -> Mappi
     name = "" if residual is None else residual.capture
     why = calibration.captures_refused.get(name)
     figures["capture"] = "used" if name in calibration.captures_used else why.cause if why else "not used"
-    figures["sigma"] = f"{calibration.sigma_rotation_deg:.2g} deg, {1000 * calibration.sigma_translation_m:.2g} mm"
+    figures["sigma"] = (
+        f"{calibration.sigma_rotation_deg:.2g} deg, {1000 * calibration.sigma_translation_m:.2g} mm"
+    )
     figures["verdict"] = calibration.verdict
-    return {key: value for key, value in figures.items() if not (isinstance(value, float) and np.isnan(value))}
+    return {
+        key: value for key, value in figures.items() if not (isinstance(value, float) and np.isnan(value))
+    }

@@ -19,7 +19,7 @@ _TILE_PX = 480
 def write_overlays(folder: Path, overlays: Iterable[tuple[str, Picture]]) -> list[Path]:
     """Write one PNG per named picture and a contact sheet of them all.
 
-    Pictures are taken one at a time and only small copies are kept, so that a long session needs little memory.
+    Pictures are taken one at a time and only small copies are kept: a long session needs little memory.
 
     Args:
         folder: is made where it does not exist.

@@ -1,1 +1,1 @@
-"""Training of the event-to-image network: scenes, simulated events, network and loss; needs the extra `train`."""
+"""Training of the event-to-image network: scenes, events, network, loss; needs the extra `train`."""

@@ -11,7 +11,7 @@ OPSET = 17
 
 
 def export_onnx(network: ReconstructionNetwork, path: Path) -> None:
-    """Write `network` with inputs voxels, state_0, state_1 and outputs picture, next_state_0, next_state_1."""
+    """Write `network`: inputs voxels, state_0, state_1; outputs picture, next_state_0, next_state_1."""
     twin = ReconstructionNetwork(network.n_half, network.n_quarter)
     twin.load_state_dict({key: value.cpu() for key, value in network.state_dict().items()})
     height, width = 64, 96

@@ -1,4 +1,4 @@
-"""Moving scenes: a board held in front of a background, both seen through homographies that change smoothly."""
+"""Moving scenes: a board before a background, both seen through homographies that change smoothly."""
 
 import math
 
@@ -42,7 +42,7 @@ class MovingPlanes:
         self.pixels = torch.stack([x.flatten(), y.flatten(), torch.ones_like(x.flatten())])
 
     def homography(self, path: Tensor) -> Tensor:
-        """Map crop pixels (centred) to texture coordinates in [-1, 1], (N, 3, 3), at the path parameter (N,)."""
+        """Map crop pixels (centred) to texture coordinates in [-1, 1], (N, 3, 3), at the path parameter."""
         wave = torch.sin(self.frequency * path[:, None, None] + self.phase_rad).mean(1)
         shift = self.offset_px + self.reach_px * wave[:, 0:2]
         angle = self.angle_rad + wave[:, 2] * self.reach_px[:, 0] / self.size_px

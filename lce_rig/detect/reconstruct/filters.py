@@ -14,7 +14,7 @@ _SUPPORT_NS = 10_000_000
 
 
 def hot_pixels(n_events: NDArray[np.uint16]) -> NDArray[np.bool_]:
-    """Find pixels that fire on their own, (H, W), from each pixel's events over half a second or more, (H, W).
+    """Find pixels that fire on their own, (H, W), from events per pixel over half a second or more, (H, W).
 
     Real edges pass over neighbours too, whichever way they move; a hot pixel's neighbours stay quiet. The
     median of the neighbours is blind to a second hot pixel next door.

@@ -177,7 +177,7 @@ class Reconstructor:
         size, expected = (batch.width_px, batch.height_px), (pending.width_px, pending.height_px)
         if size != expected:
             raise SourceError(
-                f"{batch.sensor}: events of {size[0]} x {size[1]} px follow events of {expected[0]} x {expected[1]}",
+                f"{batch.sensor}: events of {size} px follow events of {expected} px",
                 "name one sensor's stream",
             )
         if last_ns is not None and int(batch.t_ns[0]) < last_ns:

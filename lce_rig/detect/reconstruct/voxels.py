@@ -11,7 +11,7 @@ FloatArray = NDArray[np.float32]
 def voxel_grid(
     events: Events, n_bins: int = 5, start_ns: int | None = None, end_ns: int | None = None
 ) -> FloatArray:
-    """Spread the events over temporal bins, V(b) = sum p max(0, 1 - |b - t*|), t* = (B - 1) (t - t0) / dt [1].
+    """Spread events over temporal bins, V(b) = sum p max(0, 1 - |b - t*|), t* = (B - 1) (t - t0) / dt [1].
 
     Args:
         events: N events.
@@ -29,20 +29,20 @@ def voxel_grid(
         return np.zeros(shape, np.float32)
     start_ns = int(events.t_ns[0]) if start_ns is None else start_ns
     end_ns = int(events.t_ns[-1]) if end_ns is None else end_ns
-    bins_per_ns = (n_bins - 1) / max(1, end_ns - start_ns)
-    position = (events.t_ns - start_ns).astype(np.float64)
-    position *= bins_per_ns
-    np.clip(position, 0.0, n_bins - 1, out=position)
-    lower = position.astype(np.intp)
-    np.minimum(lower, n_bins - 2, out=lower)
-    position -= lower
-    n_pixels = events.height_px * events.width_px
-    cell = lower * n_pixels + _pixel_index(events)
+    duration_ns = max(1, end_ns - start_ns)
+    position = np.clip((events.t_ns - start_ns) * ((n_bins - 1) / duration_ns), 0.0, n_bins - 1)
     sign = np.where(events.polarity, 1.0, -1.0)
-    late = position * sign
-    voxels = np.bincount(cell, sign - late, n_bins * n_pixels)
-    # The share of the later bin lands one bin on: the same cells, counted into the grid from bin 1.
-    voxels[n_pixels:] += np.bincount(cell, late, (n_bins - 1) * n_pixels)
+    pixel = _pixel_index(events)
+    n_pixels = events.height_px * events.width_px
+    voxels = np.zeros((n_bins, n_pixels))
+    # Events are in time order: those between two bins form a slice, counted into two pictures.
+    bounds = np.searchsorted(position, np.arange(n_bins))
+    bounds[-1] = len(position)
+    for bin_, (first, last) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
+        cut = slice(first, last)
+        late = (position[cut] - bin_) * sign[cut]
+        voxels[bin_] += np.bincount(pixel[cut], sign[cut] - late, n_pixels)
+        voxels[bin_ + 1] += np.bincount(pixel[cut], late, n_pixels)
     return voxels.astype(np.float32).reshape(shape)
 
 
@@ -52,12 +52,10 @@ def normalise_voxels(voxels: FloatArray) -> FloatArray:
     References:
         Rebecq et al., High speed and high dynamic range video with an event camera, TPAMI 2019.
     """
-    flat = voxels.reshape(-1)
-    hit = np.flatnonzero(flat)
-    if not len(hit):
-        return voxels
-    values = flat[hit].astype(np.float64)
-    flat[hit] = (values - values.mean()) / max(float(values.std()), 1e-3)
+    is_hit = voxels != 0
+    values = voxels[is_hit]
+    if len(values):
+        voxels[is_hit] = (values - values.mean(dtype=np.float64)) / max(values.std(dtype=np.float64), 1e-3)
     return voxels
 
 

@@ -63,7 +63,7 @@ class Hdf5Events:
                         lost = f"event {begin}: {error}"
                         findings.add("torn ends of the file left out", lost)
                         return
-                    raise _unreadable(self._path, error) from None
+                    raise _unreadable(self._path, file, error) from None
                 t_us, x, y, polarity = block
                 t_ns = (t_us[: len(polarity)].astype(np.int64) + self._offset_us) * NS_PER_US
                 yield EventColumns(t_ns, x.astype(np.uint16), y.astype(np.uint16), polarity > 0)
@@ -83,9 +83,17 @@ def _open(path: Path) -> Any:
         raise SourceError(f"{path} cannot be read as HDF5: {error}") from None
 
 
-def _unreadable(path: Path, error: OSError) -> SourceError:
-    if "filter" in str(error).lower():
-        return SourceError(f"{path}: its compression is not installed ({error})", "pip install hdf5plugin")
+def _unreadable(path: Path, file: Any, error: OSError) -> SourceError:
+    """Say why: HDF5's own message on a missing filter names a folder and nothing else."""
+    from h5py.h5z import filter_avail
+
+    for name in _COLUMNS:
+        settings = file[f"events/{name}"].id.get_create_plist()
+        filters = [settings.get_filter(i) for i in range(settings.get_nfilters())]
+        missing = [label.decode() or str(number) for number, _, _, label in filters if not filter_avail(number)]
+        if missing:
+            what = f"{path}: events/{name} is compressed by {missing[0]}, which is not installed"
+            return SourceError(what, "pip install hdf5plugin")
     return SourceError(f"{path}: its events cannot be read: {error}")
 
 

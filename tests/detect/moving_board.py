@@ -1,0 +1,110 @@
+"""A small event camera that looks at a moving checkerboard: events with exact truth, in plain NumPy."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lce_rig.core.data import Events
+
+COLS, ROWS = 7, 5  # squares
+SQUARE_PX = 14.0
+WIDTH_PX, HEIGHT_PX = 160, 120
+CENTRE_PX = np.array([79.3, 59.6])
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A circle of the board's centre, once per turn_s, standing still from pause_s on."""
+
+    radius_px: float = 7.0
+    turn_s: float = 1.0
+    pause_s: float = np.inf
+
+    def shift_px(self, t_s):
+        angle = 2 * np.pi * min(t_s, self.pause_s) / self.turn_s
+        return self.radius_px * np.array([np.cos(angle), np.sin(2 * angle) * 0.7])
+
+
+def inner_corners_px(motion, t_s):
+    x = (np.arange(1, COLS) - COLS / 2) * SQUARE_PX
+    y = (np.arange(1, ROWS) - ROWS / 2) * SQUARE_PX
+    return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2) + CENTRE_PX + motion.shift_px(t_s)
+
+
+def picture(motion, t_s):
+    """Render by four samples a pixel in each direction, (H, W) in (0, 1]."""
+    offset = (np.arange(4) - 1.5) / 4
+    centre = CENTRE_PX + motion.shift_px(t_s)
+    u = ((np.arange(WIDTH_PX)[:, None] + offset).ravel() - centre[0]) / SQUARE_PX + COLS / 2
+    v = ((np.arange(HEIGHT_PX)[:, None] + offset).ravel() - centre[1]) / SQUARE_PX + ROWS / 2
+    is_light = (np.floor(u)[None] + np.floor(v)[:, None]) % 2 == 0
+    in_u, in_v = (u >= 0) & (u < COLS), (v >= 0) & (v < ROWS)
+    on_board = ((u > -0.4) & (u < COLS + 0.4))[None] & ((v > -0.4) & (v < ROWS + 0.4))[:, None]
+    fine = np.where(in_u[None] & in_v[:, None] & ~is_light, 0.08, 0.85)
+    fine = np.where(on_board, fine, 0.3)
+    return fine.reshape(HEIGHT_PX, 4, WIDTH_PX, 4).mean((1, 3))
+
+
+def board_events(motion, duration_s, seed=0, threshold=0.22, noise_hz=0.3, frames_hz=250):
+    """Simulate the events of [0, duration_s): threshold crossings of the log intensity, per-pixel thresholds."""
+    rng = np.random.default_rng(seed)
+    thresholds = threshold * (1 + 0.06 * rng.standard_normal((HEIGHT_PX, WIDTH_PX)))
+    level = np.log(picture(motion, 0.0) + 0.02)
+    memory = level.copy()
+    parts = []
+    step_ns = round(1e9 / frames_hz)
+    for index in range(round(duration_s * frames_hz)):
+        after = np.log(picture(motion, (index + 1) / frames_hz) + 0.02)
+        sign = np.sign(after - memory)
+        fired = np.floor(np.abs(after - memory) / thresholds).astype(int)
+        y, x = np.nonzero(fired)
+        count = fired[y, x]
+        which = np.repeat(np.arange(len(y)), count)
+        nth = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count) + 1
+        y, x = y[which], x[which]
+        crossing = memory[y, x] + sign[y, x] * nth * thresholds[y, x]
+        fraction = np.clip((crossing - level[y, x]) / (after[y, x] - level[y, x] + 1e-12), 0, 0.999)
+        parts.append((index * step_ns + (fraction * step_ns).astype(np.int64), x, y, sign[y, x] > 0))
+        memory += sign * fired * thresholds
+        level = after
+    n_noise = rng.poisson(noise_hz * duration_s * WIDTH_PX * HEIGHT_PX)
+    parts.append(
+        (
+            rng.integers(0, round(duration_s * 1e9), n_noise),
+            rng.integers(0, WIDTH_PX, n_noise),
+            rng.integers(0, HEIGHT_PX, n_noise),
+            rng.random(n_noise) < 0.5,
+        )
+    )
+    t, x, y, polarity = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return events_of(t // 1000 * 1000, x, y, polarity)
+
+
+def events_of(t_ns, x, y, polarity, width_px=WIDTH_PX, height_px=HEIGHT_PX):
+    """Make Events from any sequences, sorting by time."""
+    t = np.asarray(t_ns, np.int64)
+    order = np.argsort(t, kind="stable")
+    return Events(
+        "cam",
+        t[order],
+        np.asarray(x, np.uint16)[order],
+        np.asarray(y, np.uint16)[order],
+        np.asarray(polarity, bool)[order],
+        width_px,
+        height_px,
+    )
+
+
+def cut(events, n_batches, seed=0):
+    """Cut a stream into batches at random places, some of them empty."""
+    rng = np.random.default_rng(seed)
+    bounds = [0, *np.sort(rng.integers(0, len(events), n_batches - 1)), len(events)]
+    return [
+        Events(
+            events.sensor,
+            *(a[first:last] for a in (events.t_ns, events.x, events.y, events.polarity)),
+            events.width_px,
+            events.height_px,
+        )
+        for first, last in zip(bounds[:-1], bounds[1:], strict=True)
+    ]

@@ -1,0 +1,181 @@
+"""Pictures from a whole stream: at any stamp, one answer per stamp, the same however the stream arrives."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from moving_board import COLS, ROWS, Motion, board_events, cut, events_of, inner_corners_px
+
+from lce_rig.core.data import Image
+from lce_rig.core.errors import SourceError, UsageError
+from lce_rig.core.results import Refusal
+from lce_rig.detect.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
+
+MS = 1_000_000
+DURATION_S = 1.6
+STAMPS = [round((0.9 + 0.07 * k) * 1e9) for k in range(10)]
+PAUSE = Motion(pause_s=1.0)
+
+
+@pytest.fixture(scope="module")
+def stream():
+    return board_events(Motion(), DURATION_S)
+
+
+def options(**changes):
+    return ReconstructionOptions(**changes)
+
+
+def corner_rms_px(image, truth_px):
+    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    found, corners = cv2.findChessboardCornersSB(image.grey, (COLS - 1, ROWS - 1), flags=flags)
+    if not found:
+        return np.inf
+    corners = corners.reshape(-1, 2)
+    return min(np.sqrt(np.square(corners - order).sum(1).mean()) for order in (truth_px, truth_px[::-1]))
+
+
+def errors_px(events, method, windows, motion=Motion(), stamps=STAMPS):
+    pictures = Reconstructor(options=options(method=method, windows=windows)).reconstruct([events], stamps)
+    truth = [inner_corners_px(motion, stamp / 1e9) for stamp in stamps]
+    return np.array([corner_rms_px(image, corners) for image, corners in zip(pictures, truth, strict=True)])
+
+
+@pytest.mark.parametrize("kind", ["auto", "time", "count"])
+def test_the_board_is_found_where_it_truly_is_at_each_stamp(stream, kind):
+    errors = errors_px(stream, "network", WindowOptions(kind))
+    assert np.isfinite(errors).mean() >= 0.9
+    assert np.sqrt(np.mean(errors[np.isfinite(errors)] ** 2)) < 0.5
+
+
+def test_the_event_map_shows_the_board_far_less_often(stream):
+    assert np.isfinite(errors_px(stream, "map", WindowOptions())).mean() < 0.5
+
+
+def test_the_picture_lasts_while_the_board_stands_still():
+    events = board_events(PAUSE, DURATION_S)
+    stamps = [1_200 * MS, 1_500 * MS]
+    errors = errors_px(events, "network", WindowOptions(), PAUSE, stamps)
+    assert (errors < 1.0).all()
+
+
+def test_batches_may_be_cut_anywhere(stream):
+    whole, parts = (
+        list(Reconstructor().reconstruct(batches, STAMPS[:4])) for batches in ([stream], cut(stream, 37))
+    )
+    for one, other in zip(whole, parts, strict=True):
+        np.testing.assert_array_equal(one.pixels, other.pixels)
+
+
+def test_other_stamps_do_not_change_a_picture(stream):
+    alone = list(Reconstructor().reconstruct([stream], [STAMPS[5]]))[0]
+    among = list(Reconstructor().reconstruct([stream], STAMPS))[5]
+    np.testing.assert_array_equal(alone.pixels, among.pixels)
+
+
+def test_a_picture_shows_nothing_that_happened_after_its_stamp(stream):
+    stamp = STAMPS[3]
+    early = stream.between(0, stamp + 1)
+    whole = next(Reconstructor().reconstruct([stream], [stamp]))
+    seen = next(Reconstructor().reconstruct([early], [int(early.t_ns[-1])]))
+    assert isinstance(whole, Image) and isinstance(seen, Image)
+    assert np.abs(whole.pixels.astype(int) - seen.pixels).mean() < 3
+
+
+def test_every_stamp_gets_an_answer_and_warm_up_is_refused_with_its_figures(stream):
+    stamps = [100 * MS, 300 * MS, *STAMPS]
+    answers = list(Reconstructor().reconstruct([stream], stamps))
+    assert len(answers) == len(stamps)
+    assert isinstance(answers[0], Refusal)
+    assert "windows of events (0.10 s) precede the picture" in answers[0].cause
+    assert all(isinstance(answer, Image) for answer in answers[2:])
+    assert [answer.stamp_ns for answer in answers[2:]] == STAMPS
+    assert {answer.channel for answer in answers[2:]} == {"events"}
+
+
+def test_pictures_at_a_steady_rate_cover_the_stream(stream):
+    answers = list(Reconstructor().reconstruct(cut(stream, 5), every_ns=100 * MS))
+    assert len(answers) == int((stream.t_ns[-1] - stream.t_ns[0]) // (100 * MS))
+    is_picture = [isinstance(answer, Image) for answer in answers]
+    assert is_picture == sorted(is_picture)  # refused during warm-up, never afterwards
+
+
+def test_clocks_that_do_not_overlap_are_refused_saying_by_how_much(stream):
+    answers = list(Reconstructor().reconstruct([stream], [-2_500 * MS, STAMPS[0], 9_000 * MS]))
+    assert "2.5" in answers[0].cause and "before the first event" in answers[0].cause
+    assert isinstance(answers[1], Image)
+    assert "7.4" in answers[2].cause and "after the last event" in answers[2].cause
+
+
+def test_a_stream_without_events_refuses_every_stamp():
+    empty = events_of([], [], [], [])
+    for batches in ([], [empty]):
+        answers = list(Reconstructor().reconstruct(batches, [1, 2]))
+        assert [answer.cause for answer in answers] == ["the recording holds no events"] * 2
+        assert list(Reconstructor().reconstruct(batches, every_ns=MS)) == []
+
+
+def test_events_of_another_resolution_are_an_error(stream):
+    other = replace(stream.between(0, 10 * MS), width_px=640, height_px=480)
+    with pytest.raises(SourceError, match=r"cam: events of \(640, 480\) px follow events of \(160, 120\) px"):
+        list(Reconstructor().reconstruct([stream, other], STAMPS))
+
+
+def test_events_that_go_back_in_time_are_an_error(stream):
+    with pytest.raises(SourceError, match=r"cam: events go back in time by 1\.\d+ s"):
+        list(Reconstructor().reconstruct([stream, stream], [9_000 * MS]))
+
+
+def test_stamps_must_be_given_once_and_in_order(stream):
+    for wrong in ({}, {"stamps_ns": [1], "every_ns": 1}, {"stamps_ns": [2, 1]}, {"every_ns": 0}):
+        with pytest.raises(UsageError):
+            list(Reconstructor().reconstruct([stream], **wrong))
+
+
+@pytest.mark.parametrize("kind", ["auto", "time"])
+def test_an_hour_of_silence_costs_no_hour_of_steps(stream, kind):
+    first, rest = stream.between(0, 800 * MS), stream.between(800 * MS, 10_000 * MS)
+    hour_ns = 3_600 * 1_000 * MS
+    later = replace(rest, t_ns=rest.t_ns + hour_ns)
+    reconstructor = Reconstructor(options=options(windows=WindowOptions(kind)))
+    answers = list(reconstructor.reconstruct([first, later], [hour_ns + 1_500 * MS]))
+    assert isinstance(answers[0], Image)
+    assert reconstructor.n_steps < 100
+
+
+def test_a_reconstructor_starts_afresh_with_each_stream(stream):
+    reconstructor = Reconstructor()
+    first = list(reconstructor.reconstruct([stream], STAMPS[:2]))
+    second = list(reconstructor.reconstruct([stream], STAMPS[:2]))
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one.pixels, other.pixels)
+
+
+def test_steps_of_the_callers_own_windows_give_float_pictures_and_grey_ones(stream):
+    reconstructor = Reconstructor()
+    for start in range(0, 800, 50):
+        picture = reconstructor.step(
+            stream.between(start * MS, (start + 50) * MS), start * MS, (start + 50) * MS
+        )
+    assert reconstructor.is_warm and reconstructor.n_steps == 16
+    assert picture.dtype == np.float32 and picture.shape == (120, 160)
+    grey = Image("cam", "events", 800 * MS, reconstructor.to_grey(picture))
+    assert corner_rms_px(grey, inner_corners_px(Motion(), 0.8)) < 0.6
+
+
+def test_flickering_lamps_do_not_blind_the_network_for_good(stream):
+    lamp = np.arange(0, 400 * MS, 10 * MS) + 400 * MS
+    y, x = (a.ravel() for a in np.mgrid[0:120:2, 0:160:2])
+    storm = events_of(
+        np.repeat(lamp, len(x)),
+        np.tile(x, len(lamp)),
+        np.tile(y, len(lamp)),
+        np.arange(len(lamp) * len(x)) % 2,
+    )
+    parts = [
+        np.concatenate(pair)
+        for pair in zip(*((e.t_ns, e.x, e.y, e.polarity) for e in (stream, storm)), strict=True)
+    ]
+    errors = errors_px(events_of(*parts), "network", WindowOptions(), stamps=[1_300 * MS, 1_500 * MS])
+    assert (errors < 1.0).all()

@@ -1,0 +1,107 @@
+"""Events in bags: topics, packets lost or broken, torn bags."""
+
+from pathlib import Path
+
+import pytest
+
+from lce_rig.core.errors import SourceError
+from lce_rig.sources.events import EventRecording, open_events
+from lce_rig.sources.events.bag import read_triggers
+from lce_rig.sources.events.bag_writer import write_event_bag
+from tests.sources.events import encoders
+from tests.sources.events.bags import write_packet_bag
+from tests.sources.events.encoders import Event, listed, random_events
+
+TOPIC = "/event_camera/events"
+TRUTH = listed(random_events(2000, 11))
+PIECES = [TRUTH[i : i + 100] for i in range(0, 2000, 100)]
+
+
+def messages(is_ros1: bool, encoding: str = "mono") -> list[tuple[str, int, bytes]]:
+    encode = {"mono": lambda piece: encoders.mono(piece, 0), "evt3": encoders.evt3}[encoding]
+    return [
+        (TOPIC, 10**9 + 10**7 * i, encoders.packet(encode(piece), encoding, is_ros1=is_ros1, number=i))
+        for i, piece in enumerate(PIECES)
+    ]
+
+
+def everything(recording: EventRecording) -> list[Event]:
+    return [event for stretch in recording for event in listed(stretch)]
+
+
+@pytest.mark.parametrize("name", ["a.bag", "ros2"])
+@pytest.mark.parametrize("encoding", ["mono", "evt3"])
+def test_packets_of_a_topic_are_one_recording(tmp_path: Path, name: str, encoding: str) -> None:
+    path = write_packet_bag(tmp_path / name, messages(name == "a.bag", encoding))
+    recording = open_events(path)
+    assert everything(recording) == TRUTH
+    assert recording.notes == [f"{name}: events from {TOPIC} (20 messages)"]
+
+
+@pytest.mark.parametrize("name", ["a.bag", "ros2"])
+def test_broken_packets_are_counted_and_the_first_is_named(tmp_path: Path, name: str) -> None:
+    sent = messages(name == "a.bag")
+    for i in (5, 9, 17):
+        topic, received_ns, data = sent[i]
+        sent[i] = topic, received_ns, data[:-3]
+    recording = open_events(write_packet_bag(tmp_path / name, sent))
+    kept = [event for i, piece in enumerate(PIECES) if i not in (5, 9, 17) for event in piece]
+    assert everything(recording) == kept
+    assert any(
+        "3 broken packets left out (first: message 5, received 0.050 s in:" in n for n in recording.notes
+    )
+
+
+def test_packets_that_never_arrived_are_counted(tmp_path: Path) -> None:
+    sent = messages(is_ros1=True)
+    recording = open_events(write_packet_bag(tmp_path / "a.bag", sent[:4] + sent[7:]))
+    assert len(everything(recording)) == 1700
+    assert any("3 packets lost in recording" in note for note in recording.notes)
+
+
+def test_packets_of_another_size_or_encoding_are_broken_ones(tmp_path: Path) -> None:
+    sent = messages(is_ros1=True)
+    odd = encoders.packet(b"", "mono", is_ros1=True, number=20, size=(640, 480))
+    strange = encoders.packet(b"12345678", "evt9", is_ros1=True, number=21)
+    sent += [(TOPIC, 2 * 10**9, odd), (TOPIC, 2 * 10**9, strange)]
+    recording = open_events(write_packet_bag(tmp_path / "a.bag", sent))
+    assert everything(recording) == TRUTH
+    assert any("2 broken packets left out" in n and "640x480" in n for n in recording.notes)
+
+
+def test_a_bag_torn_in_the_middle_is_read_up_to_there_and_the_loss_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "a.bag"
+    events = random_events(100_000, 3, start_us=1_700_000_000_000_000, step_us=100)
+    write_event_bag(path, [events])
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    # Recorders cut files into chunks of some megabytes; this one has a single chunk, which is lost whole.
+    with pytest.raises(SourceError, match=r"a\.bag"):
+        open_events(path)
+    path.write_bytes(whole[:-2000])
+    recording = open_events(path)
+    assert everything(recording) == listed(events)
+    assert any("torn" in note for note in recording.notes)
+
+
+def test_the_topic_is_found_among_triggers_and_others(tmp_path: Path) -> None:
+    edges = [(10, 0, 1, True), (400, 0, 1, False)]
+    trigger = encoders.packet(encoders.mono(edges, 0), "trigger", is_ros1=True)
+    sent = [("/event_camera/triggers", 10**9, trigger), *messages(is_ros1=True)]
+    path = write_packet_bag(tmp_path / "a.bag", sent)
+    assert everything(open_events(path)) == TRUTH
+    assert read_triggers(path).t_ns.tolist() == [10_000, 400_000]
+    with pytest.raises(SourceError, match=r"no events.*1 packets of triggers"):
+        open_events(path, topic="/event_camera/triggers")
+
+
+def test_two_cameras_need_a_topic_and_the_topics_are_listed(tmp_path: Path) -> None:
+    sent = messages(is_ros1=True)
+    path = write_packet_bag(tmp_path / "a.bag", sent + [("/other", t, data) for _, t, data in sent[:3]])
+    with pytest.raises(SourceError, match="2 topics") as caught:
+        open_events(path)
+    assert "/other (event_camera_msgs/EventPacket, 3)" in caught.value.hint
+    assert everything(open_events(path, topic="/other")) == TRUTH[:300]
+    with pytest.raises(SourceError, match="no topic /none") as caught:
+        open_events(path, topic="/none")
+    assert TOPIC in caught.value.hint

@@ -1,0 +1,189 @@
+"""Pictures for people: what must be drawn, what must not, and that sizes and files are right."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.errors import SessionError
+from lce_rig.core.geometry import Array, transform
+from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.verify.canvas import MAGENTA, ORANGE, PANEL, Picture, round_ticks, text_width_px, wrapped
+from lce_rig.verify.contact_sheet import contact_sheet
+from lce_rig.verify.debug_image import draw_debug
+from lce_rig.verify.overlay import draw_overlay
+from lce_rig.verify.writing import write_overlays, write_picture
+
+BOARD = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)
+FOLDING = Intrinsics(300.0, 300.0, 172.5, 129.5, 346, 260, "radtan", (-0.4, 0.0, 0.0, 0.0, 0.0))
+LARGE = Intrinsics(1177.0, 1177.0, 960.0, 604.0, 1920, 1208, "equidistant", (-0.05, 0.0, 0.0, 0.0))
+# LiDAR x forward, y left, z up; camera x right, y down, z forward; same place.
+T_CAM_LIDAR = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
+T_CAM_BOARD = np.array([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2.0], [0, 0, 0, 1]], dtype=np.float64)
+
+
+def scan_of(points: Array) -> Scan:
+    n = len(points)
+    return Scan("lidar", None, points.astype(np.float32), np.zeros(n, np.float32), np.zeros(n, np.int16))
+
+
+def wall(x_m: float = 2.0) -> Array:
+    y, z = np.meshgrid(np.linspace(-0.38, 0.38, 39), np.linspace(-0.3, 0.3, 8))
+    return np.stack([np.full(y.size, x_m), y.ravel(), z.ravel()], axis=1)
+
+
+def grey(camera: Intrinsics) -> NDArray[np.uint8]:
+    return np.full((camera.height_px, camera.width_px), 128, np.uint8)
+
+
+def image_board(camera: Intrinsics) -> ImageBoard:
+    corners, _ = camera.project(transform(T_CAM_BOARD, BOARD.corners()))
+    return ImageBoard(
+        corners, T_CAM_BOARD, np.eye(6) * 1e-6, None, np.inf, False, 0.1, 0.07, {"tilt_deg": 3.0}
+    )
+
+
+def lidar_board(points: Array) -> LidarBoard:
+    T_lidar_board = np.linalg.inv(T_CAM_LIDAR) @ T_CAM_BOARD
+    ends = points[np.abs(points[:, 1]) > 0.37]
+    return LidarBoard(
+        points=points,
+        ring=np.zeros(len(points), np.int16),
+        edge_points=ends,
+        edge_ring=np.zeros(len(ends), np.int16),
+        edge_side=np.ones(len(ends), np.int8),
+        azimuth_step_rad=0.0035,
+        plane=np.array([-1.0, 0, 0, 2.0]),
+        sigma_m=0.01,
+        T_lidar_board=T_lidar_board,
+        quality={"n_rings": 8.0, "n_points": float(len(points)), "thickness_m": 0.03},
+    )
+
+
+def overlay(camera: Intrinsics, points: Array, **boards: object) -> Picture:
+    return draw_overlay(
+        Image("cam", "frames", None, grey(camera)),
+        scan_of(points),
+        camera,
+        T_CAM_LIDAR,
+        lidar_board=boards.get("lidar"),  # type: ignore[arg-type]
+        image_board=boards.get("image"),  # type: ignore[arg-type]
+        board=BOARD,
+        residuals={"plane (mm)": 4.25, "verdict": "pass"},
+        title="capture 000000",
+    )
+
+
+def picture_part(drawn: Picture, camera: Intrinsics) -> Picture:
+    """Cut title and legend off."""
+    factor = drawn.shape[1] // camera.width_px
+    top = round(2.6 * 13 * drawn.shape[1] / 1000)
+    return drawn[top : top + factor * camera.height_px]
+
+
+def count(drawn: Picture, colour: tuple[int, int, int]) -> int:
+    return int(np.all(np.abs(drawn.astype(int) - colour) < 20, axis=-1).sum())
+
+
+@pytest.mark.parametrize("camera", [FOLDING, LARGE], ids=["346x260", "1920x1208"])
+def test_points_board_and_ends_are_drawn_at_any_size(camera: Intrinsics) -> None:
+    points = wall()
+    drawn = overlay(camera, points, lidar=lidar_board(points), image=image_board(camera))
+    assert drawn.dtype == np.uint8 and drawn.shape[1] >= 960 and drawn.shape[1] % camera.width_px == 0
+    part = picture_part(drawn, camera)
+    assert count(part, MAGENTA) > 300
+    assert count(part, ORANGE) > 50
+
+
+def test_a_point_appears_where_the_camera_sees_it() -> None:
+    part = picture_part(overlay(FOLDING, np.array([[2.0, 0.4, 0.2]])), FOLDING)
+    v, u = np.argwhere(np.any(part != 128, axis=-1)).mean(axis=0)
+    truth, _ = FOLDING.project(np.array([-0.4, -0.2, 2.0]))
+    assert (u, v) == pytest.approx(tuple((truth + 0.5) * 3 - 0.5), abs=0.8)
+
+
+def test_points_behind_the_camera_or_folded_by_the_distortion_are_not_drawn() -> None:
+    behind = wall(-2.0)
+    # At 60 deg r = 1.73, beyond the fold of 1 - 0.4 r^2 at r = 0.91, where the polynomial draws it at -0.35.
+    folded = np.stack([np.ones(20), np.full(20, np.tan(np.radians(60))), np.linspace(-0.2, 0.2, 20)], axis=1)
+    part = picture_part(overlay(FOLDING, np.concatenate([behind, folded])), FOLDING)
+    assert np.all(part == 128)
+
+
+def test_near_points_cover_far_ones() -> None:
+    far, near = wall(4.0) * [1, 2, 2], wall(2.0)
+    both = picture_part(overlay(FOLDING, np.concatenate([near, far])), FOLDING)
+    swapped = picture_part(overlay(FOLDING, np.concatenate([far, near])), FOLDING)
+    assert np.array_equal(both, swapped)
+
+
+def test_an_empty_scan_and_missing_boards_are_drawn_too() -> None:
+    drawn = overlay(FOLDING, np.zeros((0, 3)))
+    assert np.all(picture_part(drawn, FOLDING) == 128)
+
+
+@pytest.mark.parametrize("has_image", [True, False])
+@pytest.mark.parametrize("has_lidar", [True, False])
+def test_a_debug_picture_is_made_of_whatever_there_is(has_image: bool, has_lidar: bool) -> None:
+    points = wall()
+    refusal = Refusal("image", "no board: 8x6 inner corners wanted, none seen", "show the whole print " * 12)
+    drawn = draw_debug(
+        Image("cam", "frames", None, grey(FOLDING)) if has_image else None,
+        scan_of(points) if has_lidar else None,
+        image_board(FOLDING) if has_image else refusal,
+        [lidar_board(points), lidar_board(points - [0, 0.2, 0])] if has_lidar else refusal,
+        board=BOARD,
+        intrinsics=FOLDING,
+        title="capture 000000",
+    )
+    assert drawn.shape[1] == 1600
+    assert (count(drawn[:, 800:], MAGENTA) > 100) == has_lidar
+
+
+def test_text_is_broken_to_fit_and_nothing_is_lost() -> None:
+    text = "board cut off by the right border: 8x6 inner corners wanted, 6x6 seen"
+    lines = wrapped(text, 200, 11)
+    assert " ".join(lines) == text
+    assert len(lines) > 2
+    assert all(text_width_px(line, 11) <= 200 for line in lines)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 10), (1, 20), (0.2, 0.9), (3, 5)])
+def test_ticks_are_round_and_within_the_scale(low: float, high: float) -> None:
+    ticks = round_ticks(low, high, 4)
+    assert 2 <= len(ticks) <= 6
+    assert all(low - 1e-9 <= tick <= high + 1e-9 for tick in ticks)
+    assert len({f"{tick:g}" for tick in ticks}) == len(ticks)
+
+
+def test_a_contact_sheet_holds_every_picture_once() -> None:
+    colours = [(20 * index, 200, 30 + 20 * index) for index in range(7)]
+    tiles = [
+        (f"{index:06d}", np.full((100, 160, 3), colour, np.uint8)) for index, colour in enumerate(colours)
+    ]
+    sheet = contact_sheet(tiles, columns=3, tile_width_px=160)
+    for colour in colours:
+        assert int(np.all(sheet == colour, axis=-1).sum()) == 16000
+    assert np.all(sheet[0, 0] == PANEL)
+    with pytest.raises(ValueError, match="at least one"):
+        contact_sheet([])
+
+
+def test_overlays_are_written_with_a_contact_sheet_and_read_back_unchanged(tmp_path: Path) -> None:
+    drawn = overlay(FOLDING, wall())
+    files = write_overlays(tmp_path / "overlays", [("000000", drawn), ("cam/../../000001", drawn)])
+    assert [file.parent for file in files] == [tmp_path / "overlays"] * 3
+    assert files[-1].name == "contact_sheet.png"
+    assert np.array_equal(cv2.imread(str(files[0])), drawn)
+    assert write_overlays(tmp_path / "none", []) == []
+
+
+def test_a_picture_that_cannot_be_written_names_the_file(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SessionError, match=r"file.a\.png"):
+        write_picture(tmp_path / "file" / "a.png", np.zeros((4, 4, 3), np.uint8))
