@@ -29,6 +29,7 @@ from lce_rig.detect.detection import (
     from_arrays,
     to_arrays,
 )
+from lce_rig.detect.gates import gate_image_board, gate_lidar_boards
 from lce_rig.export.reference import Reference
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
@@ -100,14 +101,31 @@ def detect_image(rig: Rig, image: Image) -> ImageDetection:
     """Find the board in one picture."""
     from lce_rig.detect.image_board import find_image_board
 
-    return find_image_board(image, rig.board.to_board(), rig.cameras[image.sensor].to_intrinsics())
+    found = find_image_board(
+        image,
+        rig.board.to_board(),
+        rig.cameras[image.sensor].to_intrinsics(),
+        max_reprojection_px=rig.quality.max_reprojection_px,
+    )
+    return found if isinstance(found, Refusal) else gate_image_board(found, rig.quality)
 
 
 def detect_scan(rig: Rig, scan: Scan) -> LidarDetection:
     """Find the surfaces of the board's size in one scan, likeliest first."""
     from lce_rig.detect.lidar_board import find_lidar_boards
+    from lce_rig.detect.lidar_features import Beam
 
-    return find_lidar_boards(scan, rig.board.to_board())
+    lidar, limits, board = rig.lidars[scan.sensor], rig.quality, rig.board.to_board()
+    found = find_lidar_boards(
+        scan,
+        board,
+        min_range_m=lidar.min_range_m,
+        max_range_m=min(lidar.max_range_m, limits.max_distance_m),
+        min_rings=limits.min_rings,
+        max_rms_m=limits.max_thickness_m,
+        beam=Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad),
+    )
+    return found if isinstance(found, Refusal) else gate_lidar_boards(found, board, limits)
 
 
 def _detection_digest(rig: Rig) -> str:

@@ -25,6 +25,7 @@ SIZE_PX = 192
 N_WARM_UP = 12
 COLS, ROWS = 7, 6  # squares
 MARGIN_PX = 6.0
+WRONG_GRID_PX = 5.0  # beyond, the finder took other corners than the board's
 
 
 class BoardScene:
@@ -86,7 +87,7 @@ def judge_scene(model: ReconstructionModel, seed: int, n_windows: int, every: in
     return results
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Print the figures as JSON."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -95,7 +96,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=40)
     parser.add_argument("--windows", type=int, default=60)
     parser.add_argument("--every", type=int, default=8, help="judge every so many windows")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     model = ReconstructionModel(options.model)
@@ -106,10 +107,11 @@ def main() -> None:
     ]
     errors = np.array([result["error_px"] for result in judged])
     ideal = np.array([result["ideal_px"] for result in judged])
-    found = np.isfinite(errors)
+    found = errors < WRONG_GRID_PX
     figures = {
         "pictures": len(judged),
         "found_share": float(found.mean()),
+        "wrong_grid_share": float(np.mean(errors >= WRONG_GRID_PX)),
         "corner_rms_px": float(np.sqrt(np.mean(errors[found] ** 2))),
         "corner_median_px": float(np.median(errors[found])),
         "share_below_0.5_px": float(np.mean(errors[found] < 0.5)),

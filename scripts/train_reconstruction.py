@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 from training.event_simulation import EventStream
 from training.loss import reconstruction_loss
-from training.network import N_BINS, ReconstructionNetwork
+from training.network import ReconstructionNetwork
 from training.onnx_export import export_onnx
 
 UPDATES_PER_SCENE = 6
@@ -55,8 +55,9 @@ class Trainer:
 
     def spent(self) -> float:
         """Share of the budget that is used up, by time or by updates."""
-        by_time = self.progress.elapsed_s / (60 * self.options.minutes)
-        return max(by_time, self.progress.updates / self.options.updates if self.options.updates else 0.0)
+        if self.options.updates:
+            return self.progress.updates / self.options.updates
+        return self.progress.elapsed_s / (60 * self.options.minutes)
 
     def learn_scenes(self) -> float:
         """Train on one batch of scenes from rest; return the mean loss."""
@@ -135,7 +136,7 @@ def parse_options(arguments: list[str] | None = None) -> argparse.Namespace:
         "--out", type=Path, required=True, help="folder of checkpoint.pt and reconstruction.onnx"
     )
     parser.add_argument("--minutes", type=float, default=120.0, help="training time, counted over all runs")
-    parser.add_argument("--updates", type=int, default=0, help="stop after so many updates (0: time alone)")
+    parser.add_argument("--updates", type=int, default=0, help="number of updates, in place of --minutes")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--batch", type=int, default=6, help="scenes at a time; 128 fills a GPU")
@@ -150,7 +151,6 @@ def parse_options(arguments: list[str] | None = None) -> argparse.Namespace:
 def main(arguments: list[str] | None = None) -> None:
     """Train until the budget is spent, saving once a minute."""
     options = parse_options(arguments)
-    assert N_BINS == 5
     torch.set_num_threads(1)
     options.out.mkdir(parents=True, exist_ok=True)
     trainer = Trainer(options)

@@ -127,7 +127,6 @@ def _attempts(grey: Grey, size: tuple[int, int], is_other_seen: bool) -> Iterato
         yield _classic(grey, size, 2.0)
         yield _classic(level, size, 2.0)
     yield _sector_based(level, size, 1.5, _SB_THOROUGH)
-    yield _sector_based(level, size, 1.0, _SB_THOROUGH)
 
 
 def level_contrast(grey: Grey) -> Grey:

@@ -54,6 +54,8 @@ class LidarSettings(Settings):
         topic: topic of its clouds in bags.
         min_range_m: nearer returns are ignored.
         max_range_m: farther returns are ignored.
+        beam_aperture_m: width of the light beam where it leaves the sensor; 0 for an ideal one.
+        beam_divergence_rad: full angle by which the beam widens.
     """
 
     model: str = "VLP-16"
@@ -62,6 +64,8 @@ class LidarSettings(Settings):
     rate_hz: Positive = 10.0
     min_range_m: NotNegative = 0.4
     max_range_m: Positive = 100.0
+    beam_aperture_m: NotNegative = 0.0127
+    beam_divergence_rad: NotNegative = 0.003
     timestamps: TimestampSettings = TimestampSettings(reference="first_firing")
     driver: DriverSettings = DriverSettings()
 

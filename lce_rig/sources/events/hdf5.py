@@ -90,7 +90,9 @@ def _unreadable(path: Path, file: Any, error: OSError) -> SourceError:
     for name in _COLUMNS:
         settings = file[f"events/{name}"].id.get_create_plist()
         filters = [settings.get_filter(i) for i in range(settings.get_nfilters())]
-        missing = [label.decode() or str(number) for number, _, _, label in filters if not filter_avail(number)]
+        missing = [
+            label.decode() or str(number) for number, _, _, label in filters if not filter_avail(number)
+        ]
         if missing:
             what = f"{path}: events/{name} is compressed by {missing[0]}, which is not installed"
             return SourceError(what, "pip install hdf5plugin")

@@ -31,9 +31,7 @@ def random_events(
             t_us[i:] -= t_us[i] - t_us[i - 1]
             x[i], y[i] = min(x[i - 1] + rng.integers(1, 4), size[0] - 1), y[i - 1]
     polarity = rng.random(n) < 0.5
-    return Events(
-        "events", t_us * 1000, x.astype(np.uint16), y.astype(np.uint16), polarity, *size
-    )
+    return Events("events", t_us * 1000, x.astype(np.uint16), y.astype(np.uint16), polarity, *size)
 
 
 def evt2(events: Iterable[Event]) -> bytes:

@@ -75,12 +75,14 @@ def test_a_bag_torn_in_the_middle_is_read_up_to_there_and_the_loss_is_said(tmp_p
     write_event_bag(path, [events])
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    # Recorders cut files into chunks of some megabytes; this one has a single chunk, which is lost whole.
+    # Bags are written chunk by chunk; the first, of about a megabyte, is torn here.
     with pytest.raises(SourceError, match=r"a\.bag"):
         open_events(path)
     path.write_bytes(whole[:-2000])
     recording = open_events(path)
-    assert everything(recording) == listed(events)
+    found = everything(recording)
+    assert 50_000 < len(found) < len(events)
+    assert found == listed(events)[: len(found)]
     assert any("torn" in note for note in recording.notes)
 
 

@@ -56,7 +56,10 @@ def test_a_real_drivers_compressed_packets_are_read_as_word_by_word(folder: Path
     assert np.array_equal(np.stack([x, y, polarity], axis=1), truth[order, 1:])
 
 
-@pytest.mark.parametrize(("name", "n", "duration_s"), [("event_packet_ros1.bag", 343_474, 2.078), ("evt3_pedestrians.raw", 5000, 0.045)])
+@pytest.mark.parametrize(
+    ("name", "n", "duration_s"),
+    [("event_packet_ros1.bag", 343_474, 2.078), ("evt3_pedestrians.raw", 5000, 0.045)],
+)
 def test_evt3_is_read_as_word_by_word(folder: Path, name: str, n: int, duration_s: float) -> None:
     path = folder / name
     if path.suffix == ".bag":

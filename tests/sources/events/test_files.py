@@ -115,7 +115,9 @@ def test_a_file_of_no_declared_resolution_takes_its_extent_and_says_so(tmp_path:
 
 def test_dv_processing_reads_what_is_written(tmp_path: Path) -> None:
     dv = pytest.importorskip("dv_processing")
-    write_aedat4(tmp_path / "a.aedat4", [EVENTS.select(slice(0, 9)), EVENTS.select(slice(9, None))], "cam & co")
+    write_aedat4(
+        tmp_path / "a.aedat4", [EVENTS.select(slice(0, 9)), EVENTS.select(slice(9, None))], "cam & co"
+    )
     recording = dv.io.MonoCameraRecording(str(tmp_path / "a.aedat4"))
     assert tuple(recording.getEventResolution()) == (346, 260)
     assert recording.getCameraName() == "cam & co"

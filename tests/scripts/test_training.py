@@ -1,0 +1,185 @@
+"""Training of the reconstruction network: simulated events, resuming, export."""
+
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="the extra `train` is not installed")
+pytest.importorskip("onnx", reason="the extra `train` is not installed")
+
+import evaluate_reconstruction  # noqa: E402
+import train_reconstruction  # noqa: E402
+from training.event_simulation import EventStream, Pixels, normalised  # noqa: E402
+from training.loss import reconstruction_loss, structural_similarity  # noqa: E402
+from training.network import ReconstructionNetwork  # noqa: E402
+from training.onnx_export import export_onnx  # noqa: E402
+
+from lce_rig.core.data import Events  # noqa: E402
+from lce_rig.detect.reconstruct import ReconstructionModel, normalise_voxels, voxel_grid  # noqa: E402
+
+CPU = torch.device("cpu")
+SIZE = 16
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+def quiet_pixels(n, seed=0):
+    """Make pixels without noise, leak, lag or refractory period, so that the law of crossings holds exactly."""
+    pixels = Pixels(n, SIZE, torch.Generator().manual_seed(seed), CPU)
+    pixels.noise_rate *= 0
+    pixels.hot_rate *= 0
+    pixels.leak *= 0
+    pixels.response = torch.ones_like(pixels.response)
+    pixels.most = torch.full_like(pixels.most, 1e6)
+    return pixels
+
+
+def random_light(generator, n=2):
+    return 0.05 + 0.9 * torch.rand(n, 1, SIZE, SIZE, generator=generator)
+
+
+def test_no_pixel_stays_further_than_its_threshold_from_its_last_event():
+    generator = torch.Generator().manual_seed(1)
+    pixels = quiet_pixels(2)
+    pixels.start(random_light(generator))
+    for _ in range(6):
+        pixels.expose(random_light(generator), generator)
+        left = pixels.level - pixels.memory
+        assert (left < pixels.on * 1.001).all() and (left > -pixels.off * 1.001).all()
+
+
+def test_sums_over_an_interval_equal_those_of_its_events_one_by_one():
+    generator = torch.Generator().manual_seed(2)
+    pixels = quiet_pixels(1)
+    pixels.start(random_light(generator, 1))
+    pixels.expose(random_light(generator, 1), generator)
+    before, memory = pixels.level[0, 0].double().numpy(), pixels.memory[0, 0].double().numpy()
+    early, late = (a[0, 0].numpy() for a in pixels.expose(random_light(generator, 1), generator))
+    after = pixels.level[0, 0].double().numpy()
+    expected = np.zeros((2, SIZE, SIZE))
+    for y, x in np.ndindex(SIZE, SIZE):
+        sign = np.sign(after[y, x] - memory[y, x])
+        threshold = float((pixels.on if sign > 0 else pixels.off)[0, 0, y, x])
+        for j in range(1, int(abs(after[y, x] - memory[y, x]) / threshold) + 1):
+            fraction = (memory[y, x] + sign * j * threshold - before[y, x]) / (after[y, x] - before[y, x])
+            expected[:, y, x] += sign * (1 - fraction), sign * fraction
+    np.testing.assert_allclose(np.stack([early, late]), expected, atol=2e-3)
+
+
+def test_the_simulators_grids_are_those_the_package_makes_of_events():
+    rng = np.random.default_rng(3)
+    n = 400
+    events = Events(
+        "cam",
+        np.sort(rng.integers(0, 1000, n)),
+        rng.integers(0, SIZE, n).astype(np.uint16),
+        rng.integers(0, SIZE, n).astype(np.uint16),
+        rng.random(n) < 0.5,
+        SIZE,
+        SIZE,
+    )
+    grid = voxel_grid(events, 5, 0, 1000)
+    of_training = normalised(torch.from_numpy(grid)[None])[0].numpy()
+    np.testing.assert_allclose(of_training, normalise_voxels(grid.copy()), atol=1e-4)
+
+
+def test_the_refractory_period_limits_what_a_pixel_says():
+    generator = torch.Generator().manual_seed(4)
+    pixels = quiet_pixels(2)
+    pixels.most = torch.full_like(pixels.most, 2.0)
+    pixels.start(torch.full((2, 1, SIZE, SIZE), 0.02))
+    early, late = pixels.expose(torch.full((2, 1, SIZE, SIZE), 1.0), generator)
+    np.testing.assert_allclose((early + late).numpy(), 2.0, atol=1e-4)
+
+
+def test_streams_repeat_with_their_seed_and_differ_with_another():
+    first, again, other = (EventStream(2, 32, seed, CPU) for seed in (5, 5, 6))
+    for _ in range(3):
+        windows = [stream.window() for stream in (first, again, other)]
+        for a, b in zip(windows[0], windows[1], strict=True):
+            assert torch.equal(a, b)
+        assert not torch.equal(windows[0][1], windows[2][1])
+        assert all(torch.isfinite(part).all() for window in windows for part in window)
+
+
+def test_counted_windows_reach_rates_from_sparse_to_dense():
+    stream = EventStream(24, 32, 7, CPU)
+    hits = [(stream.window()[0] != 0).any(1).float().mean((1, 2)) for _ in range(16)]
+    rate = torch.stack(hits[8:]).mean(0)
+    assert rate.min() < 0.05 and rate.max() > 0.3
+
+
+def test_the_loss_is_zero_for_the_truth_alone():
+    truth = torch.rand(2, 1, 32, 32, generator=torch.Generator().manual_seed(8))
+    weights = torch.ones_like(truth)
+    assert float(reconstruction_loss(truth, truth, weights)) == pytest.approx(0, abs=1e-5)
+    assert float(reconstruction_loss(1 - truth, truth, weights)) > 0.5
+    assert float(structural_similarity(truth, truth).mean()) == pytest.approx(1, abs=1e-4)
+
+
+def test_the_exported_file_computes_what_the_network_computes(tmp_path):
+    torch.manual_seed(9)
+    network = ReconstructionNetwork().eval()
+    export_onnx(network, tmp_path / "net.onnx")
+    model = ReconstructionModel(tmp_path / "net.onnx")
+    rng = np.random.default_rng(9)
+    states = model.initial_states(44, 52)
+    expected_states = network.initial_states(1, 44, 52)
+    for _ in range(3):
+        voxels = rng.standard_normal((5, 44, 52)).astype(np.float32)
+        picture, states = model.step(voxels, states)
+        with torch.no_grad():
+            expected, *expected_states = network(torch.from_numpy(voxels)[None], *expected_states)
+        np.testing.assert_allclose(picture, expected[0, 0].numpy(), atol=1e-4)
+
+
+TINY = ["--batch", "2", "--crop-px", "16", "--unroll", "6", "--device", "cpu"]
+
+
+def weights_of(folder):
+    return torch.load(folder / "checkpoint.pt", weights_only=True)["average"]
+
+
+def test_a_resumed_run_ends_where_an_unbroken_one_does(tmp_path, monkeypatch):
+    unbroken, broken = tmp_path / "a", tmp_path / "b"
+    train_reconstruction.main([*TINY, "--out", str(unbroken), "--updates", "12"])
+    options = train_reconstruction.parse_options([*TINY, "--out", str(broken), "--updates", "12"])
+    broken.mkdir()
+    trainer = train_reconstruction.Trainer(options)
+    trainer.learn_scenes()
+    trainer.save(broken)
+    train_reconstruction.main([*TINY, "--out", str(broken), "--updates", "12", "--resume"])
+    for name, value in weights_of(unbroken).items():
+        assert torch.equal(value, weights_of(broken)[name]), name
+    assert (broken / "reconstruction.onnx").read_bytes() == (unbroken / "reconstruction.onnx").read_bytes()
+
+
+def test_a_finished_run_is_not_trained_further(tmp_path):
+    arguments = [*TINY, "--out", str(tmp_path), "--updates", "6"]
+    train_reconstruction.main(arguments)
+    before = weights_of(tmp_path)
+    train_reconstruction.main([*arguments, "--resume"])
+    assert all(torch.equal(value, before[name]) for name, value in weights_of(tmp_path).items())
+
+
+def test_truth_of_held_out_boards_is_where_a_perfect_picture_shows_them():
+    scene = evaluate_reconstruction.BoardScene(11)
+    errors = []
+    for _ in range(12):
+        _, target, _ = scene.stream.window()
+        grey = (target[0, 0].numpy().clip(0, 1) * 255).astype(np.uint8)
+        error = evaluate_reconstruction.corner_error_px(grey, scene.corners_px())
+        if error is not None:
+            errors.append(error)
+    assert errors and max(errors) < 0.25
+
+
+@pytest.mark.slow
+def test_the_shipped_network_finds_held_out_boards(capsys):
+    evaluate_reconstruction.main(["--scenes", "12"])
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["found_share"] > 0.85 and figures["corner_rms_px"] < 0.5
