@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate, CaptureCandidates
 from lce_rig.calibrate import calibrate as estimate_extrinsic
@@ -36,6 +37,7 @@ from lce_rig.session import Capture, Session
 from lce_rig.verify.session_check import SessionCheck, check_session
 
 Progress = Callable[[int, int], None]
+Sample = TypeVar("Sample", Image, Scan)
 CALIBRATION, OVERLAYS, DEBUG = "calibration", "overlays", "debug"
 
 
@@ -81,7 +83,7 @@ def _detect_one(
 ) -> ImageDetection | LidarDetection:
     name = ".".join(sensor) if isinstance(sensor, tuple) else sensor
     try:
-        # The content is part of the key: a capture removed and another collected in its place has the same name.
+        # The content is part of the key: a capture may be removed and another take its name.
         key = f"{digest}/{capture.name}-{capture.content_sha256[:12]}.{name}"
         cached = session.load_cached(key)
         if cached is not None:
@@ -266,7 +268,8 @@ def verify(
         session: may be another one than the calibrations come from.
         detections: of this session.
         calibrations: as a rule from its result.json.
-        folder: for the pictures; the session's calibration/overlays/ where None. Several pairs get a folder each.
+        folder: for the pictures; the session's calibration/overlays/ where None. Several pairs get a
+            folder each.
         progress: called with (done, total) for each pair in turn.
     """
     base = folder or session.path / CALIBRATION / OVERLAYS
@@ -275,3 +278,41 @@ def verify(
         own = base if len(calibrations) == 1 else base / f"{c.camera}.{c.channel}.{c.lidar}"
         checks.append(check_session(session, detections, c, own, progress))
     return checks
+
+
+def write_debug_images(
+    session: Session, detections: Detections, *, folder: Path | None = None, progress: Progress = _silent
+) -> Path:
+    """Draw for every capture what each sensor saw of the board, and why it was refused.
+
+    Returns:
+        The folder of the pictures; the session's debug/ by default.
+    """
+    from lce_rig.verify.debug_image import draw_debug
+    from lce_rig.verify.writing import write_picture
+
+    base = folder or session.path / DEBUG
+    jobs = [(pair, name) for pair in detections.pairs for name in detections.captures(pair)]
+    for done, (pair, name) in enumerate(jobs, start=1):
+        capture, (image, lidar) = session.capture(name), detections.of(pair, name)
+        picture = draw_debug(
+            _readable(capture.image, pair.camera, pair.channel),
+            _readable(capture.scan, pair.lidar),
+            image,
+            lidar,
+            board=session.rig.board.to_board(),
+            intrinsics=session.rig.cameras[pair.camera].to_intrinsics(),
+            title=f"{pair}  {name}",
+        )
+        own = base if len(detections.pairs) == 1 else base / f"{pair.camera}.{pair.channel}.{pair.lidar}"
+        write_picture(own / f"{name}.png", picture)
+        progress(done, len(jobs))
+    return base
+
+
+def _readable(read: Callable[..., Sample], *sensor: str) -> Sample | None:
+    """Read a sample; None where it is damaged, as its detection says."""
+    try:
+        return read(*sensor)
+    except SessionError:
+        return None

@@ -37,10 +37,16 @@ def render_image(
         channel: channel of that camera.
         stamp_ns: device time of mid exposure.
     """
+    radiance = render_radiance(scene, backdrop)
+    return Image(sensor, channel, stamp_ns, expose(radiance, noise, rng), stamp_ns)
+
+
+def render_radiance(scene: Scene, backdrop: Backdrop) -> Array:
+    """Compute what reaches the lens: linear (H, W, 3)."""
     radiance = backdrop.radiance * _shadow(scene, backdrop)[..., None]
     _paint_mirror_images(radiance, scene, backdrop)
     _paint_moving(radiance, scene, backdrop)
-    return Image(sensor, channel, stamp_ns, _expose(radiance, noise, rng), stamp_ns)
+    return radiance
 
 
 def _shadow(scene: Scene, backdrop: Backdrop) -> Array:
@@ -203,16 +209,21 @@ def _spread(light: Array, mask: NDArray[np.bool_]) -> Array:
     return np.asarray(summed / np.maximum(total, 1e-9)[..., None])
 
 
-def _expose(radiance: Array, noise: CameraNoise, rng: np.random.Generator) -> NDArray[np.uint8]:
+def sensor_gain(height_px: int, width_px: int, noise: CameraNoise) -> Array:
+    """Compute by what radiance is multiplied on its way to each pixel (H, W): exposure and vignetting."""
+    v, u = np.mgrid[0:height_px, 0:width_px]
+    radius2 = ((u - (width_px - 1) / 2) ** 2 + (v - (height_px - 1) / 2) ** 2) / (
+        ((width_px - 1) ** 2 + (height_px - 1) ** 2) / 4
+    )
+    return np.asarray(noise.exposure * (1 - noise.vignetting * radius2))
+
+
+def expose(radiance: Array, noise: CameraNoise, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Turn linear radiance (H, W, 3) into a picture: vignetting, point spread, shot and read noise, gamma."""
     import cv2
 
     height, width = radiance.shape[:2]
-    v, u = np.mgrid[0:height, 0:width]
-    radius2 = ((u - (width - 1) / 2) ** 2 + (v - (height - 1) / 2) ** 2) / (
-        ((width - 1) ** 2 + (height - 1) ** 2) / 4
-    )
-    linear = (radiance * (noise.exposure * (1 - noise.vignetting * radius2))[..., None]).astype(np.float32)
+    linear = (radiance * sensor_gain(height, width, noise)[..., None]).astype(np.float32)
     if noise.blur_px > 0:
         linear = cv2.GaussianBlur(linear, (0, 0), noise.blur_px, borderType=cv2.BORDER_REPLICATE)
     if np.isfinite(noise.full_well_e):

@@ -7,6 +7,7 @@ from typing import Literal
 PAPER_RANGE_SIGMA_M = (0.0, 0.008, 0.016, 0.024, 0.032, 0.040, 0.048, 0.060, 0.080, 0.100)
 
 Carrier = Literal["stand", "person", "none"]
+Motion = Literal["still", "moving"]
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,67 @@ class CameraNoise:
 
 
 @dataclass(frozen=True)
+class EventNoise:
+    """How an event camera errs; the defaults are a DAVIS346's indoors.
+
+    Attributes:
+        threshold_on, threshold_off: mean change of ln(intensity) that makes an event.
+        threshold_sigma: spread of the pixels' own thresholds, fixed for a session.
+        cutoff_hz: bandwidth of a pixel that sees full white; darker ones are slower. inf for no limit.
+        refractory_s: how long a pixel is blind after each event.
+        leak_hz: ON events of a pixel that sees nothing change.
+        noise_hz: further events of each pixel, of either polarity, twice as many in the dark.
+        hot_share: share of the pixels that fire all the time ...
+        hot_hz: ... at rates between these.
+        dark_radiance: radiance that a black pixel seems to see, from stray light and dark current.
+    """
+
+    threshold_on: float = 0.25
+    threshold_off: float = 0.25
+    threshold_sigma: float = 0.03
+    cutoff_hz: float = 250.0
+    refractory_s: float = 3e-4
+    leak_hz: float = 0.1
+    noise_hz: float = 0.1
+    hot_share: float = 3e-4
+    hot_hz: tuple[float, float] = (10.0, 300.0)
+    dark_radiance: float = 0.015
+
+    @classmethod
+    def none(cls) -> "EventNoise":
+        """Pixels that are all alike, fast and quiet."""
+        return cls(
+            threshold_sigma=0.0,
+            cutoff_hz=float("inf"),
+            refractory_s=0.0,
+            leak_hz=0.0,
+            noise_hz=0.0,
+            hot_share=0.0,
+        )
+
+
+@dataclass(frozen=True)
+class HandMotion:
+    """How a hand moves the board.
+
+    Attributes:
+        speed_mps: range of the board's mean speed, drawn anew for each capture.
+        turn_deg_s: how fast it turns at most at the greatest speed.
+        tremor_m: amplitude of the hand's trembling, 5 to 9 Hz.
+        rest_s: how long it rests at each placement of a recording.
+    """
+
+    speed_mps: tuple[float, float] = (0.0, 0.3)
+    turn_deg_s: float = 12.0
+    tremor_m: float = 3e-4
+    rest_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.speed_mps[0] <= self.speed_mps[1]:
+            raise ValueError(f"speed_mps must be (slow, fast) with 0 <= slow <= fast, not {self.speed_mps}")
+
+
+@dataclass(frozen=True)
 class SimulationOptions:
     """What a simulated session shows and how its sensors err.
 
@@ -100,6 +162,14 @@ class SimulationOptions:
             one at most; never more than 0.8 of the tolerances that the profile gives.
         lidar_height_m: height of the LiDAR above the floor.
         print_reflectivity: of the dark squares at 905 nm (the ink of the paper's boards is bright there).
+        motion: whether the board is held still or moved by hand; only a moving one makes events.
+        hand: how it moves.
+        events: errors of cameras with a channel of events; their lens is `camera`'s.
+        events_span_s: how long before and after a scan's stamp a capture's events begin and end.
+        exposure_s: of a moving board's pictures.
+        frame_every_s: between the pictures of a camera that runs freely while the board moves.
+        frame_offset_s, event_offset_s: how much more the stamps of pictures and of events read than the
+            LiDAR's clock, which is the rig's.
     """
 
     carrier: Carrier = "stand"
@@ -114,6 +184,14 @@ class SimulationOptions:
     truth_translation_m: float = 0.02
     lidar_height_m: float = 1.0
     print_reflectivity: float = 0.85
+    motion: Motion = "still"
+    hand: HandMotion = field(default_factory=HandMotion)
+    events: EventNoise = field(default_factory=EventNoise)
+    events_span_s: tuple[float, float] = (1.2, 0.15)
+    exposure_s: float = 0.008
+    frame_every_s: float = 0.05
+    frame_offset_s: float = 0.0
+    event_offset_s: float = 0.0
 
     def __post_init__(self) -> None:
         if self.noise_level is not None and not 1 <= self.noise_level <= len(PAPER_RANGE_SIGMA_M):
@@ -137,4 +215,6 @@ class SimulationOptions:
         if name.startswith("sss"):
             # The paper's simulated rig: a board hung in the air, and an extrinsic that is known exactly.
             return cls(carrier="none", truth_rotation_deg=0.0, truth_translation_m=0.0)
-        return cls(carrier="person" if name.startswith("rles") else "stand")
+        if name.startswith("rles"):
+            return cls(carrier="person", motion="moving")
+        return cls()

@@ -144,6 +144,12 @@ class Scene:
         self.board_index = len(static.surfaces) + len(moving)
         self.surfaces = (*static.surfaces, *moving)
 
+    def with_board_at(self, T_world_board: Array) -> "Scene":
+        """Build the same scene with the board at another pose (4, 4); its carrier stays."""
+        moved = Scene(self.static, (), self.board, T_world_board, self.print_reflectivity)
+        moved.moving, moved.board_index, moved.surfaces = self.moving, self.board_index, self.surfaces
+        return moved
+
     @cached_property
     def occluders(self) -> Raycaster:
         """The moving surfaces and the board, as things that cast shadows."""

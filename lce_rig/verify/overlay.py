@@ -69,6 +69,13 @@ def draw_overlay(
     )
 
 
+def camera_part(overlay: Picture, image: Image) -> Picture:
+    """Cut the camera's picture out of what `draw_overlay` made of it, without title and legend."""
+    width_px = overlay.shape[1]
+    top = _title_strip("", width_px).shape[0]
+    return overlay[top : top + image.pixels.shape[0] * width_px // image.pixels.shape[1]]
+
+
 def range_limits(scan: Scan) -> tuple[float, float]:
     """Choose the ends of the range scale in m: the nearest point and the 95th percentile, at most 20 m."""
     ranges_m = np.linalg.norm(scan.points, axis=1)

@@ -1,11 +1,9 @@
 """An extrinsic held against every capture of a session: residuals, one picture each, one sheet for all."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from lce_rig.calibrate.estimate import CaptureResidual
 from lce_rig.calibrate.matching import match_candidates
@@ -17,9 +15,8 @@ from lce_rig.detect.detection import Detections, Pair
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.verify.canvas import Picture
-from lce_rig.verify.contact_sheet import contact_sheet
-from lce_rig.verify.overlay import draw_overlay
-from lce_rig.verify.picture_file import write_picture
+from lce_rig.verify.overlay import camera_part, draw_overlay
+from lce_rig.verify.writing import write_overlays
 
 Progress = Callable[[int, int], None]
 
@@ -85,41 +82,28 @@ def check_session(
     Raises:
         SessionError: the session has no such sensors, or a picture cannot be written.
     """
-    pair = Pair(calibration.camera, calibration.channel, calibration.lidar)
+    pair = _pair(calibration)
     if pair not in detections.pairs:
-        raise SessionError(
-            f"{session.path} holds no captures of {pair}", "The result belongs to another session."
-        )
-    names = detections.captures(pair)
+        hint = "The result belongs to another session."
+        raise SessionError(f"{session.path} holds no captures of {pair}", hint)
+    board = session.rig.board.to_board()
     residuals: list[CaptureResidual] = []
-    tiles: list[tuple[str, Picture]] = []
-    pictures: list[Path] = []
-    for done, name in enumerate(names, start=1):
-        observation = _observe(session.rig, detections, pair, name, calibration)
-        if observation is not None:
-            residuals.append(
-                capture_residual(calibration.T_cam_lidar, observation, session.rig.board.to_board())
-            )
-        picture = _draw(session.capture(name), session.rig, calibration, observation, residuals)
-        if picture is not None:
-            path = folder / f"{name}.png"
-            write_picture(path, picture)
-            pictures.append(path)
-            tiles.append((name, picture))
-        progress(done, len(names))
-    sheet = folder / "contact_sheet.png" if tiles else None
-    if sheet is not None:
-        write_picture(sheet, contact_sheet(tiles))
+
+    def overlays() -> Iterator[tuple[str, Picture, Picture]]:
+        names = detections.captures(pair)
+        for done, name in enumerate(names, start=1):
+            observation = _observe(session.rig, detections, pair, name, calibration)
+            residual = None
+            if observation is not None:
+                residual = capture_residual(calibration.T_cam_lidar, observation, board)
+                residuals.append(residual)
+            yield from _draw(session.capture(name), session.rig, calibration, observation, residual)
+            progress(done, len(names))
+
+    *pictures, sheet = write_overlays(folder, overlays()) or [None]
     metrics = summarise(residuals) if residuals else None
-    return SessionCheck(
-        pair,
-        calibration.verdict,
-        tuple(residuals),
-        metrics,
-        calibration.captures_used,
-        tuple(pictures),
-        sheet,
-    )
+    used = calibration.captures_used
+    return SessionCheck(pair, calibration.verdict, tuple(residuals), metrics, used, tuple(pictures), sheet)
 
 
 def _observe(
@@ -137,15 +121,15 @@ def _draw(
     rig: Rig,
     calibration: Calibration,
     observation: Observation | None,
-    residuals: list[CaptureResidual],
-) -> Picture | None:
-    """Draw one capture; None where it cannot be read."""
+    residual: CaptureResidual | None,
+) -> Iterator[tuple[str, Picture, Picture]]:
+    """Draw one capture; nothing where it cannot be read."""
     try:
         image = capture.image(calibration.camera, calibration.channel)
         scan = capture.scan(calibration.lidar)
     except SessionError:
-        return None
-    return draw_overlay(
+        return
+    picture = draw_overlay(
         image,
         scan,
         rig.cameras[calibration.camera].to_intrinsics(),
@@ -153,12 +137,13 @@ def _draw(
         lidar_board=None if observation is None else observation.lidar,
         image_board=None if observation is None else observation.image,
         board=rig.board.to_board(),
-        residuals=_legend(None if observation is None else residuals[-1], calibration),
-        title=f"{rig.name}  {calibration.camera}.{calibration.channel} and {calibration.lidar}  {capture.name}",
+        residuals=_legend(capture.name, residual, calibration),
+        title=f"{rig.name}  {_pair(calibration)}  {capture.name}",
     )
+    yield capture.name, picture, camera_part(picture, image)
 
 
-def _legend(residual: CaptureResidual | None, calibration: Calibration) -> Mapping[str, float | str]:
+def _legend(name: str, residual: CaptureResidual | None, calibration: Calibration) -> dict[str, float | str]:
     figures: dict[str, float | str] = {}
     if residual is not None:
         figures = {
@@ -166,13 +151,15 @@ def _legend(residual: CaptureResidual | None, calibration: Calibration) -> Mappi
             "edges (mm)": round(1000 * residual.edge_mean_m, 1),
             "corners (px)": round(residual.reprojection_px, 2),
         }
-    name = "" if residual is None else residual.capture
-    why = calibration.captures_refused.get(name)
-    figures["capture"] = "used" if name in calibration.captures_used else why.cause if why else "not used"
+    refusal = calibration.captures_refused.get(name)
+    is_used = name in calibration.captures_used
+    figures["capture"] = "used" if is_used else f"refused, {refusal.stage}" if refusal else "not used"
     figures["sigma"] = (
         f"{calibration.sigma_rotation_deg:.2g} deg, {1000 * calibration.sigma_translation_m:.2g} mm"
     )
     figures["verdict"] = calibration.verdict
-    return {
-        key: value for key, value in figures.items() if not (isinstance(value, float) and np.isnan(value))
-    }
+    return figures
+
+
+def _pair(calibration: Calibration) -> Pair:
+    return Pair(calibration.camera, calibration.channel, calibration.lidar)

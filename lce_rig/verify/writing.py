@@ -16,14 +16,14 @@ CONTACT_SHEET = "contact_sheet.png"
 _TILE_PX = 480
 
 
-def write_overlays(folder: Path, overlays: Iterable[tuple[str, Picture]]) -> list[Path]:
+def write_overlays(folder: Path, overlays: Iterable[tuple[str, Picture, Picture]]) -> list[Path]:
     """Write one PNG per named picture and a contact sheet of them all.
 
     Pictures are taken one at a time and only small copies are kept: a long session needs little memory.
 
     Args:
         folder: is made where it does not exist.
-        overlays: names (of captures) and BGR pictures.
+        overlays: name (of the capture), BGR picture, and the part of it that goes onto the contact sheet.
 
     Returns:
         The files, the contact sheet last; none where there are no pictures.
@@ -33,10 +33,10 @@ def write_overlays(folder: Path, overlays: Iterable[tuple[str, Picture]]) -> lis
     """
     files: list[Path] = []
     tiles: list[tuple[str, Picture]] = []
-    for name, picture in overlays:
+    for name, picture, part in overlays:
         files.append(write_picture(folder / f"{_file_name(name)}.png", picture))
-        height_px = round(picture.shape[0] * _TILE_PX / picture.shape[1])
-        tiles.append((name, canvas.fitted(picture, _TILE_PX, height_px)))
+        height_px = round(part.shape[0] * _TILE_PX / part.shape[1])
+        tiles.append((name, canvas.fitted(part, _TILE_PX, height_px)))
     if tiles:
         files.append(write_picture(folder / CONTACT_SHEET, contact_sheet(tiles, tile_width_px=_TILE_PX)))
     return files

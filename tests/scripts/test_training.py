@@ -28,7 +28,7 @@ def one_thread():
 
 
 def quiet_pixels(n, seed=0):
-    """Make pixels without noise, leak, lag or refractory period, so that the law of crossings holds exactly."""
+    """Make pixels without noise, leak, lag or refractory period: the law of crossings holds exactly."""
     pixels = Pixels(n, SIZE, torch.Generator().manual_seed(seed), CPU)
     pixels.noise_rate *= 0
     pixels.hot_rate *= 0

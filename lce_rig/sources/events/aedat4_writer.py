@@ -1,7 +1,7 @@
 """Writing AEDAT4 files of events that DV and dv-processing open, without their library.
 
 dv-processing takes events one by one, at a microsecond each; the flatbuffers are few and fixed, so they are
-laid out by hand. Until the file is closed it carries no table, as after a crash, and is readable all the same.
+laid out by hand. Until it is closed the file carries no table, as after a crash, and is readable as it is.
 
 References:
     https://docs.inivation.com/software/software-advanced-usage/file-formats/aedat-4.0.html

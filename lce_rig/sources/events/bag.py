@@ -1,6 +1,7 @@
 """Events in ROS 1 and ROS 2 bags."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from lce_rig.core.errors import SourceError
@@ -49,7 +50,7 @@ class BagEvents:
                 if self._is_array:
                     header, events = decode_event_array(message.data, message.encoding)
                     self._check_size(header)
-                    yield events
+                    yield replace(events, host_ns=message.log_ns)
                     continue
                 packet = parse_packet(message.data, message.encoding)
                 self._check_size(packet.header)

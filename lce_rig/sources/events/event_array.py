@@ -31,7 +31,7 @@ _CDR_TAIL_BYTES = 1
 
 
 def decode_event_array(data: bytes, encoding: str) -> tuple[EventHeader, EventColumns]:
-    """Decode one message; its host time is the header's.
+    """Decode one message; its header's stamp is device time, so that the host's is left open.
 
     Args:
         data: the message as it lies in the bag.
@@ -46,7 +46,7 @@ def decode_event_array(data: bytes, encoding: str) -> tuple[EventHeader, EventCo
     raw = _ros1_events(reader, n_events) if reader.is_ros1 else _cdr_events(reader, n_events)
     t_ns = raw["sec"].astype(np.int64) * 10**9 + raw["nsec"]
     x, y = raw["x"].astype(np.uint16), raw["y"].astype(np.uint16)
-    return header, EventColumns(t_ns, x, y, raw["polarity"].copy(), header.stamp_ns)
+    return header, EventColumns(t_ns, x, y, raw["polarity"].copy())
 
 
 def _ros1_events(reader: MessageReader, n_events: int) -> NDArray[np.void]:

@@ -85,7 +85,7 @@ def _open(path: Path) -> Any:
 
 def _unreadable(path: Path, file: Any, error: OSError) -> SourceError:
     """Say why: HDF5's own message on a missing filter names a folder and nothing else."""
-    from h5py.h5z import filter_avail
+    from h5py.h5z import filter_avail  # type: ignore[import-untyped]
 
     for name in _COLUMNS:
         settings = file[f"events/{name}"].id.get_create_plist()

@@ -14,6 +14,8 @@ REORDER_NS = 20_000_000
 # Counters of 31 and 32 bits of microseconds are common; they wrap after 36 and 72 minutes.
 _WRAPS_NS = tuple((1 << bits) * NS_PER_US for bits in (31, 32))
 _MAX_GAP_NS = 60_000_000_000
+# Cameras may send a little before their clock is set at the start.
+_MAX_LEAD_NS = 1_000_000_000
 # More stray stamps than this are no damage here and there but a clock that was set.
 _MAX_STRAY_SHARE = 0.01
 
@@ -103,6 +105,10 @@ def _sorted(
         back_s = (latest_before[worst] - t_ns[worst]) * 1e-9
         where = f"{seconds_in(int(latest_before[worst]), first_ns)} they run back by {back_s:.3f} s"
         if n_stray > max(1, _MAX_STRAY_SHARE * len(t_ns)):
+            reset = int(np.argmax(latest_before - t_ns > REORDER_NS))
+            if delivered_ns is None and latest_before[reset] - first_ns < _MAX_LEAD_NS:
+                findings.add("events before the clock was set left out", where, reset)
+                return _sorted(path, events.select(slice(reset, None)), findings, int(t_ns[reset]), None)
             raise SourceError(
                 f"{path}: the stamps of {n_stray} of {len(t_ns)} events do not fit: {where}",
                 "The clock was set, or two recordings were joined: split the recording there.",

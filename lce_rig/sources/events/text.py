@@ -5,6 +5,7 @@ References:
 """
 
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +19,8 @@ from lce_rig.sources.events.stream import NS_PER_US, EventColumns, Findings
 
 _BLOCK_BYTES = 1 << 22
 _N_COLUMNS = 4
+# RuntimeError: encryption or a compression that cannot be; a flipped bit says so.
+_ZIP_DAMAGE = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError)
 
 
 class TextEvents:
@@ -32,7 +35,10 @@ class TextEvents:
         self._path = path
         self.notes: list[str] = []
         with _open(path) as file:
-            first = file.readline(4096).split()
+            try:
+                first = file.readline(4096).split()
+            except _ZIP_DAMAGE as error:
+                raise SourceError(f"{path} is damaged: {error}") from None
         self._has_size = len(first) == 2 and all(word.isdigit() for word in first)
         is_comment = bool(first) and first[0].startswith(b"#")
         if not self._has_size and not is_comment and _parse_line(b" ".join(first)) is None:
@@ -48,8 +54,14 @@ class TextEvents:
             if self._has_size:
                 file.readline(4096)
             n_lines = 1 + self._has_size
-            while block := file.read(_BLOCK_BYTES):
-                block += file.readline()
+            while True:
+                try:
+                    block = file.read(_BLOCK_BYTES) + file.readline()
+                except _ZIP_DAMAGE as error:
+                    findings.add("torn ends of the file left out", f"line {n_lines}: {error}")
+                    return
+                if not block:
+                    return
                 yield _to_columns(_parse_block(block, n_lines, findings))
                 n_lines += block.count(b"\n")
 
@@ -65,7 +77,11 @@ def _open(path: Path) -> Iterator[IO[bytes]]:
         names = [name for name in archive.namelist() if name.lower().endswith((".txt", ".csv"))]
         if len(names) != 1:
             raise SourceError(f"{path} holds {len(names)} texts, not one of events")
-        with archive.open(names[0]) as file:
+        try:
+            file = archive.open(names[0])
+        except _ZIP_DAMAGE as error:
+            raise SourceError(f"{path} is damaged: {error}") from None
+        with file:
             yield file
 
 

@@ -12,7 +12,7 @@ _PACKET = (
 
 
 def write_packet_bag(path: Path, messages: Sequence[tuple[str, int, bytes]]) -> Path:
-    """Write (topic, time of receipt, message) as event_camera_msgs/EventPacket; ROS 1 where path ends in .bag."""
+    """Write (topic, time of receipt, message) as EventPackets; ROS 1 where the path ends in .bag."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if path.suffix == ".bag" else Stores.ROS2_HUMBLE)

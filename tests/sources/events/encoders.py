@@ -1,4 +1,4 @@
-"""Small encoders for the formats that cameras and drivers write: one event after the other, as the papers say."""
+"""Small encoders for the formats that cameras and drivers write, one event after the other."""
 
 import struct
 from collections.abc import Iterable, Iterator, Sequence

@@ -90,6 +90,14 @@ def test_a_clock_that_was_set_back_is_refused_with_figures_after_what_is_sound()
     assert delivered == (first[:500] * 1000).tolist()
 
 
+def test_events_before_the_clock_is_set_at_the_start_are_left_out_and_counted() -> None:
+    before, after = 10**12 + np.arange(200) * 1000, np.arange(1000) * 1000
+    recording = record(columns(before), columns(after[:400]), columns(after[400:]))
+    assert stamps_us(recording) == after.tolist()
+    assert any("200 events before the clock was set left out" in note for note in recording.notes)
+    assert recording.duration_s == pytest.approx(0.999)
+
+
 @pytest.mark.parametrize("stray_us", [10**9, -(10**9)])
 @pytest.mark.parametrize("at", [3, 499, 500, 700])
 def test_a_single_stray_stamp_is_left_out_and_counted(stray_us: int, at: int) -> None:

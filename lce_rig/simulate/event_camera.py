@@ -1,0 +1,201 @@
+"""An event camera's pixels: each reports when its own slow view of ln(intensity) has changed by its threshold.
+
+References:
+    P. Lichtsteiner, C. Posch and T. Delbruck, A 128x128 120 dB 15 us latency asynchronous temporal contrast
+        vision sensor, IEEE JSSC 43(2), 2008.
+    H. Rebecq, D. Gehrig and D. Scaramuzza, ESIM: an open event camera simulator, CoRL 2018.
+    Y. Hu, S.-C. Liu and T. Delbruck, v2e: from video frames to realistic DVS events, CVPRW 2021.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Events
+from lce_rig.core.geometry import Array
+from lce_rig.simulate.options import EventNoise
+
+_NS_PER_US = 1000
+_LEAST_THRESHOLD = 0.05
+# A pixel in the dark keeps this share of the bandwidth that full white gives it: the photoreceptor's bias.
+_DARK_BANDWIDTH = 0.1
+_HOT_ON_SHARE = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class EventPixels:
+    """What makes one pixel differ from the next, fixed for a sensor.
+
+    Attributes:
+        width_px, height_px: of the sensor.
+        threshold_on, threshold_off: (P,) by row-major pixel.
+        hot_hz: (P,) events a second that have no cause at all.
+    """
+
+    width_px: int
+    height_px: int
+    threshold_on: Array
+    threshold_off: Array
+    hot_hz: Array
+
+
+def draw_pixels(intrinsics: Intrinsics, noise: EventNoise, rng: np.random.Generator) -> EventPixels:
+    """Draw a sensor's pixels."""
+    n = intrinsics.width_px * intrinsics.height_px
+    spread = noise.threshold_sigma * rng.standard_normal((2, n))
+    means = np.array([[noise.threshold_on], [noise.threshold_off]])
+    on, off = np.maximum(means + spread, np.minimum(means, _LEAST_THRESHOLD))
+    hot_hz = np.zeros(n)
+    hot = rng.choice(n, round(noise.hot_share * n), replace=False)
+    hot_hz[hot] = np.exp(rng.uniform(*np.log(noise.hot_hz), len(hot)))
+    return EventPixels(intrinsics.width_px, intrinsics.height_px, on, off, hot_hz)
+
+
+@dataclass(frozen=True, eq=False)
+class _Raw:
+    """Events of unsorted pixels: time in s after the start, pixel and sign."""
+
+    t_s: Array
+    pixel: NDArray[np.intp]
+    polarity: NDArray[np.bool_]
+
+
+class EventCamera:
+    """An event camera at work: give it the scene's intensities in order of time, it gives events.
+
+    Args:
+        pixels: the sensor.
+        noise: how it errs.
+        radiance: (H, W) linear intensity at the start, to which the pixels have settled.
+        start_ns: when that is, on the rig's clock.
+        rng: source of noise.
+        sensor: name in the rig profile.
+        offset_ns: how much more its stamps read than the rig's clock.
+    """
+
+    def __init__(
+        self,
+        pixels: EventPixels,
+        noise: EventNoise,
+        radiance: NDArray[np.float32],
+        start_ns: int,
+        rng: np.random.Generator,
+        *,
+        sensor: str = "cam",
+        offset_ns: int = 0,
+    ) -> None:
+        self._pixels, self._noise, self._rng = pixels, noise, rng
+        self._sensor, self._start_ns, self._offset_ns = sensor, start_ns, offset_ns
+        self._now_s = 0.0
+        self._input = self._log(radiance)
+        self._output = self._input.copy()
+        self._reference = self._input.copy()
+        n = len(self._input)
+        self._released_s = np.full(n, -np.inf)  # a pixel is blind until then
+        self._last_s = np.full(n, -np.inf)  # when it last made an event
+        self._raw: list[_Raw] = []
+        self._taken_s = 0.0
+        self._darkness = 1.0 / (1.0 + np.clip(radiance.ravel(), 0.0, 1.0).astype(np.float64))
+
+    def _log(self, radiance: NDArray[np.float32]) -> Array:
+        return np.log(radiance.ravel() + np.float32(self._noise.dark_radiance)).astype(np.float64)
+
+    def see(self, radiance: NDArray[np.float32], t_ns: int) -> None:
+        """Let ln(intensity) run in a straight line from what was seen last to `radiance` (H, W) at t_ns."""
+        now_s, start_s = 1e-9 * (t_ns - self._start_ns), self._now_s
+        seen = self._log(radiance)
+        output = self._filter(seen, radiance.ravel(), now_s - start_s)
+        leak_per_s = self._noise.leak_hz * self._pixels.threshold_on
+        # What the pixel compares, at the start of the step, and how fast it grows: e(t) = excess + slope t.
+        excess = self._output - self._reference
+        slope = (output - self._output) / (now_s - start_s) + leak_per_s
+        begin_s = self._released_s - start_s
+        is_waking = begin_s > 0
+        # A pixel compares against what it sees at the moment it is released from its refractory period.
+        excess = np.where(is_waking, -slope * begin_s, excess)
+        end_excess = excess + slope * (now_s - start_s)
+        is_blind = begin_s > now_s - start_s
+        self._reference = np.where(is_blind, self._reference, output - end_excess)
+        fires = (end_excess >= self._pixels.threshold_on) | (end_excess <= -self._pixels.threshold_off)
+        self._fire(np.flatnonzero(fires & ~is_blind), excess, slope, start_s, now_s, output)
+        self._input, self._output, self._now_s = seen, output, now_s
+
+    def _filter(self, seen: Array, intensity: NDArray[np.float32], step_s: float) -> Array:
+        """Pass a ramp from the last input to `seen` (P,) through each pixel's low-pass, exactly.
+
+        y' = (x - y) / tau with x = x0 + k t has the solution x - k tau + (y0 - x0 + k tau) exp(-t / tau).
+        """
+        if not np.isfinite(self._noise.cutoff_hz):
+            return seen
+        bandwidth = _DARK_BANDWIDTH + (1 - _DARK_BANDWIDTH) * np.clip(intensity, 0.0, 1.0)
+        tau_s = 1.0 / (2 * np.pi * self._noise.cutoff_hz * bandwidth)
+        lag = (seen - self._input) * (tau_s / step_s)
+        return np.asarray(seen - lag + (self._output - self._input + lag) * np.exp(-step_s / tau_s))
+
+    def _fire(
+        self, pixel: NDArray[np.intp], excess: Array, slope: Array, start_s: float, now_s: float, output: Array
+    ) -> None:
+        """Make the events of pixels (M,) whose excess (P,) + slope (P,) t passes their threshold by now_s."""
+        if not len(pixel):
+            return
+        rate = slope[pixel]
+        is_on = rate > 0
+        threshold = np.where(is_on, self._pixels.threshold_on[pixel], -self._pixels.threshold_off[pixel])
+        first_s = start_s + np.maximum((threshold - excess[pixel]) / rate, 0.0)
+        # After its first event a pixel starts from zero: the others follow at a constant distance.
+        apart_s = self._noise.refractory_s + threshold / rate
+        n_more = np.floor(np.maximum(now_s - first_s, 0.0) / apart_s).astype(np.int64)
+        n = n_more + 1
+        number = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+        t_s = np.repeat(first_s, n) + number * np.repeat(apart_s, n)
+        self._raw.append(_Raw(np.minimum(t_s, now_s), np.repeat(pixel, n), np.repeat(is_on, n)))
+        released_s = first_s + n_more * apart_s + self._noise.refractory_s
+        self._released_s[pixel] = released_s
+        self._reference[pixel] = output[pixel] - rate * np.maximum(now_s - released_s, 0.0)
+
+    def take(self) -> Events:
+        """Hand over the events since the last call, in order of time, with those of noise among them."""
+        raw = [*self._raw, self._noise_events(self._taken_s, self._now_s)]
+        self._raw, self._taken_s = [], self._now_s
+        t_s, pixel, polarity = (np.concatenate([getattr(r, k) for r in raw]) for k in ("t_s", "pixel", "polarity"))
+        order = np.lexsort((polarity, pixel, t_s))
+        t_s, pixel, polarity = t_s[order], pixel[order], polarity[order]
+        keep = self._outlasts_refractory(t_s, pixel)
+        t_ns = self._start_ns + self._offset_ns + np.rint(1e9 * t_s[keep]).astype(np.int64)
+        row, column = np.divmod(pixel[keep], self._pixels.width_px)
+        return Events(
+            self._sensor,
+            t_ns // _NS_PER_US * _NS_PER_US,
+            column.astype(np.uint16),
+            row.astype(np.uint16),
+            polarity[keep],
+            self._pixels.width_px,
+            self._pixels.height_px,
+            int(t_ns[0]) if len(t_ns) else None,
+        )
+
+    def _noise_events(self, start_s: float, end_s: float) -> _Raw:
+        """Draw events without a cause: shot noise, more of it in the dark, and pixels that fire all the time."""
+        shot_hz = self._noise.noise_hz * 2 * self._darkness
+        summed_hz = np.cumsum(shot_hz + self._pixels.hot_hz)
+        n = self._rng.poisson(summed_hz[-1] * (end_s - start_s))
+        t_s = self._rng.uniform(start_s, end_s, n)
+        pixel = np.searchsorted(summed_hz, self._rng.uniform(0.0, summed_hz[-1], n), side="right")
+        pixel = np.minimum(pixel, len(summed_hz) - 1)
+        on_share = np.where(self._pixels.hot_hz[pixel] > 0, _HOT_ON_SHARE, 0.5)
+        return _Raw(t_s, pixel, self._rng.random(n) < on_share)
+
+    def _outlasts_refractory(self, t_s: Array, pixel: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Tell which events (N,), in order of time, come a refractory period or more after their pixel's last."""
+        order = np.argsort(pixel, kind="stable")
+        by_pixel, by_time = pixel[order], t_s[order]
+        is_first = np.ones(len(order), dtype=np.bool_)
+        is_first[1:] = by_pixel[1:] != by_pixel[:-1]
+        before_s = np.append(-np.inf, by_time[:-1])[: len(order)]
+        before_s = np.where(is_first, self._last_s[by_pixel], before_s)
+        keep = np.empty(len(order), dtype=np.bool_)
+        keep[order] = by_time - before_s >= self._noise.refractory_s * (1 - 1e-9)
+        self._last_s[by_pixel] = by_time  # the last of each pixel stands at its end
+        return keep

@@ -1,0 +1,190 @@
+"""What stays the same over a simulated session: the room, the sensors' true places and their own errors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.errors import ProfileError
+from lce_rig.core.geometry import Array, invert, perturb, pose
+from lce_rig.rig import Rig
+from lce_rig.simulate.backdrop import Backdrop, build_backdrop
+from lce_rig.simulate.event_camera import EventPixels, draw_pixels
+from lce_rig.simulate.lidar import VLP16, LidarModel
+from lce_rig.simulate.options import SimulationOptions
+from lce_rig.simulate.placements import View, place_board
+from lce_rig.simulate.room import Room, build_room
+
+LIDAR_MODELS = {"vlp16": VLP16}
+
+# Independent streams of random numbers, so that more captures or another camera change nothing else.
+# Streams of a session are [seed, OF_SESSION, stream, ...], those of a capture [seed, index, stream, ...].
+OF_SESSION = 1_000_000_007
+TRUTH, ROOM, LASERS, START, PLACEMENT, SCAN, IMAGE, PIXELS, HAND, CARRIER, PHASE, EVENTS = range(12)
+# Camera optical axes (x right, y down, z forward) from the LiDAR's (x forward, y left, z up).
+_FORWARD = pose(
+    np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([0.0, -0.08, -0.08])
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """What stays the same over a session.
+
+    Attributes:
+        rig: the profile.
+        seed: of the session.
+        options: what it shows.
+        board: the profile's board.
+        room: where all of it stands.
+        T_world_sensor: (4, 4) of each camera and LiDAR.
+        backdrops: what each simulated camera sees of the room.
+        models: of each LiDAR.
+        laser_bias_m: (L,) range offset of each laser of each LiDAR.
+        pixels: those of each camera with a channel of events.
+        views: pairs of sensors that the board is placed for in turn.
+    """
+
+    rig: Rig
+    seed: int
+    options: SimulationOptions
+    board: Board
+    room: Room
+    T_world_sensor: Mapping[str, Array]
+    backdrops: Mapping[str, Backdrop]
+    models: Mapping[str, LidarModel]
+    laser_bias_m: Mapping[str, Array]
+    pixels: Mapping[str, EventPixels]
+    views: list[View]
+
+    def rng(self, *stream: int) -> np.random.Generator:
+        """Begin a stream of random numbers of this session or of one of its captures."""
+        return np.random.default_rng([self.seed, *stream])
+
+    def place(self, index: int, rng: np.random.Generator) -> Array:
+        """Choose T_world_board (4, 4) of a placement.
+
+        Raises:
+            LceRigError: no place is seen by the camera and the LiDAR whose turn it is.
+        """
+        view = self.views[index % len(self.views)]
+        start = self.rng(OF_SESSION, START).random(3)
+        return place_board(view, self.board, self.room, self.options, index // len(self.views), rng, start)
+
+
+def truth_extrinsics(
+    rig: Rig, seed: int, options: SimulationOptions | None = None
+) -> dict[tuple[str, str], Array]:
+    """Draw the true T_cam_lidar (4, 4) of every camera and LiDAR.
+
+    The nominal extrinsics of the profile, each moved by a seeded few degrees and centimetres, so that nobody
+    can pass by handing back the nominal. Pairs without an entry follow from the others; a camera without any
+    looks along the first LiDAR's x axis.
+
+    Args:
+        rig: the profile.
+        seed: of the session.
+        options: `SimulationOptions.for_rig` of the rig by default.
+    """
+    options = options or SimulationOptions.for_rig(rig.name)
+    T_base_sensor = _sensor_poses(rig, seed, options)
+    return {
+        (camera, lidar): invert(T_base_sensor[camera]) @ T_base_sensor[lidar]
+        for camera in rig.cameras
+        for lidar in rig.lidars
+    }
+
+
+def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> Stage:
+    """Draw the truth of a session and render the room once for all its captures.
+
+    Args:
+        rig: the profile.
+        seed: of the session.
+        options: `SimulationOptions.for_rig` of the rig by default.
+
+    Raises:
+        ProfileError: a LiDAR's model is unknown, or no camera has a channel that can be simulated.
+    """
+    options = options or SimulationOptions.for_rig(rig.name)
+    T_world_base = pose(np.eye(3), np.array([0.0, 0.0, options.lidar_height_m]))
+    T_world_sensor = {name: T_world_base @ T for name, T in _sensor_poses(rig, seed, options).items()}
+    kinds = ("frames", "events") if options.motion == "moving" else ("frames",)
+    cameras = [name for name in rig.cameras if any(channel_of(rig, name, kind) for kind in kinds)]
+    if not cameras:
+        hint = "Of a board held still, only frames can be simulated: events need motion."
+        raise ProfileError(f"rig {rig.name}: no camera has a channel of kind {' or '.join(kinds)}", hint)
+    sight = T_world_sensor[cameras[0]][:3, 2]
+    room = build_room(
+        float(np.arctan2(sight[1], sight[0])),
+        np.random.default_rng([seed, OF_SESSION, ROOM]),
+        rig.board.to_board() if options.has_decoy_plate else None,
+        options.lidar_height_m,
+    )
+    lenses = {name: rig.cameras[name].to_intrinsics() for name in cameras}
+    models = {name: _lidar_model(rig, name) for name in rig.lidars}
+    bias = {
+        name: _laser_bias(models[name], np.random.default_rng([seed, OF_SESSION, LASERS, k]), options)
+        for k, name in enumerate(rig.lidars)
+    }
+    pixels = {
+        name: draw_pixels(lenses[name], options.events, np.random.default_rng([seed, OF_SESSION, PIXELS, k]))
+        for k, name in enumerate(cameras)
+        if "events" in kinds and channel_of(rig, name, "events")
+    }
+    views = [
+        View(camera, lenses[camera], T_world_sensor[camera], lidar, models[lidar], T_world_sensor[lidar])
+        for camera in cameras
+        for lidar in rig.lidars
+    ]
+    backdrops = {name: build_backdrop(room, T_world_sensor[name], lenses[name]) for name in cameras}
+    board = rig.board.to_board()
+    return Stage(rig, seed, options, board, room, T_world_sensor, backdrops, models, bias, pixels, views)
+
+
+def channel_of(rig: Rig, camera: str, kind: str) -> str | None:
+    """Find the camera's first channel of a kind, "frames" or "events"."""
+    channels = rig.cameras[camera].channels
+    return next((name for name, channel in channels.items() if channel.kind == kind), None)
+
+
+def _sensor_poses(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, Array]:
+    """Chain the perturbed nominal extrinsics into T_base_sensor, the base being the first LiDAR."""
+    links: list[tuple[str, str, Array]] = []
+    for index, entry in enumerate(rig.nominal_extrinsics):
+        rng = np.random.default_rng([seed, OF_SESSION, TRUTH, index])
+        angle_deg = min(options.truth_rotation_deg, 0.8 * entry.tolerance_deg) * rng.uniform(0.4, 1.0)
+        shift_m = min(options.truth_translation_m, 0.8 * entry.tolerance_m) * rng.uniform(0.4, 1.0)
+        axes = rng.standard_normal((2, 3))
+        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+        tangent = np.concatenate([shift_m * axes[0], np.radians(angle_deg) * axes[1]])
+        links.append((entry.camera, entry.lidar, perturb(entry.to_matrix(), tangent)))
+    base = next(iter(rig.lidars))
+    T_base: dict[str, Array] = {base: np.eye(4)}
+    for _ in range(len(links)):
+        for camera, lidar, T_cam_lidar in links:
+            if lidar in T_base and camera not in T_base:
+                T_base[camera] = T_base[lidar] @ invert(T_cam_lidar)
+            elif camera in T_base and lidar not in T_base:
+                T_base[lidar] = T_base[camera] @ T_cam_lidar
+    for name in rig.cameras:
+        T_base.setdefault(name, invert(_FORWARD))
+    for name in rig.lidars:
+        T_base.setdefault(name, np.eye(4))
+    return T_base
+
+
+def _lidar_model(rig: Rig, lidar: str) -> LidarModel:
+    given, rate_hz = rig.lidars[lidar].model, rig.lidars[lidar].rate_hz
+    model = LIDAR_MODELS.get("".join(c for c in given.lower() if c.isalnum()))
+    if model is None:
+        known = ", ".join(m.name for m in LIDAR_MODELS.values())
+        raise ProfileError(f"lidars.{lidar}.model: {given} cannot be simulated", f"Known models: {known}.")
+    return replace(model, period_ns=round(1e9 / rate_hz))
+
+
+def _laser_bias(model: LidarModel, rng: np.random.Generator, options: SimulationOptions) -> Array:
+    """Draw each laser's offset; their mean is `LidarNoise.range_offset_m` and nothing else."""
+    bias = options.lidar_noise.laser_sigma_m * rng.standard_normal(len(model.elevations_rad))
+    return np.asarray(bias - bias.mean())

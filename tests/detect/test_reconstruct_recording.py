@@ -1,0 +1,98 @@
+"""A real DAVIS346 in front of an AprilTag board: tags read and lines straight in reconstructed pictures.
+
+The network was trained on simulated events alone; no part of this recording was ever trained on.
+"""
+
+import time
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Image
+from lce_rig.detect.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
+from lce_rig.sources.events import open_events
+
+pytestmark = pytest.mark.dataset
+N_COLS, N_TAGS = 4, 12
+WINDOW_EVENTS = 18_000
+# Tag 0 is at the lower left of the board, ids grow to the right and upwards; the first corner that OpenCV
+# gives of these tags is the lower right one. In units of a tag's side, y up.
+TAG = np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+GAP = 0.294  # between tags, in sides of a tag; fitted to these pictures
+
+
+@pytest.fixture(scope="module")
+def recording(recordings):
+    path = recordings / "events" / "davis346_apriltag_libcaer_cmp.mcap"
+    if not path.exists():
+        pytest.skip(f"no {path.name}")
+    return open_events(path, sensor="davis")
+
+
+def tags(grey):
+    """Read the tags: corners (4, 2) by id."""
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    corners, ids, _ = cv2.aruco.ArucoDetector(family).detectMarkers(grey)
+    return (
+        {} if ids is None else {int(i): c[0] for i, c in zip(ids.ravel(), corners, strict=True) if i < N_TAGS}
+    )
+
+
+def homography_residual_px(found):
+    """Fit the board's plane to all corners; rms distance. The lens's distortion is in it."""
+    ids = sorted(found)
+    board = np.concatenate([TAG + (1 + GAP) * np.array([i % N_COLS, i // N_COLS]) for i in ids])
+    seen = np.concatenate([found[i] for i in ids]).astype(np.float64)
+    matrix, _ = cv2.findHomography(board, seen, 0)
+    projected = cv2.perspectiveTransform(board[:, None], matrix)[:, 0]
+    return np.sqrt(np.square(projected - seen).sum(1).mean())
+
+
+def whole(recording):
+    """Read the recording in one piece."""
+    first_ns, last_ns = recording.span_ns
+    return recording.read(first_ns, last_ns + 1)
+
+
+def judged(events, method):
+    """Judge the last half of the pictures of 18,000 events each: tags a picture, residuals."""
+    reconstructor = Reconstructor(options=ReconstructionOptions(method=method))
+    pictures = []
+    for first, last in pairwise(range(0, len(events) + 1, WINDOW_EVENTS)):
+        begin, end = int(events.t_ns[first]), int(events.t_ns[last - 1]) + 1
+        pictures.append(reconstructor.to_grey(reconstructor.step(events.between(begin, end), begin, end)))
+    found = [tags(grey) for grey in pictures[len(pictures) // 2 :]]
+    residuals = [homography_residual_px(one) for one in found if len(one) >= 4]
+    return np.mean([len(one) for one in found]), residuals
+
+
+def test_nearly_all_tags_are_read_and_their_corners_lie_on_a_plane(recording):
+    n_tags, residuals = judged(whole(recording), "network")
+    assert n_tags >= 11.9
+    assert np.mean(residuals) <= 1.29
+
+
+def test_the_event_map_shows_far_fewer_tags(recording):
+    n_tags, _ = judged(whole(recording), "map")
+    assert n_tags < 6
+
+
+@pytest.mark.parametrize("windows", [WindowOptions(), WindowOptions("time"), WindowOptions("count")])
+def test_tags_are_read_at_the_stamps_of_a_lidar_too(recording, windows):
+    last_ns = recording.span_ns[1]
+    stamps = range(last_ns - 200_000_000, last_ns + 1, 50_000_000)
+    options = ReconstructionOptions(windows=windows)
+    pictures = list(Reconstructor(options=options).reconstruct(recording, list(stamps)))
+    assert all(isinstance(picture, Image) for picture in pictures)
+    assert np.mean([len(tags(picture.grey)) for picture in pictures]) >= 11
+
+
+def test_reconstruction_at_10_hz_is_faster_than_real_time_on_one_core(recording):
+    stretches = list(recording)
+    begun = time.process_time()
+    pictures = list(Reconstructor().reconstruct(stretches, every_ns=100_000_000))
+    spent_s = time.process_time() - begun
+    assert len(pictures) == 9
+    assert spent_s < recording.duration_s
