@@ -76,9 +76,11 @@ class Trainer:
         self.progress.elapsed_s += time.monotonic() - begun
         return total / UPDATES_PER_SCENE
 
-    def _unroll(self, stream, states, skip):
+    def _unroll(
+        self, stream: EventStream, states: tuple[torch.Tensor, ...], skip: int
+    ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
         """Run one truncation length; the first `skip` windows after rest are not judged."""
-        loss = 0.0
+        loss = torch.zeros((), device=self.device)
         for k in range(self.options.unroll):
             voxels, target, weight = stream.window()
             with torch.autocast(self.device.type, dtype=torch.bfloat16):
@@ -86,9 +88,9 @@ class Trainer:
                 picture, *states = self.network(voxels, *states)
             if k >= skip:
                 loss = loss + reconstruction_loss(picture.float(), target, weight)
-        return loss / (self.options.unroll - skip), states
+        return loss / (self.options.unroll - skip), tuple(states)
 
-    def _descend(self, loss) -> None:
+    def _descend(self, loss: torch.Tensor) -> None:
         warm = min(1.0, (self.progress.updates + 1) / WARM_UP_UPDATES)
         cosine = 0.5 + 0.5 * math.cos(math.pi * min(1.0, self.spent()))
         for group in self.optimiser.param_groups:

@@ -98,9 +98,7 @@ _COLUMNS = (
 
 
 def _table(detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> Any:
-    from rich.table import Table
-
-    table = Table(title=str(pair), title_justify="left", pad_edge=False, box=None, header_style="bold")
+    table = show.plain_table(str(pair))
     table.add_column("capture")
     for title, *_ in _COLUMNS:
         table.add_column(title, justify="right")

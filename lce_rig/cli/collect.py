@@ -37,12 +37,14 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     show_default=True,
     help="How a folder's pictures and clouds belong together: equal names, sorted order, nearest time.",
 )
-@click.option("--pair-tolerance", type=click.FloatRange(0), metavar="S", help="Largest difference in time of a pair.")
-@click.option("--topic", "topics", multiple=True, callback=_topics, metavar="SENSOR=/TOPIC", help="Topic of a sensor.")
+@click.option("--pair-tolerance", type=click.FloatRange(0), metavar="S", help="Largest difference of a pair.")
+@click.option(
+    "--topic", "topics", multiple=True, callback=_topics, metavar="SENSOR=/TOPIC", help="Topic of a sensor."
+)
 @click.option("--camera", help="Camera that a folder's pictures belong to, where the rig has several.")
 @click.option("--channel", help="Channel of it, such as events for pictures reconstructed from events.")
 @click.option("--lidar", help="LiDAR that a folder's clouds belong to, where the rig has several.")
-@click.option("--max-captures", type=click.IntRange(1), metavar="N", help="Never fill the session beyond N captures.")
+@click.option("--max-captures", type=click.IntRange(1), metavar="N", help="Leave the session at N captures.")
 @click.option("--target", type=click.IntRange(1), metavar="N", help="Stop reading at N captures.")
 def collect(
     rig_name: str,
@@ -66,7 +68,8 @@ def collect(
     from lce_rig.collect import collect as fill
     from lce_rig.rig import load_rig
     from lce_rig.session import Session
-    from lce_rig.sources import SourceOptions, open_recording
+    from lce_rig.sources import open_recording
+    from lce_rig.sources.base import SourceOptions
 
     rig = load_rig(rig_name)
     options = SourceOptions(camera, channel, lidar, pair, pair_tolerance, topics)

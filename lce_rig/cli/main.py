@@ -110,7 +110,7 @@ def run(arguments: list[str]) -> int:
         click.echo("interrupted; what was written so far is whole", err=True)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
-        # The reader of our output went away (`lce-rig check | head`): nothing to report, and nobody to read it.
+        # The reader of our output went away (`lce-rig check | head`): nobody is left to report to.
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
     except ModuleNotFoundError as error:

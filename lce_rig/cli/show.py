@@ -26,6 +26,13 @@ def print_json(document: Any) -> None:
     click.echo(json.dumps(document, indent=2, allow_nan=False))
 
 
+def plain_table(title: str) -> Any:
+    """Start a rich table without lines, which survives copying into a message."""
+    from rich.table import Table
+
+    return Table(title=title, title_justify="left", pad_edge=False, box=None, header_style="bold")
+
+
 def print_table(table: Any) -> None:
     """Print a rich table on stdout, as wide as it needs where nobody watches."""
     from rich.console import Console

@@ -21,17 +21,18 @@ from lce_rig.cli import show
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the residuals as JSON.")
 def verify(session: Path, result: Path | None, output: Path | None, as_json: bool) -> None:
-    """Draw the LiDAR of each capture of SESSION (default: session/) into its pictures and print residuals.
+    """Draw the LiDAR of each capture of SESSION (default: session/) into its picture; print residuals.
 
-    Pictures and one contact sheet go to SESSION/calibration/overlays/. Exits with 7 where the verdict is fail.
+    """Draw the LiDAR of each capture of SESSION (default: session/) into its picture, print residuals.
     """
     from lce_rig import pipeline
     from lce_rig.cli.calibrate import exit_by_verdict
     from lce_rig.export.result import read_result
+    from lce_rig.pipeline.calibration import CALIBRATION
     from lce_rig.session import Session
 
     opened = Session.open(session)
-    saved = read_result(result or session / pipeline.CALIBRATION / "result.json")
+    saved = read_result(result or session / CALIBRATION / "result.json")
     with show.progress_bar("detecting") as progress:
         detections = pipeline.detect(opened, progress=progress)
     with show.progress_bar("drawing") as progress:
@@ -48,9 +49,7 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
 
 
 def _table(checked: Any) -> Any:
-    from rich.table import Table
-
-    table = Table(title=str(checked.pair), title_justify="left", pad_edge=False, box=None, header_style="bold")
+    table = show.plain_table(str(checked.pair))
     for title in ("capture", "planes mm", "rms", "edges mm", "rms", "corners px"):
         table.add_column(title, justify="left" if title == "capture" else "right")
     table.add_column("")

@@ -15,7 +15,7 @@ Arrays = dict[str, NDArray[Any]]
 LidarDetection = list[LidarBoard] | Refusal
 ImageDetection = ImageBoard | Refusal
 
-_KINDS = {kind.__name__: kind for kind in (ImageBoard, LidarBoard, Refusal)}
+_KINDS: dict[str, Any] = {kind.__name__: kind for kind in (ImageBoard, LidarBoard, Refusal)}
 
 
 def to_arrays(detection: ImageDetection | LidarDetection) -> Arrays:

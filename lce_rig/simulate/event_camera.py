@@ -93,6 +93,9 @@ class EventCamera:
         self._output = self._input.copy()
         self._reference = self._input.copy()
         n = len(self._input)
+        if noise.leak_hz > 0:
+            # Pixels leak since long ago: each is somewhere on its way to its next event.
+            self._reference -= pixels.threshold_on * rng.random(n)
         self._released_s = np.full(n, -np.inf)  # a pixel is blind until then
         self._last_s = np.full(n, -np.inf)  # when it last made an event
         self._raw: list[_Raw] = []
@@ -119,7 +122,8 @@ class EventCamera:
         is_blind = begin_s > now_s - start_s
         self._reference = np.where(is_blind, self._reference, output - end_excess)
         fires = (end_excess >= self._pixels.threshold_on) | (end_excess <= -self._pixels.threshold_off)
-        self._fire(np.flatnonzero(fires & ~is_blind), excess, slope, start_s, now_s, output)
+        pixel = np.flatnonzero(fires & ~is_blind)
+        self._fire(pixel, excess[pixel], slope[pixel], end_excess[pixel] > 0, start_s, now_s, output)
         self._input, self._output, self._now_s = seen, output, now_s
 
     def _filter(self, seen: Array, intensity: NDArray[np.float32], step_s: float) -> Array:
@@ -135,25 +139,33 @@ class EventCamera:
         return np.asarray(seen - lag + (self._output - self._input + lag) * np.exp(-step_s / tau_s))
 
     def _fire(
-        self, pixel: NDArray[np.intp], excess: Array, slope: Array, start_s: float, now_s: float, output: Array
+        self,
+        pixel: NDArray[np.intp],
+        excess: Array,
+        slope: Array,
+        is_on: NDArray[np.bool_],
+        start_s: float,
+        now_s: float,
+        output: Array,
     ) -> None:
-        """Make the events of pixels (M,) whose excess (P,) + slope (P,) t passes their threshold by now_s."""
+        """Make the events of pixels (M,) whose excess + slope t (M,) passes their threshold by now_s."""
         if not len(pixel):
             return
-        rate = slope[pixel]
-        is_on = rate > 0
-        threshold = np.where(is_on, self._pixels.threshold_on[pixel], -self._pixels.threshold_off[pixel])
-        first_s = start_s + np.maximum((threshold - excess[pixel]) / rate, 0.0)
+        threshold = np.where(is_on, self._pixels.threshold_on[pixel], self._pixels.threshold_off[pixel])
+        sign = np.where(is_on, 1.0, -1.0)
+        # Rounding can leave a pixel at its threshold with no slope, or one away from it.
+        rate = np.maximum(sign * slope, 1e-9)
+        first_s = start_s + np.clip((threshold - sign * excess) / rate, 0.0, now_s - start_s)
         # After its first event a pixel starts from zero: the others follow at a constant distance.
         apart_s = self._noise.refractory_s + threshold / rate
-        n_more = np.floor(np.maximum(now_s - first_s, 0.0) / apart_s).astype(np.int64)
+        n_more = np.floor((now_s - first_s) / apart_s).astype(np.int64)
         n = n_more + 1
         number = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
         t_s = np.repeat(first_s, n) + number * np.repeat(apart_s, n)
         self._raw.append(_Raw(np.minimum(t_s, now_s), np.repeat(pixel, n), np.repeat(is_on, n)))
         released_s = first_s + n_more * apart_s + self._noise.refractory_s
         self._released_s[pixel] = released_s
-        self._reference[pixel] = output[pixel] - rate * np.maximum(now_s - released_s, 0.0)
+        self._reference[pixel] = output[pixel] - slope * np.maximum(now_s - released_s, 0.0)
 
     def take(self) -> Events:
         """Hand over the events since the last call, in order of time, with those of noise among them."""

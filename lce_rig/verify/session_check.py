@@ -100,10 +100,11 @@ def check_session(
             yield from _draw(session.capture(name), session.rig, calibration, observation, residual)
             progress(done, len(names))
 
-    *pictures, sheet = write_overlays(folder, overlays()) or [None]
+    files = write_overlays(folder, overlays())
     metrics = summarise(residuals) if residuals else None
     used = calibration.captures_used
-    return SessionCheck(pair, calibration.verdict, tuple(residuals), metrics, used, tuple(pictures), sheet)
+    sheet = files[-1] if files else None
+    return SessionCheck(pair, calibration.verdict, tuple(residuals), metrics, used, tuple(files[:-1]), sheet)
 
 
 def _observe(

@@ -40,7 +40,10 @@ def test_arrays_that_are_no_detection_are_refused():
 
 def test_a_pair_shares_the_captures_that_hold_samples_of_both_sensors():
     refusal = Refusal("image", "no board", "show it")
-    images = {("cam", "frames"): {"000000": refusal, "000001": refusal}, ("cam", "events"): {"000002": refusal}}
+    images = {
+        ("cam", "frames"): {"000000": refusal, "000001": refusal},
+        ("cam", "events"): {"000002": refusal},
+    }
     detections = Detections(images, {"lidar": {"000001": [], "000003": []}})
     assert detections.pairs == [Pair("cam", "frames", "lidar")]
     assert detections.captures(detections.pairs[0]) == ["000001"]

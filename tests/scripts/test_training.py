@@ -13,7 +13,7 @@ import train_reconstruction  # noqa: E402
 from training.event_simulation import EventStream, Pixels, normalised  # noqa: E402
 from training.loss import reconstruction_loss, structural_similarity  # noqa: E402
 from training.network import ReconstructionNetwork  # noqa: E402
-from training.onnx_export import export_onnx  # noqa: E402
+from training.onnx_export import export_onnx, export_recurrent  # noqa: E402
 
 from lce_rig.core.data import Events  # noqa: E402
 from lce_rig.detect.reconstruct import ReconstructionModel, normalise_voxels, voxel_grid  # noqa: E402
@@ -135,6 +135,27 @@ def test_the_exported_file_computes_what_the_network_computes(tmp_path):
         with torch.no_grad():
             expected, *expected_states = network(torch.from_numpy(voxels)[None], *expected_states)
         np.testing.assert_allclose(picture, expected[0, 0].numpy(), atol=1e-4)
+
+
+class FullResolutionNetwork(torch.nn.Module):
+    """The shape of FireNet: both states at full resolution."""
+
+    def __init__(self):
+        super().__init__()
+        self.first, self.second = (torch.nn.Conv2d(n, 8, 3, padding=1) for n in (3 + 8, 16))
+
+    def forward(self, voxels, first, second):
+        first = torch.tanh(self.first(torch.cat([voxels, first], 1)))
+        second = torch.tanh(self.second(torch.cat([first, second], 1)))
+        return second.mean(1, keepdim=True), first, second
+
+
+def test_a_network_of_other_shape_exported_by_the_recipe_is_accepted(tmp_path):
+    export_recurrent(FullResolutionNetwork(), [(8, 1), (8, 1)], tmp_path / "fire.onnx", n_bins=3)
+    model = ReconstructionModel(tmp_path / "fire.onnx")
+    assert (model.n_bins, [state.divisor for state in model.states]) == (3, [1, 1])
+    picture, _ = model.step(np.ones((3, 21, 33), np.float32), model.initial_states(21, 33))
+    assert picture.shape == (21, 33)
 
 
 TINY = ["--batch", "2", "--crop-px", "16", "--unroll", "6", "--device", "cpu"]

@@ -176,7 +176,9 @@ def test_a_contact_sheet_holds_every_picture_once() -> None:
 
 def test_overlays_are_written_with_a_contact_sheet_and_read_back_unchanged(tmp_path: Path) -> None:
     drawn = overlay(FOLDING, wall())
-    files = write_overlays(tmp_path / "overlays", [("000000", drawn, drawn), ("cam/../../000001", drawn, drawn)])
+    files = write_overlays(
+        tmp_path / "overlays", [("000000", drawn, drawn), ("cam/../../000001", drawn, drawn)]
+    )
     assert [file.parent for file in files] == [tmp_path / "overlays"] * 3
     assert files[-1].name == "contact_sheet.png"
     assert np.array_equal(cv2.imread(str(files[0])), drawn)

@@ -10,7 +10,38 @@ from lce_rig.core.data import Events
 # A pixel is hot where it fires this many times as often as the 5 x 5 pixels around it.
 _HOT_FACTOR = 8.0
 _HOT_MIN_EVENTS = 20
+_HOT_PERIOD_NS = 500_000_000
 _SUPPORT_NS = 10_000_000
+
+
+class NoiseFilter:
+    """Learns along the stream which pixels are hot, and leaves out their events and lone ones."""
+
+    def __init__(self) -> None:
+        self._n_events: NDArray[np.int64] | None = None
+        self._since_ns = 0
+        self._is_hot: NDArray[np.bool_] | None = None
+
+    def learn(self, events: Events) -> None:
+        """Count the next stretch of the stream; twice a second the hot pixels are found anew."""
+        if not len(events):
+            return
+        shape = events.height_px, events.width_px
+        if self._n_events is None:
+            self._n_events, self._since_ns = np.zeros(shape, np.int64), int(events.t_ns[0])
+        index = events.y.astype(np.intp) * events.width_px + events.x
+        self._n_events += np.bincount(index, minlength=shape[0] * shape[1]).reshape(shape)
+        last_ns = int(events.t_ns[-1])
+        if last_ns - self._since_ns >= _HOT_PERIOD_NS:
+            self._is_hot = hot_pixels(np.minimum(self._n_events, 65535).astype(np.uint16))
+            self._n_events[:] = 0
+            self._since_ns = last_ns
+
+    def clean(self, events: Events) -> Events:
+        """Leave out the events of hot pixels known so far and background activity."""
+        if self._is_hot is not None:
+            events = without_pixels(events, self._is_hot)
+        return without_background_activity(events)
 
 
 def hot_pixels(n_events: NDArray[np.uint16]) -> NDArray[np.bool_]:

@@ -7,14 +7,16 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.data import Events, Image
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.results import Refusal
-from lce_rig.detect.reconstruct.filters import hot_pixels, without_background_activity, without_pixels
+from lce_rig.detect.reconstruct.filters import NoiseFilter
 from lce_rig.detect.reconstruct.imagers import EventImager, MapImager, NetworkImager
 from lce_rig.detect.reconstruct.intensity import IntensityScale
 from lce_rig.detect.reconstruct.model import States
+from lce_rig.detect.reconstruct.refusals import still_cold, too_early, too_late
 from lce_rig.detect.reconstruct.voxels import FloatArray
 from lce_rig.detect.reconstruct.windows import WindowOptions, WindowRule, active_share, window_rule
 
@@ -22,7 +24,6 @@ from lce_rig.detect.reconstruct.windows import WindowOptions, WindowRule, active
 _MIN_FILL = 0.5
 # Nothing happens in a longer silence: it is passed over in one stride, states kept.
 _LONGEST_SILENCE_NS = 2_000_000_000
-_HOT_PIXEL_PERIOD_NS = 500_000_000
 _SHARE_MEMORY = 0.8
 
 
@@ -91,9 +92,7 @@ class Reconstructor:
         self._first_ns: int | None = None
         self._previous: _Window | None = None
         self._current: _Window | None = None
-        self._hot: np.ndarray | None = None
-        self._n_by_pixel: np.ndarray | None = None
-        self._counted_since_ns = 0
+        self._noise = NoiseFilter()
 
     @property
     def is_warm(self) -> bool:
@@ -117,7 +116,7 @@ class Reconstructor:
         self._current = _Window(start_ns, events, self._current.states)
         return self._commit(end_ns)
 
-    def to_grey(self, picture: FloatArray) -> np.ndarray:
+    def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
         """Map a picture of `step` to uint8, (H, W), with percentiles smoothed over the steps so far."""
         return self._scale.to_grey(picture)
 
@@ -159,14 +158,12 @@ class Reconstructor:
                 stamp = next(waiting, None)
             self._advance(last_ns)
         if stamps_ns is not None and waiting is not None:
-            yield from (_too_late(late, last_ns) for late in _with_first(stamp, waiting))
+            yield from (too_late(late, last_ns) for late in _with_first(stamp, waiting))
 
     def _begin(self, events: Events) -> None:
         self._first_ns = int(events.t_ns[0]) if len(events) else 0
-        self._counted_since_ns = self._first_ns
         states = self._imager.initial_states(events.height_px, events.width_px)
         self._current = _Window(self._first_ns, events, states)
-        self._n_by_pixel = np.zeros(events.height_px * events.width_px, np.int64)
 
     def _take(self, batch: Events, last_ns: int | None) -> None:
         """Append a batch to the current window."""
@@ -207,7 +204,9 @@ class Reconstructor:
         """Close the current window and step; what is left of its events begins the next."""
         assert self._current is not None
         window = self._current
-        events = self._filtered(window.events.between(window.start_ns, end_ns))
+        events = window.events.between(window.start_ns, end_ns)
+        self._noise.learn(events)
+        events = self._cleaned(events)
         picture, states = self._imager.picture(events, window.start_ns, end_ns, window.states)
         self._scale.follow(picture)
         self._share = _SHARE_MEMORY * self._share + (1 - _SHARE_MEMORY) * active_share(events)
@@ -217,40 +216,16 @@ class Reconstructor:
         self.n_steps += 1
         return picture
 
-    def _filtered(self, events: Events) -> Events:
-        if not self.options.is_filtered or not len(events):
-            return events
-        assert self._n_by_pixel is not None
-        index = events.y.astype(np.intp) * events.width_px + events.x
-        self._n_by_pixel += np.bincount(index, minlength=len(self._n_by_pixel))
-        last_ns = int(events.t_ns[-1])
-        if last_ns - self._counted_since_ns >= _HOT_PIXEL_PERIOD_NS:
-            counts = np.minimum(self._n_by_pixel, 65535).astype(np.uint16)
-            self._hot = hot_pixels(counts.reshape(events.height_px, events.width_px))
-            self._n_by_pixel[:] = 0
-            self._counted_since_ns = last_ns
-        return self._cleaned(events)
-
     def _cleaned(self, events: Events) -> Events:
-        if not self.options.is_filtered:
-            return events
-        if self._hot is not None:
-            events = without_pixels(events, self._hot)
-        return without_background_activity(events)
+        return self._noise.clean(events) if self.options.is_filtered else events
 
     def _picture_at(self, stamp_ns: int) -> Image | Refusal:
         assert self._first_ns is not None
         if stamp_ns <= self._first_ns:
-            return _too_early(stamp_ns, self._first_ns)
+            return too_early(stamp_ns, self._first_ns)
         self._advance(stamp_ns)
         if not self.is_warm:
-            seen_s = (stamp_ns - self._first_ns) / 1e9
-            return Refusal(
-                "read",
-                f"{self.n_steps} windows of events ({seen_s:.2f} s) precede the picture, "
-                f"the network needs {self._imager.n_warm_up} to settle",
-                "keep the board or the camera moving for a second before the first capture",
-            )
+            return still_cold(self.n_steps, self._imager.n_warm_up, stamp_ns - self._first_ns)
         window = self._current
         assert window is not None
         events = self._cleaned(window.events.between(window.start_ns, stamp_ns))
@@ -278,23 +253,3 @@ def _with_first(first: int | None, rest: Iterator[int]) -> Iterator[int]:
     if first is not None:
         yield first
     yield from rest
-
-
-def _too_early(stamp_ns: int, first_ns: int) -> Refusal:
-    gap_s = (first_ns - stamp_ns) / 1e9
-    return Refusal(
-        "read",
-        f"the picture is asked for {gap_s:.3f} s before the first event",
-        "check that both sensors' clocks agree, or start the event camera first",
-    )
-
-
-def _too_late(stamp_ns: int, last_ns: int | None) -> Refusal:
-    if last_ns is None:
-        return Refusal("read", "the recording holds no events", "check the events' topic and the camera")
-    gap_s = (stamp_ns - last_ns) / 1e9
-    return Refusal(
-        "read",
-        f"the picture is asked for {gap_s:.3f} s after the last event",
-        "check that both sensors' clocks agree, or record events to the end",
-    )

@@ -26,11 +26,13 @@ class Evt2Decoder:
         has_vectors: EVT2.1, whose events carry 32 pixels each.
         n_untimed: words with events met before any stamp, left out.
         n_unknown: words of no known code, passed over.
+        n_repaired: time words that did not fit those around them, for which the one before was taken.
     """
 
     has_vectors: bool
     n_untimed: int = 0
     n_unknown: int = 0
+    n_repaired: int = 0
     _high: int | None = None
 
     def decode(self, words: NDArray[np.unsignedinteger]) -> EventColumns:
@@ -59,6 +61,12 @@ class Evt2Decoder:
         values = (upper[at] & np.uint32((1 << _HIGH_BITS) - 1)).astype(np.int64)
         timed_from = 0 if self._high is not None else int(at[0]) if len(at) else len(code)
         before = self._high or 0
+        step = values[2:] - values[:-2]
+        is_odd = (
+            (step >= 0) & (step <= _MAX_STEP_BACK) & (np.abs(values[1:-1] - values[:-2]) > _MAX_STEP_BACK)
+        )
+        values[1:-1][is_odd] = values[:-2][is_odd]
+        self.n_repaired += int(np.count_nonzero(is_odd))
         if len(values):
             first = values[0] if self._high is None else before % (1 << _HIGH_BITS)
             wraps = np.cumsum(values + _MAX_STEP_BACK < np.concatenate(([first], values[:-1])))

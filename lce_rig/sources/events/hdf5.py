@@ -17,6 +17,8 @@ from lce_rig.sources.events.stream import NS_PER_US, EventColumns, Findings
 
 _BLOCK_EVENTS = 1 << 20
 _COLUMNS = ("t", "x", "y", "p")
+# What h5py raises on a damaged file.
+_DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 
 
 class Hdf5Events:
@@ -31,22 +33,28 @@ class Hdf5Events:
         self._path = path
         self.notes: list[str] = []
         with _open(path) as file:
-            columns = [file.get(f"events/{name}") for name in _COLUMNS]
-            missing = [name for name, column in zip(_COLUMNS, columns, strict=True) if column is None]
-            if missing:
-                raise SourceError(
-                    f"{path} has no events/{missing[0]}; it has {_list_names(file)}",
-                    "Events are read as DSEC lays them out: events/t, events/x, events/y, events/p.",
-                )
-            lengths = {name: len(column) for name, column in zip(_COLUMNS, columns, strict=True)}
-            self._n_events = min(lengths.values())
-            if self._n_events < max(lengths.values()):
-                said = ", ".join(f"{name} {length}" for name, length in lengths.items())
-                self.notes.append(f"{path.name}: columns of unequal length ({said}); the shortest is taken")
-            group = file["events"]
-            size = [_integer(group, name) or _integer(file, name) for name in ("width", "height")]
-            self.resolution_px = (size[0], size[1]) if size[0] and size[1] else None
-            self._offset_us = _integer(file, "t_offset") or _integer(group, "t_offset") or 0
+            try:
+                self._find_columns(file)
+            except _DAMAGE as error:
+                raise SourceError(f"{path} is damaged: {error}") from None
+
+    def _find_columns(self, file: Any) -> None:
+        columns = [file.get(f"events/{name}") for name in _COLUMNS]
+        missing = [name for name, column in zip(_COLUMNS, columns, strict=True) if column is None]
+        if missing:
+            raise SourceError(
+                f"{self._path} has no events/{missing[0]}; it has {_list_names(file)}",
+                "Events are read as DSEC lays them out: events/t, events/x, events/y, events/p.",
+            )
+        lengths = {name: len(column) for name, column in zip(_COLUMNS, columns, strict=True)}
+        self._n_events = min(lengths.values())
+        if self._n_events < max(lengths.values()):
+            said = ", ".join(f"{name} {length}" for name, length in lengths.items())
+            self.notes.append(f"{self._path.name}: columns of unequal length ({said}); the shortest is taken")
+        group = file["events"]
+        size = [_integer(group, name) or _integer(file, name) for name in ("width", "height")]
+        self.resolution_px = (size[0], size[1]) if size[0] and size[1] else None
+        self._offset_us = _integer(file, "t_offset") or _integer(group, "t_offset") or 0
 
     def stretches(self, findings: Findings) -> Iterator[EventColumns]:
         """Yield the events a million at a time.
@@ -58,7 +66,7 @@ class Hdf5Events:
             for begin in range(0, self._n_events, _BLOCK_EVENTS):
                 try:
                     block = [file[f"events/{name}"][begin : begin + _BLOCK_EVENTS] for name in _COLUMNS]
-                except OSError as error:
+                except _DAMAGE as error:
                     if begin:
                         lost = f"event {begin}: {error}"
                         findings.add("torn ends of the file left out", lost)
@@ -83,7 +91,7 @@ def _open(path: Path) -> Any:
         raise SourceError(f"{path} cannot be read as HDF5: {error}") from None
 
 
-def _unreadable(path: Path, file: Any, error: OSError) -> SourceError:
+def _unreadable(path: Path, file: Any, error: Exception) -> SourceError:
     """Say why: HDF5's own message on a missing filter names a folder and nothing else."""
     from h5py.h5z import filter_avail  # type: ignore[import-untyped]
 
@@ -108,5 +116,6 @@ def _integer(holder: Any, name: str) -> int | None:
 
 def _list_names(file: Any) -> str:
     names: list[str] = []
-    file.visit(names.append)
+    with suppress(RuntimeError):
+        file.visit(names.append)
     return ", ".join(names[:12]) or "nothing"

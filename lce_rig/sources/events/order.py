@@ -18,6 +18,7 @@ _MAX_GAP_NS = 60_000_000_000
 _MAX_LEAD_NS = 1_000_000_000
 # More stray stamps than this are no damage here and there but a clock that was set.
 _MAX_STRAY_SHARE = 0.01
+_MAX_DAMAGED_SHARE = 0.25
 
 
 def in_time_order(
@@ -104,7 +105,9 @@ def _sorted(
         worst = int(np.argmax(latest_before - t_ns))
         back_s = (latest_before[worst] - t_ns[worst]) * 1e-9
         where = f"{seconds_in(int(latest_before[worst]), first_ns)} they run back by {back_s:.3f} s"
-        if n_stray > max(1, _MAX_STRAY_SHARE * len(t_ns)):
+        # A clock that was set divides the stream; damage lies between stamps that go on.
+        is_between = not (stray[0] or stray[-1]) and n_stray <= _MAX_DAMAGED_SHARE * len(t_ns)
+        if n_stray > max(1, _MAX_STRAY_SHARE * len(t_ns)) and not is_between:
             reset = int(np.argmax(latest_before - t_ns > REORDER_NS))
             if delivered_ns is None and latest_before[reset] - first_ns < _MAX_LEAD_NS:
                 findings.add("events before the clock was set left out", where, reset)

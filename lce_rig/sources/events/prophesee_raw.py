@@ -45,26 +45,26 @@ class PropheseeEvents:
             header = _read_header(file)
             self._begin = file.tell()
         self._version = _version(path, header)
-        self._is_swapped = self._version == "21" and _field(header, "endianness") == "legacy"
+        order = _field(header, "endianness")
+        self._is_swapped = self._version == "21" and (
+            order == "legacy" or (not order and _looks_swapped(path, self._begin))
+        )
         self.resolution_px = _resolution(header)
 
     def stretches(self, findings: Findings) -> Iterator[EventColumns]:
         """Yield the events of the file, block by block."""
         dtype = np.dtype(_WORDS[self._version])
-        decoder: WordDecoder | Evt2Decoder = (
-            WordDecoder(EVT3) if self._version == "3" else Evt2Decoder(self._version == "21")
-        )
+        decoder: Any = WordDecoder(EVT3) if self._version == "3" else Evt2Decoder(self._version == "21")
         with self._path.open("rb") as file:
             file.seek(self._begin)
             while block := file.read(_BLOCK_BYTES):
                 n_torn = len(block) % dtype.itemsize
                 words: NDArray[Any] = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
-                if self._is_swapped:
-                    words = words.view("<u4").reshape(-1, 2)[:, ::-1].copy().view("<u8").ravel()
-                yield decoder.decode(words)
+                yield decoder.decode(_swapped(words) if self._is_swapped else words)
                 if n_torn:
                     findings.add("bytes of a torn last word left out", n=n_torn)
         findings.add("events before the first stamp left out", n=decoder.n_untimed)
+        findings.add("time words that did not fit repaired", n=decoder.n_repaired)
         findings.add(f"words of no EVT{self._version} code passed over", n=decoder.n_unknown)
 
 
@@ -81,6 +81,26 @@ def _read_header(file: BinaryIO) -> dict[str, str]:
         if key == "end":
             return header
         header[key] = value
+
+
+def _swapped(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Exchange the halves of EVT2.1 words: the IMX636 sends the upper one first."""
+    return np.asarray(words >> np.uint64(32) | words << np.uint64(32))
+
+
+def _looks_swapped(path: Path, begin: int) -> bool:
+    """Tell the order of EVT2.1's halves by the stamps, which rise in the right one."""
+    with path.open("rb") as file:
+        file.seek(begin)
+        block = file.read(_BLOCK_BYTES)
+    words = np.frombuffer(block, "<u8", len(block) // 8)
+    upper, swapped = (w >> np.uint64(32) for w in (words, _swapped(words)))
+    return not _has_clock(upper) and _has_clock(swapped)
+
+
+def _has_clock(upper: NDArray[np.uint64]) -> bool:
+    high = upper[upper >> np.uint64(28) == 8].astype(np.int64)
+    return len(high) > 0 and bool(np.all(np.diff(high) >= 0))
 
 
 def _version(path: Path, header: dict[str, str]) -> str:

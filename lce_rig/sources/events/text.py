@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.events.stream import NS_PER_US, EventColumns, Findings
 
-_BLOCK_BYTES = 1 << 22
+_BLOCK_BYTES = 1 << 18
 _N_COLUMNS = 4
 # RuntimeError: encryption or a compression that cannot be; a flipped bit says so.
 _ZIP_DAMAGE = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError)
@@ -73,16 +73,16 @@ def _open(path: Path) -> Iterator[IO[bytes]]:
         with path.open("rb") as file:
             yield file
         return
-    with zipfile.ZipFile(path) as archive:
+    try:
+        archive = zipfile.ZipFile(path)
         names = [name for name in archive.namelist() if name.lower().endswith((".txt", ".csv"))]
         if len(names) != 1:
             raise SourceError(f"{path} holds {len(names)} texts, not one of events")
-        try:
-            file = archive.open(names[0])
-        except _ZIP_DAMAGE as error:
-            raise SourceError(f"{path} is damaged: {error}") from None
-        with file:
-            yield file
+        member = archive.open(names[0])
+    except _ZIP_DAMAGE as error:
+        raise SourceError(f"{path} is damaged: {error}") from None
+    with archive, member:
+        yield member
 
 
 def _parse_block(block: bytes, first_line: int, findings: Findings) -> NDArray[np.float64]:

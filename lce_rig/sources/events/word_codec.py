@@ -58,11 +58,13 @@ class WordDecoder:
         layout: what the codes mean.
         n_untimed: events met before any stamp, left out.
         n_unknown: words of no known code, passed over.
+        n_repaired: time words that did not fit those around them, for which the one before was taken.
     """
 
     layout: WordLayout
     n_untimed: int = 0
     n_unknown: int = 0
+    n_repaired: int = 0
     _high: int | None = None
     _low: int | None = None
     _line: int = 0
@@ -135,6 +137,11 @@ class WordDecoder:
         """Count the wraps of the high part, every 16.8 s."""
         if not len(high):
             return high
+        # One damaged word would look like a wrap, and 16.8 s would stay added for good.
+        step = high[2:] - high[:-2]
+        is_odd = (step >= 0) & (step <= _MAX_STEP_BACK) & (np.abs(high[1:-1] - high[:-2]) > _MAX_STEP_BACK)
+        high[1:-1][is_odd] = high[:-2][is_odd]
+        self.n_repaired += int(np.count_nonzero(is_odd))
         before = 0 if self._high is None else self._high
         previous = np.concatenate(([before % _WRAP if self._high is not None else high[0]], high[:-1]))
         wraps = np.cumsum(high + _MAX_STEP_BACK < previous)

@@ -65,6 +65,21 @@ def test_a_time_word_that_steps_back_a_little_is_no_wrap() -> None:
     assert (events.t_ns // 4_096_000).tolist() == [50, 49, 51]
 
 
+@pytest.mark.parametrize("name", sorted(WORDS))
+def test_a_damaged_time_word_is_repaired_and_counted(name: str) -> None:
+    encode, dtype = WORDS[name]
+    truth = [(5000 * i, i, i, True) for i in range(100)]
+    words = np.frombuffer(encode(truth), dtype).copy()
+    code_at = words.dtype.itemsize * 8 - 4
+    high = np.flatnonzero(words >> words.dtype.type(code_at) == 8)
+    words[high[50]] ^= words.dtype.type(1 << {"evt2": 20, "evt21": 52, "evt3": 10}[name])
+    decoder = decoder_of(name)
+    found = columns_listed(decoder.decode(words))
+    assert decoder.n_repaired == 1
+    assert found[:50] + found[51:] == truth[:50] + truth[51:]
+    assert abs(found[50][0] - truth[50][0]) < 10_000
+
+
 def test_events_before_the_first_stamp_are_left_out_and_counted() -> None:
     truth = listed(random_events(50, 2))
     for name, (encode, dtype) in WORDS.items():

@@ -226,11 +226,11 @@ def test_raw_files_of_every_version_and_header_are_read(
     assert everything(recording) == truth
 
 
-def test_the_legacy_word_order_of_evt21_is_undone(tmp_path: Path) -> None:
+@pytest.mark.parametrize("head", ["% format EVT21;endianness=legacy\n", "% evt 2.1\n"])
+def test_the_legacy_word_order_of_evt21_is_undone(tmp_path: Path, head: str) -> None:
     truth = listed(random_events(500, 8, (640, 480)))
     words = np.frombuffer(encoders.evt21(truth), "<u4").reshape(-1, 2)[:, ::-1].tobytes()
-    head = b"% format EVT21;endianness=legacy;height=480;width=640\n% end\n"
-    (tmp_path / "a.raw").write_bytes(head + words)
+    (tmp_path / "a.raw").write_bytes(head.encode() + words)
     assert everything(open_events(tmp_path / "a.raw")) == truth
 
 

@@ -109,6 +109,15 @@ def test_a_single_stray_stamp_is_left_out_and_counted(stray_us: int, at: int) ->
     assert any("1 events with stray stamps left out" in note for note in recording.notes)
 
 
+def test_a_damaged_stretch_between_sound_ones_is_left_out_and_counted() -> None:
+    truth = np.arange(1000) * 1000
+    t_us = truth.copy()
+    t_us[600:700] += 10**9
+    recording = record(columns(t_us[:500]), columns(t_us[500:]))
+    assert stamps_us(recording) == np.delete(truth, np.arange(600, 700)).tolist()
+    assert any("100 events with stray stamps left out" in note for note in recording.notes)
+
+
 def test_events_off_the_sensor_are_left_out_when_few_and_refused_when_many() -> None:
     stretch = columns(np.arange(1000))
     few, many = stretch.x.copy(), stretch.x.copy()

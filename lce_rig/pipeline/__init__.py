@@ -1,0 +1,30 @@
+"""The story in order: captures -> detections -> extrinsics -> files and pictures. Start reading here.
+
+    detections = detect(session)                            the board in every picture and scan
+    results = calibrate(rig, detections, options)           an extrinsic and verdict for every pair of sensors
+    write_results(session, calibrations, force=False)       result.json, YAML, URDF, camera_info, transforms
+    verify(session, detections, calibrations)               the LiDAR drawn into the pictures
+
+Every step takes a session and what the step before it made. Results are frozen dataclasses; only the
+session and the export layer touch files.
+"""
+
+from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
+from lce_rig.pipeline.calibration import calibrate, refusals, write_results
+from lce_rig.pipeline.detection import detect, detect_image, detect_scan
+from lce_rig.pipeline.verification import verify, write_debug_images
+
+__all__ = [
+    "Detections",
+    "ImageDetection",
+    "LidarDetection",
+    "Pair",
+    "calibrate",
+    "detect",
+    "detect_image",
+    "detect_scan",
+    "refusals",
+    "verify",
+    "write_debug_images",
+    "write_results",
+]

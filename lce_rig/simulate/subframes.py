@@ -1,0 +1,239 @@
+"""Grey sub-frames of the moving board: fast enough for hundreds a second, smooth enough for event pixels.
+
+`render_image` draws single pictures with shadows and mirror images. Here the room is one fixed picture, the
+board is drawn analytically, and its carrier is a cut-out that shifts. Edges are smoothed by their distance
+in units of the pixel's own spread, not by sampling: intensities change without steps as the board moves.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.simulate.backdrop import Backdrop, pixel_rays
+from lce_rig.simulate.camera import sensor_gain
+from lce_rig.simulate.carrier_layer import (
+    GREY,
+    CarrierLayer,
+    Window,
+    carrier_middle,
+    clip_window,
+    render_carrier,
+)
+from lce_rig.simulate.event_camera import EventCamera
+from lce_rig.simulate.light import irradiance
+from lce_rig.simulate.motion import Trajectory
+from lce_rig.simulate.options import CameraNoise
+from lce_rig.simulate.scene import PLATE, PLATE_BACK, PRINT_ALBEDO, Scene
+
+Float = NDArray[np.float32]
+_KEY_NS = 250_000_000
+_STEP_PX = 0.4
+_STEP_NS = (500_000, 5_000_000)
+_ALONG = np.linspace(0, 1, 17)[:, None, None]
+# Mean square distance of a pixel's area from its middle, px^2, along one axis.
+_PIXEL_AREA_PX2 = 1 / 12
+
+
+@dataclass(frozen=True, eq=False)
+class _Key:
+    """What is computed only now and then: the carrier's picture, and the light on the board.
+
+    Attributes:
+        carrier: None where there is none to be seen.
+        light: (4,) of light = a + b x + c y + d x y over the board, on its printed side.
+    """
+
+    carrier: CarrierLayer | None
+    light: Array
+
+
+@dataclass(eq=False)
+class MovingView:
+    """What one camera sees of the board on its way.
+
+    Attributes:
+        backdrop: the camera and the standing room.
+        board: the board.
+        trajectory: where it is.
+        scene_at: the scene at a time of the rig's clock, ns: for the carrier.
+        lens: the camera's errors; blur, exposure and vignetting count.
+    """
+
+    backdrop: Backdrop
+    board: Board
+    trajectory: Trajectory
+    scene_at: Callable[[int], Scene]
+    lens: CameraNoise
+    _keys: dict[int, _Key] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        import cv2
+
+        grey = (self.backdrop.radiance @ GREY).astype(np.float32)
+        if self.lens.blur_px > 0:
+            grey = cv2.GaussianBlur(grey, (0, 0), self.lens.blur_px, borderType=cv2.BORDER_REPLICATE)
+        self._room: Float = grey
+        self._gain = sensor_gain(*grey.shape, self.lens).astype(np.float32)
+        self._rays = pixel_rays(self.backdrop.corner_rays).astype(np.float32)
+        self._room_range_m = self.backdrop.range_m.astype(np.float32)
+
+    def at(self, t_ns: int) -> Float:
+        """Render the linear intensity (H, W) that the sensor sees at a time of the rig's clock."""
+        seen = self._room.copy()
+        T_world_board = self.trajectory.at(t_ns)
+        layers = self._carrier(t_ns, T_world_board)
+        if layers is not None:
+            window, both = layers
+            seen[window] += both[..., 0] - both[..., 1] * seen[window]
+        board_window = self._board_window(T_world_board)
+        if board_window is not None:
+            radiance, cover = self._board(board_window, T_world_board, self._light(t_ns))
+            seen[board_window] += cover * (radiance - seen[board_window])
+        if layers is not None:
+            seen[window] += both[..., 2] - both[..., 3] * seen[window]
+        return np.asarray(seen * self._gain)
+
+    def speed_px_s(self, t_ns: int) -> float:
+        """Measure how fast the board's outline moves through the picture at most."""
+        step_ns = 1_000_000
+        outlines = transform(self.trajectory.at(np.array([t_ns, t_ns + step_ns])), self.board.outline())
+        pixels, is_valid = self.backdrop.intrinsics.project(transform(invert(self.backdrop.T_world_cam), outlines))
+        way_px = np.linalg.norm(pixels[1] - pixels[0], axis=-1)[is_valid.all(axis=0)]
+        return float(way_px.max(initial=0.0)) / (1e-9 * step_ns)
+
+    def _board_window(self, T_world_board: Array) -> Window | None:
+        outline = transform(T_world_board, self.board.outline())
+        edges = ((1 - _ALONG) * outline + _ALONG * np.roll(outline, -1, axis=0)).reshape(-1, 3)
+        pixels, is_valid = self.backdrop.intrinsics.project(transform(invert(self.backdrop.T_world_cam), edges))
+        if not is_valid.any():
+            return None
+        bounds = np.stack([pixels[is_valid].min(axis=0) - 4, pixels[is_valid].max(axis=0) + 5])
+        return clip_window(bounds, self.backdrop)
+
+    def _board(self, window: Window, T_world_board: Array, light: Array) -> tuple[Float, Float]:
+        """Compute the board's radiance and its cover (h, w) of each pixel, 0..1."""
+        R, eye = T_world_board[:3, :3].astype(np.float32), transform(invert(T_world_board), self.backdrop.origin[None])[0]
+        rays = self._rays[window]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            range_m = np.float32(-eye[2]) / (rays @ R[:, 2])
+            x = np.float32(eye[0]) + range_m * (rays @ R[:, 0])
+            y = np.float32(eye[1]) + range_m * (rays @ R[:, 1])
+        is_before = (range_m > 0) & (range_m < self._room_range_m[window])
+        sigma_px = np.float32(np.sqrt(self.lens.blur_px**2 + _PIXEL_AREA_PX2))
+        spread_x, spread_y = (sigma_px * _slope(along) for along in (x, y))
+        cover = _inside(self.board.width_m / 2, x, spread_x) * _inside(self.board.height_m / 2, y, spread_y)
+        cover *= is_before
+        shade = light[0] + light[1] * x + light[2] * y + light[3] * x * y
+        if eye[2] > 0:
+            white, ink = (np.float32(np.dot(GREY, colour)) for colour in (PLATE.colour, (PRINT_ALBEDO,) * 3))
+            shade *= white + (ink - white) * self._print(x, y, spread_x, spread_y)
+        else:
+            shade *= np.float32(np.dot(GREY, PLATE_BACK.colour))
+        return np.nan_to_num(shade.astype(np.float32)), np.nan_to_num(cover)
+
+    def _print(self, x: Float, y: Float, spread_x: Float, spread_y: Float) -> Float:
+        """Compute the share (h, w) of each pixel that is inked.
+
+        Along each axis the squares are a wave of +-1, smoothed where it changes sign; where both waves have
+        the same sign the print is dark. For a smoothing that is round in the picture this product is what
+        smoothing the whole print would give, as long as the board is not seen at a grazing angle.
+        """
+        board = self.board
+        column = (x - np.float32(board.pattern_offset_m[0])) / board.square_m + np.float32((board.cols + 1) / 2)
+        row = (np.float32(board.pattern_offset_m[1]) - y) / board.square_m + np.float32((board.rows + 1) / 2)
+        share = np.float32(0.5)
+        inside = np.float32(1.0)
+        wave = np.float32(1.0)
+        for place, n_inner, spread in ((column, board.cols, spread_x), (row, board.rows, spread_y)):
+            sigma = spread / np.float32(board.square_m)
+            edge = np.clip(np.rint(place), 1, n_inner)
+            sign = 1 - 2 * np.mod(edge, 2)
+            wave = wave * sign * (2 * _smooth_step(place - edge, sigma) - 1)
+            half = np.float32((n_inner + 1) / 2)
+            inside = inside * _inside(half, place - half, sigma)
+        return np.asarray(inside * share * (1 + wave))
+
+    def _carrier(self, t_ns: int, T_world_board: Array) -> tuple[Window, Float] | None:
+        """Draw the carrier (h, w, 4) as blended from the pictures before and after this time."""
+        middle = carrier_middle(self.backdrop, T_world_board)
+        k, weight = divmod(t_ns, _KEY_NS)
+        carriers = [self._key(k).carrier, self._key(k + 1).carrier]
+        if middle is None or carriers[0] is None or carriers[1] is None:
+            return None
+        bounds = np.stack([carrier.bounds_px(*middle) for carrier in carriers if carrier])
+        window = clip_window(np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)]), self.backdrop)
+        if window is None:
+            return None
+        before, after = (carrier.shifted(window, *middle) for carrier in carriers if carrier)
+        share = np.float32(weight / _KEY_NS)
+        return window, before + share * (after - before)
+
+    def _light(self, t_ns: int) -> Array:
+        k, weight = divmod(t_ns, _KEY_NS)
+        before, after = self._key(k).light, self._key(k + 1).light
+        return np.asarray(before + (weight / _KEY_NS) * (after - before), dtype=np.float32)
+
+    def _key(self, k: int) -> _Key:
+        if k not in self._keys:
+            for old in [j for j in self._keys if j < k - 1]:
+                del self._keys[old]
+            scene = self.scene_at(k * _KEY_NS)
+            self._keys[k] = _Key(render_carrier(scene, self.backdrop), _light_on_board(scene, self.backdrop))
+        return self._keys[k]
+
+
+def film(view: MovingView, camera: EventCamera, start_ns: int, end_ns: int) -> None:
+    """Show an event camera what moves from start_ns on, which it has seen already, up to end_ns.
+
+    The steps are short enough that an edge crosses no more than a part of a pixel in each.
+    """
+    t_ns = start_ns
+    while t_ns < end_ns:
+        speed_px_s = max(view.speed_px_s(t_ns), 1e-3)
+        step_ns = int(np.clip(1e9 * _STEP_PX / speed_px_s, *_STEP_NS))
+        t_ns = min(t_ns + step_ns, end_ns)
+        camera.see(view.at(t_ns), t_ns)
+
+
+def _light_on_board(scene: Scene, backdrop: Backdrop) -> Array:
+    """Fit the light (4,) on the side of the board that the camera sees, unshadowed."""
+    x, y = (grid.ravel() for grid in np.meshgrid(*(np.linspace(-0.5, 0.5, 3) * s for s in _size(scene.board))))
+    points = transform(scene.T_world_board, np.stack([x, y, np.zeros(9)], axis=1))
+    side = np.sign((backdrop.origin - scene.T_world_board[:3, 3]) @ scene.T_world_board[:3, 2])
+    normals = np.tile(side * scene.T_world_board[:3, 2], (9, 1))
+    light = irradiance(backdrop.lamps, points, normals) @ GREY
+    terms = np.stack([np.ones(9), x, y, x * y], axis=1)
+    return np.asarray(np.linalg.lstsq(terms, light, rcond=None)[0])
+
+
+def _size(board: Board) -> Sequence[float]:
+    return board.width_m, board.height_m
+
+
+def _slope(values: Float) -> Float:
+    """Measure |gradient| (h, w) of a picture, per px."""
+    down, across = np.empty_like(values), np.empty_like(values)
+    if min(values.shape) < 3:
+        return np.zeros_like(values)
+    down[1:-1], across[:, 1:-1] = values[2:] - values[:-2], values[:, 2:] - values[:, :-2]
+    down[0], down[-1], across[:, 0], across[:, -1] = down[1], down[-2], across[:, 1], across[:, -2]
+    return np.asarray(np.float32(0.5) * np.sqrt(down * down + across * across))
+
+
+def _smooth_step(distance: Float, sigma: Float) -> Float:
+    """Integrate a parabolic kernel of deviation sigma from -inf to distance: 0..1.
+
+    The kernel 3/(4h) (1 - (d/h)^2) on |d| < h has the variance h^2 / 5.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        d = np.clip(distance / (np.float32(np.sqrt(5)) * sigma), -1, 1)
+    return np.asarray(np.float32(0.5) + d * (np.float32(0.75) - np.float32(0.25) * d * d))
+
+
+def _inside(half: float | np.float32, place: Float, sigma: Float) -> Float:
+    """Tell how much of each pixel lies within +-half of a place: 0..1."""
+    return _smooth_step(np.float32(half) - np.abs(place), sigma)
