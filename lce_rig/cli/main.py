@@ -114,7 +114,7 @@ def run(arguments: list[str]) -> int:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
     except ModuleNotFoundError as error:
-        if show_traceback:
+        if show_traceback or (error.name or "").startswith("lce_rig"):
             traceback.print_exc()
         click.secho(f"error: the package '{error.name}' is missing", fg="red", err=True)
         click.echo(f"  pip install {error.name}", err=True)

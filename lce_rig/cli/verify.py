@@ -21,10 +21,7 @@ from lce_rig.cli import show
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the residuals as JSON.")
 def verify(session: Path, result: Path | None, output: Path | None, as_json: bool) -> None:
-    """Draw the LiDAR of each capture of SESSION (default: session/) into its picture; print residuals.
-
-    """Draw the LiDAR of each capture of SESSION (default: session/) into its picture, print residuals.
-    """
+    """Draw the LiDAR of each capture of SESSION (default: session/) into its picture, print residuals."""
     from lce_rig import pipeline
     from lce_rig.cli.calibrate import exit_by_verdict
     from lce_rig.export.result import read_result

@@ -1,10 +1,13 @@
 """The simulated rig: captures of any profile with exact truth, errors and clutter like real ones."""
 
-from lce_rig.simulate.captures import SimulatedCapture, simulate_captures, truth_extrinsics
-from lce_rig.simulate.options import CameraNoise, LidarNoise, SimulationOptions
+from lce_rig.simulate.captures import SimulatedCapture, simulate_captures
+from lce_rig.simulate.options import CameraNoise, EventNoise, HandMotion, LidarNoise, SimulationOptions
+from lce_rig.simulate.stage import truth_extrinsics
 
 __all__ = [
     "CameraNoise",
+    "EventNoise",
+    "HandMotion",
     "LidarNoise",
     "SimulatedCapture",
     "SimulationOptions",

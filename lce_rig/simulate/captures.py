@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, invert
@@ -13,7 +14,8 @@ from lce_rig.simulate.motion import Trajectory, hold_board, sway_board
 from lce_rig.simulate.options import SimulationOptions
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import CARRIER, HAND, PHASE, PLACEMENT, Stage, set_stage
-from lce_rig.simulate.takes import MovingBoard, take_events, take_image, take_scan
+from lce_rig.simulate.subframes import film
+from lce_rig.simulate.takes import MovingBoard, take_image, take_scan
 
 _FIRST_STAMP_NS = 1_700_000_000_000_000_000
 _CAPTURE_EVERY_NS = 4_000_000_000
@@ -46,7 +48,7 @@ class SimulatedCapture:
     trajectory: Trajectory
     T_world_sensor: Mapping[str, Array]
 
-    def T_sensor_board(self, sensor: str, t_ns: int | np.ndarray) -> Array:
+    def T_sensor_board(self, sensor: str, t_ns: int | NDArray[np.int64]) -> Array:
         """Compute the board's true pose (..., 4, 4) before a camera or LiDAR at times of the rig's clock.
 
         Stamps of pictures and events read `frame_offset_s` or `event_offset_s` more than that clock.
@@ -101,9 +103,55 @@ def _moving_capture(stage: Stage, index: int) -> SimulatedCapture:
     # A camera that runs freely: its picture nearest to the scan's middle, by its own stamps.
     phase_s = options.frame_every_s * stage.rng(index, PHASE).uniform(-0.5, 0.5)
     exposed_ns = middle_ns + round(1e9 * (phase_s - options.frame_offset_s))
-    span_ns = [stamp_ns - round(1e9 * (options.event_offset_s - s)) for s in (-options.events_span_s[0], options.events_span_s[1])]
     images = [board.take_image(camera, exposed_ns, (index,)) for camera in stage.framed]
     scans = [board.take_scan(lidar, stamp_ns, (index,)) for lidar in stage.models]
-    events = [take_events(board, camera, (span_ns[0], span_ns[1]), (index,)) for camera in stage.pixels]
+    events = [_film_capture(board, camera, stamp_ns, index) for camera in stage.pixels]
     times_ns = {name: stamp_ns for name in stage.T_world_sensor} | {name: exposed_ns for name in stage.framed}
     return _capture(stage, index, images, scans, events, trajectory, times_ns)
+
+
+def _film_capture(board: MovingBoard, camera: str, stamp_ns: int, index: int) -> Events:
+    """Record the events whose stamps lie about a scan's."""
+    options = board.stage.options
+    before_s, after_s = options.events_span_s
+    start_ns, end_ns = (
+        stamp_ns + round(1e9 * (s - options.event_offset_s)) for s in (-before_s, after_s)
+    )
+    view = board.view(camera)
+    sensor = board.event_camera(camera, view, start_ns, (index,))
+    film(view, sensor, start_ns, end_ns)
+    return sensor.take()
+
+
+def _half_turn_ns(stage: Stage, index: int) -> int:
+    """How long after its scan's stamp the LiDAR of this capture looks straight ahead."""
+    view = stage.views[index % len(stage.views)]
+    return stage.models[view.lidar].period_ns // 2
+
+
+def _capture(
+    stage: Stage,
+    index: int,
+    images: list[Image],
+    scans: list[Scan],
+    events: list[Events],
+    trajectory: Trajectory,
+    times_ns: Mapping[str, int],
+) -> SimulatedCapture:
+    """Put samples together with the truth at each sensor's own time."""
+    view = stage.views[index % len(stage.views)]
+    T_sensor_board = {
+        name: invert(T_world_sensor) @ trajectory.at(times_ns[name])
+        for name, T_world_sensor in stage.T_world_sensor.items()
+    }
+    return SimulatedCapture(
+        index,
+        images,
+        scans,
+        {name: T_sensor_board[name] for name in stage.rig.lidars},
+        {name: T_sensor_board[name] for name in stage.rig.cameras},
+        (view.camera, view.lidar),
+        events,
+        trajectory,
+        stage.T_world_sensor,
+    )

@@ -58,6 +58,11 @@ class Stage:
     pixels: Mapping[str, EventPixels]
     views: list[View]
 
+    @property
+    def framed(self) -> list[str]:
+        """The cameras that take pictures, in the profile's order."""
+        return [name for name in self.backdrops if channel_of(self.rig, name, "frames")]
+
     def rng(self, *stream: int) -> np.random.Generator:
         """Begin a stream of random numbers of this session or of one of its captures."""
         return np.random.default_rng([self.seed, *stream])

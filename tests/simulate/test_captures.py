@@ -9,8 +9,8 @@ from lce_rig.core.errors import LceRigError, ProfileError
 from lce_rig.core.geometry import Array, invert, rotation_angle, transform
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures, truth_extrinsics
-from lce_rig.simulate.captures import LIDAR_MODELS
 from lce_rig.simulate.room import build_room
+from lce_rig.simulate.stage import LIDAR_MODELS
 
 from .conftest import make_rig
 

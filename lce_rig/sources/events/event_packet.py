@@ -134,6 +134,8 @@ class PacketDecoder:
         """Say what was passed over, and what could not be decoded inside packets."""
         findings.add("packets of triggers passed over", n=self._n_trigger_packets)
         findings.add("events before the first stamp left out", n=self._evt3.n_untimed)
+        n_repaired = self._evt3.n_repaired + self._compressed.n_repaired
+        findings.add("time words that did not fit repaired", n=n_repaired)
         findings.add(
             "words of no known code passed over", n=self._evt3.n_unknown + self._compressed.n_unknown
         )

@@ -5,11 +5,12 @@ References:
     https://docs.prophesee.ai/stable/data/encoding_formats/evt21.html
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.sources.events.counter import WrappingCounter
 from lce_rig.sources.events.stream import NS_PER_US, EventColumns
 
 _OFF, _ON, _TIME_HIGH = 0, 1, 8
@@ -26,14 +27,17 @@ class Evt2Decoder:
         has_vectors: EVT2.1, whose events carry 32 pixels each.
         n_untimed: words with events met before any stamp, left out.
         n_unknown: words of no known code, passed over.
-        n_repaired: time words that did not fit those around them, for which the one before was taken.
     """
 
     has_vectors: bool
     n_untimed: int = 0
     n_unknown: int = 0
-    n_repaired: int = 0
-    _high: int | None = None
+    _clock: WrappingCounter = field(default_factory=lambda: WrappingCounter(_HIGH_BITS, _MAX_STEP_BACK))
+
+    @property
+    def n_repaired(self) -> int:
+        """Time words that did not fit those around them, for which the one before was taken."""
+        return self._clock.n_repaired
 
     def decode(self, words: NDArray[np.unsignedinteger]) -> EventColumns:
         """Decode a block of words (N,), uint32 for EVT2 and uint64 for EVT2.1."""
@@ -59,21 +63,11 @@ class Evt2Decoder:
         """Give the high part (N,) of the time that holds at each word, and the first word that has one."""
         at = np.flatnonzero(code == _TIME_HIGH)
         values = (upper[at] & np.uint32((1 << _HIGH_BITS) - 1)).astype(np.int64)
-        timed_from = 0 if self._high is not None else int(at[0]) if len(at) else len(code)
-        before = self._high or 0
-        step = values[2:] - values[:-2]
-        is_odd = (
-            (step >= 0) & (step <= _MAX_STEP_BACK) & (np.abs(values[1:-1] - values[:-2]) > _MAX_STEP_BACK)
-        )
-        values[1:-1][is_odd] = values[:-2][is_odd]
-        self.n_repaired += int(np.count_nonzero(is_odd))
-        if len(values):
-            first = values[0] if self._high is None else before % (1 << _HIGH_BITS)
-            wraps = np.cumsum(values + _MAX_STEP_BACK < np.concatenate(([first], values[:-1])))
-            values += (wraps + (before >> _HIGH_BITS)) << _HIGH_BITS
-            self._high = int(values[-1])
+        before = self._clock.last
+        timed_from = 0 if before is not None else int(at[0]) if len(at) else len(code)
+        values = self._clock.unwrap(values)
         lengths = np.diff(at, prepend=0, append=len(code))
-        return np.repeat(np.concatenate(([before], values)), lengths), timed_from
+        return np.repeat(np.concatenate(([before or 0], values)), lengths), timed_from
 
 
 def _expand(columns: EventColumns, vector: NDArray[np.uint32]) -> EventColumns:

@@ -15,11 +15,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.sources.events.counter import WrappingCounter
 from lce_rig.sources.events.stream import NS_PER_US, EventColumns
 
-# Time-high words may step back a little without having wrapped; each counts 4.096 ms.
+# Time-high words count 4.096 ms each, wrap every 16.8 s, and may step back a little without having wrapped.
+_HIGH_BITS = 12
 _MAX_STEP_BACK = 10
-_WRAP = 4096
 
 
 @dataclass(frozen=True)
@@ -58,14 +59,12 @@ class WordDecoder:
         layout: what the codes mean.
         n_untimed: events met before any stamp, left out.
         n_unknown: words of no known code, passed over.
-        n_repaired: time words that did not fit those around them, for which the one before was taken.
     """
 
     layout: WordLayout
     n_untimed: int = 0
     n_unknown: int = 0
-    n_repaired: int = 0
-    _high: int | None = None
+    _clock: WrappingCounter = field(default_factory=lambda: WrappingCounter(_HIGH_BITS, _MAX_STEP_BACK))
     _low: int | None = None
     _line: int = 0
     _next: int = 0
@@ -82,9 +81,14 @@ class WordDecoder:
         unknown[list(named)] = 0
         self._tables = {"width": width, "unknown": unknown}
 
+    @property
+    def n_repaired(self) -> int:
+        """Time words that did not fit those around them, for which the one before was taken."""
+        return self._clock.n_repaired
+
     def start_packet(self) -> None:
         """Begin a packet that counts its time from zero."""
-        self._high, self._low = 0, 0
+        self._clock.last, self._low = 0, 0
 
     def decode(self, words: NDArray[np.uint16]) -> EventColumns:
         """Decode a block of words (N,), of any length."""
@@ -114,38 +118,21 @@ class WordDecoder:
         at_high = np.flatnonzero(code == self.layout.time_high)
         at_low = np.flatnonzero(code == self.layout.time_low)
         timed_from = len(code)
-        if self._high is not None and self._low is not None:
+        last = self._clock.last
+        if last is not None and self._low is not None:
             timed_from = 0
-        elif self._high is not None and len(at_low):
+        elif last is not None and len(at_low):
             timed_from = int(at_low[0])
         elif len(at_high) and len(at_low[at_low > at_high[0]]):
             timed_from = int(at_low[at_low > at_high[0]][0])
-        high = self._unwrapped(payload[at_high].astype(np.int64))
+        high = self._clock.unwrap(payload[at_high].astype(np.int64))
         low = payload[at_low]
-        t_us = _held(at_high, high, self._high or 0, len(code))[emitting] << 12
+        t_us = _held(at_high, high, last or 0, len(code))[emitting] << 12
         t_us |= _held(at_low, low, self._low or 0, len(code))[emitting]
-        if len(high):
-            self._high = int(high[-1])
-            # A stamp needs its low part after its high one.
-            if self._low is None and timed_from == len(code):
-                low = low[:0]
-        if len(low) and self._high is not None:
+        # A stamp needs its low part after its high one.
+        if len(low) and timed_from < len(code):
             self._low = int(low[-1])
         return t_us, emitting >= timed_from
-
-    def _unwrapped(self, high: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Count the wraps of the high part, every 16.8 s."""
-        if not len(high):
-            return high
-        # One damaged word would look like a wrap, and 16.8 s would stay added for good.
-        step = high[2:] - high[:-2]
-        is_odd = (step >= 0) & (step <= _MAX_STEP_BACK) & (np.abs(high[1:-1] - high[:-2]) > _MAX_STEP_BACK)
-        high[1:-1][is_odd] = high[:-2][is_odd]
-        self.n_repaired += int(np.count_nonzero(is_odd))
-        before = 0 if self._high is None else self._high
-        previous = np.concatenate(([before % _WRAP if self._high is not None else high[0]], high[:-1]))
-        wraps = np.cumsum(high + _MAX_STEP_BACK < previous)
-        return np.asarray(high + (wraps + before // _WRAP) * _WRAP, dtype=np.int64)
 
     def _lines(
         self, code: NDArray[np.uint8], payload: NDArray[np.uint16], emitting: NDArray[np.intp]

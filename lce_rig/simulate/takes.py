@@ -1,0 +1,129 @@
+"""One sample of one sensor: of a board that is held still, or of one on its way."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.geometry import Array
+from lce_rig.simulate.camera import expose, render_radiance
+from lce_rig.simulate.carriers import build_carrier
+from lce_rig.simulate.event_camera import EventCamera
+from lce_rig.simulate.lidar import simulate_scan
+from lce_rig.simulate.motion import Trajectory
+from lce_rig.simulate.scene import Scene
+from lce_rig.simulate.stage import EVENTS, IMAGE, SCAN, Stage, channel_of
+from lce_rig.simulate.subframes import MovingView
+
+# While the shutter is open the board is drawn at moments that lie this far apart in the picture at most.
+_SMEAR_STEP_PX = 0.35
+_MOST_MOMENTS = 15
+
+Stream = tuple[int, ...]
+
+
+def take_image(stage: Stage, camera: str, scene: Scene, exposed_ns: int, stream: Stream) -> Image:
+    """Take a picture of a scene that stands still, exposed about a time of the rig's clock."""
+    return _develop(stage, camera, render_radiance(scene, stage.backdrops[camera]), exposed_ns, stream)
+
+
+def take_scan(
+    stage: Stage,
+    lidar: str,
+    scene: Scene,
+    stamp_ns: int,
+    stream: Stream,
+    board_at: Callable[[NDArray[np.int64]], Array] | None = None,
+) -> Scan:
+    """Take a scan that begins at a time of the rig's clock; of a moving board where `board_at` is given."""
+    settings = stage.rig.lidars[lidar]
+    return simulate_scan(
+        scene,
+        stage.T_world_sensor[lidar],
+        stage.models[lidar],
+        stage.options.lidar_noise,
+        stage.rng(*_numbered(stream, SCAN, list(stage.models).index(lidar))),
+        board_at=board_at,
+        laser_bias_m=stage.laser_bias_m[lidar],
+        sensor=lidar,
+        stamp_ns=stamp_ns,
+        min_range_m=settings.min_range_m,
+        max_range_m=settings.max_range_m,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class MovingBoard:
+    """A board on its way before the sensors of a stage, and whoever carries it.
+
+    Attributes:
+        stage: the session.
+        trajectory: where the board is.
+        carrier_stream: of random numbers that decide what its carrier looks like.
+    """
+
+    stage: Stage
+    trajectory: Trajectory
+    carrier_stream: Stream
+
+    def scene_at(self, t_ns: int) -> Scene:
+        """Build the scene at a time of the rig's clock."""
+        T_world_board, stage = self.trajectory.at(t_ns), self.stage
+        rng = stage.rng(*self.carrier_stream)
+        carrier = build_carrier(stage.options.carrier, stage.board, T_world_board, rng)
+        return Scene(
+            stage.room.raycaster, carrier, stage.board, T_world_board, stage.options.print_reflectivity
+        )
+
+    def take_image(self, camera: str, exposed_ns: int, stream: Stream) -> Image:
+        """Expose a picture about a time of the rig's clock: the mean of what is seen while it lasts."""
+        backdrop, options = self.stage.backdrops[camera], self.stage.options
+        smear_px = options.exposure_s * self.view(camera).speed_px_s(exposed_ns)
+        n_moments = int(np.clip(np.ceil(smear_px / _SMEAR_STEP_PX), 1, _MOST_MOMENTS))
+        middles = (np.arange(n_moments) + 0.5) / n_moments - 0.5
+        moments_ns = exposed_ns + np.rint(1e9 * options.exposure_s * middles).astype(np.int64)
+        scene = self.scene_at(exposed_ns)
+        scenes = [scene.with_board_at(T_world_board) for T_world_board in self.trajectory.at(moments_ns)]
+        radiance = np.mean([render_radiance(each, backdrop) for each in scenes], axis=0)
+        return _develop(self.stage, camera, radiance, exposed_ns, stream)
+
+    def take_scan(self, lidar: str, stamp_ns: int, stream: Stream) -> Scan:
+        """Take a scan whose every firing meets the board where it is by then.
+
+        The carrier stays where it is when the rotor has made half its turn.
+        """
+        scene = self.scene_at(stamp_ns + self.stage.models[lidar].period_ns // 2)
+        return take_scan(self.stage, lidar, scene, stamp_ns, stream, self.trajectory.at)
+
+    def view(self, camera: str) -> MovingView:
+        """Look at the board through a camera's lens."""
+        stage = self.stage
+        lens, backdrop = stage.options.camera, stage.backdrops[camera]
+        return MovingView(backdrop, stage.board, self.trajectory, self.scene_at, lens)
+
+    def event_camera(self, camera: str, view: MovingView, start_ns: int, stream: Stream) -> EventCamera:
+        """Switch an event camera on at a time of the rig's clock."""
+        stage = self.stage
+        return EventCamera(
+            stage.pixels[camera],
+            stage.options.events,
+            view.at(start_ns),
+            start_ns,
+            stage.rng(*_numbered(stream, EVENTS, list(stage.pixels).index(camera))),
+            sensor=camera,
+            offset_ns=round(1e9 * stage.options.event_offset_s),
+        )
+
+
+def _develop(stage: Stage, camera: str, radiance: Array, exposed_ns: int, stream: Stream) -> Image:
+    rng = stage.rng(*_numbered(stream, IMAGE, list(stage.backdrops).index(camera)))
+    stamp_ns = exposed_ns + round(1e9 * stage.options.frame_offset_s)
+    channel = channel_of(stage.rig, camera, "frames") or "frames"
+    return Image(camera, channel, stamp_ns, expose(radiance, stage.options.camera, rng), stamp_ns)
+
+
+def _numbered(stream: Stream, kind: int, sensor: int) -> Stream:
+    """Name the stream of one sensor: (session or capture, kind, sensor, what else there is)."""
+    return (stream[0], kind, sensor, *stream[1:])
