@@ -14,8 +14,8 @@ from lce_rig.core.results import Observation
 def match_candidates(candidates: CaptureCandidates, board: Board, T_cam_lidar: Array) -> Observation:
     """Pair the candidates of one capture that lie closest to each other under a known extrinsic.
 
-    Centres and normals decide, the angle weighed by the plate's half diagonal; turns in the plane do not count,
-    since a scan cannot tell a rectangle's.
+    Centres and normals decide, the angle weighed by the plate's half diagonal; turns in the plane do not
+    count, since a scan cannot tell a rectangle's.
 
     Args:
         candidates: what both sensors saw.

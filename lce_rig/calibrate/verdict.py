@@ -16,6 +16,10 @@ _ORDER: tuple[Verdict, ...] = ("pass", "marginal", "fail")
 
 # Camera and LiDAR distances: intrinsics and squares measured with care agree to about 1 %.
 SCALE_MARGINAL, SCALE_FAIL = 0.01, 0.025
+# A side of the plate counts as measured below this deviation; 5 % of it is more than the beam's spot.
+PLATE_KNOWN_M, PLATE_FAIL = 0.03, 0.05
+# Planes of both sensors agree to 6-8 mm where boards stand still, to 20-30 mm where they are hand-held.
+MOVING_M = 0.012
 # How many times the target a deviation may be before the result is of no use.
 SIGMA_FAIL = 3.0
 # Held-out residuals of a sound model exceed the fitted ones only slightly.
@@ -31,7 +35,7 @@ class Doubt:
 
 
 def judge(
-    estimate: CalibrationEstimate, rig: Rig, camera: str, lidar: str
+    estimate: CalibrationEstimate, rig: Rig, camera: str, lidar: str, n_captures: int
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Weigh everything known about an extrinsic.
 
@@ -40,6 +44,7 @@ def judge(
         rig: thresholds, targets and the nominal extrinsic.
         camera: name of the camera.
         lidar: name of the LiDAR.
+        n_captures: captures looked at, with those in which no board was found.
 
     Returns:
         The verdict, and the reasons for anything but a pass, worst first.
@@ -48,9 +53,12 @@ def judge(
         *_certificate(estimate),
         *_precision(estimate, rig),
         *_residuals(estimate, rig),
+        *_motion(estimate),
         *_refusals(estimate),
+        *_detected(estimate, n_captures, rig.quality.min_detected_fraction),
         *_nominal(estimate, rig.nominal(camera, lidar)),
         *_scale(estimate, rig.board.to_board()),
+        *_plate(estimate, rig.board.to_board()),
     ]
     doubts.sort(key=lambda doubt: -_ORDER.index(doubt.verdict))
     verdict = doubts[0].verdict if doubts else "pass"
@@ -99,6 +107,15 @@ def _residuals(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
     return doubts
 
 
+def _motion(estimate: CalibrationEstimate) -> list[Doubt]:
+    rms_m = estimate.diagnostics.get("fit_plane_rms_m", 0.0)
+    if rms_m <= MOVING_M:
+        return []
+    text = f"camera and LiDAR see the planes {1000 * rms_m:.0f} mm apart (rms; under 10 mm for still boards)"
+    advice = "did the board move, or do pictures and scans not belong together in time?"
+    return [Doubt("marginal", f"{text}: {advice}")]
+
+
 def _refusals(estimate: CalibrationEstimate) -> list[Doubt]:
     refused = sorted(estimate.refused.items())
     disagreeing = [name for name, why in refused if why.stage in ("pair", "calibrate")]
@@ -109,6 +126,13 @@ def _refusals(estimate: CalibrationEstimate) -> list[Doubt]:
     shown = ", ".join(disagreeing[:4]) + (" ..." if len(disagreeing) > 4 else "")
     text = f"the sensors disagree in {len(disagreeing)} of {n} captures ({shown})"
     return [Doubt(verdict, f"{text}: look for a moving board, a second board, or wrong pairing")]
+
+
+def _detected(estimate: CalibrationEstimate, n_captures: int, min_fraction: float) -> list[Doubt]:
+    if len(estimate.used) >= min_fraction * n_captures:
+        return []
+    text = f"only {len(estimate.used)} of {n_captures} captures could be used"
+    return [Doubt("marginal", f"{text}: see the causes with `lce-rig check`")]
 
 
 def _nominal(estimate: CalibrationEstimate, nominal: NominalExtrinsic | None) -> list[Doubt]:
@@ -135,6 +159,26 @@ def _scale(estimate: CalibrationEstimate, board: Board) -> list[Doubt]:
         return []
     verdict: Verdict = "fail" if check.is_off(SCALE_FAIL) else "marginal"
     return [Doubt(verdict, explain_scale(check, board))]
+
+
+def _plate(estimate: CalibrationEstimate, board: Board) -> list[Doubt]:
+    """Compare the plate as the LiDAR measures it with the profile; sigmas are mostly the beam's spot."""
+    doubts = []
+    records = [estimate.observations[name].lidar.quality for name in estimate.used]
+    for side, wanted_m in (("width", board.width_m), ("height", board.height_m)):
+        known = [q for q in records if q.get(f"{side}_sigma_m", np.inf) < PLATE_KNOWN_M]
+        if len(known) < 3:
+            continue
+        measured_m = float(np.median([q[f"{side}_m"] for q in known]))
+        sigma_m = float(np.median([q[f"{side}_sigma_m"] for q in known]))
+        if abs(measured_m - wanted_m) > 2 * sigma_m:
+            verdict: Verdict = "fail" if abs(measured_m - wanted_m) > PLATE_FAIL * wanted_m else "marginal"
+            percent = 100 * abs(measured_m / wanted_m - 1)
+            size = "larger" if measured_m > wanted_m else "smaller"
+            text = f"the plate's {side} is {percent:.1f} % {size} in the LiDAR ({measured_m:.3f} m)"
+            text += f" than the profile says ({wanted_m:.3f} m): measure the plate"
+            doubts.append(Doubt(verdict, text))
+    return doubts
 
 
 def explain_scale(check: ScaleCheck, board: Board) -> str:

@@ -17,9 +17,13 @@ from lce_rig.core.data import Events
 _HOT_RATIO = 5.0
 _HOT_SIGMAS = 6.0
 _MAX_FLICKER_BINS = 20_000
+# Motion in the scene lies below, lamps and screens above.
+_MIN_FLICKER_HZ = 20.0
 # A storm: this share of all events comes in bursts of one polarity, and these bursts are regular.
 _STORM_COHERENCE = 0.5
 _STORM_PEAK_SHARE = 0.3
+# Or nearly all are of one polarity at a time, as when a light is switched; a board's edges make both.
+_ONE_SIDED_COHERENCE = 0.9
 
 
 def find_hot_pixels(events: Events, min_rate_hz: float = 10.0) -> NDArray[np.bool_]:
@@ -104,9 +108,9 @@ class Flicker:
     """How much of a stretch of events is lamps that flicker.
 
     Attributes:
-        frequency_hz: of the strongest regular alternation of polarity.
-        coherence: share of the events that outweigh the other polarity in their millisecond; near 1 where the
-            whole picture brightens and darkens at once, near 0 where edges move.
+        frequency_hz: of the strongest regular alternation of polarity above 20 Hz; 0 in too short a stretch.
+        coherence: how much one polarity outweighs the other in a millisecond; near 1 where the whole picture
+            brightens and darkens at once, near 0 where edges move.
         peak_share: share of that alternation's power at the frequency and its multiples.
     """
 
@@ -116,8 +120,9 @@ class Flicker:
 
     @property
     def is_storm(self) -> bool:
-        """Whether flicker drowns the scene."""
-        return self.coherence > _STORM_COHERENCE and self.peak_share > _STORM_PEAK_SHARE
+        """Whether flicker, or events of one polarity alone, drown the scene."""
+        is_regular = self.coherence > _STORM_COHERENCE and self.peak_share > _STORM_PEAK_SHARE
+        return is_regular or self.coherence > _ONE_SIDED_COHERENCE
 
 
 def measure_flicker(events: Events, bin_ns: int = 1_000_000) -> Flicker:
@@ -126,7 +131,7 @@ def measure_flicker(events: Events, bin_ns: int = 1_000_000) -> Flicker:
     Mains lamps flicker at 100 or 120 Hz: all pixels that see them turn brighter together, then darker.
 
     Args:
-        events: at least some tens of periods; of longer stretches the first 20 s are looked at.
+        events: at least 0.2 s; of longer stretches the first 20 s are looked at.
         bin_ns: twice the bins' length is the shortest period seen.
     """
     if len(events) < 2:
@@ -135,15 +140,23 @@ def measure_flicker(events: Events, bin_ns: int = 1_000_000) -> Flicker:
     is_used = bins < _MAX_FLICKER_BINS
     bins, polarity = bins[is_used], events.polarity[is_used]
     signed = np.bincount(bins, weights=np.where(polarity, 1.0, -1.0))
-    coherence = float(np.abs(signed).sum() / len(bins))
+    coherence = _coherence(signed, np.bincount(bins))
     power = np.abs(np.fft.rfft(signed - signed.mean())) ** 2
-    if len(power) < 4 or power[1:].sum() == 0:
+    duration_s = len(signed) * bin_ns * 1e-9
+    slowest = int(np.ceil(_MIN_FLICKER_HZ * duration_s))
+    # Below four periods a line and its leakage are most of the spectrum.
+    if slowest < 4 or len(power) <= slowest + 1 or power.sum() == 0:
         return Flicker(0.0, coherence, 0.0)
-    peak = int(np.argmax(power[1:])) + 1
+    peak = slowest + int(np.argmax(power[slowest:]))
     # A line that falls between two frequencies leaks into both.
     lines = np.unique(np.clip(np.arange(peak, len(power), peak)[:, None] + (-1, 0, 1), 1, len(power) - 1))
-    frequency_hz = peak / (len(signed) * bin_ns * 1e-9)
-    return Flicker(frequency_hz, coherence, float(power[lines].sum() / power[1:].sum()))
+    return Flicker(peak / duration_s, coherence, float(power[lines].sum() / power.sum()))
+
+
+def _coherence(signed: NDArray[np.float64], counts: NDArray[np.intp]) -> float:
+    """Mean product of the polarities of two events in one bin, as a root: few events do not look coherent."""
+    n_pairs = float((counts * (counts - 1)).sum())
+    return float(np.sqrt(max((signed**2 - counts).sum() / n_pairs, 0.0))) if n_pairs else 0.0
 
 
 def _around(counts: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -97,7 +97,7 @@ def _commonest(refused: dict[str, Refusal]) -> str:
 def _judged(
     rig: Rig, pair: Pair, estimate: CalibrationEstimate, *, n_captures: int, refused: dict[str, Refusal]
 ) -> Calibration:
-    verdict, reasons = judge(estimate, rig, pair.camera, pair.lidar)
+    verdict, reasons = judge(estimate, rig, pair.camera, pair.lidar, n_captures)
     return Calibration(
         camera=pair.camera,
         channel=pair.channel,

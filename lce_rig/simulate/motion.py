@@ -44,7 +44,10 @@ class Trajectory:
     def at(self, t_ns: int | NDArray[np.int64]) -> Array:
         """Compute T_world_board (..., 4, 4) at times (...) of the rig's clock."""
         t_ns = np.asarray(t_ns, dtype=np.int64)
-        return perturb(self._carried(t_ns), self._sway(t_ns) - self.centre)
+        T_world_board = self._carried(t_ns)
+        if not len(self.frequency_hz):
+            return T_world_board
+        return perturb(T_world_board, self._sway(t_ns) - self.centre)
 
     def speed_mps(self, t_ns: int | NDArray[np.int64]) -> Array:
         """Compute the speed (...) of the board's middle."""

@@ -21,8 +21,8 @@ def estimate():
     return calibrate(simulate(20, seed=1), BOARD, CalibrateOptions(n_draws=3))
 
 
-def verdict_of(estimate, rig=RIG):
-    return judge(estimate, rig, "cam", "lidar")
+def verdict_of(estimate, rig=RIG, n_captures=20):
+    return judge(estimate, rig, "cam", "lidar", n_captures)
 
 
 def test_a_sound_result_passes_without_reasons(estimate):
@@ -61,6 +61,31 @@ def test_sensors_that_disagree_in_many_captures_are_a_doubt(estimate):
     assert "30 of 50 captures" in reasons[0]
 
 
+def test_boards_that_moved_between_picture_and_scan_are_a_doubt(estimate):
+    moving = dict(estimate.diagnostics) | {"fit_plane_rms_m": 0.025}
+    verdict, reasons = verdict_of(replace(estimate, diagnostics=moving))
+    assert verdict == "marginal"
+    assert "25 mm apart" in reasons[0]
+
+
+def test_few_usable_captures_of_many_are_a_doubt(estimate):
+    verdict, reasons = verdict_of(estimate, n_captures=50)
+    assert verdict == "marginal"
+    assert reasons[0].startswith("only 20 of 50 captures")
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(1.01, "pass"), (1.04, "marginal"), (0.9, "fail")])
+def test_a_plate_of_another_size_than_the_profiles_is_named(estimate, factor, expected):
+    def resized(seen):
+        quality = {"width_m": factor * BOARD.width_m, "width_sigma_m": 0.01}
+        return replace(seen, lidar=replace(seen.lidar, quality=quality))
+
+    other = {name: resized(seen) for name, seen in estimate.observations.items()}
+    verdict, reasons = verdict_of(replace(estimate, observations=other))
+    assert verdict == expected
+    assert expected == "pass" or "the plate's width is" in reasons[0]
+
+
 def test_large_residuals_fail_and_name_their_limit(estimate):
     bad = replace(estimate, metrics=replace(estimate.metrics, mpe_m=0.08))
     verdict, reasons = verdict_of(bad)
@@ -95,7 +120,7 @@ def test_squares_of_the_wrong_size_are_told_from_the_distances():
 def test_scales_agree_within_their_sigma_where_the_board_is_right():
     errors = []
     for seed in range(10):
-        found = calibrate(simulate(15, seed), BOARD, CalibrateOptions(n_draws=0))
+        found = calibrate(simulate(15, seed), BOARD, CalibrateOptions(n_draws=1))
         check = compare_scales([found.observations[name] for name in found.used])
         errors.append((check.ratio - 1) / check.sigma)
     assert np.sqrt(np.mean(np.square(errors))) < 2.0

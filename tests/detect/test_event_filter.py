@@ -1,5 +1,8 @@
 """Noise of event cameras is told from the scene: hot pixels, lone events, flickering lamps."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -10,6 +13,7 @@ from lce_rig.detect.event_filter import (
     measure_flicker,
     without_pixels,
 )
+from lce_rig.sources.events import open_events
 
 WIDTH, HEIGHT = 160, 120
 
@@ -117,6 +121,30 @@ def test_lamps_that_flicker_are_told_from_motion() -> None:
     assert flicker.coherence > 0.9
     for scene in (moving_edges(8), noise(9, 5.0), merged(moving_edges(8), noise(9, 1.0))[0]):
         assert not measure_flicker(scene).is_storm
+
+
+def test_events_of_one_polarity_alone_are_a_storm() -> None:
+    scene = noise(9, 5.0)
+    assert measure_flicker(replace(scene, polarity=np.ones(len(scene), bool))).is_storm
+    sparse = noise(9, 0.02)
+    assert not measure_flicker(sparse).is_storm
+
+
+@pytest.mark.dataset
+@pytest.mark.parametrize(
+    ("name", "is_storm"), [("event_packet_ros1.bag", True), ("davis346_apriltag_libcaer_cmp.mcap", False)]
+)
+def test_a_real_room_with_mains_light_is_told_from_one_without(
+    recordings: Path, name: str, is_storm: bool
+) -> None:
+    if not (recordings / "events").is_dir():
+        pytest.skip("no recordings of events")
+    recording = open_events(recordings / "events" / name)
+    first_ns, last_ns = recording.span_ns
+    flicker = measure_flicker(recording.read(first_ns, last_ns))
+    assert flicker.is_storm == is_storm
+    if is_storm:
+        assert flicker.frequency_hz == pytest.approx(120.0, abs=1.0)
 
 
 def test_a_moment_is_no_storm() -> None:

@@ -109,6 +109,13 @@ def test_clocks_that_do_not_overlap_are_refused_saying_by_how_much(stream):
     assert "7.4" in answers[2].cause and "after the last event" in answers[2].cause
 
 
+def test_a_stream_cut_off_at_the_stamp_gives_the_same_picture(stream):
+    stamp = STAMPS[4]
+    whole = next(Reconstructor().reconstruct([stream], [stamp]))
+    excerpt = next(Reconstructor().reconstruct([stream.between(0, stamp)], [stamp]))
+    np.testing.assert_array_equal(whole.pixels, excerpt.pixels)
+
+
 def test_a_stream_without_events_refuses_every_stamp():
     empty = events_of([], [], [], [])
     for batches in ([], [empty]):

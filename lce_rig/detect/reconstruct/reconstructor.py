@@ -1,8 +1,8 @@
 """Pictures from an event stream, at any time asked for."""
 
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import count
 from pathlib import Path
 from typing import Literal
 
@@ -24,6 +24,8 @@ from lce_rig.detect.reconstruct.windows import WindowOptions, WindowRule, active
 _MIN_FILL = 0.5
 # Nothing happens in a longer silence: it is passed over in one stride, states kept.
 _LONGEST_SILENCE_NS = 2_000_000_000
+# A stream cut off at the stamp ends with its last event, a little before.
+_MAX_AFTER_END_NS = 100_000_000
 _SHARE_MEMORY = 0.8
 
 
@@ -134,31 +136,25 @@ class Reconstructor:
             SourceError: the batches are of different sensors or go back in time.
             UsageError: neither or both of stamps_ns and every_ns, or stamps out of order.
         """
+        _check_request(stamps_ns, every_ns)
         self.reset()
-        if (stamps_ns is None) == (every_ns is None):
-            raise UsageError("either stamps_ns or every_ns says when pictures are wanted")
-        if stamps_ns is not None and np.any(np.diff(np.asarray(stamps_ns, dtype=np.int64)) < 0):
-            raise UsageError("stamps at which pictures are wanted must not decrease")
-        if every_ns is not None and every_ns <= 0:
-            raise UsageError(f"a picture every {every_ns} ns makes no sense")
-        waiting = iter(stamps_ns) if stamps_ns is not None else None
-        stamp: int | None = None
+        wanted = deque(stamps_ns or ())
         last_ns: int | None = None
         for batch in batches:
             if not len(batch):
                 continue
             self._take(batch, last_ns)
-            last_ns = int(batch.t_ns[-1])
-            if waiting is None:
-                assert every_ns is not None and self._first_ns is not None
-                waiting = count(self._first_ns + every_ns, every_ns)
-            stamp = next(waiting, None) if stamp is None else stamp
-            while stamp is not None and stamp <= last_ns:
-                yield self._picture_at(stamp)
-                stamp = next(waiting, None)
+            first_ns, before_ns, last_ns = self._first_ns, last_ns, int(batch.t_ns[-1])
+            assert first_ns is not None
+            if every_ns is not None:
+                n_passed = 0 if before_ns is None else (before_ns - first_ns) // every_ns
+                wanted.extend(range(first_ns + (n_passed + 1) * every_ns, last_ns + 1, every_ns))
+            while wanted and wanted[0] <= last_ns:
+                yield self._picture_at(wanted.popleft())
             self._advance(last_ns)
-        if stamps_ns is not None and waiting is not None:
-            yield from (too_late(late, last_ns) for late in _with_first(stamp, waiting))
+        for stamp_ns in wanted:
+            is_covered = last_ns is not None and stamp_ns - last_ns <= _MAX_AFTER_END_NS
+            yield self._picture_at(stamp_ns) if is_covered else too_late(stamp_ns, last_ns)
 
     def _begin(self, events: Events) -> None:
         self._first_ns = int(events.t_ns[0]) if len(events) else 0
@@ -209,7 +205,8 @@ class Reconstructor:
         events = self._cleaned(events)
         picture, states = self._imager.picture(events, window.start_ns, end_ns, window.states)
         self._scale.follow(picture)
-        self._share = _SHARE_MEMORY * self._share + (1 - _SHARE_MEMORY) * active_share(events)
+        memory = _SHARE_MEMORY if self.n_steps else 0.0
+        self._share = memory * self._share + (1 - memory) * active_share(events)
         self._previous = replace(window, events=events)
         last_ns = int(window.events.t_ns[-1]) + 1 if len(window.events) else end_ns
         self._current = _Window(end_ns, window.events.between(end_ns, max(last_ns, end_ns)), states)
@@ -249,7 +246,10 @@ def _joined(first: Events, second: Events) -> Events:
     )
 
 
-def _with_first(first: int | None, rest: Iterator[int]) -> Iterator[int]:
-    if first is not None:
-        yield first
-    yield from rest
+def _check_request(stamps_ns: Sequence[int] | None, every_ns: int | None) -> None:
+    if (stamps_ns is None) == (every_ns is None):
+        raise UsageError("either stamps_ns or every_ns says when pictures are wanted")
+    if stamps_ns is not None and np.any(np.diff(np.asarray(stamps_ns, dtype=np.int64)) < 0):
+        raise UsageError("stamps at which pictures are wanted must not decrease")
+    if every_ns is not None and every_ns <= 0:
+        raise UsageError(f"a picture every {every_ns} ns makes no sense")

@@ -1,5 +1,7 @@
 """Events summed into arrays: the network's voxel grid and the plain event map."""
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,7 +40,7 @@ def voxel_grid(
     # Events are in time order: those between two bins form a slice, counted into two pictures.
     bounds = np.searchsorted(position, np.arange(n_bins))
     bounds[-1] = len(position)
-    for bin_, (first, last) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
+    for bin_, (first, last) in enumerate(pairwise(bounds)):
         cut = slice(first, last)
         late = (position[cut] - bin_) * sign[cut]
         voxels[bin_] += np.bincount(pixel[cut], sign[cut] - late, n_pixels)

@@ -40,6 +40,6 @@ class WrappingCounter:
         is_steady = (after >= before) & (after - before <= self.max_step_back)
         is_odd = is_steady & (np.abs(word - before) > self.max_step_back)
         self.n_repaired += int(np.count_nonzero(is_odd))
-        repaired = values.copy()
+        repaired: NDArray[np.int64] = values.copy()
         repaired[1:-1] = np.where(is_odd, before, word)
         return repaired

@@ -1,6 +1,6 @@
 """Putting a stream of events in the order of time, with as little held in memory as that needs."""
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -26,38 +26,91 @@ def in_time_order(
 ) -> Iterator[EventColumns]:
     """Yield stretches whose stamps never decrease, within and from one to the next.
 
-    Stamps mixed within 20 ms are sorted; counters that wrap are unwrapped; single stray stamps are left out.
+    Stamps mixed within 20 ms are sorted; counters that wrap are unwrapped; stray stamps are left out.
 
     Raises:
         SourceError: the stamps run back for good; everything before has been yielded.
     """
-    held: EventColumns | None = None
     clock = _Clock()
-    delivered_ns: int | None = None
-    first_ns: int | None = None
+    sorter = _Sorter(path, findings)
     for stretch in stretches:
-        if not len(stretch):
-            continue
-        current = clock.unwrap(stretch, findings)
-        first_ns = int(current.t_ns[0]) if first_ns is None else first_ns
-        if held is None:
+        if len(stretch):
+            yield from sorter.push(clock.unwrap(stretch, findings))
+    if sorter.held is not None:
+        yield sorter.held
+
+
+class _Sorter:
+    """Holds a stretch back until the next has shown that nothing earlier follows.
+
+    Attributes:
+        held: ordered events that have not been yielded.
+    """
+
+    def __init__(self, path: Path, findings: Findings) -> None:
+        self.held: EventColumns | None = None
+        self._path = path
+        self._findings = findings
+        self._first_ns = 0
+        self._delivered_ns: int | None = None
+
+    def push(self, current: EventColumns) -> Iterator[EventColumns]:
+        """Take the next stretch and yield what is in order by now."""
+        if self.held is None:
             together = current
-        elif int(current.t_ns.min()) >= held.t_ns[-1]:
-            yield held
-            delivered_ns, together = int(held.t_ns[-1]), current
+            self._first_ns = self._first_ns if self._delivered_ns is not None else int(current.t_ns[0])
+        elif int(current.t_ns.min()) >= self.held.t_ns[-1]:
+            yield self.held
+            self._delivered_ns, together = int(self.held.t_ns[-1]), current
         else:
-            together = join([held, current])
+            together = join([self.held, current])
         if _never_falls(together.t_ns):
-            held = together
-            continue
-        mixed = _sorted(path, together, findings, first_ns, delivered_ns)
+            self.held = together
+            return
+        reset = _find_reset(together.t_ns)
+        if reset is not None:
+            together = yield from self._begin_anew(together, reset)
+        mixed = self._tidied(together)
         cut = int(np.searchsorted(mixed.t_ns, mixed.t_ns[-1] - REORDER_NS)) if len(mixed) else 0
         if cut:
             yield mixed.select(slice(0, cut))
-            delivered_ns = int(mixed.t_ns[cut - 1])
-        held = mixed.select(slice(cut, None)) if cut < len(mixed) else None
-    if held is not None:
-        yield held
+            self._delivered_ns = int(mixed.t_ns[cut - 1])
+        self.held = mixed.select(slice(cut, None)) if cut < len(mixed) else None
+
+    def _begin_anew(self, together: EventColumns, reset: int) -> Generator[EventColumns, None, EventColumns]:
+        """Drop what came before the clock was set, if that is next to nothing; else yield it and give up."""
+        before_ns, after_ns = int(together.t_ns[:reset].max()), int(together.t_ns[reset])
+        back_s = (before_ns - after_ns) * 1e-9
+        where = f"{seconds_in(before_ns, self._first_ns)} the stamps run back by {back_s:.3f} s"
+        if self._delivered_ns is None and before_ns - self._first_ns < _MAX_LEAD_NS:
+            self._findings.add("events before the clock was set left out", where, reset)
+            self._first_ns = after_ns
+            return together.select(slice(reset, None))
+        sound = self._tidied(together.select(slice(0, reset)))
+        if len(sound):
+            yield sound
+        raise SourceError(
+            f"{self._path}: {where}, and stay there",
+            "The clock was set, or two recordings were joined: split the recording there.",
+        )
+
+    def _tidied(self, events: EventColumns) -> EventColumns:
+        """Leave out stray stamps and sort the others."""
+        stray = _stray(events.t_ns)
+        n_stray = int(np.count_nonzero(stray))
+        if n_stray:
+            where = seconds_in(int(events.t_ns[max(int(np.argmax(stray)) - 1, 0)]), self._first_ns)
+            self._findings.add("events with stray stamps left out", where, n_stray)
+            events = events.select(~stray)
+        if self._delivered_ns is not None:
+            is_late = events.t_ns < self._delivered_ns
+            self._findings.add("events that came too late left out", n=int(np.count_nonzero(is_late)))
+            events = events.select(~is_late)
+        n_back = int(np.count_nonzero(np.diff(events.t_ns) < 0))
+        if n_back:
+            self._findings.add("places where stamps run back by up to 20 ms, sorted", n=n_back)
+            events = events.select(np.argsort(events.t_ns, kind="stable"))
+        return events
 
 
 class _Clock:
@@ -90,40 +143,19 @@ def _never_falls(t_ns: NDArray[np.int64]) -> bool:
     return bool(np.all(t_ns[1:] >= t_ns[:-1]))
 
 
-def _sorted(
-    path: Path, events: EventColumns, findings: Findings, first_ns: int, delivered_ns: int | None
-) -> EventColumns:
-    """Leave out stray stamps and sort the others."""
-    t_ns = events.t_ns
-    latest_before = np.maximum.accumulate(t_ns)
-    earliest_after = np.minimum.accumulate(t_ns[::-1])[::-1]
-    late, early = latest_before - t_ns > REORDER_NS, t_ns - earliest_after > REORDER_NS
+def _stray(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Find the stamps that do not fit the others, (N,)."""
+    late = np.maximum.accumulate(t_ns) - t_ns > REORDER_NS
+    early = t_ns - np.minimum.accumulate(t_ns[::-1])[::-1] > REORDER_NS
     # A stamp too far ahead makes all that follow look late, and the other way round: the fewer are astray.
-    stray = min(late, early, key=np.count_nonzero)
+    return min(late, early, key=np.count_nonzero)
+
+
+def _find_reset(t_ns: NDArray[np.int64]) -> int | None:
+    """Find where a clock was set back: that divides a stream, while damage lies between stamps that go on."""
+    stray = _stray(t_ns)
     n_stray = int(np.count_nonzero(stray))
-    if n_stray:
-        worst = int(np.argmax(latest_before - t_ns))
-        back_s = (latest_before[worst] - t_ns[worst]) * 1e-9
-        where = f"{seconds_in(int(latest_before[worst]), first_ns)} they run back by {back_s:.3f} s"
-        # A clock that was set divides the stream; damage lies between stamps that go on.
-        is_between = not (stray[0] or stray[-1]) and n_stray <= _MAX_DAMAGED_SHARE * len(t_ns)
-        if n_stray > max(1, _MAX_STRAY_SHARE * len(t_ns)) and not is_between:
-            reset = int(np.argmax(latest_before - t_ns > REORDER_NS))
-            if delivered_ns is None and latest_before[reset] - first_ns < _MAX_LEAD_NS:
-                findings.add("events before the clock was set left out", where, reset)
-                return _sorted(path, events.select(slice(reset, None)), findings, int(t_ns[reset]), None)
-            raise SourceError(
-                f"{path}: the stamps of {n_stray} of {len(t_ns)} events do not fit: {where}",
-                "The clock was set, or two recordings were joined: split the recording there.",
-            )
-        findings.add("events with stray stamps left out", where, n_stray)
-        events = events.select(~stray)
-    if delivered_ns is not None and len(events):
-        is_late = events.t_ns < delivered_ns
-        findings.add("events that came too late left out", n=int(np.count_nonzero(is_late)))
-        events = events.select(~is_late)
-    n_back = int(np.count_nonzero(np.diff(events.t_ns) < 0))
-    if n_back:
-        findings.add("places where stamps run back by up to 20 ms, sorted", n=n_back)
-        events = events.select(np.argsort(events.t_ns, kind="stable"))
-    return events
+    is_between = not (stray[0] or stray[-1]) and n_stray <= _MAX_DAMAGED_SHARE * len(t_ns)
+    if is_between or n_stray <= max(1, _MAX_STRAY_SHARE * len(t_ns)):
+        return None
+    return int(np.argmax(np.maximum.accumulate(t_ns) - t_ns > REORDER_NS))

@@ -62,6 +62,11 @@ class EventRecording:
         return self._stream.notes + [f"{self.path.name}: {line}" for line in found]
 
     @property
+    def start_ns(self) -> int:
+        """First stamp, device time; only the beginning is read."""
+        return int(next(iter(self)).t_ns[0])
+
+    @property
     def span_ns(self) -> tuple[int, int]:
         """First and last stamp, device time; the first call reads the whole recording."""
         if self._span_ns is None:
@@ -187,7 +192,8 @@ class _Window:
         return self._join([stretch.between(start_ns, end_ns) for stretch in self._kept])
 
     def _join(self, parts: list[Events]) -> Events:
-        columns = [EventColumns(p.t_ns, p.x, p.y, p.polarity, p.host_ns) for p in parts if len(p)]
+        # Arrival is known of a stretch's first event, not of a window's.
+        columns = [EventColumns(p.t_ns, p.x, p.y, p.polarity) for p in parts if len(p)]
         return self._recording.to_events(join(columns or [NO_EVENTS]))
 
 

@@ -7,7 +7,7 @@ import pytest
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.events import EventRecording, open_events
 from lce_rig.sources.events.bag import read_triggers
-from lce_rig.sources.events.bag_writer import write_event_bag
+from lce_rig.sources.events.bag_writer import add_event_topic, event_messages, write_event_bag
 from tests.sources.events import encoders
 from tests.sources.events.bags import write_packet_bag
 from tests.sources.events.encoders import Event, listed, random_events
@@ -36,6 +36,19 @@ def test_packets_of_a_topic_are_one_recording(tmp_path: Path, name: str, encodin
     recording = open_events(path)
     assert everything(recording) == TRUTH
     assert recording.notes == [f"{name}: events from {TOPIC} (20 messages)"]
+
+
+def test_sqlite_bags_are_read_as_a_folder_and_as_a_file(tmp_path: Path) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    events = random_events(2000, 11, start_us=1_700_000_000_000_000)
+    with Writer(tmp_path / "ros2", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = add_event_topic(writer, "/dvs/events", is_ros1=False)
+        for received_ns, message in event_messages(events, "cam", is_ros1=False):
+            writer.write(connection, received_ns, message)
+    (file,) = (tmp_path / "ros2").glob("*.db3")
+    for path in (tmp_path / "ros2", file):
+        assert everything(open_events(path)) == listed(events)
 
 
 @pytest.mark.parametrize("name", ["a.bag", "ros2"])
