@@ -7,6 +7,7 @@ References:
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,7 +154,7 @@ def measure_flicker(events: Events, bin_ns: int = 1_000_000) -> Flicker:
     return Flicker(peak / duration_s, coherence, float(power[lines].sum() / power.sum()))
 
 
-def _coherence(signed: NDArray[np.float64], counts: NDArray[np.intp]) -> float:
+def _coherence(signed: NDArray[Any], counts: NDArray[np.intp]) -> float:
     """Mean product of the polarities of two events in one bin, as a root: few events do not look coherent."""
     n_pairs = float((counts * (counts - 1)).sum())
     return float(np.sqrt(max((signed**2 - counts).sum() / n_pairs, 0.0))) if n_pairs else 0.0

@@ -1,19 +1,48 @@
 """Find the board in a full LiDAR scan, without a prior."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
+from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Refusal
 from lce_rig.detect import lidar_refusal
 from lce_rig.detect.lidar_features import Beam, build_board, refine
 from lce_rig.detect.lidar_plates import propose_plates, screen_plates
-from lce_rig.detect.lidar_segments import cut_segments, order_scan
+from lce_rig.detect.lidar_segments import OrderedScan, cut_segments, order_scan
+from lce_rig.detect.lidar_template import Placement
 
 MAX_CANDIDATES = 4
 # A plate with as many rings and as little else in its plane is not outdone by plates that fit far worse.
 CLEAR_RINGS = 6
 CLEAR_SHARE = 0.05
+# Beside a clear board, a plate with such a share of returns beyond its outline is a patch of a wall.
+PATCH_SHARE = 0.20
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a plate must meet to be taken for the board.
+
+    Attributes:
+        template_m: largest mean distance of the outline from where the rings end.
+        rms_m: largest rms distance of the returns from the plane.
+        min_rings: fewest rings on the board.
+    """
+
+    template_m: float
+    rms_m: float
+    min_rings: int
+
+    def widened(self, sigma_m: float) -> "Limits":
+        """Allow for the noise that a scan shows."""
+        template_m = min(self.template_m + 1.5 * sigma_m, 0.06)
+        return Limits(template_m, self.rms_m + 1.5 * sigma_m, self.min_rings)
+
+
+STANDARD = Limits(template_m=0.025, rms_m=0.012, min_rings=4)
 
 
 def find_lidar_boards(
@@ -22,9 +51,9 @@ def find_lidar_boards(
     *,
     min_range_m: float = 0.4,
     max_range_m: float = 6.0,
-    min_rings: int = 4,
-    max_template_m: float = 0.025,
-    max_rms_m: float = 0.012,
+    min_rings: int = STANDARD.min_rings,
+    max_template_m: float = STANDARD.template_m,
+    max_rms_m: float = STANDARD.rms_m,
     beam: Beam | None = None,
 ) -> list[LidarBoard] | Refusal:
     """Find the plates of the board's size in a scan, best first.
@@ -54,41 +83,74 @@ def find_lidar_boards(
         return lidar_refusal.no_returns(len(scan.points), min_range_m)
     segments = cut_segments(ordered, max_range_m, 2.0 * float(np.hypot(board.width_m, board.height_m)))
     plates, ends = propose_plates(ordered, segments, board)
-    limit_m = min(max_template_m + 1.5 * ordered.sigma_m, 0.06)
-    rms_limit_m = max_rms_m + 1.5 * ordered.sigma_m
+    limits = Limits(max_template_m, max_rms_m, min_rings).widened(ordered.sigma_m)
     found: list[LidarBoard] = []
     misses: list[Refusal] = []
-    rival_m = limit_m
-    for plane, origin, start in screen_plates(plates, ends, board, limit_m):
+    rival_m, max_beyond = limits.template_m, np.inf
+    for plane, origin, start in screen_plates(plates, ends, board, limits.template_m):
         if start.error_m > rival_m:
             break
-        refined = refine(ordered, plane, origin, start, limit_m)
-        if refined is None:
-            continue
-        view, placement = refined
-        if placement.error_m > limit_m:
-            misses.append(lidar_refusal.outline_misfit(view, placement, limit_m, rms_limit_m))
-            continue
-        candidate = build_board(ordered, scan, board, view, placement, beam or Beam())
-        if candidate is None:
-            continue
-        if candidate.quality["n_rings"] < min_rings:
-            misses.append(lidar_refusal.too_few_rings(candidate, min_rings))
-        elif candidate.sigma_m > rms_limit_m:
-            heights_m = candidate.points @ candidate.plane[:3] + candidate.plane[3]
-            misses.append(lidar_refusal.too_thick(heights_m, rms_limit_m))
-        else:
-            found.append(candidate)
-            if (
-                candidate.quality["n_rings"] >= CLEAR_RINGS
-                and candidate.quality["beyond_share"] < CLEAR_SHARE
-            ):
-                rival_m = min(rival_m, 2 * start.error_m + 0.005)
+        measured = measure_plate(ordered, scan, board, plane, origin, start, limits, beam, max_beyond)
+        if isinstance(measured, Refusal):
+            misses.append(measured)
+        elif measured is not None:
+            found.append(measured)
+            if _is_clear(measured):
+                rival_m, max_beyond = min(rival_m, 2 * start.error_m + 0.005), PATCH_SHARE
     if found:
         return _distinct(found, board)
     if misses:
         return misses[0]
-    return lidar_refusal.no_plate(ordered, board, limit_m, min_range_m, max_range_m)
+    return lidar_refusal.no_plate(ordered, board, limits.template_m, min_range_m, max_range_m)
+
+
+def measure_plate(
+    ordered: OrderedScan,
+    scan: Scan,
+    board: Board,
+    plane: Array,
+    origin: Array,
+    start: Placement,
+    limits: Limits,
+    beam: Beam | None = None,
+    max_beyond: float = np.inf,
+) -> LidarBoard | Refusal | None:
+    """Register the board's outline from a first guess, measure the board and check it against the limits.
+
+    Args:
+        ordered: the returns of the scan.
+        scan: where they come from.
+        board: nominal size.
+        plane: (4,) first guess, as (n, d).
+        origin: (3,) m, the point of the plane the first guess is counted from.
+        start: first guess of the outline.
+        limits: with the scan's noise.
+        beam: light spot of the LiDAR; that of a VLP-16 where None.
+        max_beyond: largest share of returns in the plane beyond the outline, as it is guessed.
+
+    Returns:
+        The board, why it is refused, None where there is no plate to speak of.
+    """
+    refined = refine(ordered, plane, origin, start, limits.template_m, max_beyond)
+    if refined is None:
+        return None
+    view, placement = refined
+    if placement.error_m > limits.template_m:
+        return lidar_refusal.outline_misfit(view, placement, limits.template_m, limits.rms_m)
+    measured = build_board(ordered, scan, board, view, placement, beam or Beam())
+    if measured is None:
+        return None
+    if measured.quality["n_rings"] < limits.min_rings:
+        return lidar_refusal.too_few_rings(measured, limits.min_rings)
+    if measured.sigma_m > limits.rms_m:
+        heights_m = measured.points @ measured.plane[:3] + measured.plane[3]
+        return lidar_refusal.too_thick(heights_m, limits.rms_m)
+    return measured
+
+
+def _is_clear(found: LidarBoard) -> bool:
+    """Tell whether a candidate has many rings and its plane almost to itself."""
+    return found.quality["n_rings"] >= CLEAR_RINGS and found.quality["beyond_share"] < CLEAR_SHARE
 
 
 def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:

@@ -30,6 +30,13 @@ class RingEnds:
     is_border: NDArray[np.bool_]
 
 
+def median(values: Array) -> float:
+    """Take the median: on a few hundred values several times faster than `numpy.median`."""
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    ordered = np.sort(values)
+    return float(ordered[low] + ordered[high]) / 2
+
+
 def find_ring_ends(scan: OrderedScan, view: PlaneView, is_board: NDArray[np.bool_]) -> RingEnds:
     """Take the first and last board return of each ring and look at the beams beyond them.
 
@@ -111,7 +118,7 @@ def measure_size(
     x = np.zeros(5)
     for _ in range(6):
         residual = target - jacobian @ x
-        scale = np.maximum(np.median(np.abs(residual[usable])) * 1.4826, 0.003) if usable.any() else 0.01
+        scale = max(median(np.abs(residual[usable])) * 1.4826, 0.003) if usable.any() else 0.01
         weight = usable * np.maximum(1 - (residual / (4.7 * np.maximum(scale, sigma_m))) ** 2, 0.0) ** 2
         information = (jacobian * (weight / sigma_m**2)[:, None]).T @ jacobian + prior
         x = np.linalg.solve(information, jacobian.T @ (weight / sigma_m**2 * target))
@@ -120,7 +127,7 @@ def measure_size(
     freedom = max(1.0, float((weight > 0).sum()) - 5)
     chi2 = float((weight * (residual / sigma_m) ** 2).sum()) / freedom
     # Ends of rings at equal gaps share their phase: their steps do not average out.
-    common_m = float(np.median(step_m)) / np.sqrt(12) if len(step_m) else 0.0
+    common_m = median(step_m) / np.sqrt(12) if len(step_m) else 0.0
     size_sigma_m = np.hypot(2 * np.sqrt(np.diag(cov)[3:] * max(1.0, chi2)), common_m)
     if np.abs(x[:2]).max() > SLACK_M or np.abs(x[3:]).max() > SLACK_M:
         # The ends contradict each other: they say nothing about the size.

@@ -8,15 +8,15 @@ from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, pose
 from lce_rig.core.results import LidarBoard
-from lce_rig.detect.lidar_edges import SLACK_M, find_ring_ends, measure_size
+from lce_rig.detect.lidar_edges import SLACK_M, find_ring_ends, measure_size, median
 from lce_rig.detect.lidar_segments import OrderedScan
 from lce_rig.detect.lidar_template import (
     Placement,
     PlaneView,
+    beams_about,
     plane_axes,
     rate,
     register,
-    signed_distance,
     view_plane,
 )
 
@@ -72,7 +72,12 @@ def fit_plane_to_ranges(points: Array, start: Array, scale_m: float, n_rounds: i
 
 
 def refine(
-    scan: OrderedScan, plane: Array, centre: Array, placement: Placement, limit_m: float
+    scan: OrderedScan,
+    plane: Array,
+    centre: Array,
+    placement: Placement,
+    limit_m: float,
+    max_beyond: float = np.inf,
 ) -> tuple[PlaneView, Placement] | None:
     """Fit the plane to the single returns inside the outline, and the outline to the beams about it.
 
@@ -82,38 +87,39 @@ def refine(
         centre: (3,) m, the point of the plane the placement is counted from.
         placement: first guess of the outline.
         limit_m: largest error of an outline; what is far worse is not improved further.
+        max_beyond: most returns in the plane beyond the outline, per return inside, to look closer.
 
     Returns:
         The beams about the plate and the outline among them, with its error; None where too few returns lie
-        on the plane.
+        on the plane inside the outline, or too many beyond it.
     """
     radius_m = float(np.hypot(*placement.half_m)) + SURROUND_M
     tolerance_m = 4.0 * scan.sigma_m + 0.01
-    for _ in range(3):
+    near = beams_about(scan, centre + plane_axes(plane[:3]) @ [placement.u_m, placement.v_m], 1.3 * radius_m)
+    for k in range(3):
         centre = centre + plane_axes(plane[:3]) @ [placement.u_m, placement.v_m]
         placement = replace(placement, u_m=0.0, v_m=0.0)
-        view = view_plane(scan, plane, centre, radius_m, tolerance_m)
-        error_m = rate(scan, view, placement)
-        if error_m > 2.0 * limit_m:
-            return view, replace(placement, error_m=error_m)
-        distance, _ = signed_distance(placement.local(view.uv), placement.half_m)
-        on = view.member[view.is_on & (distance < 0.0)]
-        if len(on) < 10:
+        view = view_plane(scan, near, plane, centre, radius_m, tolerance_m)
+        if k == 0:
+            error_m = rate(scan, view, placement)
+            if error_m > 2.0 * limit_m:
+                return view, replace(placement, error_m=error_m)
+        away = placement.distance_m(view.uv[view.is_on])
+        on = view.member[view.is_on][away < 0.0]
+        if len(on) < 10 or (k == 0 and np.count_nonzero(away > SLACK_M) > max_beyond * len(on)):
             return None
         points = scan.points[on].astype(np.float64)
         height = points @ plane[:3] + plane[3]
-        scale_m = 1.4826 * float(np.median(np.abs(height - np.median(height)))) + 0.001
+        scale_m = 1.4826 * median(np.abs(height - median(height))) + 0.001
         plane = fit_plane_to_ranges(points, plane, scale_m * float(np.linalg.norm(centre)) / plane[3])
         height = points @ plane[:3] + plane[3]
-        tolerance_m = 3.5 * 1.4826 * float(np.median(np.abs(height))) + 0.004
-        view = view_plane(scan, plane, view.origin, radius_m, tolerance_m)
+        tolerance_m = 3.5 * 1.4826 * median(np.abs(height)) + 0.004
+        view = view_plane(scan, near, plane, view.origin, radius_m, tolerance_m)
         registered = register(scan, view, placement)
         if registered is None:
             return None
         placement, centre = registered, view.origin
-        if placement.error_m > 1.5 * limit_m:
-            break
-        if np.hypot(placement.u_m, placement.v_m) < SETTLED_M:
+        if placement.error_m > 1.5 * limit_m or np.hypot(placement.u_m, placement.v_m) < SETTLED_M:
             break
     return view, placement
 
@@ -136,11 +142,11 @@ def build_board(
     """
     distance_m = float(np.linalg.norm(view.origin))
     beyond_m = beam.half_width_m(distance_m)
-    away, _ = signed_distance(placement.local(view.uv), placement.half_m)
+    away = placement.distance_m(view.uv)
     # A plate somewhat larger than it should be is to be measured, not cut to size.
     ends = find_ring_ends(scan, view, view.is_on & (away <= beyond_m + SLACK_M))
     fitted, size_sigma_m, residual, step_m = measure_size(ends, view.uv, placement, beyond_m)
-    away, _ = signed_distance(fitted.local(view.uv), fitted.half_m)
+    away = fitted.distance_m(view.uv)
     is_board = view.is_on & (away <= beyond_m + EDGE_TOLERANCE_M)
     if is_board.sum() < MIN_POINTS:
         return None
@@ -151,17 +157,18 @@ def build_board(
     kept, edge = view.member[is_board], view.member[ends.beam[order]]
     points = scan.points[kept].astype(np.float64)
     height = points @ view.plane[:3] + view.plane[3]
+    low_m, high_m = np.percentile(height, [2.5, 97.5])
     size_m = 2 * np.asarray(fitted.half_m)
     size_sigma_m = np.hypot(size_sigma_m, beyond_m)  # how much of the light spot counts is not known
     spec_m = np.array([board.width_m, board.height_m])
     weight = 1.0 / size_sigma_m**2
     incidence = np.arccos(np.clip(view.plane[3] / distance_m, 0.0, 1.0))
     quality = {
-        "n_rings": float(len(np.unique(scan.ring[kept]))),
+        "n_rings": float(1 + np.count_nonzero(np.diff(scan.ring[kept]))),
         "n_points": float(len(kept)),
         "n_ring_ends": float(len(edge)),
         "n_ring_ends_dropped": float(len(ends.beam) - len(edge)),
-        "thickness_m": float(np.percentile(height, 97.5) - np.percentile(height, 2.5)),
+        "thickness_m": float(high_m - low_m),
         "width_m": float(size_m[0]),
         "height_m": float(size_m[1]),
         "width_sigma_m": float(size_sigma_m[0]),

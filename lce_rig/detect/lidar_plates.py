@@ -195,7 +195,8 @@ def _within_reach(centres: Array, others: Array, reach_m: float, block: int = 32
     rows, columns = [], []
     for begin in range(0, len(centres), block):
         dot = centres[begin : begin + block] @ others.T
-        row, column = np.nonzero(half_squared - dot < limit[begin : begin + block, None])
+        is_near = half_squared - dot < limit[begin : begin + block, None]
+        row, column = np.divmod(np.flatnonzero(is_near), len(others))  # faster than nonzero in two dimensions
         rows.append(row + begin)
         columns.append(column)
     return np.concatenate(rows or [np.zeros(0, np.intp)]), np.concatenate(columns or [np.zeros(0, np.intp)])
@@ -220,14 +221,18 @@ def _different(plates: Plates, candidates: Indices, board: Board, n_plates: int)
     misfit = np.abs(np.log(np.maximum(plates.size_m[candidates], 1e-3) / [long_m, short_m])).sum(axis=1)
     # Few rings say little about a size; many returns on a wrong size say no.
     rank = candidates[np.argsort(misfit - 0.1 * np.minimum(plates.n_rings[candidates], 8), kind="stable")]
+    rank = rank[: 20 * n_plates]
+    centre, normal = plates.centre[rank], plates.plane[rank, :3]
+    apart = np.linalg.norm(centre[:, None] - centre, axis=2)
+    offset = np.abs(centre @ normal.T + plates.plane[rank, 3])
+    is_same = (apart <= 0.3 * np.hypot(long_m, short_m)) & (normal @ normal.T >= 0.95) & (offset <= 0.05)
+    is_open = np.ones(len(rank), dtype=np.bool_)
     chosen: list[int] = []
-    while len(rank) and len(chosen) < n_plates:
-        best = int(rank[0])
-        chosen.append(best)
-        apart = np.linalg.norm(plates.centre[rank] - plates.centre[best], axis=1)
-        cosine = plates.plane[rank, :3] @ plates.plane[best, :3]
-        offset = np.abs(plates.plane[rank, :3] @ plates.centre[best] + plates.plane[rank, 3])
-        rank = rank[(apart > 0.3 * np.hypot(long_m, short_m)) | (cosine < 0.95) | (offset > 0.05)]
+    while is_open.any() and len(chosen) < n_plates:
+        best = int(np.argmax(is_open))
+        chosen.append(int(rank[best]))
+        is_open &= ~is_same[best]
+        is_open[best] = False
     return np.array(chosen, dtype=np.intp)
 
 

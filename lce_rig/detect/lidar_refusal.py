@@ -9,7 +9,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Refusal
 from lce_rig.detect.lidar_plates import propose_plates, screen_plates
 from lce_rig.detect.lidar_segments import OrderedScan, cut_segments
-from lce_rig.detect.lidar_template import Placement, PlaneView, signed_distance, view_plane
+from lce_rig.detect.lidar_template import Placement, PlaneView, beams_about, view_plane
 
 # Share of returns beyond the outline, in the board's plane, from which something touches the board.
 TOUCHING_SHARE = 0.10
@@ -65,7 +65,7 @@ def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_li
         limit_m: largest error of an outline.
         rms_limit_m: largest rms distance of the returns from the plane.
     """
-    distance, _ = signed_distance(placement.local(view.uv), placement.half_m)
+    distance = placement.distance_m(view.uv)
     n_on = max(1, int((view.is_on & (distance <= 0)).sum()))
     beyond = int((view.is_on & (distance > 0.03)).sum()) / n_on
     heights_m = view.height_m[(distance < -0.03) & (np.abs(view.height_m) < LAYER_M)]
@@ -106,8 +106,8 @@ def no_plate(
     plates, ends = propose_plates(coarse, cut_segments(coarse, max_range_m), board, is_any_size=True)
     for plane, centre, placement in screen_plates(plates, ends, board, limit_m):
         radius_m = float(np.hypot(*placement.half_m))
-        view = view_plane(scan, plane, centre, radius_m, LAYER_M)
-        distance, _ = signed_distance(placement.local(view.uv), placement.half_m)
+        view = view_plane(scan, beams_about(scan, centre, radius_m), plane, centre, radius_m, LAYER_M)
+        distance = placement.distance_m(view.uv)
         heights_m = view.height_m[(distance < -0.03) & view.is_on]
         if len(heights_m) > 0.8 * (distance < -0.03).sum() and np.std(heights_m) > 2.0 * scan.sigma_m + 0.008:
             return too_thick(heights_m, 2.0 * scan.sigma_m + 0.008)

@@ -69,14 +69,28 @@ class Placement:
         offset = uv - [self.u_m, self.v_m]
         return np.asarray(offset @ np.array([[cosine, -sine], [sine, cosine]]))
 
+    def distance_m(self, uv: Array) -> Array:
+        """Measure the distance of points (..., 2) of the plane view from the border, negative inside."""
+        over = np.abs(self.local(uv)) - self.half_m
+        return _distance_over(over[..., 0], over[..., 1])[0]
+
+
+def beams_about(scan: OrderedScan, centre: Array, radius_m: float) -> Indices:
+    """List the beams (M,) in the cone about a sphere: most are elsewhere, and need no closer look."""
+    distance = float(np.linalg.norm(centre))
+    cosine = np.sqrt(max(0.0, 1.0 - (radius_m / max(distance, 1e-6)) ** 2))
+    along = scan.points @ centre.astype(np.float32)
+    return np.flatnonzero(along > np.float32(cosine * distance) * scan.range_m)
+
 
 def view_plane(
-    scan: OrderedScan, plane: Array, centre: Array, radius_m: float, tolerance_m: float
+    scan: OrderedScan, among: Indices, plane: Array, centre: Array, radius_m: float, tolerance_m: float
 ) -> PlaneView:
-    """Pierce a plane by all beams that do so within a radius of a point.
+    """Pierce a plane by those beams that do so within a radius of a point.
 
     Args:
         scan: all returns.
+        among: (K,) beams that are tried, of `beams_about`.
         plane: (4,) as (n, d), n towards the LiDAR.
         centre: (3,) m, near the plane.
         radius_m: of the disc that is looked at.
@@ -84,21 +98,14 @@ def view_plane(
     """
     normal, d = plane[:3], plane[3]
     origin = centre - (centre @ normal + d) * normal
-    distance = float(np.linalg.norm(origin))
-    # Coarse cone about the disc first: most returns are elsewhere.
-    cosine = np.cos(np.arcsin(min(1.0, radius_m / max(distance, 1e-6))))
-    near = np.flatnonzero(
-        scan.points @ origin.astype(np.float32) > np.float32(cosine * distance) * scan.range_m
-    )
-    points = scan.points[near].astype(np.float64)
+    points = scan.points.take(among, axis=0).astype(np.float64)
     along_normal = points @ normal
     with np.errstate(divide="ignore", invalid="ignore"):
         pierced = points * (-d / along_normal)[:, None] - origin
     is_near = (along_normal < 0) & (np.einsum("ij,ij->i", pierced, pierced) <= radius_m**2)
-    near, pierced, height_m = near[is_near], pierced[is_near], along_normal[is_near] + d
     axes = plane_axes(normal)
-    uv = pierced @ axes
-    return PlaneView(plane, axes, origin, near, uv, height_m, tolerance_m)
+    uv = pierced[is_near] @ axes
+    return PlaneView(plane, axes, origin, among[is_near], uv, along_normal[is_near] + d, tolerance_m)
 
 
 def plane_axes(normal: Array) -> Array:
@@ -135,7 +142,7 @@ def find_chords(scan: OrderedScan, view: PlaneView, placement: Placement) -> tup
     is_cut = (np.diff(ring) != 0) | (turn > MAX_STEPS * scan.step_rad)
     start = np.concatenate([[0], np.flatnonzero(is_cut) + 1])
     end = np.append(start[1:], len(on)) - 1
-    is_inside = signed_distance(placement.local(view.uv[on]), placement.half_m)[0] < 0
+    is_inside = placement.distance_m(view.uv[on]) < 0
     n_inside = np.add.reduceat(is_inside.astype(np.intp), start)
     order = np.lexsort((-n_inside, ring[start]))
     best = order[np.diff(ring[start][order], prepend=-1) != 0]
@@ -199,15 +206,17 @@ def register_ends(ends: Array, board: Board) -> list[Placement]:
         board: gives the rectangle.
     """
     half = (board.width_m / 2, board.height_m / 2)
-    kind = np.where(np.isnan(ends[..., 0]), UNUSED, END)
+    is_unused = np.isnan(ends[..., 0])
+    kind = np.where(is_unused, UNUSED, END)
+    samples = np.where(is_unused[..., None], ends[:, :1], ends)
     angle = np.arange(N_ANGLES) * np.pi / N_ANGLES
-    axes = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], axis=1).reshape(-1, 2, 2)
+    cosine, sine = np.cos(angle), np.sin(angle)
     # At each angle the rectangle starts in the middle of the ends' extent.
-    local = ends[:, None] @ axes
-    middle = (np.nanmin(local, axis=2) + np.nanmax(local, axis=2)) / 2
-    centre = np.einsum("aij,gaj->gai", axes, middle)
-    starts = np.concatenate([centre, np.broadcast_to(angle[None, :, None], (*centre.shape[:2], 1))], axis=2)
-    samples = np.nan_to_num(ends)
+    u, v = samples[:, None, :, 0], samples[:, None, :, 1]
+    x = u * cosine[:, None] + v * sine[:, None]
+    y = v * cosine[:, None] - u * sine[:, None]
+    x, y = (x.min(axis=2) + x.max(axis=2)) / 2, (y.min(axis=2) + y.max(axis=2)) / 2
+    starts = np.stack([x * cosine - y * sine, x * sine + y * cosine, np.broadcast_to(angle, x.shape)], axis=2)
     cost = _cost(starts, samples, kind, half)
     best = np.argsort(cost, axis=1, kind="stable")[:, :2]
     starts = np.take_along_axis(starts, best[..., None], axis=1)
@@ -218,26 +227,10 @@ def register_ends(ends: Array, board: Board) -> list[Placement]:
     ]
 
 
-def signed_distance(local: Array, half: tuple[float, float]) -> tuple[Array, Array]:
-    """Measure the distance from a rectangle's border in m, negative inside, and its gradient.
-
-    Args:
-        local: (..., 2) m, axes of the rectangle.
-        half: half width and half height, m.
-
-    Returns:
-        (...,) and (..., 2).
-    """
-    over_x, over_y = np.abs(local[..., 0]) - half[0], np.abs(local[..., 1]) - half[1]
-    out_x, out_y = np.maximum(over_x, 0.0), np.maximum(over_y, 0.0)
-    away = np.sqrt(out_x * out_x + out_y * out_y)
-    is_outside = away > 0
-    distance = np.where(is_outside, away, np.maximum(over_x, over_y))
-    scale = np.where(is_outside, away, 1.0)
-    gradient = np.empty_like(local)
-    gradient[..., 0] = np.copysign(np.where(is_outside, out_x, over_x > over_y) / scale, local[..., 0])
-    gradient[..., 1] = np.copysign(np.where(is_outside, out_y, over_x <= over_y) / scale, local[..., 1])
-    return distance, gradient
+def _distance_over(over_x: Array, over_y: Array) -> tuple[Array, Array]:
+    """Turn how far points lie over the sides, m, into signed distances and distances outside."""
+    away = np.hypot(np.maximum(over_x, 0.0), np.maximum(over_y, 0.0))
+    return away + np.minimum(np.maximum(over_x, over_y), 0.0), away
 
 
 def _search(
@@ -257,16 +250,16 @@ def _search(
 
 def _residuals(
     state: Array, samples: Array, kind: Indices, half: tuple[float, float]
-) -> tuple[Array, Array, Array]:
-    """Compute signed violations (G, A, M), their gradients (G, A, M, 2) and local points (G, A, M, 2)."""
+) -> tuple[Array, Array, Array, Array]:
+    """Compute signed violations, local x and y, and distances outside, each (G, A, M)."""
     cosine, sine = np.cos(state[..., 2])[..., None], np.sin(state[..., 2])[..., None]
-    u = samples[:, None, :, 0] - state[..., 0][..., None]
-    v = samples[:, None, :, 1] - state[..., 1][..., None]
-    local = np.stack([u * cosine + v * sine, v * cosine - u * sine], axis=-1)
-    distance, gradient = signed_distance(local, half)
+    u = samples[:, None, :, 0] - state[..., 0, None]
+    v = samples[:, None, :, 1] - state[..., 1, None]
+    x, y = u * cosine + v * sine, v * cosine - u * sine
+    distance, away = _distance_over(np.abs(x) - half[0], np.abs(y) - half[1])
     kind = kind[:, None]
-    counts = (kind == END) | ((kind == INSIDE) & (distance > 0)) | ((kind == OUTSIDE) & (distance < 0))
-    return np.where(counts, distance, 0.0), gradient, local
+    counts = (kind == END) | (kind == np.where(distance > 0, INSIDE, OUTSIDE))
+    return distance * counts, x, y, away
 
 
 def _cost(state: Array, samples: Array, kind: Indices, half: tuple[float, float]) -> Array:
@@ -280,18 +273,21 @@ def _cost(state: Array, samples: Array, kind: Indices, half: tuple[float, float]
 
 def _step(state: Array, samples: Array, kind: Indices, half: tuple[float, float], scale_m: float) -> Array:
     """Take one damped Gauss-Newton step of (u, v, angle) from each state (G, A, 3)."""
-    residual, gradient, local = _residuals(state, samples, kind, half)
+    residual, x, y, away = _residuals(state, samples, kind, half)
     weight = (residual != 0) / (1.0 + (residual / scale_m) ** 2) ** 2
-    cosine, sine = np.cos(state[..., 2])[..., None], np.sin(state[..., 2])[..., None]
-    jacobian = np.stack(
-        [
-            gradient[..., 1] * sine - gradient[..., 0] * cosine,
-            -gradient[..., 0] * sine - gradient[..., 1] * cosine,
-            gradient[..., 0] * local[..., 1] - gradient[..., 1] * local[..., 0],
-        ],
-        axis=-1,
-    )
-    weighted = np.swapaxes(jacobian * weight[..., None], -1, -2)
-    hessian = weighted @ jacobian + np.diag([0.1, 0.1, 0.01])
-    slope = weighted @ residual[..., None]
-    return np.asarray(state - np.linalg.solve(hessian, slope)[..., 0])
+    over_x, over_y = np.abs(x) - half[0], np.abs(y) - half[1]
+    # Gradient of the signed distance: away from the nearest point of the border.
+    is_outside, scale = away > 0, np.maximum(away, 1e-12)
+    along_x = np.copysign(np.where(is_outside, np.maximum(over_x, 0.0) / scale, over_x > over_y), x)
+    along_y = np.copysign(np.where(is_outside, np.maximum(over_y, 0.0) / scale, over_x <= over_y), y)
+    # The shift is counted along the rectangle's axes, which spares turning every gradient.
+    jacobian = np.empty((*residual.shape[:2], 3, residual.shape[2]))
+    np.negative(along_x, out=jacobian[:, :, 0])
+    np.negative(along_y, out=jacobian[:, :, 1])
+    np.subtract(along_x * y, along_y * x, out=jacobian[:, :, 2])
+    weighted = jacobian * weight[:, :, None]
+    hessian = weighted @ np.swapaxes(jacobian, -1, -2) + np.diag([0.1, 0.1, 0.01])
+    step = np.linalg.solve(hessian, weighted @ residual[..., None])[..., 0]
+    cosine, sine = np.cos(state[..., 2]), np.sin(state[..., 2])
+    turned = (step[..., 0] * cosine - step[..., 1] * sine, step[..., 0] * sine + step[..., 1] * cosine)
+    return np.asarray(state - np.stack([*turned, step[..., 2]], axis=-1))

@@ -5,9 +5,15 @@ import numpy as np
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.results import LidarBoard, Refusal
-from lce_rig.detect.lidar_board import find_lidar_boards
+from lce_rig.detect.lidar_board import STANDARD, Limits, find_lidar_boards, measure_plate
 from lce_rig.detect.lidar_features import Beam
+from lce_rig.detect.lidar_segments import Indices, order_scan
+from lce_rig.detect.lidar_template import Placement, plane_axes
 
+WORSE_M = 0.003  # by how much the outline of a board held still may fit worse than before
+# Farther from its last pose a board did not stand still: the search is the safer start.
+STILL_M, STILL_TURN = 0.02, np.cos(np.radians(1.5))
+STILL_SHARE = 0.9  # of the board's returns must lie where it was for a closer look
 MAX_TURN = np.cos(np.radians(45.0))
 
 
@@ -22,6 +28,8 @@ def track_lidar_board(
     beam: Beam | None = None,
 ) -> LidarBoard | Refusal:
     """Find the board near its previous pose: only returns in a box about it are looked at.
+
+    A board held still is measured again where it was; one that moved is searched for in the box.
 
     Args:
         scan: one revolution.
@@ -38,16 +46,12 @@ def track_lidar_board(
     References:
         LCE-Calib, "Checkerboard Tracking".
     """
-    T = previous.T_lidar_board
-    half = np.array([board.width_m / 2, board.height_m / 2, 0.0]) + margin_m
-    rotation, centre = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
-    # A sphere first: it is the cheaper test, and few returns pass it.
-    away = scan.points - centre
-    with np.errstate(invalid="ignore"):
-        near = np.flatnonzero(np.einsum("ij,ij->i", away, away) < float(half @ half))
-    near = near[(np.abs(away[near] @ rotation) <= half).all(axis=1)]
+    nearby = scan.select(_near(scan, board, previous, margin_m))
+    still = _measure_again(nearby, board, previous, min_range_m, min_rings, beam)
+    if still is not None:
+        return still
     found = find_lidar_boards(
-        scan.select(near), board, min_range_m=min_range_m, max_range_m=np.inf, min_rings=min_rings, beam=beam
+        nearby, board, min_range_m=min_range_m, max_range_m=np.inf, min_rings=min_rings, beam=beam
     )
     if isinstance(found, Refusal):
         return Refusal("lidar", f"lost near its last place: {found.cause}", found.action)
@@ -57,3 +61,43 @@ def track_lidar_board(
     return Refusal(
         "lidar", "the only plate near the board's last place is turned by over 45 deg", "move more slowly"
     )
+
+
+def _near(scan: Scan, board: Board, previous: LidarBoard, margin_m: float) -> Indices:
+    """List the returns in a box about the board's last place."""
+    T = previous.T_lidar_board
+    half = np.array([board.width_m / 2, board.height_m / 2, 0.0]) + margin_m
+    rotation, centre = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
+    # A sphere first: it is the cheaper test, and few returns pass it.
+    away = np.ascontiguousarray(scan.points.T) - centre[:, None]
+    with np.errstate(invalid="ignore", over="ignore"):
+        near = np.flatnonzero((away * away).sum(axis=0) < float(half @ half))
+    is_inside = (np.abs(away[:, near].T @ rotation) <= half).all(axis=1)
+    return np.asarray(near[is_inside])
+
+
+def _measure_again(
+    nearby: Scan, board: Board, previous: LidarBoard, min_range_m: float, min_rings: int, beam: Beam | None
+) -> LidarBoard | None:
+    """Start from the last pose, which a board held still hardly leaves; None unless it fits as well again."""
+    T = previous.T_lidar_board
+    half = np.array([board.width_m / 2, board.height_m / 2, 3.0 * previous.sigma_m])
+    is_on = (np.abs((nearby.points - T[:3, 3]) @ T[:3, :3]) <= half).all(axis=1)
+    if np.count_nonzero(is_on) < max(STILL_SHARE * len(previous.points), 1):
+        return None
+    ordered = order_scan(nearby, min_range_m)
+    if len(ordered.index) == 0:
+        return None
+    width_axis = plane_axes(previous.plane[:3]).T @ T[:3, 0]
+    half_m = (board.width_m / 2, board.height_m / 2)
+    start = Placement(0.0, 0.0, float(np.arctan2(width_axis[1], width_axis[0])), half_m)
+    limits = Limits(
+        min(STANDARD.template_m, previous.quality["template_m"] + WORSE_M), STANDARD.rms_m, min_rings
+    )
+    measured = measure_plate(
+        ordered, nearby, board, previous.plane, T[:3, 3], start, limits.widened(ordered.sigma_m), beam
+    )
+    if not isinstance(measured, LidarBoard):
+        return None
+    is_still = np.linalg.norm(measured.T_lidar_board[:3, 3] - T[:3, 3]) < STILL_M
+    return measured if is_still and measured.plane[:3] @ previous.plane[:3] > STILL_TURN else None

@@ -2,6 +2,7 @@
 
 from lce_rig.simulate.captures import SimulatedCapture, simulate_captures
 from lce_rig.simulate.options import CameraNoise, EventNoise, HandMotion, LidarNoise, SimulationOptions
+from lce_rig.simulate.recording import SimulatedRecording, simulate_recording
 from lce_rig.simulate.stage import truth_extrinsics
 
 __all__ = [
@@ -10,7 +11,9 @@ __all__ = [
     "HandMotion",
     "LidarNoise",
     "SimulatedCapture",
+    "SimulatedRecording",
     "SimulationOptions",
     "simulate_captures",
+    "simulate_recording",
     "truth_extrinsics",
 ]

@@ -225,7 +225,8 @@ def expose(radiance: Array, noise: CameraNoise, rng: np.random.Generator) -> NDA
     height, width = radiance.shape[:2]
     linear = (radiance * sensor_gain(height, width, noise)[..., None]).astype(np.float32)
     if noise.blur_px > 0:
-        linear = cv2.GaussianBlur(linear, (0, 0), noise.blur_px, borderType=cv2.BORDER_REPLICATE)
+        soft = cv2.GaussianBlur(linear, (0, 0), noise.blur_px, borderType=cv2.BORDER_REPLICATE)
+        linear = np.asarray(soft, dtype=np.float32)
     if np.isfinite(noise.full_well_e):
         electrons = np.clip(linear, 0, None) * noise.full_well_e
         sigma = np.sqrt(electrons + noise.read_noise_e**2)

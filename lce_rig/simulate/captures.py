@@ -81,14 +81,12 @@ def _still_capture(stage: Stage, index: int) -> SimulatedCapture:
     rng = stage.rng(index, PLACEMENT)
     T_world_board = stage.place(index, rng)
     carrier = build_carrier(stage.options.carrier, stage.board, T_world_board, rng)
-    scene = Scene(
-        stage.room.raycaster, carrier, stage.board, T_world_board, stage.options.print_reflectivity
-    )
+    scene = Scene(stage.room.raycaster, carrier, stage.board, T_world_board, stage.options.print_reflectivity)
     stamp_ns = _FIRST_STAMP_NS + index * _CAPTURE_EVERY_NS
     exposed_ns = stamp_ns + _half_turn_ns(stage, index)
     images = [take_image(stage, camera, scene, exposed_ns, (index,)) for camera in stage.framed]
     scans = [take_scan(stage, lidar, scene, stamp_ns, (index,)) for lidar in stage.models]
-    times_ns = {name: stamp_ns for name in stage.T_world_sensor}
+    times_ns = dict.fromkeys(stage.T_world_sensor, stamp_ns)
     return _capture(stage, index, images, scans, [], hold_board(T_world_board), times_ns)
 
 
@@ -106,7 +104,7 @@ def _moving_capture(stage: Stage, index: int) -> SimulatedCapture:
     images = [board.take_image(camera, exposed_ns, (index,)) for camera in stage.framed]
     scans = [board.take_scan(lidar, stamp_ns, (index,)) for lidar in stage.models]
     events = [_film_capture(board, camera, stamp_ns, index) for camera in stage.pixels]
-    times_ns = {name: stamp_ns for name in stage.T_world_sensor} | {name: exposed_ns for name in stage.framed}
+    times_ns = dict.fromkeys(stage.T_world_sensor, stamp_ns) | dict.fromkeys(stage.framed, exposed_ns)
     return _capture(stage, index, images, scans, events, trajectory, times_ns)
 
 
@@ -114,9 +112,7 @@ def _film_capture(board: MovingBoard, camera: str, stamp_ns: int, index: int) ->
     """Record the events whose stamps lie about a scan's."""
     options = board.stage.options
     before_s, after_s = options.events_span_s
-    start_ns, end_ns = (
-        stamp_ns + round(1e9 * (s - options.event_offset_s)) for s in (-before_s, after_s)
-    )
+    start_ns, end_ns = (stamp_ns + round(1e9 * (s - options.event_offset_s)) for s in (-before_s, after_s))
     view = board.view(camera)
     sensor = board.event_camera(camera, view, start_ns, (index,))
     film(view, sensor, start_ns, end_ns)

@@ -15,7 +15,7 @@ GREY = np.array([0.114, 0.587, 0.299])
 _BEHIND_M = 0.15
 _MARGIN_PX = 4
 # Rays go through pixels' centres only: this blur stands for the pixel's area and keeps borders smooth.
-_SOFT_PX = 0.7
+_PIXEL_PX = 0.36
 
 Window = tuple[slice, slice]
 
@@ -57,7 +57,7 @@ class CarrierLayer:
 
 
 def carrier_middle(backdrop: Backdrop, T_world_board: Array) -> tuple[Array, float] | None:
-    """Find the picture (2,) of the carrier's middle and its distance; None where the lens does not show it."""
+    """Find the carrier's middle in the picture (2,) and its distance; None where no lens shows it."""
     middle = T_world_board[:3, 3] - _BEHIND_M * T_world_board[:3, 2]
     pixel, is_valid = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam), middle[None]))
     if not is_valid[0]:
@@ -65,8 +65,8 @@ def carrier_middle(backdrop: Backdrop, T_world_board: Array) -> tuple[Array, flo
     return pixel[0], float(np.linalg.norm(middle - backdrop.origin))
 
 
-def render_carrier(scene: Scene, backdrop: Backdrop) -> CarrierLayer | None:
-    """Cut the carrier out of the scene as the camera sees it; None where it does not."""
+def render_carrier(scene: Scene, backdrop: Backdrop, blur_px: float) -> CarrierLayer | None:
+    """Cut the carrier out of the scene as a lens of this blur shows it; None where it does not."""
     import cv2
 
     middle = carrier_middle(backdrop, scene.T_world_board)
@@ -87,8 +87,11 @@ def render_carrier(scene: Scene, backdrop: Backdrop) -> CarrierLayer | None:
     ahead = seen[kept.range_m < scene.cast_board(backdrop.origin, rays[seen]).range_m]
     layers[ahead, 2:] = layers[ahead, :2]
     shape = (rows.stop - rows.start, cols.stop - cols.start, 4)
-    soft = cv2.GaussianBlur(layers.reshape(shape), (0, 0), _SOFT_PX, borderType=cv2.BORDER_REPLICATE)
-    return CarrierLayer(soft, np.array([cols.start, rows.start], dtype=np.float64), *middle)
+    sigma_px = float(np.hypot(blur_px, _PIXEL_PX))
+    soft = cv2.GaussianBlur(layers.reshape(shape), (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE)
+    return CarrierLayer(
+        np.asarray(soft, dtype=np.float32), np.array([cols.start, rows.start], dtype=np.float64), *middle
+    )
 
 
 def _window(moving: Raycaster, backdrop: Backdrop) -> Window | None:

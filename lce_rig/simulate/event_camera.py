@@ -1,4 +1,4 @@
-"""An event camera's pixels: each reports when its own slow view of ln(intensity) has changed by its threshold.
+"""An event camera's pixels: each tells when its own slow view of ln(intensity) has changed enough.
 
 References:
     P. Lichtsteiner, C. Posch and T. Delbruck, A 128x128 120 dB 15 us latency asynchronous temporal contrast
@@ -49,7 +49,7 @@ def draw_pixels(intrinsics: Intrinsics, noise: EventNoise, rng: np.random.Genera
     on, off = np.maximum(means + spread, np.minimum(means, _LEAST_THRESHOLD))
     hot_hz = np.zeros(n)
     hot = rng.choice(n, round(noise.hot_share * n), replace=False)
-    hot_hz[hot] = np.exp(rng.uniform(*np.log(noise.hot_hz), len(hot)))
+    hot_hz[hot] = noise.hot_hz[0] * (noise.hot_hz[1] / noise.hot_hz[0]) ** rng.random(len(hot))
     return EventPixels(intrinsics.width_px, intrinsics.height_px, on, off, hot_hz)
 
 
@@ -88,6 +88,7 @@ class EventCamera:
     ) -> None:
         self._pixels, self._noise, self._rng = pixels, noise, rng
         self._sensor, self._start_ns, self._offset_ns = sensor, start_ns, offset_ns
+        self._on, self._off = pixels.threshold_on.copy(), pixels.threshold_off.copy()
         self._now_s = 0.0
         self._input = self._log(radiance)
         self._output = self._input.copy()
@@ -96,14 +97,15 @@ class EventCamera:
         if noise.leak_hz > 0:
             # Pixels leak since long ago: each is somewhere on its way to its next event.
             self._reference -= pixels.threshold_on * rng.random(n)
-        self._released_s = np.full(n, -np.inf)  # a pixel is blind until then
+        self._released_s = np.zeros(n)  # a pixel is blind until then
         self._last_s = np.full(n, -np.inf)  # when it last made an event
         self._raw: list[_Raw] = []
         self._taken_s = 0.0
         self._darkness = 1.0 / (1.0 + np.clip(radiance.ravel(), 0.0, 1.0).astype(np.float64))
 
     def _log(self, radiance: NDArray[np.float32]) -> Array:
-        return np.log(radiance.ravel() + np.float32(self._noise.dark_radiance)).astype(np.float64)
+        seen = np.log(radiance.ravel() + np.float32(self._noise.dark_radiance))
+        return np.asarray(seen, dtype=np.float64)
 
     def see(self, radiance: NDArray[np.float32], t_ns: int) -> None:
         """Let ln(intensity) run in a straight line from what was seen last to `radiance` (H, W) at t_ns."""
@@ -121,7 +123,7 @@ class EventCamera:
         end_excess = excess + slope * (now_s - start_s)
         is_blind = begin_s > now_s - start_s
         self._reference = np.where(is_blind, self._reference, output - end_excess)
-        fires = (end_excess >= self._pixels.threshold_on) | (end_excess <= -self._pixels.threshold_off)
+        fires = (end_excess >= self._on) | (end_excess <= -self._off)
         pixel = np.flatnonzero(fires & ~is_blind)
         self._fire(pixel, excess[pixel], slope[pixel], end_excess[pixel] > 0, start_s, now_s, output)
         self._input, self._output, self._now_s = seen, output, now_s
@@ -151,7 +153,7 @@ class EventCamera:
         """Make the events of pixels (M,) whose excess + slope t (M,) passes their threshold by now_s."""
         if not len(pixel):
             return
-        threshold = np.where(is_on, self._pixels.threshold_on[pixel], self._pixels.threshold_off[pixel])
+        threshold = np.where(is_on, self._on[pixel], self._off[pixel])
         sign = np.where(is_on, 1.0, -1.0)
         # Rounding can leave a pixel at its threshold with no slope, or one away from it.
         rate = np.maximum(sign * slope, 1e-9)
@@ -162,16 +164,26 @@ class EventCamera:
         n = n_more + 1
         number = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
         t_s = np.repeat(first_s, n) + number * np.repeat(apart_s, n)
+        self._redraw_thresholds(pixel)
         self._raw.append(_Raw(np.minimum(t_s, now_s), np.repeat(pixel, n), np.repeat(is_on, n)))
         released_s = first_s + n_more * apart_s + self._noise.refractory_s
         self._released_s[pixel] = released_s
         self._reference[pixel] = output[pixel] - slope * np.maximum(now_s - released_s, 0.0)
 
+    def _redraw_thresholds(self, pixel: NDArray[np.intp]) -> None:
+        """Let the noise of pixels (M,) decide how much change it takes to make their next event."""
+        if self._noise.event_sigma > 0:
+            change = self._noise.event_sigma * self._rng.standard_normal((2, len(pixel)))
+            self._on[pixel] = np.maximum(self._pixels.threshold_on[pixel] + change[0], _LEAST_THRESHOLD)
+            self._off[pixel] = np.maximum(self._pixels.threshold_off[pixel] + change[1], _LEAST_THRESHOLD)
+
     def take(self) -> Events:
         """Hand over the events since the last call, in order of time, with those of noise among them."""
         raw = [*self._raw, self._noise_events(self._taken_s, self._now_s)]
         self._raw, self._taken_s = [], self._now_s
-        t_s, pixel, polarity = (np.concatenate([getattr(r, k) for r in raw]) for k in ("t_s", "pixel", "polarity"))
+        t_s, pixel, polarity = (
+            np.concatenate([getattr(r, k) for r in raw]) for k in ("t_s", "pixel", "polarity")
+        )
         order = np.lexsort((polarity, pixel, t_s))
         t_s, pixel, polarity = t_s[order], pixel[order], polarity[order]
         keep = self._outlasts_refractory(t_s, pixel)
@@ -189,7 +201,7 @@ class EventCamera:
         )
 
     def _noise_events(self, start_s: float, end_s: float) -> _Raw:
-        """Draw events without a cause: shot noise, more of it in the dark, and pixels that fire all the time."""
+        """Draw events without a cause: shot noise, more of it in the dark, and hot pixels'."""
         shot_hz = self._noise.noise_hz * 2 * self._darkness
         summed_hz = np.cumsum(shot_hz + self._pixels.hot_hz)
         n = self._rng.poisson(summed_hz[-1] * (end_s - start_s))
@@ -200,7 +212,7 @@ class EventCamera:
         return _Raw(t_s, pixel, self._rng.random(n) < on_share)
 
     def _outlasts_refractory(self, t_s: Array, pixel: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Tell which events (N,), in order of time, come a refractory period or more after their pixel's last."""
+        """Tell which events (N,), in order of time, their pixel was not blind for after its last."""
         order = np.argsort(pixel, kind="stable")
         by_pixel, by_time = pixel[order], t_s[order]
         is_first = np.ones(len(order), dtype=np.bool_)

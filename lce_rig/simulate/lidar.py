@@ -89,7 +89,7 @@ def simulate_scan(
         model: the LiDAR's geometry and timing.
         noise: its errors.
         rng: source of the azimuth phase and of all noise.
-        board_at: T_world_board (N, 4, 4) at times (N,) ns of the stamp's clock; None for the scene's own pose.
+        board_at: T_world_board (N, 4, 4) at times (N,) ns of the stamp's clock; None for the scene's.
         laser_bias_m: (L,) constant range offset of each laser in firing order; zeros by default.
         sensor: name in the rig profile.
         stamp_ns: device time of the first firing.
@@ -149,7 +149,9 @@ def _receive_moving(
         parts.append(receive(scene, origins[beams], directions[beams], noise))
         rims.append(_near_border(scene, origins[beams], directions[beams], parts[-1], noise))
     fields = ("range_m", "energy", "reflectivity", "surface")
-    return Returns(*(np.concatenate([getattr(p, name) for p in parts]) for name in fields)), np.concatenate(rims)
+    return Returns(*(np.concatenate([getattr(p, name) for p in parts]) for name in fields)), np.concatenate(
+        rims
+    )
 
 
 def _measure(

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ _TREMOR_HZ = (5.0, 9.0)
 _ARM_M = 0.4
 #: The speed is that of the second before the anchor, which is what a picture of events is made of.
 _SPEED_WINDOW_S = np.linspace(-1.0, 0.2, 61)
+_FASTEST_TURN_RAD_S = np.radians(60.0)
 _PROBE_NS = 500_000
 
 
@@ -85,7 +87,9 @@ def hold_board(T_world_board: Array) -> Trajectory:
     return Trajectory(zero, zero, T_world_board[None], np.zeros(0), none, none, np.zeros(6))
 
 
-def sway_board(T_world_board: Array, anchor_ns: int, hand: HandMotion, rng: np.random.Generator) -> Trajectory:
+def sway_board(
+    T_world_board: Array, anchor_ns: int, hand: HandMotion, rng: np.random.Generator
+) -> Trajectory:
     """Let a hand move the board about and through T_world_board (4, 4), where it is at anchor_ns exactly."""
     speed_mps = rng.uniform(*hand.speed_mps)
     frequency_hz, amplitude, phase_rad = _draw_sways(T_world_board, speed_mps, hand, rng)
@@ -102,16 +106,16 @@ def carry_board(
     It sways by a quarter of the greatest speed while it rests: no hand is still.
     """
     arrivals, departures = [start_ns], [start_ns + round(1e9 * hand.rest_s)]
-    for start, end in zip(placements[:-1], placements[1:], strict=True):
+    for start, end in pairwise(placements):
         way_m = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
         turn_rad = float(np.linalg.norm(log_so3(start[:3, :3].T @ end[:3, :3])))
         # The way of least jerk is 15/8 as fast in its middle as on average.
-        duration_s = 15 / 8 * max(way_m / hand.speed_mps[1], turn_rad / np.radians(4 * hand.turn_deg_s))
+        duration_s = 15 / 8 * max(way_m / hand.carry_mps, turn_rad / _FASTEST_TURN_RAD_S)
         arrivals.append(departures[-1] + round(1e9 * max(duration_s, 0.2)))
         departures.append(arrivals[-1] + round(1e9 * hand.rest_s))
     sways = _draw_sways(placements[0], 0.25 * hand.speed_mps[1], hand, rng)
-    times = (np.array(times_ns, dtype=np.int64) for times_ns in (arrivals, departures))
-    return Trajectory(*times, np.stack(placements), *sways, np.zeros(6))
+    arrival_ns, departure_ns = np.array(arrivals, dtype=np.int64), np.array(departures, dtype=np.int64)
+    return Trajectory(arrival_ns, departure_ns, np.stack(placements), *sways, np.zeros(6))
 
 
 def _draw_sways(
@@ -130,6 +134,8 @@ def _draw_sways(
     turn_rad_s = np.radians(hand.turn_deg_s) * speed_mps / fastest_mps * rng.uniform(0.5, 1.0)
     for part, wanted in ((slice(0, 3), speed_mps), (slice(3, 6), turn_rad_s)):
         rate[:, part] *= wanted / np.sqrt(np.mean(np.sum(drawn[:, part] ** 2, axis=1)))
-    tremor = rng.standard_normal((1, 6)) * hand.tremor_m * np.array([1, 1, 1, 1 / _ARM_M, 1 / _ARM_M, 1 / _ARM_M])
+    tremor = (
+        rng.standard_normal((1, 6)) * hand.tremor_m * np.array([1, 1, 1, 1 / _ARM_M, 1 / _ARM_M, 1 / _ARM_M])
+    )
     amplitude = np.concatenate([rate / (2 * np.pi * frequency_hz[:, None]), tremor])
     return np.append(frequency_hz, rng.uniform(*_TREMOR_HZ)), amplitude, phase_rad

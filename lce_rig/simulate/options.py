@@ -90,31 +90,34 @@ class EventNoise:
     Attributes:
         threshold_on, threshold_off: mean change of ln(intensity) that makes an event.
         threshold_sigma: spread of the pixels' own thresholds, fixed for a session.
+        event_sigma: spread of one pixel's threshold from event to event.
         cutoff_hz: bandwidth of a pixel that sees full white; darker ones are slower. inf for no limit.
         refractory_s: how long a pixel is blind after each event.
         leak_hz: ON events of a pixel that sees nothing change.
         noise_hz: further events of each pixel, of either polarity, twice as many in the dark.
         hot_share: share of the pixels that fire all the time ...
         hot_hz: ... at rates between these.
-        dark_radiance: radiance that a black pixel seems to see, from stray light and dark current.
+        dark_radiance: radiance that a black pixel seems to see: light strayed in the lens, and dark current.
     """
 
-    threshold_on: float = 0.25
+    threshold_on: float = 0.30
     threshold_off: float = 0.25
     threshold_sigma: float = 0.03
+    event_sigma: float = 0.03
     cutoff_hz: float = 250.0
     refractory_s: float = 3e-4
-    leak_hz: float = 0.1
-    noise_hz: float = 0.1
-    hot_share: float = 3e-4
+    leak_hz: float = 0.05
+    noise_hz: float = 0.06
+    hot_share: float = 2e-4
     hot_hz: tuple[float, float] = (10.0, 300.0)
-    dark_radiance: float = 0.015
+    dark_radiance: float = 0.03
 
     @classmethod
     def none(cls) -> "EventNoise":
         """Pixels that are all alike, fast and quiet."""
         return cls(
             threshold_sigma=0.0,
+            event_sigma=0.0,
             cutoff_hz=float("inf"),
             refractory_s=0.0,
             leak_hz=0.0,
@@ -131,12 +134,14 @@ class HandMotion:
         speed_mps: range of the board's mean speed, drawn anew for each capture.
         turn_deg_s: how fast it turns at most at the greatest speed.
         tremor_m: amplitude of the hand's trembling, 5 to 9 Hz.
+        carry_mps: greatest speed on the way from one placement of a recording to the next.
         rest_s: how long it rests at each placement of a recording.
     """
 
     speed_mps: tuple[float, float] = (0.0, 0.3)
     turn_deg_s: float = 12.0
     tremor_m: float = 3e-4
+    carry_mps: float = 0.6
     rest_s: float = 1.0
 
     def __post_init__(self) -> None:
@@ -168,6 +173,7 @@ class SimulationOptions:
         events_span_s: how long before and after a scan's stamp a capture's events begin and end.
         exposure_s: of a moving board's pictures.
         frame_every_s: between the pictures of a camera that runs freely while the board moves.
+        flicker_depth, flicker_hz: how much the lamps' light swings, to event cameras, and how often a second.
         frame_offset_s, event_offset_s: how much more the stamps of pictures and of events read than the
             LiDAR's clock, which is the rig's.
     """
@@ -190,6 +196,8 @@ class SimulationOptions:
     events_span_s: tuple[float, float] = (1.2, 0.15)
     exposure_s: float = 0.008
     frame_every_s: float = 0.05
+    flicker_depth: float = 0.0
+    flicker_hz: float = 100.0
     frame_offset_s: float = 0.0
     event_offset_s: float = 0.0
 
@@ -210,11 +218,9 @@ class SimulationOptions:
         return replace(quiet, range_sigma_m=sigma_m, rim_spread_rad=0.0015)
 
     @classmethod
-    def for_rig(cls, name: str) -> "SimulationOptions":
-        """Choose what the recordings of the rig of this name show."""
+    def for_rig(cls, name: str, motion: Motion = "still") -> "SimulationOptions":
+        """Choose what the recordings of the rig of this name show, of a board held still or moving."""
         if name.startswith("sss"):
             # The paper's simulated rig: a board hung in the air, and an extrinsic that is known exactly.
-            return cls(carrier="none", truth_rotation_deg=0.0, truth_translation_m=0.0)
-        if name.startswith("rles"):
-            return cls(carrier="person", motion="moving")
-        return cls()
+            return cls(carrier="none", motion=motion, truth_rotation_deg=0.0, truth_translation_m=0.0)
+        return cls(carrier="person" if name.startswith("rles") else "stand", motion=motion)

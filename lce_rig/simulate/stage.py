@@ -115,11 +115,7 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
     options = options or SimulationOptions.for_rig(rig.name)
     T_world_base = pose(np.eye(3), np.array([0.0, 0.0, options.lidar_height_m]))
     T_world_sensor = {name: T_world_base @ T for name, T in _sensor_poses(rig, seed, options).items()}
-    kinds = ("frames", "events") if options.motion == "moving" else ("frames",)
-    cameras = [name for name in rig.cameras if any(channel_of(rig, name, kind) for kind in kinds)]
-    if not cameras:
-        hint = "Of a board held still, only frames can be simulated: events need motion."
-        raise ProfileError(f"rig {rig.name}: no camera has a channel of kind {' or '.join(kinds)}", hint)
+    cameras = _simulated_cameras(rig, options)
     sight = T_world_sensor[cameras[0]][:3, 2]
     room = build_room(
         float(np.arctan2(sight[1], sight[0])),
@@ -136,7 +132,7 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
     pixels = {
         name: draw_pixels(lenses[name], options.events, np.random.default_rng([seed, OF_SESSION, PIXELS, k]))
         for k, name in enumerate(cameras)
-        if "events" in kinds and channel_of(rig, name, "events")
+        if options.motion == "moving" and channel_of(rig, name, "events")
     }
     views = [
         View(camera, lenses[camera], T_world_sensor[camera], lidar, models[lidar], T_world_sensor[lidar])
@@ -152,6 +148,15 @@ def channel_of(rig: Rig, camera: str, kind: str) -> str | None:
     """Find the camera's first channel of a kind, "frames" or "events"."""
     channels = rig.cameras[camera].channels
     return next((name for name, channel in channels.items() if channel.kind == kind), None)
+
+
+def _simulated_cameras(rig: Rig, options: SimulationOptions) -> list[str]:
+    kinds = ("frames", "events") if options.motion == "moving" else ("frames",)
+    cameras = [name for name in rig.cameras if any(channel_of(rig, name, kind) for kind in kinds)]
+    if not cameras:
+        hint = "Of a board held still, only frames can be simulated: events need motion."
+        raise ProfileError(f"rig {rig.name}: no camera has a channel of kind {' or '.join(kinds)}", hint)
+    return cameras
 
 
 def _sensor_poses(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, Array]:

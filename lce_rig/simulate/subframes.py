@@ -32,6 +32,7 @@ from lce_rig.simulate.scene import PLATE, PLATE_BACK, PRINT_ALBEDO, Scene
 Float = NDArray[np.float32]
 _KEY_NS = 250_000_000
 _STEP_PX = 0.4
+_STEPS_PER_FLICKER = 16
 _STEP_NS = (500_000, 5_000_000)
 _ALONG = np.linspace(0, 1, 17)[:, None, None]
 # Mean square distance of a pixel's area from its middle, px^2, along one axis.
@@ -61,6 +62,7 @@ class MovingView:
         trajectory: where it is.
         scene_at: the scene at a time of the rig's clock, ns: for the carrier.
         lens: the camera's errors; blur, exposure and vignetting count.
+        flicker_depth, flicker_hz: the lamps' light is 1 + depth sin(2 pi f t).
     """
 
     backdrop: Backdrop
@@ -68,6 +70,8 @@ class MovingView:
     trajectory: Trajectory
     scene_at: Callable[[int], Scene]
     lens: CameraNoise
+    flicker_depth: float = 0.0
+    flicker_hz: float = 100.0
     _keys: dict[int, _Key] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -75,9 +79,11 @@ class MovingView:
 
         grey = (self.backdrop.radiance @ GREY).astype(np.float32)
         if self.lens.blur_px > 0:
-            grey = cv2.GaussianBlur(grey, (0, 0), self.lens.blur_px, borderType=cv2.BORDER_REPLICATE)
+            soft = cv2.GaussianBlur(grey, (0, 0), self.lens.blur_px, borderType=cv2.BORDER_REPLICATE)
+            grey = np.asarray(soft, dtype=np.float32)
         self._room: Float = grey
-        self._gain = sensor_gain(*grey.shape, self.lens).astype(np.float32)
+        height_px, width_px = grey.shape
+        self._gain = sensor_gain(height_px, width_px, self.lens).astype(np.float32)
         self._rays = pixel_rays(self.backdrop.corner_rays).astype(np.float32)
         self._room_range_m = self.backdrop.range_m.astype(np.float32)
 
@@ -95,20 +101,26 @@ class MovingView:
             seen[board_window] += cover * (radiance - seen[board_window])
         if layers is not None:
             seen[window] += both[..., 2] - both[..., 3] * seen[window]
-        return np.asarray(seen * self._gain)
+        seen *= self._gain
+        if self.flicker_depth > 0:
+            cycle = (1e-9 * (t_ns % 1_000_000_000)) * self.flicker_hz
+            seen *= np.float32(1 + self.flicker_depth * np.sin(2 * np.pi * cycle))
+        return np.asarray(seen)
 
-    def speed_px_s(self, t_ns: int) -> float:
-        """Measure how fast the board's outline moves through the picture at most."""
-        step_ns = 1_000_000
-        outlines = transform(self.trajectory.at(np.array([t_ns, t_ns + step_ns])), self.board.outline())
-        pixels, is_valid = self.backdrop.intrinsics.project(transform(invert(self.backdrop.T_world_cam), outlines))
-        way_px = np.linalg.norm(pixels[1] - pixels[0], axis=-1)[is_valid.all(axis=0)]
-        return float(way_px.max(initial=0.0)) / (1e-9 * step_ns)
+    def step_ns(self, t_ns: int) -> int:
+        """Choose how long after t_ns the next sub-frame is due."""
+        speed = speed_px_s(self.trajectory, self.board, self.backdrop, t_ns)
+        step_ns = 1e9 * _STEP_PX / max(speed, 1e-3)
+        if self.flicker_depth > 0:
+            step_ns = min(step_ns, 1e9 / (_STEPS_PER_FLICKER * self.flicker_hz))
+        return int(np.clip(step_ns, *_STEP_NS))
 
     def _board_window(self, T_world_board: Array) -> Window | None:
         outline = transform(T_world_board, self.board.outline())
         edges = ((1 - _ALONG) * outline + _ALONG * np.roll(outline, -1, axis=0)).reshape(-1, 3)
-        pixels, is_valid = self.backdrop.intrinsics.project(transform(invert(self.backdrop.T_world_cam), edges))
+        pixels, is_valid = self.backdrop.intrinsics.project(
+            transform(invert(self.backdrop.T_world_cam), edges)
+        )
         if not is_valid.any():
             return None
         bounds = np.stack([pixels[is_valid].min(axis=0) - 4, pixels[is_valid].max(axis=0) + 5])
@@ -116,7 +128,8 @@ class MovingView:
 
     def _board(self, window: Window, T_world_board: Array, light: Array) -> tuple[Float, Float]:
         """Compute the board's radiance and its cover (h, w) of each pixel, 0..1."""
-        R, eye = T_world_board[:3, :3].astype(np.float32), transform(invert(T_world_board), self.backdrop.origin[None])[0]
+        R = T_world_board[:3, :3].astype(np.float32)
+        eye = transform(invert(T_world_board), self.backdrop.origin[None])[0]
         rays = self._rays[window]
         with np.errstate(divide="ignore", invalid="ignore"):
             range_m = np.float32(-eye[2]) / (rays @ R[:, 2])
@@ -142,33 +155,30 @@ class MovingView:
         the same sign the print is dark. For a smoothing that is round in the picture this product is what
         smoothing the whole print would give, as long as the board is not seen at a grazing angle.
         """
-        board = self.board
-        column = (x - np.float32(board.pattern_offset_m[0])) / board.square_m + np.float32((board.cols + 1) / 2)
-        row = (np.float32(board.pattern_offset_m[1]) - y) / board.square_m + np.float32((board.rows + 1) / 2)
-        share = np.float32(0.5)
-        inside = np.float32(1.0)
-        wave = np.float32(1.0)
-        for place, n_inner, spread in ((column, board.cols, spread_x), (row, board.rows, spread_y)):
-            sigma = spread / np.float32(board.square_m)
+        board, offset_m = self.board, self.board.pattern_offset_m
+        axes = ((x - offset_m[0], board.cols, spread_x), (offset_m[1] - y, board.rows, spread_y))
+        inside, wave = np.float32(1.0), np.float32(1.0)
+        for from_middle_m, n_inner, spread_m in axes:
+            half = (n_inner + 1) / 2
+            place, sigma = from_middle_m / board.square_m + half, spread_m / board.square_m
             edge = np.clip(np.rint(place), 1, n_inner)
             sign = 1 - 2 * np.mod(edge, 2)
             wave = wave * sign * (2 * _smooth_step(place - edge, sigma) - 1)
-            half = np.float32((n_inner + 1) / 2)
             inside = inside * _inside(half, place - half, sigma)
-        return np.asarray(inside * share * (1 + wave))
+        return np.asarray(inside * (1 + wave) / 2, dtype=np.float32)
 
     def _carrier(self, t_ns: int, T_world_board: Array) -> tuple[Window, Float] | None:
         """Draw the carrier (h, w, 4) as blended from the pictures before and after this time."""
         middle = carrier_middle(self.backdrop, T_world_board)
         k, weight = divmod(t_ns, _KEY_NS)
-        carriers = [self._key(k).carrier, self._key(k + 1).carrier]
-        if middle is None or carriers[0] is None or carriers[1] is None:
+        first, second = self._key(k).carrier, self._key(k + 1).carrier
+        if middle is None or first is None or second is None:
             return None
-        bounds = np.stack([carrier.bounds_px(*middle) for carrier in carriers if carrier])
+        bounds = np.stack([first.bounds_px(*middle), second.bounds_px(*middle)])
         window = clip_window(np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)]), self.backdrop)
         if window is None:
             return None
-        before, after = (carrier.shifted(window, *middle) for carrier in carriers if carrier)
+        before, after = first.shifted(window, *middle), second.shifted(window, *middle)
         share = np.float32(weight / _KEY_NS)
         return window, before + share * (after - before)
 
@@ -182,7 +192,8 @@ class MovingView:
             for old in [j for j in self._keys if j < k - 1]:
                 del self._keys[old]
             scene = self.scene_at(k * _KEY_NS)
-            self._keys[k] = _Key(render_carrier(scene, self.backdrop), _light_on_board(scene, self.backdrop))
+            carrier = render_carrier(scene, self.backdrop, self.lens.blur_px)
+            self._keys[k] = _Key(carrier, _light_on_board(scene, self.backdrop))
         return self._keys[k]
 
 
@@ -193,15 +204,24 @@ def film(view: MovingView, camera: EventCamera, start_ns: int, end_ns: int) -> N
     """
     t_ns = start_ns
     while t_ns < end_ns:
-        speed_px_s = max(view.speed_px_s(t_ns), 1e-3)
-        step_ns = int(np.clip(1e9 * _STEP_PX / speed_px_s, *_STEP_NS))
-        t_ns = min(t_ns + step_ns, end_ns)
+        t_ns = min(t_ns + view.step_ns(t_ns), end_ns)
         camera.see(view.at(t_ns), t_ns)
+
+
+def speed_px_s(trajectory: Trajectory, board: Board, backdrop: Backdrop, t_ns: int) -> float:
+    """Measure how fast the board's outline moves through the picture at most."""
+    step_ns = 1_000_000
+    outlines = transform(trajectory.at(np.array([t_ns, t_ns + step_ns])), board.outline())
+    pixels, is_valid = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam), outlines))
+    way_px = np.linalg.norm(pixels[1] - pixels[0], axis=-1)[is_valid.all(axis=0)]
+    return float(way_px.max(initial=0.0)) / (1e-9 * step_ns)
 
 
 def _light_on_board(scene: Scene, backdrop: Backdrop) -> Array:
     """Fit the light (4,) on the side of the board that the camera sees, unshadowed."""
-    x, y = (grid.ravel() for grid in np.meshgrid(*(np.linspace(-0.5, 0.5, 3) * s for s in _size(scene.board))))
+    x, y = (
+        grid.ravel() for grid in np.meshgrid(*(np.linspace(-0.5, 0.5, 3) * s for s in _size(scene.board)))
+    )
     points = transform(scene.T_world_board, np.stack([x, y, np.zeros(9)], axis=1))
     side = np.sign((backdrop.origin - scene.T_world_board[:3, 3]) @ scene.T_world_board[:3, 2])
     normals = np.tile(side * scene.T_world_board[:3, 2], (9, 1))
@@ -234,6 +254,6 @@ def _smooth_step(distance: Float, sigma: Float) -> Float:
     return np.asarray(np.float32(0.5) + d * (np.float32(0.75) - np.float32(0.25) * d * d))
 
 
-def _inside(half: float | np.float32, place: Float, sigma: Float) -> Float:
+def _inside(half: float, place: Float, sigma: Float) -> Float:
     """Tell how much of each pixel lies within +-half of a place: 0..1."""
     return _smooth_step(np.float32(half) - np.abs(place), sigma)

@@ -15,7 +15,7 @@ from lce_rig.simulate.lidar import simulate_scan
 from lce_rig.simulate.motion import Trajectory
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import EVENTS, IMAGE, SCAN, Stage, channel_of
-from lce_rig.simulate.subframes import MovingView
+from lce_rig.simulate.subframes import MovingView, speed_px_s
 
 # While the shutter is open the board is drawn at moments that lie this far apart in the picture at most.
 _SMEAR_STEP_PX = 0.35
@@ -80,7 +80,7 @@ class MovingBoard:
     def take_image(self, camera: str, exposed_ns: int, stream: Stream) -> Image:
         """Expose a picture about a time of the rig's clock: the mean of what is seen while it lasts."""
         backdrop, options = self.stage.backdrops[camera], self.stage.options
-        smear_px = options.exposure_s * self.view(camera).speed_px_s(exposed_ns)
+        smear_px = options.exposure_s * speed_px_s(self.trajectory, self.stage.board, backdrop, exposed_ns)
         n_moments = int(np.clip(np.ceil(smear_px / _SMEAR_STEP_PX), 1, _MOST_MOMENTS))
         middles = (np.arange(n_moments) + 0.5) / n_moments - 0.5
         moments_ns = exposed_ns + np.rint(1e9 * options.exposure_s * middles).astype(np.int64)
@@ -99,9 +99,16 @@ class MovingBoard:
 
     def view(self, camera: str) -> MovingView:
         """Look at the board through a camera's lens."""
-        stage = self.stage
-        lens, backdrop = stage.options.camera, stage.backdrops[camera]
-        return MovingView(backdrop, stage.board, self.trajectory, self.scene_at, lens)
+        options = self.stage.options
+        return MovingView(
+            self.stage.backdrops[camera],
+            self.stage.board,
+            self.trajectory,
+            self.scene_at,
+            options.camera,
+            options.flicker_depth,
+            options.flicker_hz,
+        )
 
     def event_camera(self, camera: str, view: MovingView, start_ns: int, stream: Stream) -> EventCamera:
         """Switch an event camera on at a time of the rig's clock."""

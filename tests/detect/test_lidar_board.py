@@ -280,3 +280,12 @@ def test_bent_board_is_refused_for_its_thickness():
     refusal = find(bent)
     assert isinstance(refusal, Refusal)
     assert "thick" in refusal.cause
+
+
+def test_plate_with_much_else_in_its_plane_is_no_rival_of_a_clear_board():
+    T, patch = place(2.5, 30), place(3.0, 150)
+    beside = Plate(patch @ pose(np.eye(3), np.array([BOARD.width_m / 2 + 0.35, 0, 0])), 0.6, 0.8)
+    assert len(find(cast([board_plate(patch), beside, *ROOM], sigma_m=0.01))) == 1
+    found = find(cast([board_plate(T), board_plate(patch), beside, *ROOM], sigma_m=0.01))
+    assert_is_board(found, T)
+    assert len(found) == 1

@@ -38,3 +38,15 @@ def test_board_that_left_is_reported_lost():
     refusal = track_lidar_board(view(place(2.5, 200)), BOARD, board, beam=BEAM)
     assert isinstance(refusal, Refusal)
     assert refusal.cause.startswith("lost near its last place")
+
+
+def test_board_held_still_is_measured_as_well_as_by_the_full_search():
+    found_deg, tracked_deg = [], []
+    for seed in range(8):
+        T = place(2.0 + 0.1 * seed, 40 - 10 * seed, 35, 25, 15)
+        previous = find_lidar_boards(view(T, seed=100 + seed), BOARD, beam=BEAM)[0]
+        full = find_lidar_boards(view(T, seed=seed), BOARD, beam=BEAM)[0]
+        tracked = track_lidar_board(view(T, seed=seed), BOARD, previous, beam=BEAM)
+        for errors, board in ((found_deg, full), (tracked_deg, tracked)):
+            errors.append(np.degrees(np.linalg.norm(np.cross(board.plane[:3], T[:3, 2]))))
+    assert np.sqrt(np.mean(np.square(tracked_deg))) < 1.1 * np.sqrt(np.mean(np.square(found_deg)))

@@ -158,6 +158,39 @@ def test_a_network_of_other_shape_exported_by_the_recipe_is_accepted(tmp_path):
     assert picture.shape == (21, 33)
 
 
+class PairedStatesNetwork(torch.nn.Module):
+    """The shape of E2VID: ConvLSTM pairs at a half, a quarter and an eighth, flattened as in the recipe."""
+
+    def __init__(self):
+        super().__init__()
+        self.down = torch.nn.ModuleList(torch.nn.Conv2d(n, 4, 3, 2, 1) for n in (5, 4, 4))
+        self.gates = torch.nn.ModuleList(torch.nn.Conv2d(8, 16, 3, padding=1) for _ in range(3))
+        self.up = torch.nn.Conv2d(4, 64, 1)
+
+    def forward(self, voxels, *states):
+        features, following = voxels, []
+        for down, gates, hidden, cell in zip(self.down, self.gates, states[0::2], states[1::2], strict=True):
+            features = torch.relu(down(features))
+            drop, write, value, show = gates(torch.cat([features, hidden], 1)).chunk(4, 1)
+            cell = torch.sigmoid(drop) * cell + torch.sigmoid(write) * torch.tanh(value)
+            features = torch.sigmoid(show) * torch.tanh(cell)
+            following += [features, cell]
+        return (torch.nn.functional.pixel_shuffle(self.up(features), 8), *following)
+
+
+def test_paired_states_at_an_eighth_are_padded_for_and_carried_on(tmp_path):
+    export_recurrent(
+        PairedStatesNetwork(), [(4, 2), (4, 2), (4, 4), (4, 4), (4, 8), (4, 8)], tmp_path / "lstm.onnx"
+    )
+    model = ReconstructionModel(tmp_path / "lstm.onnx")
+    states = model.initial_states(43, 61)
+    assert states[-1].shape == (1, 4, 6, 8)
+    voxels = np.ones((5, 43, 61), np.float32)
+    first, states = model.step(voxels, states)
+    second, _ = model.step(voxels, states)
+    assert first.shape == (43, 61) and np.abs(second - first).max() > 1e-4
+
+
 TINY = ["--batch", "2", "--crop-px", "16", "--unroll", "6", "--device", "cpu"]
 
 

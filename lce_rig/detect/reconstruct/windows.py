@@ -12,9 +12,9 @@ from lce_rig.core.errors import UsageError
 _EVENTS_PER_PIXEL = 0.35
 _BLOCK_PX = 16
 # Share of the sensor that takes part in a usual scene with the camera moving; see `active_share`.
-_USUAL_ACTIVE_SHARE = 0.5
+_USUAL_ACTIVE_SHARE = 0.25
 _MIN_ACTIVE_SHARE = 0.05
-_AUTO_LONGEST_NS = 100_000_000
+_AUTO_LONGEST_NS = 60_000_000
 _AUTO_SHORTEST_NS = 20_000_000
 _FOREVER_NS = 1 << 62
 
@@ -25,7 +25,7 @@ class WindowOptions:
 
     Attributes:
         kind: "time" (constant duration), "count" (constant number of events) or "auto": as many events as the
-            active part of the sensor calls for, but 20 to 100 ms.
+            active part of the sensor calls for, but 20 to 60 ms.
         duration_s: of "time"; 0.05 is what the paper used.
         n_events: of "count"; None takes 0.35 events per pixel of the sensor.
     """

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from lce_rig.core.errors import SourceError
+from lce_rig.sources.bag_file import SUFFIXES
 from lce_rig.sources.events.recording import EventRecording
 
 READERS = {
@@ -46,7 +47,7 @@ def open_events(
     path = Path(path)
     if not path.exists():
         raise SourceError(f"{path} does not exist")
-    kind = ".mcap" if path.is_dir() else path.suffix.lower()
+    kind = _kind(path)
     if kind not in READERS:
         hint = f"Give a ROS 2 bag's folder or a file of one of these kinds: {', '.join(READERS)}."
         raise SourceError(f"{path} is no recording of events this program reads", hint)
@@ -54,3 +55,10 @@ def open_events(
     reader: Any = getattr(import_module(module), name)
     stream = reader(path, topic) if name == "BagEvents" else reader(path)
     return EventRecording(path, stream, sensor, resolution)
+
+
+def _kind(path: Path) -> str:
+    if not path.is_dir():
+        return path.suffix.lower()
+    bags = sorted(file.suffix.lower() for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+    return bags[0] if bags else "folder"

@@ -8,6 +8,7 @@ References:
     https://flatbuffers.dev/internals/
 """
 
+import re
 import struct
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -26,6 +27,7 @@ EVENT = np.dtype({"names": ["t", "x", "y", "on"], "formats": ["<i8", "<i2", "<i2
 _LZ4_MAGIC, _ZSTD_MAGIC = b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd"
 _MAX_PACKET_BYTES = 1 << 30
 _STRETCH_EVENTS = 1 << 16
+_SEARCH_BYTES = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -74,26 +76,47 @@ class Aedat4Events:
         yield from join_small(self._packets(findings), _STRETCH_EVENTS)
 
     def _packets(self, findings: Findings) -> Iterator[EventColumns]:
-        end = self._path.stat().st_size if self._header.end is None else self._header.end
+        n_bytes = self._path.stat().st_size
+        end = min(self._header.end or n_bytes, n_bytes)
+        position, n_packets = self._header.begin, 0
         with self._path.open("rb") as file:
-            position, n_packets = self._header.begin, 0
             while position < end:
-                file.seek(position)
-                head = file.read(8)
-                number, size = struct.unpack("<ii", head) if len(head) == 8 else (-1, -1)
-                is_whole = 0 <= size <= _MAX_PACKET_BYTES and position + 8 + size <= end
-                if not is_whole or number not in self._header.streams:
-                    lost = f"{end - position} bytes, after {n_packets} packets"
-                    findings.add("torn ends of the file left out", lost)
-                    return
+                where = f"packet {n_packets} at byte {position}"
+                number, size = self._packet_head(file, position, end)
+                if size is None:
+                    following = self._next_packet(file, position + 1, end)
+                    if following is None:
+                        findings.add("torn ends of the file left out", f"{end - position} bytes, {where}")
+                        return
+                    findings.add("broken packets left out", f"{where}: its head is damaged")
+                    position, n_packets = following, n_packets + 1
+                    continue
                 if number == self._number:
                     try:
                         yield _decode_packet(file.read(size))
                     except Exception as error:  # A damaged packet fails in any way: lz4, zstd, struct, sizes.
-                        where = f"packet {n_packets} at byte {position}: {str(error) or type(error).__name__}"
-                        findings.add("broken packets left out", where)
+                        what = str(error) or type(error).__name__
+                        findings.add("broken packets left out", f"{where}: {what}")
                 position += 8 + size
                 n_packets += 1
+
+    def _packet_head(self, file: BinaryIO, position: int, end: int) -> tuple[int, int | None]:
+        """Read stream and size of a packet; no size where it cannot be one."""
+        file.seek(position)
+        head = file.read(8)
+        number, size = struct.unpack("<ii", head) if len(head) == 8 else (-1, -1)
+        is_whole = 0 <= size <= _MAX_PACKET_BYTES and position + 8 + size <= end
+        return number, size if is_whole and number in self._header.streams else None
+
+    def _next_packet(self, file: BinaryIO, position: int, end: int) -> int | None:
+        """Find the next packet behind a damaged head by what compressed data begins with."""
+        file.seek(position)
+        data = file.read(min(end - position, _SEARCH_BYTES))
+        for match in re.finditer(re.escape(_LZ4_MAGIC) + b"|" + re.escape(_ZSTD_MAGIC), data):
+            found = position + match.start() - 8
+            if match.start() >= 8 and self._packet_head(file, found, end)[1] is not None:
+                return found
+        return None
 
 
 def read_header(path: Path) -> Aedat4Header:

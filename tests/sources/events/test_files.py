@@ -169,12 +169,15 @@ def test_a_packet_cut_off_costs_only_itself_and_is_said(tmp_path: Path) -> None:
     assert any("torn ends of the file left out" in note for note in recording.notes)
 
 
-def test_a_damaged_packet_is_left_out_and_its_place_is_said(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("from_byte", "to_byte"), [(8, 60), (0, 8), (4, 8)])
+def test_a_damaged_packet_is_left_out_and_its_place_is_said(
+    tmp_path: Path, from_byte: int, to_byte: int
+) -> None:
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
     data = bytearray((tmp_path / "a.aedat4").read_bytes())
     begin = 14 + 4 + struct.unpack_from("<I", data, 14)[0]
     second = begin + 8 + struct.unpack_from("<i", data, begin + 4)[0]
-    data[second + 8 : second + 60] = bytes(52)
+    data[second + from_byte : second + to_byte] = b"\xff" * (to_byte - from_byte)
     (tmp_path / "a.aedat4").write_bytes(data)
     recording = open_events(tmp_path / "a.aedat4")
     assert everything(recording) == listed(EVENTS)[:8192] + listed(EVENTS)[16384:]
@@ -315,5 +318,7 @@ def test_paths_that_are_no_recording_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="does not exist"):
         open_events(tmp_path / "a.aedat4")
     (tmp_path / "a.mp4").touch()
-    with pytest.raises(SourceError, match="no recording of events"):
-        open_events(tmp_path / "a.mp4")
+    (tmp_path / "img").mkdir()
+    for name in ("a.mp4", "img"):
+        with pytest.raises(SourceError, match="no recording of events"):
+            open_events(tmp_path / name)

@@ -1,0 +1,108 @@
+"""Wrong specifications and hostile recordings: each is named, and nothing wrong is handed out."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from lce_rig.cli.main import run
+from lce_rig.core.geometry import rotation_angle
+
+
+def edit_profile(session: Path, **changes) -> None:
+    """Change keys of the session's profile, as somebody who measured the rig wrongly would have them."""
+    path = session / "rig.yaml"
+    document = yaml.safe_load(path.read_text())
+    for key, value in changes.items():
+        *parents, last = key.split("__")
+        place = document
+        for parent in parents:
+            place = place[parent]
+        place[last] = value
+    path.write_text(yaml.safe_dump(document))
+
+
+def test_inner_corners_counted_wrongly_are_named_with_what_is_seen(lce_rig, session):
+    edit_profile(session, board__inner_corners=[8, 5])
+    outcome = lce_rig("calibrate", session)
+    assert outcome.code == 6
+    assert "8x5 inner corners wanted, 9x6 seen" in outcome.err
+
+
+@pytest.mark.parametrize(("square_m", "measured"), [(0.064, "6[78]"), (0.072, "6[78]")])
+def test_squares_of_the_wrong_size_fail_and_the_right_size_is_told(lce_rig, session, square_m, measured):
+    edit_profile(session, board__square_m=square_m)
+    outcome = lce_rig("calibrate", session)
+    assert outcome.code in (6, 7)
+    if outcome.code == 7:
+        import re
+
+        assert re.search(rf"squares measure {measured}\.\d mm instead of {1000 * square_m:.1f} mm", outcome.err)
+
+
+def test_width_and_height_swapped_are_found_in_the_profile_already(lce_rig, session):
+    edit_profile(session, board__width_m=0.6, board__height_m=0.8)
+    outcome = lce_rig("calibrate", session)
+    assert outcome.code == 4
+    assert "does not fit on a plate 0.6 x 0.8 m" in outcome.err
+
+
+def test_intrinsics_of_another_resolution_are_named_with_both_sizes(lce_rig, session):
+    camera = "cameras__davis__"
+    edit_profile(
+        session,
+        **{
+            camera + "resolution_px": [692, 520],
+            camera + "intrinsics__cx_px": 345.0,
+            camera + "intrinsics__cy_px": 253.0,
+        },
+    )
+    outcome = lce_rig("calibrate", session)
+    assert outcome.code == 6
+    assert "346x260" in outcome.err
+    assert "692x520" in outcome.err
+
+
+def test_pictures_without_a_board_say_so(lce_rig, session):
+    import cv2
+
+    for capture in sorted((session / "captures").iterdir()):
+        picture = next(capture.glob("*.png"))
+        empty = np.full_like(cv2.imread(str(picture), cv2.IMREAD_UNCHANGED), 90)
+        shutil.copy(picture, capture / "kept.png")
+        cv2.imwrite(str(picture), empty)
+        meta = json.loads((capture / "meta.json").read_text())
+        for entry in meta["files"]:
+            if entry["file"] == picture.name:
+                entry.pop("sha256", None)
+        (capture / "meta.json").write_text(json.dumps(meta))
+    outcome = lce_rig("check", session)
+    assert outcome.code == 6
+    assert "0 of 10 captures can be used" in outcome.err
+
+
+def test_a_plate_of_the_boards_size_that_stands_in_the_room_is_not_taken_for_the_board(tmp_path):
+    """The decoy is in every scan; only the board moves with what the camera sees."""
+    session = tmp_path / "session"
+    words = ["simulate", "--rig", "rles", str(session), "--captures", "10", "--seed", "5", "--decoy"]
+    assert run(words) == 0
+    assert run(["calibrate", str(session), "--reference", str(session / "truth.json"), "--draws", "10"]) == 0
+    pair = json.loads((session / "calibration" / "result.json").read_text())["pairs"][0]
+    truth = np.array(json.loads((session / "truth.json").read_text())["T_cam_lidar"])
+    assert len(pair["captures_used"]) >= 8
+    assert np.degrees(rotation_angle(np.array(pair["T_cam_lidar"])[:3, :3], truth[:3, :3])) < 0.5
+
+
+def test_a_manifest_that_points_outside_the_session_is_refused(lce_rig, session, tmp_path):
+    (tmp_path / "secret.png").write_bytes(b"not yours")
+    manifest = session / "captures" / "000002" / "meta.json"
+    document = json.loads(manifest.read_text())
+    document["files"][0]["file"] = "../../../secret.png"
+    manifest.write_text(json.dumps(document))
+    outcome = lce_rig("check", session)
+    assert outcome.code == 0
+    assert "000002: read:" in outcome.err
+    assert "outside the capture's folder" in outcome.err

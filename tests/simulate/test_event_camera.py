@@ -1,0 +1,239 @@
+"""Event pixels follow their own law exactly when quiet, and err as they claim to when not."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Events
+from lce_rig.core.geometry import Array
+from lce_rig.simulate.event_camera import EventCamera, EventPixels, draw_pixels
+from lce_rig.simulate.options import EventNoise
+
+LENS = Intrinsics(60.0, 60.0, 31.5, 23.5, 64, 48)
+SHAPE = (48, 64)
+QUIET = EventNoise.none()
+START_NS = 1_700_000_000_000_000_000
+SECOND_NS = 1_000_000_000
+
+Radiance = NDArray[np.float32]
+
+
+def ripples(seed: int = 0) -> Callable[[float], Radiance]:
+    """Intensities that rise and fall smoothly, each pixel in its own way, by a factor of up to twenty."""
+    rng = np.random.default_rng(seed)
+    swing, rate, phase = rng.uniform(0.1, 1.5, SHAPE), rng.uniform(3, 20, SHAPE), rng.uniform(0, 6.3, SHAPE)
+    return lambda t_s: np.exp(swing * np.sin(rate * t_s + phase) - 1.6).astype(np.float32)
+
+
+def flat(value: float) -> Callable[[float], Radiance]:
+    return lambda t_s: np.full(SHAPE, value, dtype=np.float32)
+
+
+def record(
+    noise: EventNoise,
+    scene: Callable[[float], Radiance],
+    *,
+    duration_s: float = 0.5,
+    step_s: float = 0.002,
+    seed: int = 0,
+    n_packets: int = 1,
+    pixels: EventPixels | None = None,
+    offset_ns: int = 0,
+) -> list[Events]:
+    pixels = pixels or draw_pixels(LENS, noise, np.random.default_rng(seed))
+    camera = EventCamera(
+        pixels, noise, scene(0.0), START_NS, np.random.default_rng(seed), sensor="dvs", offset_ns=offset_ns
+    )
+    packets = []
+    n_steps = round(duration_s / step_s)
+    for k in range(1, n_steps + 1):
+        camera.see(scene(k * step_s), START_NS + round(1e9 * k * step_s))
+        if k % (n_steps // n_packets) == 0:
+            packets.append(camera.take())
+    return packets
+
+
+def pixel_of(events: Events) -> NDArray[np.int64]:
+    return events.y.astype(np.int64) * events.width_px + events.x
+
+
+def counts(events: Events, polarity: bool) -> Array:
+    chosen = events.polarity == polarity
+    return np.bincount(pixel_of(events)[chosen], minlength=SHAPE[0] * SHAPE[1]).astype(float)
+
+
+def logs(scene: Callable[[float], Radiance], noise: EventNoise, t_s: float) -> Array:
+    return np.log(scene(t_s).astype(np.float64).ravel() + noise.dark_radiance)
+
+
+def intervals_ns(events: Events) -> NDArray[np.int64]:
+    order = np.lexsort((events.t_ns, pixel_of(events)))
+    same = np.diff(pixel_of(events)[order]) == 0
+    return np.diff(events.t_ns[order])[same]
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.05])
+def test_quiet_pixels_reproduce_the_change_of_ln_intensity_within_one_threshold(sigma: float) -> None:
+    noise = replace(QUIET, threshold_sigma=sigma)
+    pixels, scene = draw_pixels(LENS, noise, np.random.default_rng(4)), ripples()
+    for duration_s in (0.1, 0.37, 0.5):
+        (events,) = record(noise, scene, duration_s=duration_s, pixels=pixels)
+        told = pixels.threshold_on * counts(events, True) - pixels.threshold_off * counts(events, False)
+        change = logs(scene, noise, duration_s) - logs(scene, noise, 0.0)
+        assert np.all(np.abs(change - told) <= np.maximum(pixels.threshold_on, pixels.threshold_off) + 1e-5)
+        assert len(events) > 1000
+
+
+def test_a_ramp_gives_as_many_events_of_its_sign_as_thresholds_fit_into_it() -> None:
+    def ramp(t_s: float) -> Radiance:
+        left = np.arange(SHAPE[1]) < 32
+        up = 0.1 * np.exp(4.01 * t_s * 0.30)
+        down = 0.1 * np.exp(-4.01 * t_s * 0.25)
+        return np.where(left, up, down).astype(np.float32) * np.ones(SHAPE, dtype=np.float32)
+
+    noise = replace(QUIET, dark_radiance=0.0)
+    (events,) = record(noise, ramp, duration_s=1.0)
+    assert np.all(events.polarity == (events.x < 32))
+    assert np.all(counts(events, True) + counts(events, False) == 4)
+    expected_s = np.arange(1, 5) / 4.01
+    first = events.select(pixel_of(events) == 0)
+    assert np.allclose(1e-9 * (first.t_ns - START_NS), expected_s, atol=1e-4)
+
+
+def test_stamps_lie_between_the_subframes_where_the_ramp_crosses() -> None:
+    scene = ripples(3)
+    coarse, fine = (record(QUIET, scene, duration_s=0.2, step_s=s)[0] for s in (0.004, 0.0005))
+    assert len(coarse) == pytest.approx(len(fine), rel=0.01)
+    first_s = []
+    for events in (coarse, fine):
+        pixel, index = np.unique(pixel_of(events), return_index=True)
+        when = np.full(SHAPE[0] * SHAPE[1], np.nan)
+        when[pixel] = 1e-9 * (events.t_ns[index] - START_NS)
+        first_s.append(when)
+    late_s = first_s[0] - first_s[1]
+    assert np.nanmedian(np.abs(late_s)) < 1e-4, "far below the coarse step of 4 ms"
+
+
+def test_events_come_in_order_of_whole_microseconds_across_packets() -> None:
+    packets = record(EventNoise(), ripples(), n_packets=10)
+    t_ns = np.concatenate([packet.t_ns for packet in packets])
+    assert np.all(np.diff(t_ns) >= 0)
+    assert np.all(t_ns % 1000 == 0)
+    assert t_ns[0] >= START_NS and t_ns[-1] <= START_NS + SECOND_NS // 2
+    assert {packet.sensor for packet in packets} == {"dvs"}
+    assert {(packet.width_px, packet.height_px) for packet in packets} == {(64, 48)}
+    assert max(int(packet.x.max()) for packet in packets) == 63
+
+
+def test_packets_hold_what_one_recording_would() -> None:
+    (whole,) = record(QUIET, ripples())
+    parts = record(QUIET, ripples(), n_packets=5)
+    assert np.array_equal(np.concatenate([part.t_ns for part in parts]), whole.t_ns)
+    assert np.array_equal(np.concatenate([part.x for part in parts]), whole.x)
+
+
+def test_no_pixel_fires_within_its_refractory_period() -> None:
+    fast = ripples(1)
+    noise = EventNoise(refractory_s=0.004, noise_hz=20.0, threshold_on=0.1, threshold_off=0.1)
+    packets = record(noise, lambda t_s: fast(4 * t_s), n_packets=7)
+    together = [np.concatenate([getattr(p, k) for p in packets]) for k in ("t_ns", "x", "y", "polarity")]
+    events = Events("dvs", *together, 64, 48)
+    assert len(events) > 10_000
+    assert intervals_ns(events).min() >= 4_000_000 - 1000
+    free = record(replace(noise, refractory_s=0.0), lambda t_s: fast(4 * t_s))[0]
+    assert np.mean(intervals_ns(free) < 4_000_000) > 0.1
+
+
+def test_a_pixel_blind_for_a_while_compares_against_what_it_sees_when_released() -> None:
+    # ln rises by 10 a second; threshold 0.25 after 25 ms, blind for 15 ms: an event every 40 ms.
+    noise = replace(QUIET, threshold_on=0.25, dark_radiance=0.0, refractory_s=0.015)
+    (events,) = record(noise, lambda t_s: 0.01 * np.exp(10 * np.float32(t_s)) * flat(1.0)(0), duration_s=0.4)
+    expected_ns = 1_000_000 * (25 + 40 * np.arange(10))
+    one = events.select(pixel_of(events) == 77)
+    assert np.allclose(one.t_ns - START_NS, expected_ns, atol=20_000)
+
+
+def test_slow_pixels_lag_behind_and_dark_ones_more() -> None:
+    def step(level: float) -> Callable[[float], Radiance]:
+        return lambda t_s: flat(level if t_s <= 0.01 else 1.3 * level)(t_s)
+
+    delay_s = []
+    for level in (0.7, 0.1):
+        noise = replace(QUIET, cutoff_hz=50.0, threshold_on=0.1, dark_radiance=0.0)
+        (events,) = record(noise, step(level), duration_s=0.2, step_s=0.001)
+        assert np.all(counts(events, True) == 2) and events.polarity.all()
+        delay_s.append(1e-9 * (events.t_ns[-1] - START_NS) - 0.01)
+    # 1 - exp(-t/tau) = 0.2 / ln 1.3, with 1 / tau = 2 pi 50 Hz (0.1 + 0.9 I) after the step.
+    expected = [-np.log(1 - 0.2 / np.log(1.3)) / (2 * np.pi * 50 * (0.1 + 0.9 * 1.3 * i)) for i in (0.7, 0.1)]
+    assert np.allclose(delay_s, expected, atol=1e-3)
+
+
+def test_leaks_are_on_events_at_their_rate_and_not_in_step() -> None:
+    noise = replace(QUIET, leak_hz=2.0)
+    (events,) = record(noise, flat(0.3), duration_s=2.0, step_s=0.01)
+    assert events.polarity.all()
+    assert len(events) / 2.0 / np.prod(SHAPE) == pytest.approx(2.0, rel=0.03)
+    per_tenth = np.histogram(events.t_ns, 20)[0]
+    assert per_tenth.min() > 0.8 * per_tenth.max()
+
+
+def test_noise_comes_at_its_rate_and_more_of_it_in_the_dark() -> None:
+    noise = replace(QUIET, noise_hz=10.0)
+    halves = np.where(np.arange(SHAPE[1]) < 32, 0.0, 1.0).astype(np.float32) * np.ones(SHAPE, np.float32)
+    (events,) = record(noise, lambda t_s: halves, duration_s=2.0, step_s=0.05)
+    rate_hz = [np.sum((events.x < 32) == dark) / (2.0 * np.prod(SHAPE) / 2) for dark in (True, False)]
+    assert rate_hz == pytest.approx([20.0, 10.0], rel=0.05)
+    assert events.polarity.mean() == pytest.approx(0.5, abs=0.02)
+
+
+def test_hot_pixels_are_the_sensors_own_and_fire_on_events() -> None:
+    noise = replace(QUIET, hot_share=0.004, hot_hz=(50.0, 200.0))
+    pixels = draw_pixels(LENS, noise, np.random.default_rng(9))
+    hot = np.flatnonzero(pixels.hot_hz)
+    assert len(hot) == 12
+    for seed in (0, 1):
+        (events,) = record(noise, flat(0.3), duration_s=2.0, step_s=0.05, pixels=pixels, seed=seed)
+        assert set(np.unique(pixel_of(events))) == set(hot)
+        assert events.polarity.mean() > 0.9
+        assert counts(events, True).sum() + counts(events, False).sum() == pytest.approx(
+            2.0 * pixels.hot_hz.sum(), rel=0.15
+        )
+
+
+def test_thresholds_spread_from_pixel_to_pixel_and_from_event_to_event() -> None:
+    noise = replace(QUIET, threshold_sigma=0.04)
+    pixels = draw_pixels(LENS, noise, np.random.default_rng(0))
+    assert pixels.threshold_on.mean() == pytest.approx(noise.threshold_on, abs=0.004)
+    assert pixels.threshold_on.std() == pytest.approx(0.04, rel=0.05)
+    assert abs(np.corrcoef(pixels.threshold_on, pixels.threshold_off)[0, 1]) < 0.1
+
+    def rise(t_s: float) -> Radiance:
+        return 0.01 * np.exp(np.float32(10 * t_s)) * flat(1.0)(0)
+
+    steady, shaky = (
+        record(replace(QUIET, dark_radiance=0.0, event_sigma=s), rise, duration_s=0.4)[0] for s in (0.0, 0.03)
+    )
+    assert intervals_ns(steady).std() < 1e5
+    assert intervals_ns(shaky).std() * 10e-9 == pytest.approx(0.03, rel=0.1)
+
+
+def test_stamps_carry_the_offset_of_the_cameras_clock() -> None:
+    plain, shifted = (record(QUIET, ripples(), offset_ns=offset)[0] for offset in (0, -15_000_000))
+    assert np.array_equal(shifted.t_ns, plain.t_ns - 15_000_000)
+    assert np.array_equal(shifted.x, plain.x)
+
+
+def test_the_same_seed_gives_the_same_bytes() -> None:
+    one, same, other = (record(EventNoise(noise_hz=5.0), ripples(), seed=s)[0] for s in (4, 4, 5))
+    for column in ("t_ns", "x", "y", "polarity"):
+        assert getattr(one, column).tobytes() == getattr(same, column).tobytes()
+    assert one.t_ns.tobytes() != other.t_ns.tobytes()
+
+
+def test_a_camera_that_sees_nothing_change_is_silent_without_noise() -> None:
+    (events,) = record(QUIET, flat(0.5))
+    assert len(events) == 0 and events.t_ns.dtype == np.int64 and events.host_ns is None

@@ -1,0 +1,146 @@
+"""Hands move the board smoothly, at the speed asked for, and through its placements."""
+
+import numpy as np
+import pytest
+
+from lce_rig.core.board import Board
+from lce_rig.core.data import Scan
+from lce_rig.core.geometry import Array, difference, exp_so3, invert, pose, rotation_angle
+from lce_rig.simulate.lidar import VLP16, simulate_scan
+from lce_rig.simulate.motion import Trajectory, carry_board, hold_board, sway_board
+from lce_rig.simulate.options import HandMotion, LidarNoise
+from lce_rig.simulate.scene import Raycaster, Scene
+
+from .conftest import board_before_lidar
+
+ANCHOR_NS = 1_700_000_000_050_000_000
+BEFORE_NS = ANCHOR_NS + 1_000_000 * np.arange(-1000, 201, 5)
+STEADY = HandMotion(speed_mps=(0.3, 0.3), tremor_m=0.0)
+
+
+def sway(hand: HandMotion, seed: int) -> Trajectory:
+    return sway_board(board_before_lidar(2.0), ANCHOR_NS, hand, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_swaying_board_passes_its_placement_exactly(seed: int) -> None:
+    trajectory = sway(HandMotion(), seed)
+    assert np.allclose(trajectory.at(ANCHOR_NS), board_before_lidar(2.0), atol=1e-12)
+    assert trajectory.at(BEFORE_NS).shape == (len(BEFORE_NS), 4, 4)
+    assert np.allclose(trajectory.at(BEFORE_NS)[7], trajectory.at(int(BEFORE_NS[7])), atol=1e-15)
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 0.05, 0.3])
+def test_speed_is_the_one_asked_for_over_the_second_before(speed_mps: float) -> None:
+    for seed in range(4):
+        trajectory = sway(HandMotion(speed_mps=(speed_mps, speed_mps), tremor_m=0.0), seed)
+        rms_mps = np.sqrt(np.mean(trajectory.speed_mps(BEFORE_NS) ** 2))
+        assert rms_mps == pytest.approx(speed_mps, rel=0.02, abs=1e-6)
+
+
+def test_speeds_fill_their_range_from_still_to_fast() -> None:
+    means = [sway(HandMotion(), seed).speed_mps(BEFORE_NS).mean() for seed in range(40)]
+    assert min(means) < 0.04 and 0.24 < max(means) < 0.32
+
+
+def test_motion_is_smooth_and_stays_near_the_placement() -> None:
+    for seed in range(8):
+        T = sway(STEADY, seed).at(BEFORE_NS)
+        acceleration = np.diff(T[:, :3, 3], 2, axis=0) / 0.005**2
+        # A sway of 1.2 Hz at 0.3 m/s is accelerated by 2 pi 1.2 Hz 0.3 m/s sqrt 2 at most.
+        assert np.linalg.norm(acceleration, axis=1).max() < 3.5
+        assert np.linalg.norm(T[:, :3, 3] - T[200, :3, 3], axis=1).max() < 0.35
+        assert np.degrees(rotation_angle(T[:, :3, :3], T[200, :3, :3])).max() < 15
+
+
+def test_hands_move_the_board_sideways_more_than_towards_the_sensors() -> None:
+    ways = [np.ptp(sway(STEADY, seed).at(BEFORE_NS)[:, :3, 3], axis=0) for seed in range(30)]
+    depth, left, up = np.mean(ways, axis=0)
+    assert depth < 0.6 * min(left, up)
+
+
+def test_a_trembling_hand_moves_by_its_amplitude_many_times_a_second() -> None:
+    trajectory = sway(HandMotion(speed_mps=(0.0, 0.0), tremor_m=0.001), 3)
+    height = trajectory.at(BEFORE_NS)[:, 2, 3]
+    turns = np.sum(np.diff(np.sign(np.diff(height))) != 0)
+    assert 8 < turns < 24
+    assert 1e-5 < np.ptp(height) < 0.008
+
+
+def test_a_held_board_stays_to_the_last_bit() -> None:
+    T = board_before_lidar(2.0)
+    assert hold_board(T).at(BEFORE_NS).tobytes() == np.broadcast_to(T, (len(BEFORE_NS), 4, 4)).tobytes()
+    assert hold_board(T).speed_mps(ANCHOR_NS) == 0.0
+
+
+def test_a_carried_board_rests_at_each_placement_and_never_jumps() -> None:
+    placements = [board_before_lidar(2.0), board_before_lidar(3.0, roll_deg=30.0, yaw_deg=25.0)]
+    placements.append(
+        pose(placements[0][:3, :3] @ exp_so3(np.array([0.3, -0.4, 0.1])), np.array([1.5, 0.7, 1.2]))
+    )
+    hand = HandMotion(speed_mps=(0.0, 0.0), tremor_m=0.0, rest_s=0.5)
+    trajectory = carry_board(placements, ANCHOR_NS, hand, np.random.default_rng(0))
+    for k, T in enumerate(placements):
+        for t_ns in (trajectory.arrival_ns[k], trajectory.departure_ns[k]):
+            assert np.allclose(trajectory.at(t_ns), T, atol=1e-9)
+    times_ns = np.arange(ANCHOR_NS, trajectory.departure_ns[-1] + 1_000_000_000, 2_000_000)
+    assert trajectory.speed_mps(times_ns).max() <= hand.carry_mps * 1.001
+    step = difference(trajectory.at(times_ns[1:]), trajectory.at(times_ns[:-1]))
+    assert np.linalg.norm(step[:, 3:], axis=1).max() / 0.002 < np.radians(61)
+
+
+def test_a_resting_hand_still_sways() -> None:
+    trajectory = carry_board([board_before_lidar(2.0)], ANCHOR_NS, HandMotion(), np.random.default_rng(0))
+    speeds = trajectory.speed_mps(ANCHOR_NS + 10_000_000 * np.arange(100))
+    assert 0.02 < speeds.mean() < 0.2
+
+
+@pytest.mark.parametrize("speed_mps", [(-0.1, 0.2), (0.3, 0.1)])
+def test_speeds_that_cannot_be_meant_are_refused(speed_mps: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="speed_mps"):
+        HandMotion(speed_mps=speed_mps)
+
+
+def moving_scan(board: Board, T_world_lidar: Array, trajectory: Trajectory, noise: LidarNoise) -> Scan:
+    stamp_ns = ANCHOR_NS - 50_000_000
+    scene = Scene(Raycaster(()), [], board, trajectory.at(ANCHOR_NS))
+    return simulate_scan(
+        scene,
+        T_world_lidar,
+        VLP16,
+        noise,
+        np.random.default_rng(0),
+        board_at=trajectory.at,
+        stamp_ns=stamp_ns,
+    )
+
+
+def heights_m(scan: Scan, T_world_lidar: Array, T_world_board: Array) -> Array:
+    """Distance of each point from the plane of its own pose (N, 4, 4), or of one for all."""
+    T_board_lidar = invert(T_world_board) @ T_world_lidar
+    along = np.broadcast_to(T_board_lidar[..., 2, :3], scan.points.shape)
+    return np.einsum("nj,nj->n", along, scan.points) + T_board_lidar[..., 2, 3]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_lidar_meets_a_moving_board_where_it_is_at_each_firing(
+    board: Board, T_world_lidar: Array, seed: int
+) -> None:
+    trajectory = sway(HandMotion(speed_mps=(0.5, 0.5), turn_deg_s=40.0), seed)
+    scan = moving_scan(board, T_world_lidar, trajectory, LidarNoise.none())
+    assert scan.offset_ns is not None and scan.stamp_ns is not None and len(scan.points) > 500
+    own = heights_m(scan, T_world_lidar, trajectory.at(scan.stamp_ns + scan.offset_ns))
+    assert np.abs(own).max() < 1e-3
+    at_stamp = heights_m(scan, T_world_lidar, trajectory.at(scan.stamp_ns))
+    assert np.abs(at_stamp).max() > 5 * np.abs(own).max()
+
+
+def test_a_board_that_does_not_move_gives_the_scan_of_a_still_one(board: Board, T_world_lidar: Array) -> None:
+    trajectory = hold_board(board_before_lidar(2.0))
+    moving = moving_scan(board, T_world_lidar, trajectory, LidarNoise())
+    scene = Scene(Raycaster(()), [], board, board_before_lidar(2.0))
+    still = simulate_scan(
+        scene, T_world_lidar, VLP16, LidarNoise(), np.random.default_rng(0), stamp_ns=ANCHOR_NS - 50_000_000
+    )
+    assert moving.points.tobytes() == still.points.tobytes()
+    assert moving.intensity.tobytes() == still.intensity.tobytes()

@@ -1,0 +1,253 @@
+"""Captures of a moving board: pictures, scans and events tell of one board at their own times."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Image
+from lce_rig.core.errors import ProfileError
+from lce_rig.core.geometry import Array, transform
+from lce_rig.rig import Rig
+from lce_rig.simulate import (
+    CameraNoise,
+    EventNoise,
+    HandMotion,
+    LidarNoise,
+    SimulatedCapture,
+    SimulationOptions,
+    simulate_captures,
+    truth_extrinsics,
+)
+from lce_rig.simulate.stage import PLACEMENT, set_stage
+from lce_rig.simulate.takes import MovingBoard
+
+from .conftest import make_rig
+
+MOVING = SimulationOptions(carrier="person", motion="moving", hand=HandMotion(speed_mps=(0.15, 0.3)))
+QUIET = replace(
+    MOVING,
+    carrier="none",
+    lidar=LidarNoise.none(),
+    camera=replace(CameraNoise.none(), blur_px=0.6),
+    events=EventNoise.none(),
+    hand=HandMotion(speed_mps=(0.3, 0.3)),
+    distance_m=(1.4, 2.0),
+)
+BRIEF = replace(QUIET, events_span_s=(0.2, 0.1))
+CHANNELS = {"frames": {"kind": "frames"}, "events": {"kind": "events"}}
+
+
+def moving_rig(**channels: Any) -> Rig:
+    camera = make_rig().cameras["cam"].model_dump()
+    return make_rig(cameras={"cam": {**camera, "channels": channels or CHANNELS}})
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return moving_rig()
+
+
+@pytest.fixture(scope="module")
+def captures(rig: Rig) -> list[SimulatedCapture]:
+    return list(simulate_captures(rig, n_captures=2, seed=5, options=MOVING))
+
+
+@pytest.fixture(scope="module")
+def quiet(rig: Rig) -> SimulatedCapture:
+    return next(simulate_captures(rig, n_captures=1, seed=6, options=BRIEF))
+
+
+def stamp_of(image: Image) -> int:
+    assert image.stamp_ns is not None
+    return image.stamp_ns
+
+
+def found_corners(rig: Rig, image: Image, T_cam_board: Array) -> tuple[Array, Array]:
+    """Corners refined in a picture from where the truth has them, and the truth (N, 2)."""
+    import cv2
+
+    corners = transform(T_cam_board, rig.board.to_board().corners())
+    truth, _ = rig.cameras["cam"].to_intrinsics().project(corners)
+    start = truth.astype(np.float32).reshape(-1, 1, 2)
+    found = cv2.cornerSubPix(image.grey, start, (4, 4), (-1, -1), (3, 50, 1e-4)).reshape(-1, 2)
+    return found, truth
+
+
+def test_the_board_passes_its_placement_when_the_lidar_looks_ahead(
+    rig: Rig, captures: list[SimulatedCapture]
+) -> None:
+    stage = set_stage(rig, 5, MOVING)
+    for capture in captures:
+        middle_ns = (capture.scans[0].stamp_ns or 0) + 50_000_000
+        T_world_board = stage.place(capture.index, stage.rng(capture.index, PLACEMENT))
+        assert np.allclose(capture.trajectory.at(middle_ns), T_world_board, atol=1e-12)
+
+
+def test_truth_at_any_time_is_the_same_for_camera_and_lidar(
+    rig: Rig, captures: list[SimulatedCapture]
+) -> None:
+    T_cam_lidar = truth_extrinsics(rig, 5, MOVING)["cam", "lidar"]
+    for capture in captures:
+        scan_ns = capture.scans[0].stamp_ns or 0
+        times_ns = scan_ns + np.array([-300_000_000, 0, 70_000_000])
+        T_lidar_board = capture.T_sensor_board("lidar", times_ns)
+        assert np.allclose(capture.T_sensor_board("cam", times_ns), T_cam_lidar @ T_lidar_board, atol=1e-12)
+        assert np.array_equal(capture.T_lidar_board["lidar"], capture.T_sensor_board("lidar", scan_ns))
+        picture_ns = stamp_of(capture.images[0])
+        assert np.array_equal(capture.T_cam_board["cam"], capture.T_sensor_board("cam", picture_ns))
+
+
+def test_pictures_and_events_surround_the_scan(captures: list[SimulatedCapture]) -> None:
+    phases_ns = []
+    for capture in captures:
+        scan_ns, events = capture.scans[0].stamp_ns or 0, capture.events[0]
+        phases_ns.append(stamp_of(capture.images[0]) - scan_ns - 50_000_000)
+        assert abs(phases_ns[-1]) <= 25_000_000
+        assert (events.sensor, events.width_px, events.height_px) == ("cam", 346, 260)
+        assert events.t_ns[0] == pytest.approx(scan_ns - 1.2e9, abs=2e7)
+        assert events.t_ns[-1] == pytest.approx(scan_ns + 0.15e9, abs=2e7)
+        assert np.all(np.diff(events.t_ns) >= 0) and np.all(events.t_ns % 1000 == 0)
+        assert capture.scans[0].offset_ns is not None
+    assert np.ptp(phases_ns) > 1_000_000, "the camera runs freely"
+
+
+def test_event_rates_are_those_of_a_davis346(captures: list[SimulatedCapture]) -> None:
+    for capture in captures:
+        events = capture.events[0]
+        rate_hz = len(events) / 1.35
+        assert 5e4 < rate_hz < 3e6
+        assert 0.3 < events.polarity.mean() < 0.7
+        per_pixel = np.bincount(events.y.astype(int) * 346 + events.x, minlength=346 * 260) / 1.35
+        quiet_hz = np.mean(np.sort(per_pixel)[: len(per_pixel) // 2])
+        assert quiet_hz < 0.5, "where nothing moves there is little"
+        assert np.sum(per_pixel > 9.0) >= 5 and per_pixel.max() > 50
+
+
+def test_most_events_lie_where_the_board_and_its_carrier_move(
+    rig: Rig, captures: list[SimulatedCapture]
+) -> None:
+    board, lens = rig.board.to_board(), rig.cameras["cam"].to_intrinsics()
+    for capture in captures:
+        scan_ns = capture.scans[0].stamp_ns or 0
+        events = capture.events[0].between(scan_ns + 40_000_000, scan_ns + 60_000_000)
+        T_cam_board = capture.T_sensor_board("cam", scan_ns + 50_000_000)
+        outline, _ = lens.project(transform(T_cam_board, board.outline()))
+        low, high = outline.min(axis=0) - 3, outline.max(axis=0) + 3
+        xy = np.stack([events.x, events.y], axis=1)
+        area = np.prod(high - low) / (346 * 260)
+        assert np.all((xy > low) & (xy < high), axis=1).mean() > max(0.5, 1.5 * area)
+
+
+def test_quiet_events_reproduce_what_the_camera_saw(rig: Rig, quiet: SimulatedCapture) -> None:
+    stage = set_stage(rig, 6, BRIEF)
+    view = MovingBoard(stage, quiet.trajectory, (0,)).view("cam")
+    noise, events = BRIEF.events, quiet.events[0]
+    scan_ns = quiet.scans[0].stamp_ns or 0
+    start, end = (
+        np.log(view.at(scan_ns + dt).astype(float).ravel() + noise.dark_radiance)
+        for dt in (-200_000_000, 100_000_000)
+    )
+    step = np.where(events.polarity, noise.threshold_on, -noise.threshold_off)
+    told = np.bincount(events.y.astype(int) * 346 + events.x, weights=step, minlength=346 * 260)
+    assert np.abs(end - start - told).max() <= max(noise.threshold_on, noise.threshold_off) + 1e-4
+    assert np.abs(told).max() > 2.0
+
+
+def test_points_lie_on_the_board_at_their_own_firing_times(rig: Rig, quiet: SimulatedCapture) -> None:
+    scan, board = quiet.scans[0], rig.board.to_board()
+    assert scan.stamp_ns is not None and scan.offset_ns is not None
+    T_lidar_board = quiet.T_sensor_board("lidar", scan.stamp_ns + scan.offset_ns)
+    xyz = np.einsum("nji,nj->ni", T_lidar_board[:, :3, :3], scan.points - T_lidar_board[:, :3, 3])
+    on_board = np.all(np.abs(xyz) < [board.width_m / 2 - 0.02, board.height_m / 2 - 0.02, 0.05], axis=1)
+    assert on_board.sum() > 200
+    assert np.abs(xyz[on_board, 2]).max() < 1e-3
+
+
+def test_stamps_mark_the_middle_of_the_exposure(rig: Rig) -> None:
+    options = replace(BRIEF, exposure_s=0.02, events_span_s=(0.0, 0.01))
+    for capture in simulate_captures(rig, n_captures=2, seed=8, options=options):
+        picture_ns = stamp_of(capture.images[0])
+        found, truth = found_corners(rig, capture.images[0], capture.T_cam_board["cam"])
+        assert np.sqrt(np.mean((found - truth) ** 2)) < 0.08
+        early = capture.T_sensor_board("cam", picture_ns - 10_000_000)
+        _, at_start = found_corners(rig, capture.images[0], early)
+        assert np.linalg.norm((found - at_start).mean(axis=0)) > 5 * np.linalg.norm(
+            (found - truth).mean(axis=0)
+        )
+
+
+def test_blur_grows_with_speed(rig: Rig) -> None:
+    sharpness = []
+    for speed_mps in (0.0, 0.3, 0.6):
+        hand = HandMotion(speed_mps=(speed_mps, speed_mps), turn_deg_s=0.0, tremor_m=0.0)
+        options = replace(BRIEF, exposure_s=0.05, hand=hand, events_span_s=(0.0, 0.01), frame_every_s=0.001)
+        capture = next(simulate_captures(rig, n_captures=1, seed=8, options=options))
+        corners = transform(capture.T_cam_board["cam"], rig.board.to_board().corners())
+        (u0, v0), (u1, v1) = (
+            f(rig.cameras["cam"].to_intrinsics().project(corners)[0], axis=0).astype(int)
+            for f in (np.min, np.max)
+        )
+        board = capture.images[0].grey[v0:v1, u0:u1].astype(float)
+        sharpness.append(np.mean(np.diff(board, axis=0) ** 2) + np.mean(np.diff(board, axis=1) ** 2))
+    assert sharpness[0] > 1.05 * sharpness[1] > 1.1 * sharpness[2]
+
+
+def test_stamps_read_more_than_the_rigs_clock_by_their_channels_offset(
+    rig: Rig, quiet: SimulatedCapture
+) -> None:
+    late = replace(BRIEF, frame_offset_s=0.12, event_offset_s=-0.015)
+    capture = next(simulate_captures(rig, n_captures=1, seed=6, options=late))
+    assert stamp_of(capture.images[0]) == stamp_of(quiet.images[0])
+    shown = capture.T_sensor_board("cam", stamp_of(capture.images[0]) - 120_000_000)
+    assert np.array_equal(capture.T_cam_board["cam"], shown)
+    found, truth = found_corners(rig, capture.images[0], shown)
+    assert np.sqrt(np.mean((found - truth) ** 2)) < 0.08
+    both = capture.events[0], quiet.events[0]
+    assert [events.t_ns[0] for events in both] == pytest.approx([both[1].t_ns[0]] * 2, abs=2e7)
+    # The same flash of the scene is told 15 ms earlier: activity follows the speed, shifted.
+    scan_ns = quiet.scans[0].stamp_ns or 0
+    edges = scan_ns + 1_000_000 * np.arange(-150, 90, 10)
+    shifted, plain = np.histogram(both[0].t_ns, edges - 15_000_000)[0], np.histogram(both[1].t_ns, edges)[0]
+    assert np.corrcoef(shifted[5:], plain[5:])[0, 1] > 0.95
+    assert capture.scans[0].points.tobytes() == quiet.scans[0].points.tobytes()
+
+
+def test_flickering_lamps_make_a_storm_of_events_everywhere(rig: Rig, quiet: SimulatedCapture) -> None:
+    options = replace(BRIEF, events_span_s=(0.03, 0.03), flicker_depth=0.3)
+    events = next(simulate_captures(rig, n_captures=1, seed=6, options=options)).events[0]
+    assert len(events) / 0.06 > 10 * len(quiet.events[0]) / 0.3
+    per_pixel = np.bincount(events.y.astype(int) * 346 + events.x, minlength=346 * 260)
+    assert np.mean(per_pixel > 0) > 0.95
+    # ln(1.3 / 0.7) = 0.62 twice a cycle: at least one event up and one down in each of six cycles.
+    assert 12 <= np.median(per_pixel) <= 6 * 5
+    edges = (quiet.scans[0].stamp_ns or 0) + 2_500_000 * np.arange(-12, 13)
+    on, off = (np.histogram(events.t_ns[events.polarity == p], edges)[0] for p in (True, False))
+    is_rising = np.tile([True, False, False, True], 6)
+    assert on[is_rising].sum() > 0.97 * on.sum() and off[~is_rising].sum() > 0.97 * off.sum()
+
+
+def test_the_same_seed_gives_the_same_bytes(rig: Rig, quiet: SimulatedCapture) -> None:
+    (again,) = simulate_captures(rig, n_captures=1, seed=6, options=BRIEF)
+    assert again.images[0].pixels.tobytes() == quiet.images[0].pixels.tobytes()
+    assert again.scans[0].points.tobytes() == quiet.scans[0].points.tobytes()
+    for column in ("t_ns", "x", "y", "polarity"):
+        assert getattr(again.events[0], column).tobytes() == getattr(quiet.events[0], column).tobytes()
+
+
+def test_a_camera_of_events_alone_is_enough_for_a_moving_board_only() -> None:
+    rig = moving_rig(dvs={"kind": "events"})
+    capture = next(
+        simulate_captures(rig, n_captures=1, seed=6, options=replace(BRIEF, events_span_s=(0.02, 0.0)))
+    )
+    assert capture.images == [] and len(capture.events) == 1
+    with pytest.raises(ProfileError, match="no camera has a channel of kind frames"):
+        next(simulate_captures(rig, n_captures=1, seed=6, options=replace(BRIEF, motion="still")))
+
+
+@pytest.mark.parametrize("name", ["rlfs", "rles", "sss"])
+def test_any_rigs_board_is_held_still_unless_it_is_told_to_move(name: str) -> None:
+    assert SimulationOptions.for_rig(name).motion == "still"
+    moving = SimulationOptions.for_rig(name, motion="moving")
+    assert moving == replace(SimulationOptions.for_rig(name), motion="moving")

@@ -1,0 +1,112 @@
+"""A recording yields samples in order, of one board, and survives the file formats of event cameras."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.geometry import invert, transform
+from lce_rig.rig import Rig
+from lce_rig.simulate import HandMotion, SimulatedRecording, SimulationOptions, simulate_recording
+from lce_rig.simulate.recording import stamp_of
+from lce_rig.sources.events import open_events
+from lce_rig.sources.events.aedat4_writer import write_aedat4
+from lce_rig.sources.events.bag_writer import write_event_bag
+
+from .test_moving_captures import found_corners, moving_rig
+
+OPTIONS = SimulationOptions(carrier="person", hand=HandMotion(rest_s=0.1, carry_mps=2.0), exposure_s=0.002)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return moving_rig()
+
+
+@pytest.fixture(scope="module")
+def recording(rig: Rig) -> SimulatedRecording:
+    return simulate_recording(rig, duration_s=0.6, seed=3, options=OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def samples(recording: SimulatedRecording) -> list[Image | Scan | Events]:
+    return list(recording)
+
+
+@pytest.fixture(scope="module")
+def packets(samples: list[Image | Scan | Events]) -> list[Events]:
+    return [sample for sample in samples if isinstance(sample, Events)]
+
+
+def test_samples_come_in_order_at_each_sensors_own_rate(
+    recording: SimulatedRecording, samples: list[Image | Scan | Events]
+) -> None:
+    assert np.all(np.diff([stamp_of(sample) for sample in samples]) >= 0)
+    counts = {kind: sum(isinstance(sample, kind) for sample in samples) for kind in (Image, Scan, Events)}
+    assert counts == {Image: 12, Scan: 6, Events: 30}
+    assert stamp_of(samples[0]) >= recording.start_ns
+    assert max(stamp_of(sample) for sample in samples) < recording.end_ns == recording.start_ns + 600_000_000
+
+
+def test_packets_join_into_one_stream(recording: SimulatedRecording, packets: list[Events]) -> None:
+    t_ns = np.concatenate([packet.t_ns for packet in packets])
+    assert np.all(np.diff(t_ns) >= 0)
+    assert max(packet.t_ns[-1] - packet.t_ns[0] for packet in packets) <= 20_000_000
+    assert 5e4 < len(t_ns) / 0.6 < 3e6
+
+
+def test_pictures_and_scans_show_the_board_where_the_truth_has_it(
+    rig: Rig, recording: SimulatedRecording, samples: list[Image | Scan | Events]
+) -> None:
+    lens, n_seen = rig.cameras["cam"].to_intrinsics(), 0
+    for sample in samples:
+        if isinstance(sample, Image):
+            T_cam_board = recording.T_sensor_board("cam", stamp_of(sample))
+            truth, _ = lens.project(transform(T_cam_board, rig.board.to_board().corners()))
+            if lens.is_inside(truth, 8.0).all():
+                found, truth = found_corners(rig, sample, T_cam_board)
+                assert np.median(np.abs(found - truth)) < 0.1
+                n_seen += 1
+        elif isinstance(sample, Scan):
+            assert sample.stamp_ns is not None and sample.offset_ns is not None
+            T_board_lidar = invert(recording.T_sensor_board("lidar", sample.stamp_ns + sample.offset_ns))
+            xyz = np.einsum("nij,nj->ni", T_board_lidar[:, :3, :3], sample.points) + T_board_lidar[:, :3, 3]
+            on_board = np.all(np.abs(xyz) < [0.35, 0.25, 0.045], axis=1)
+            assert on_board.sum() > 50
+            assert np.abs(np.median(xyz[on_board, 2])) < 0.01
+    assert n_seen >= 4
+
+
+def test_the_board_goes_on_to_the_next_placement(recording: SimulatedRecording) -> None:
+    assert len(recording.trajectory.arrival_ns) >= 2
+    assert recording.trajectory.departure_ns[-1] >= recording.end_ns
+
+
+def test_iterating_twice_gives_the_same_bytes(rig: Rig) -> None:
+    short = simulate_recording(rig, duration_s=0.1, seed=4, options=replace(OPTIONS, carrier="none"))
+    one, other = list(short), list(short)
+    assert len(one) == len(other) == 2 + 1 + 5
+    for first, second in zip(one, other, strict=True):
+        if isinstance(first, Events) and isinstance(second, Events):
+            assert first.t_ns.tobytes() == second.t_ns.tobytes() and first.x.tobytes() == second.x.tobytes()
+        elif isinstance(first, Image) and isinstance(second, Image):
+            assert first.pixels.tobytes() == second.pixels.tobytes()
+        else:
+            assert isinstance(first, Scan) and isinstance(second, Scan)
+            assert first.points.tobytes() == second.points.tobytes()
+
+
+@pytest.mark.parametrize("name", ["events.aedat4", "events.bag", "events_ros2"])
+def test_events_come_back_from_files_as_they_were(tmp_path: Path, packets: list[Events], name: str) -> None:
+    path = tmp_path / name
+    if name.endswith(".aedat4"):
+        write_aedat4(path, packets)
+    else:
+        write_event_bag(path, packets)
+    read = list(open_events(path, sensor="cam"))
+    for column in ("t_ns", "x", "y", "polarity"):
+        back, given = (np.concatenate([getattr(part, column) for part in parts]) for parts in (read, packets))
+        assert np.array_equal(back, given)
+    assert {(part.sensor, part.width_px, part.height_px) for part in read} == {("cam", 346, 260)}

@@ -1,0 +1,122 @@
+"""What event pixels see agrees in geometry and brightness with the pictures of the renderer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.simulate.backdrop import Backdrop
+from lce_rig.simulate.camera import render_image, render_radiance
+from lce_rig.simulate.carrier_layer import GREY
+from lce_rig.simulate.carriers import build_carrier
+from lce_rig.simulate.motion import Trajectory, hold_board, sway_board
+from lce_rig.simulate.options import CameraNoise, Carrier, HandMotion
+from lce_rig.simulate.room import Room
+from lce_rig.simulate.scene import Scene
+from lce_rig.simulate.subframes import MovingView, speed_px_s
+
+from .test_camera import PLACEMENTS, QUIET
+
+T_NS = 1_700_000_000_123_000_000
+
+
+def make_view(
+    room: Room, board: Board, backdrop: Backdrop, trajectory: Trajectory, carrier: Carrier = "person"
+) -> MovingView:
+    def scene_at(t_ns: int) -> Scene:
+        T = trajectory.at(t_ns)
+        return Scene(room.raycaster, build_carrier(carrier, board, T, np.random.default_rng(0)), board, T)
+
+    return MovingView(backdrop, board, trajectory, scene_at, QUIET)
+
+
+def refined(picture: np.ndarray, truth: Array) -> Array:
+    import cv2
+
+    start = truth.astype(np.float32).reshape(-1, 1, 2) + np.float32(0.3)
+    return np.asarray(cv2.cornerSubPix(picture, start, (4, 4), (-1, -1), (3, 50, 1e-4)).reshape(-1, 2))
+
+
+@pytest.mark.parametrize("T_world_board", PLACEMENTS, ids=["near", "middle", "side"])
+def test_corners_lie_where_truth_and_pictures_have_them(
+    room: Room, board: Board, backdrop: Backdrop, T_world_board: Array
+) -> None:
+    view = make_view(room, board, backdrop, hold_board(T_world_board))
+    seen = view.at(T_NS)
+    subframe = np.rint(255 * np.clip(seen, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+    picture = render_image(view.scene_at(T_NS), backdrop, QUIET, np.random.default_rng(0)).grey
+    corners_cam = transform(invert(backdrop.T_world_cam) @ T_world_board, board.corners())
+    truth, _ = backdrop.intrinsics.project(corners_cam)
+    in_subframe, in_picture = refined(subframe, truth), refined(picture, truth)
+    assert np.sqrt(np.mean((in_subframe - truth) ** 2)) < 0.04
+    assert np.abs(in_subframe - in_picture).max() < 0.1
+
+
+def test_the_board_and_its_carrier_are_as_bright_as_in_pictures(
+    room: Room, board: Board, backdrop: Backdrop
+) -> None:
+    import cv2
+
+    view = make_view(room, board, backdrop, hold_board(PLACEMENTS[0]))
+    radiance = (render_radiance(view.scene_at(T_NS), backdrop) @ GREY).astype(np.float32)
+    expected = cv2.GaussianBlur(radiance, (0, 0), QUIET.blur_px)
+    error = np.abs(view.at(T_NS) - expected)
+    # Shadows on the room are left out of sub-frames, and hands cast some on the board.
+    assert np.mean(error > 0.1) < 0.03
+    window = view._board_window(PLACEMENTS[0])
+    assert window is not None
+    assert np.median(error[window]) < 0.02
+
+
+def test_intensities_change_without_steps_as_the_board_moves(
+    room: Room, board: Board, backdrop: Backdrop
+) -> None:
+    hand = HandMotion(speed_mps=(0.1, 0.1), tremor_m=0.0)
+    trajectory = sway_board(PLACEMENTS[1], T_NS, hand, np.random.default_rng(2))
+    view = make_view(room, board, backdrop, trajectory)
+    times_ns = T_NS + 1_000_000 * np.arange(12)
+    logs = np.log(np.stack([view.at(int(t)) for t in times_ns]).astype(float) + 0.03)
+    way_px = speed_px_s(trajectory, board, backdrop, T_NS) * 1e-3
+    assert 0.003 < way_px < 0.1
+    # An edge of ln(25) is about 2.5 px wide; the second difference of a smooth one is far below the first.
+    step, bend = np.abs(np.diff(logs, axis=0)).max(), np.abs(np.diff(logs, 2, axis=0)).max()
+    assert step < 4.0 * way_px
+    assert bend < 0.25 * step
+
+
+def test_speed_in_the_picture_is_that_of_the_outline(room: Room, board: Board, backdrop: Backdrop) -> None:
+    trajectory = sway_board(PLACEMENTS[1], T_NS, HandMotion(speed_mps=(0.2, 0.2)), np.random.default_rng(5))
+    T_cam_world = invert(backdrop.T_world_cam)
+    ends = [
+        backdrop.intrinsics.project(transform(T_cam_world @ trajectory.at(T_NS + dt), board.outline()))[0]
+        for dt in (0, 100_000)
+    ]
+    expected = np.linalg.norm(ends[1] - ends[0], axis=1).max() / 1e-4
+    assert speed_px_s(trajectory, board, backdrop, T_NS) == pytest.approx(expected, rel=0.05)
+
+
+def test_a_board_behind_a_wall_or_the_camera_is_not_seen(
+    room: Room, board: Board, backdrop: Backdrop
+) -> None:
+    from .test_camera import placed
+
+    empty = make_view(room, board, backdrop, hold_board(placed(-2.0, 0.0, 0.0, 0.0, 45.0)), "none").at(T_NS)
+    behind = make_view(room, board, backdrop, hold_board(placed(12.0, 0.0, 0.0, 0.0, 45.0)), "none").at(T_NS)
+    assert np.array_equal(empty, behind)
+
+
+def test_blur_and_vignetting_are_the_cameras(room: Room, board: Board, backdrop: Backdrop) -> None:
+    views = [make_view(room, board, backdrop, hold_board(PLACEMENTS[0])) for _ in range(3)]
+    views[1] = MovingView(
+        backdrop, board, views[1].trajectory, views[1].scene_at, replace(QUIET, blur_px=2.0)
+    )
+    dim = replace(CameraNoise.none(), blur_px=QUIET.blur_px, vignetting=0.3)
+    views[2] = MovingView(backdrop, board, views[2].trajectory, views[2].scene_at, dim)
+    sharp, soft, dimmed = (view.at(T_NS) for view in views)
+    window = views[0]._board_window(PLACEMENTS[0])
+    assert window is not None
+    steepest = [np.abs(np.diff(seen[window], axis=1)).max() for seen in (sharp, soft)]
+    assert steepest[1] < 0.6 * steepest[0]
+    assert dimmed[0, 0] / sharp[0, 0] == pytest.approx(0.7 / (1 - QUIET.vignetting), rel=0.02)
