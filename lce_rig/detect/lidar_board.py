@@ -15,7 +15,7 @@ from lce_rig.detect.lidar_segments import OrderedScan, cut_segments, order_scan
 from lce_rig.detect.lidar_template import Placement
 
 MAX_CANDIDATES = 4
-# A plate with as many rings and as little else in its plane is not outdone by plates that fit far worse.
+# A plate with as many rings and as little else in its plane is clear.
 CLEAR_RINGS = 6
 CLEAR_SHARE = 0.05
 # Beside a clear board, a plate with such a share of returns beyond its outline is a patch of a wall.
@@ -86,17 +86,15 @@ def find_lidar_boards(
     limits = Limits(max_template_m, max_rms_m, min_rings).widened(ordered.sigma_m)
     found: list[LidarBoard] = []
     misses: list[Refusal] = []
-    rival_m, max_beyond = limits.template_m, np.inf
+    max_beyond = np.inf
     for plane, origin, start in screen_plates(plates, ends, board, limits.template_m):
-        if start.error_m > rival_m:
-            break
         measured = measure_plate(ordered, scan, board, plane, origin, start, limits, beam, max_beyond)
         if isinstance(measured, Refusal):
             misses.append(measured)
         elif measured is not None:
             found.append(measured)
             if _is_clear(measured):
-                rival_m, max_beyond = min(rival_m, 2 * start.error_m + 0.005), PATCH_SHARE
+                max_beyond = PATCH_SHARE
     if found:
         return _distinct(found, board)
     if misses:

@@ -245,8 +245,6 @@ def screen_plates(
     relative = ends - plates.centre[:, None]
     placements = register_ends(relative @ plane_axes(plates.plane[:, :3]), board)
     rank = sorted(range(len(placements)), key=lambda k: placements[k].error_m)
-    # What fits far worse than the best plate is no rival of it.
-    limit_m = min(limit_m, 3 * placements[rank[0]].error_m + 0.01)
     return [
         (plates.plane[k], plates.centre[k], placements[k]) for k in rank if placements[k].error_m < limit_m
     ]

@@ -115,10 +115,11 @@ def plane_axes(normal: Array) -> Array:
     is_level = length < 1e-3
     safe = np.where(is_level, 1.0, length)
     a, b = np.where(is_level, 0.0, -y / safe), np.where(is_level, -1.0, x / safe)
-    level = np.stack([a, b, np.zeros_like(a)], axis=-1)
+    axes = np.zeros((*normal.shape, 2))
+    axes[..., 0, 0], axes[..., 1, 0] = a, b
     # n x level, written out.
-    upwards = np.stack([-z * b, z * a, x * b - y * a], axis=-1)
-    return np.stack([level, upwards], axis=-1)
+    axes[..., 0, 1], axes[..., 1, 1], axes[..., 2, 1] = -z * b, z * a, x * b - y * a
+    return axes
 
 
 def find_chords(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[Indices, Indices]:

@@ -40,7 +40,9 @@ def test_squares_of_the_wrong_size_fail_and_the_right_size_is_told(lce_rig, sess
     if outcome.code == 7:
         import re
 
-        assert re.search(rf"squares measure {measured}\.\d mm instead of {1000 * square_m:.1f} mm", outcome.err)
+        assert re.search(
+            rf"squares measure {measured}\.\d mm instead of {1000 * square_m:.1f} mm", outcome.err
+        )
 
 
 def test_width_and_height_swapped_are_found_in_the_profile_already(lce_rig, session):
