@@ -88,6 +88,7 @@ def _remembered(
 ) -> Any:
     """Look a detection up in the session's cache, or make and keep it; a damaged sample is a refusal."""
     try:
+        capture.check()
         # The content is part of the key: a capture may be removed and another take its name.
         key = f"{digest}/{capture.name}-{capture.content_sha256[:12]}.{sensor}"
         cached = session.load_cached(key)

@@ -33,9 +33,9 @@ def lce_rig(capsys):
 
 @pytest.fixture(scope="session")
 def simulated(tmp_path_factory) -> Path:
-    """A session of the rig rles with ten captures, detected once."""
+    """A session of the rig rles with sixteen captures, detected once."""
     session = tmp_path_factory.mktemp("simulated") / "session"
-    assert run(["simulate", "--rig", "rles", str(session), "--captures", "10", "--seed", "3"]) == 0
+    assert run(["simulate", "--rig", "rles", str(session), "--captures", "16", "--seed", "3"]) == 0
     assert run(["check", str(session)]) == 0
     return session
 

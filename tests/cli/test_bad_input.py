@@ -83,7 +83,7 @@ def test_pictures_without_a_board_say_so(lce_rig, session):
         (capture / "meta.json").write_text(json.dumps(meta))
     outcome = lce_rig("check", session)
     assert outcome.code == 6
-    assert "0 of 10 captures can be used" in outcome.err
+    assert "0 of 16 captures can be used" in outcome.err
 
 
 def test_a_plate_of_the_boards_size_that_stands_in_the_room_is_not_taken_for_the_board(tmp_path):

@@ -12,14 +12,14 @@ def read(path):
 def test_check_shows_a_row_a_capture_and_counts_the_usable_ones(lce_rig, simulated):
     outcome = lce_rig("check", simulated)
     assert outcome.code == 0
-    assert sum(line.startswith("0000") for line in outcome.out.splitlines()) == 10
-    assert "10 of 10 captures can be used" in outcome.err
+    assert sum(line.startswith("0000") for line in outcome.out.splitlines()) == 16
+    assert "16 of 16 captures can be used" in outcome.err
 
 
 def test_check_gives_machines_every_figure_and_cause(lce_rig, simulated):
     document = json.loads(lce_rig("check", simulated, "--json").out)
     captures = document["pairs"][0]["captures"]
-    assert len(captures) == 10
+    assert len(captures) == 16
     assert captures["000000"]["is_usable"]
     assert captures["000000"]["lidar"]["n_rings"] >= 4
     assert captures["000000"]["image"]["distance_m"] > 1
@@ -78,7 +78,7 @@ def test_verify_draws_every_capture_and_one_sheet(lce_rig, session):
     assert outcome.code == 0
     assert "mean over captures" in outcome.out
     pictures = sorted(path.name for path in (session / "calibration" / "overlays").iterdir())
-    assert pictures == [*(f"{k:06d}.png" for k in range(10)), "contact_sheet.png"]
+    assert pictures == [*(f"{k:06d}.png" for k in range(16)), "contact_sheet.png"]
 
 
 def test_verify_tells_a_wrong_extrinsic_by_its_residuals(lce_rig, session):
@@ -118,7 +118,7 @@ def test_a_nominal_extrinsic_far_off_fails_with_7_and_nothing_is_exported(lce_ri
 def test_too_few_captures_exit_with_6_and_say_how_many_are_needed(lce_rig, session):
     import shutil
 
-    for k in range(4, 10):
+    for k in range(4, 16):
         shutil.rmtree(session / "captures" / f"{k:06d}")
     outcome = lce_rig("calibrate", session)
     assert outcome.code == 6
@@ -129,7 +129,7 @@ def test_a_damaged_capture_is_named_and_the_others_still_count(lce_rig, session)
     (session / "captures" / "000004" / "lidar.pcd").write_bytes(b"# .PCD v0.7")
     outcome = lce_rig("check", session)
     assert outcome.code == 0
-    assert "9 of 10 captures can be used" in outcome.err
+    assert "15 of 16 captures can be used" in outcome.err
     assert "000004: read:" in outcome.err
     assert "lidar.pcd" in outcome.err
 
