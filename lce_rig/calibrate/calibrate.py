@@ -20,11 +20,12 @@ from lce_rig.calibrate.observability import describe_weakest, linearise, require
 from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates
 from lce_rig.calibrate.outliers import reject_outliers
 from lce_rig.calibrate.problem import Problem, Solutions, Weights
+from lce_rig.calibrate.systematic import ring_sensitivities
 from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Certificate, Observation, Refusal
-from lce_rig.solvers.covariance import jackknife_covariance
+from lce_rig.solvers.covariance import jackknife_covariance, systematic_covariance
 
 # Weights given by the user count in captures with residuals of this size, which sets the scale of the prior.
 NOMINAL_SIGMA_M = 0.01
@@ -70,7 +71,8 @@ def calibrate(
     draws = draw_subsets(problem, T_planes, options.n_draws, options.n_rounds, options.seed, progress)
     T_start = T_planes if draws is None else draws.T_mean[draws.best]
     solution = problem.solve(np.ones((1, problem.n_captures)), T_start, options.n_rounds)
-    return _report(observations, features, board, problem, solution, draws, refused, consensus)
+    covariances = _covariances(observations, board, options, problem, solution)
+    return _report(observations, features, board, problem, solution, covariances, draws, refused, consensus)
 
 
 def _agree(candidates: Sequence[CaptureCandidates], board: Board, options: CalibrateOptions) -> Consensus:
@@ -120,12 +122,13 @@ def _report(
     board: Board,
     problem: Problem,
     solution: Solutions,
+    covariances: tuple[Array, Array],
     draws: Draws | None,
     refused: dict[str, Refusal],
     consensus: Consensus,
 ) -> CalibrationEstimate:
     T = solution.T[0]
-    cov = _covariance(problem, solution)
+    cov = covariances[0] + covariances[1]
     held_out = np.full(len(features), np.nan) if draws is None else draws.capture_held_out_m
     residuals: list[CaptureResidual] = [
         capture_residual(T, observation, board, float(error))
@@ -144,22 +147,43 @@ def _report(
         held_out_m=float(np.mean(held_out)),
         weak_direction=describe_weakest(cov[:6, :6], features),
         # The paper's code counts every ring end twice, which halves its mean.
-        diagnostics=_diagnostics(problem, solution, cov, draws, consensus)
+        diagnostics=_diagnostics(problem, solution, covariances, draws, consensus)
         | {"paper_mee_m": metrics.mee_m / 2},
     )
 
 
-def _covariance(problem: Problem, solution: Solutions) -> Array:
-    """Estimate the covariance (6 + k, 6 + k) of the solution, edge shift last."""
-    gradients, hessians = linearise(problem, solution.x[0], solution.edge_ids[0])
+def _covariances(
+    observations: Sequence[Observation],
+    board: Board,
+    options: CalibrateOptions,
+    problem: Problem,
+    solution: Solutions,
+) -> tuple[Array, Array]:
+    """Estimate the covariances (6 + k, 6 + k) of the solution, edge shift last.
+
+    Returns:
+        What the scatter between captures shows, and what the LiDAR's errors common to them add.
+    """
+    x, edge_ids = solution.x[0], solution.edge_ids[0]
+    gradients, hessians = linearise(problem, x, edge_ids)
     prior = np.zeros_like(hessians[0])
     if problem.weights.shift_prior is not None:
         prior[6, 6] = problem.weights.shift_prior
-    return jackknife_covariance(gradients, hessians, prior)
+    scatter = jackknife_covariance(gradients, hessians, prior)
+    laser_m, offset_m = options.laser_bias_sigma_m, options.range_offset_sigma_m
+    if laser_m == 0 and offset_m == 0:
+        return scatter, np.zeros_like(scatter)
+    information = hessians.sum(axis=0) + prior
+    sensitivities = ring_sensitivities(observations, board, options, problem, x, edge_ids, information)
+    return scatter, systematic_covariance(sensitivities, laser_m, offset_m)
 
 
 def _diagnostics(
-    problem: Problem, solution: Solutions, cov: Array, draws: Draws | None, consensus: Consensus
+    problem: Problem,
+    solution: Solutions,
+    covariances: tuple[Array, Array],
+    draws: Draws | None,
+    consensus: Consensus,
 ) -> dict[str, float]:
     plane, edge = problem.errors(solution.x)
     figures = {
@@ -169,9 +193,12 @@ def _diagnostics(
         "fit_edge_rms_m": float(np.sqrt(np.mean(edge**2))),
         "n_alternative_poses": float(consensus.n_alternative_poses),
     }
+    for name, cov in zip(("scatter", "systematic"), covariances, strict=True):
+        figures[f"sigma_{name}_rotation_deg"] = float(np.degrees(np.sqrt(np.trace(cov[3:6, 3:6]))))
+        figures[f"sigma_{name}_translation_m"] = float(np.sqrt(np.trace(cov[:3, :3])))
     if problem.n_shift:
         figures["edge_shift_m"] = float(solution.linear[0, 3])
-        figures["edge_shift_sigma_m"] = float(np.sqrt(cov[6, 6]))
+        figures["edge_shift_sigma_m"] = float(np.sqrt(covariances[0][6, 6] + covariances[1][6, 6]))
     if draws is not None:
         offset = error_to_reference(draws.T_mean[draws.best], solution.T[0])
         figures |= {

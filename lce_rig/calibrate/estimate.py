@@ -34,7 +34,9 @@ class CalibrationEstimate:
 
     Attributes:
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
-        cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
+        cov: (6, 6), tangent (translation m, rotation rad), axes of the camera: what the scatter between
+            captures shows, and what range errors of the LiDAR add that are the same in all captures. Errors
+            of the intrinsics and of the board's size are not in it.
         certificate: of the final cost over all captures used.
         metrics: errors over all captures used.
         used: names of the captures behind the estimate, sorted.

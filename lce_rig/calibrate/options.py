@@ -40,6 +40,8 @@ class CalibrateOptions:
         edge_shift: "free": ring ends may lie beyond the printed size by a common distance, as the finite beam
             makes them; "off": they may not.
         edge_shift_sigma_m: standard deviation of that distance a priori.
+        laser_bias_sigma_m: standard deviation of each laser's own range offset a priori, the same in all captures.
+        range_offset_sigma_m: standard deviation a priori of the offset that all ranges have in common.
         reject_outliers: leave out captures that disagree with what the others predict.
         min_captures: fewer captures are refused.
     """
@@ -56,5 +58,7 @@ class CalibrateOptions:
     half_step: bool = True
     edge_shift: Literal["free", "off"] = "free"
     edge_shift_sigma_m: float = 0.015
+    laser_bias_sigma_m: float = 0.0
+    range_offset_sigma_m: float = 0.0
     reject_outliers: bool = True
     min_captures: int = 3

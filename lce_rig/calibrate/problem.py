@@ -91,6 +91,7 @@ class Problem:
         keep: Sequence[NDArray[np.bool_]] | None = None,
     ) -> None:
         self.n_captures = len(features)
+        self.keep = keep
         self.n_shift = 0 if weights.shift_prior is None else 1
         self.size = 13 + self.n_shift
         self._upper = np.triu_indices(self.size)

@@ -17,6 +17,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "rigs": ("lce_rig.cli.rigs", "List, show, check and derive rig profiles."),
     "simulate": ("lce_rig.cli.simulate", "Make a session of a simulated rig, with exact truth."),
     "collect": ("lce_rig.cli.collect", "Build a session from recordings."),
+    "reconstruct": ("lce_rig.cli.reconstruct", "Turn the events of a recording into pictures."),
     "check": ("lce_rig.cli.check", "Show what was detected in each capture, and why not."),
     "calibrate": ("lce_rig.cli.calibrate", "Estimate the extrinsics of a session."),
     "verify": ("lce_rig.cli.verify", "Draw the LiDAR into the pictures and print residuals."),

@@ -51,7 +51,13 @@ def calibrate(
                 f"{len(candidates) + len(refused)} captures, at least {needed} are needed",
                 _commonest(refused) or "collect more captures",
             )
-        estimate = estimate_extrinsic(candidates, rig.board.to_board(), options, progress)
+        lidar = rig.lidars[pair.lidar]
+        pair_options = replace(
+            options,
+            laser_bias_sigma_m=lidar.laser_bias_sigma_m,
+            range_offset_sigma_m=lidar.range_offset_sigma_m,
+        )
+        estimate = estimate_extrinsic(candidates, rig.board.to_board(), pair_options, progress)
         calibration = _judged(rig, pair, estimate, n_captures=len(candidates) + len(refused), refused=refused)
         truth = reference.of(pair.camera, pair.lidar) if reference else None
         if truth is not None:

@@ -7,6 +7,8 @@ from pydantic import Field, model_validator
 from lce_rig.core.camera import Intrinsics
 from lce_rig.rig.settings import FrameName, Name, NotNegative, Positive, Settings, TopicName, problem
 
+# Beyond this the figure is in millimetres, or the sensor is broken.
+RangeError = Annotated[float, Field(ge=0, le=0.2)]
 Coefficient = Annotated[float, Field(ge=-1000, le=1000)]
 _COUNTS = {"radtan": ((0, 4, 5, 8), "4, 5 or 8 (or none)"), "equidistant": ((4,), "4")}
 
@@ -56,6 +58,8 @@ class LidarSettings(Settings):
         max_range_m: farther returns are ignored.
         beam_aperture_m: width of the light beam where it leaves the sensor; 0 for an ideal one.
         beam_divergence_rad: full angle by which the beam widens.
+        laser_bias_sigma_m: standard deviation of each laser's own constant range error.
+        range_offset_sigma_m: standard deviation of the constant range error that all lasers share.
     """
 
     model: str = "VLP-16"
@@ -66,6 +70,8 @@ class LidarSettings(Settings):
     max_range_m: Positive = 100.0
     beam_aperture_m: NotNegative = 0.0127
     beam_divergence_rad: NotNegative = 0.003
+    laser_bias_sigma_m: RangeError = 0.008
+    range_offset_sigma_m: RangeError = 0.005
     timestamps: TimestampSettings = TimestampSettings(reference="first_firing")
     driver: DriverSettings = DriverSettings()
 

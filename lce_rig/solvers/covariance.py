@@ -1,4 +1,4 @@
-"""Covariance of an estimate from how its independent groups of residuals (captures) disagree."""
+"""Covariance of an estimate: how its groups of residuals (captures) disagree, and what they have in common."""
 
 import numpy as np
 
@@ -40,6 +40,27 @@ def jackknife_covariance(gradients: Array, hessians: Array, prior: Array) -> Arr
     steps = -(symmetric_inverse(remaining) @ gradients[..., None])[..., 0]
     correction = (n_groups - 1) / max(n_groups - p - 2, 2)  # equation (2)
     return np.asarray(correction * (n_groups - 1) / n_groups * steps.T @ steps)
+
+
+def systematic_covariance(sensitivities: Array, sigma_each: float, sigma_common: float) -> Array:
+    """Propagate errors that every group shares, and that no scatter between groups can show.
+
+    Source r is off by e_r + e, with e_r of its own and e common to all sources; it moves the estimate by s_r
+    for each unit. With all of them independent
+
+        cov = sigma_each^2 sum_r s_r s_r^T + sigma_common^2 (sum_r s_r) (sum_r s_r)^T
+
+    Args:
+        sensitivities: (p, L) s_r in columns.
+        sigma_each: standard deviation of e_r.
+        sigma_common: standard deviation of e.
+
+    Returns:
+        (p, p).
+    """
+    common = sensitivities.sum(axis=1)
+    each = sensitivities @ sensitivities.T
+    return np.asarray(sigma_each**2 * each + sigma_common**2 * np.outer(common, common))
 
 
 def symmetric_inverse(H: Array) -> Array:

@@ -25,6 +25,8 @@ class Scenario:
     """What is simulated: noise, beam, and how the board is held."""
 
     range_sigma_m: float = 0.01
+    laser_bias_sigma_m: float = 0.0
+    range_offset_m: float = 0.0
     corner_sigma_px: float = 0.1
     footprint_m: float = 0.0
     lost_share: float = 0.0
@@ -46,10 +48,14 @@ def simulate(
     """Simulate n captures in which both sensors see the board."""
     scenario = scenario or Scenario()
     rng = np.random.default_rng(seed)
+    # A generator of their own: the captures of a seed are otherwise the same with and without biases.
+    bias_m = scenario.range_offset_m + scenario.laser_bias_sigma_m * np.random.default_rng(
+        [seed, 1]
+    ).standard_normal(16)
     captures: list[CaptureCandidates] = []
     while len(captures) < n:
         T_cam_board = random_pose(rng, scenario, board)
-        lidar = scan_board(invert(T_cam_lidar) @ T_cam_board, rng, scenario, board)
+        lidar = scan_board(invert(T_cam_lidar) @ T_cam_board, rng, scenario, board, bias_m)
         image = photograph(T_cam_board, rng, scenario, board)
         if lidar is not None and image is not None:
             captures.append(CaptureCandidates(f"{len(captures):06d}", image, [lidar]))
@@ -94,9 +100,13 @@ def photograph(
 
 
 def scan_board(
-    T_lidar_board: np.ndarray, rng: np.random.Generator, scenario: Scenario, board: Board
+    T_lidar_board: np.ndarray,
+    rng: np.random.Generator,
+    scenario: Scenario,
+    board: Board,
+    bias_m: np.ndarray,
 ) -> LidarBoard | None:
-    """Fire 16 rings at a board; ring ends lie up to `footprint_m` outside it, some are lost."""
+    """Fire 16 rings at a board; ring ends lie up to `footprint_m` outside it, some are lost, and each ring's ranges are off by `bias_m`."""
     R, centre = T_lidar_board[:3, :3], T_lidar_board[:3, 3]
     step = np.radians(scenario.step_deg)
     middle, reach = np.arctan2(centre[1], centre[0]), 0.7 / np.hypot(centre[0], centre[1])
@@ -124,7 +134,8 @@ def scan_board(
     columns = np.arange(is_hit.shape[1])
     is_hit &= (columns >= first[:, None]) & (columns <= last[:, None])
     is_hit[np.setdiff1d(np.arange(16), rings)] = False
-    points = rays * (ranges + scenario.range_sigma_m * rng.standard_normal(ranges.shape))[..., None]
+    measured = ranges + bias_m[:, None] + scenario.range_sigma_m * rng.standard_normal(ranges.shape)
+    points = rays * measured[..., None]
     plane, rms = fit_plane(points[is_hit])
     in_plane = exp_so3(
         np.array([0, 0, scenario.template_sigma_rad * rng.standard_normal() + np.pi * rng.integers(2)])

@@ -1,0 +1,108 @@
+"""How errors that the LiDAR repeats in every capture move the solution.
+
+Captures differ from one another by noise, and their scatter shows it. A laser whose ranges are all 8 mm too
+long is wrong in the same way in each of them: nothing scatters, and the extrinsic is off all the same.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.calibrate.features import CaptureFeatures, extract_features
+from lce_rig.calibrate.observability import linearise
+from lce_rig.calibrate.options import CalibrateOptions
+from lce_rig.calibrate.problem import Problem
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import LidarBoard, Observation
+from lce_rig.solvers.covariance import symmetric_inverse
+
+# Of the order of the errors themselves, so that the difference quotient sees what they would do.
+STEP_M = 0.005
+
+
+def ring_sensitivities(
+    observations: Sequence[Observation],
+    board: Board,
+    options: CalibrateOptions,
+    problem: Problem,
+    x: Array,
+    edge_ids: NDArray[np.int8],
+    information: Array,
+) -> Array:
+    """Differentiate the solution by the range offset of each ring, by one Newton step.
+
+    With half gradient g and half Hessian H of the cost, both at the solution, ranges that are off by b in
+    ring r move the minimum by
+
+        s_r b = -H^-1 sum_k (g_k(ranges of ring r + b) - g_k)                                            (1)
+
+    A ring that some capture does not see leaves its g_k alone: only (capture, ring) pairs that occur are
+    built, as captures of one large problem. To first order an offset common to all rings moves the minimum
+    by the sum of all s_r.
+
+    Args:
+        observations: the F captures in `problem`.
+        board: the board.
+        options: how features are extracted.
+        problem: their moments.
+        x: (m,) solution [vec R; t; d; 1].
+        edge_ids: (n,) its association, which is held.
+        information: (6 + k, 6 + k) H with the prior.
+
+    Returns:
+        (6 + k, L): a column for each of the L rings seen, tangent (translation m, rotation rad, edge shift m)
+        per m of range.
+    """
+    boards = [observation.lidar for observation in observations]
+    seen = [np.union1d(lidar.ring, lidar.edge_ring) for lidar in boards]
+    capture = np.repeat(np.arange(len(boards)), [len(rings) for rings in seen])
+    ring, column = np.unique(np.concatenate(seen), return_inverse=True)
+    shifted: list[CaptureFeatures] = []
+    for observation, rings in zip(observations, seen, strict=True):
+        for lidar in shift_rings(observation.lidar, rings, STEP_M):
+            shifted.append(extract_features(replace(observation, lidar=lidar), board, options))
+    keep = None if problem.keep is None else [problem.keep[k] for k in capture]
+    ids = [edge_ids[problem.edge_capture == k] for k in capture]
+    gradients, _ = linearise(problem, x, edge_ids)
+    moved, _ = linearise(Problem(shifted, board, problem.weights, keep), x, np.concatenate(ids))
+    change = np.zeros((len(ring), len(information)))
+    np.add.at(change, column, (moved - gradients[capture]) / STEP_M)
+    return np.asarray(-symmetric_inverse(information) @ change.T)
+
+
+def shift_rings(lidar: LidarBoard, rings: NDArray[np.int16], offset_m: float) -> list[LidarBoard]:
+    """Lengthen the ranges of one ring at a time, and let the plane follow.
+
+    The plane m . p = 1, with m = -n / d, predicts ranges r_i = 1 / (m . u_i) along the rays u_i. Fitted to
+    them by least squares it follows ranges that are off by b_i to first order by
+
+        dm = (sum J_i^T J_i)^-1 sum J_i^T b_i,    J_i = -r_i^2 u_i^T                                     (2)
+
+    Args:
+        lidar: a board as measured.
+        rings: (L,) ring numbers.
+        offset_m: what is added to every range of the ring.
+
+    Returns:
+        The board with the points and ring ends of each ring moved along their rays, and the plane refitted.
+    """
+    rays = lidar.points / np.linalg.norm(lidar.points, axis=1, keepdims=True)
+    end_rays = lidar.edge_points / np.linalg.norm(lidar.edge_points, axis=1, keepdims=True)
+    m = -lidar.plane[:3] / lidar.plane[3]
+    jacobian = -rays / (rays @ m)[:, None] ** 2
+    is_ring, is_end = lidar.ring == rings[:, None], lidar.edge_ring == rings[:, None]
+    m_moved = m + offset_m * (is_ring @ jacobian) @ symmetric_inverse(jacobian.T @ jacobian)
+    planes = np.column_stack([-m_moved, np.ones(len(rings))])
+    planes /= np.linalg.norm(m_moved, axis=1, keepdims=True)
+    return [
+        replace(
+            lidar,
+            points=lidar.points + offset_m * moved[:, None] * rays,
+            edge_points=lidar.edge_points + offset_m * moved_ends[:, None] * end_rays,
+            plane=plane,
+        )
+        for plane, moved, moved_ends in zip(planes, is_ring, is_end, strict=True)
+    ]
