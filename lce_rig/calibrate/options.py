@@ -40,8 +40,8 @@ class CalibrateOptions:
         edge_shift: "free": ring ends may lie beyond the printed size by a common distance, as the finite beam
             makes them; "off": they may not.
         edge_shift_sigma_m: standard deviation of that distance a priori.
-        laser_bias_sigma_m: standard deviation of each laser's own range offset a priori, the same in all captures.
-        range_offset_sigma_m: standard deviation a priori of the offset that all ranges have in common.
+        laser_bias_sigma_m: standard deviation a priori of the lasers' range offsets about their mean.
+        range_offset_sigma_m: standard deviation a priori of that mean, the offset common to all ranges.
         reject_outliers: leave out captures that disagree with what the others predict.
         min_captures: fewer captures are refused.
     """

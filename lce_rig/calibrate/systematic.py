@@ -64,7 +64,7 @@ def ring_sensitivities(
     for observation, rings in zip(observations, seen, strict=True):
         for lidar in shift_rings(observation.lidar, rings, STEP_M):
             shifted.append(extract_features(replace(observation, lidar=lidar), board, options))
-    keep = None if problem.keep is None else [problem.keep[k] for k in capture]
+    keep = None if problem.keep is None else [problem.keep[int(k)] for k in capture]
     ids = [edge_ids[problem.edge_capture == k] for k in capture]
     gradients, _ = linearise(problem, x, edge_ids)
     moved, _ = linearise(Problem(shifted, board, problem.weights, keep), x, np.concatenate(ids))

@@ -20,6 +20,11 @@ SCALE_MARGINAL, SCALE_FAIL = 0.01, 0.025
 PLATE_KNOWN_M, PLATE_FAIL = 0.03, 0.05
 # Planes of both sensors agree to 6-8 mm where boards stand still, to 20-30 mm where they are hand-held.
 MOVING_M = 0.012
+# What helps where more captures do not.
+MEASURE_RANGES = (
+    "the LiDAR's constant range errors alone exceed it: measure them, correct them in its driver and lower "
+    "range_offset_sigma_m and laser_bias_sigma_m in the profile, or put more rings on the board"
+)
 # How many times the target a deviation may be before the result is of no use.
 SIGMA_FAIL = 3.0
 # Held-out residuals of a sound model exceed the fitted ones only slightly.
@@ -84,8 +89,12 @@ def _precision(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
         if sigma > goal:
             verdict: Verdict = "fail" if sigma > SIGMA_FAIL * goal else "marginal"
             figures = f"{scale * sigma:.2g} {unit}, target {scale * goal:.2g} {unit}"
-            advice = f"weakest: {estimate.weak_direction}"
-            doubts.append(Doubt(verdict, f"{what} known to {figures}: collect more captures; {advice}"))
+            key = f"sigma_systematic_{what}_{'deg' if what == 'rotation' else 'm'}"
+            # Where the LiDAR's own errors alone miss the target, no number of captures will reach it.
+            is_lidar = estimate.diagnostics.get(key, 0.0) > goal
+            advice = MEASURE_RANGES if is_lidar else "collect more captures"
+            weakest = f"weakest: {estimate.weak_direction}"
+            doubts.append(Doubt(verdict, f"{what} known to {figures}: {advice}; {weakest}"))
     return doubts
 
 

@@ -1,5 +1,6 @@
 """`lce-rig calibrate`: the extrinsics of a session, judged and written as files."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,7 @@ def calibrate(
     """
     from lce_rig import pipeline
     from lce_rig.calibrate import CalibrateOptions
+    from lce_rig.core.errors import UsageError
     from lce_rig.export.reference import read_reference
     from lce_rig.session import Session
 
@@ -89,6 +91,8 @@ def calibrate(
     if weights == "profile":
         settings = opened.rig.calibration
         switches |= {"plane_weight": settings.plane_weight, "edge_weight": settings.edge_weight}
+    if not (switches["use_ptpl"] or switches["use_ptl"]):
+        raise UsageError("--no-ptpl and --no-ptl together leave nothing to fit")
     options = CalibrateOptions(**switches)
     truth = None if reference is None else read_reference(reference)
     with show.progress_bar("detecting") as progress:
@@ -105,11 +109,11 @@ def calibrate(
         for calibration, estimate in results:
             show.print_lines(_lines(calibration, estimate.held_out_m, estimate.weak_direction))
         show.note("written: " + ", ".join(path.name for path in files) + f" in {files[0].parent}")
-    exit_by_verdict(calibrations)
+    exit_by_verdict(calibrations, are_told=not as_json)
 
 
-def exit_by_verdict(calibrations: Sequence[Calibration]) -> None:
-    """Leave with exit code 7 where a result must not be used.
+def exit_by_verdict(calibrations: Sequence[Calibration], *, are_told: bool = False) -> None:
+    """Leave with exit code 7 where a result must not be used; the reasons stand in what was printed before.
 
     Raises:
         ResultRefusedError: the worst verdict is "fail".
@@ -119,9 +123,12 @@ def exit_by_verdict(calibrations: Sequence[Calibration]) -> None:
     failed = [c for c in calibrations if c.verdict == "fail"]
     if failed:
         pairs = ", ".join(f"{c.camera}.{c.channel} and {c.lidar}" for c in failed)
-        raise ResultRefusedError(
-            f"do not use the result of {pairs}", "\n".join(r for c in failed for r in c.reasons)
-        )
+        causes = "\n".join(reason for c in failed for reason in c.reasons)
+        raise ResultRefusedError(f"do not use the result of {pairs}", "" if are_told else causes)
+
+
+def _left_out(held_out_m: float) -> str:
+    return f"left out {1000 * held_out_m:.1f} mm, " if math.isfinite(held_out_m) else ""
 
 
 def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> list[str]:
@@ -137,7 +144,7 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
         f"  captures     {len(c.captures_used)} used of {c.n_captures}, "
         f"board found by both sensors in {c.n_detected}",
         f"  residuals    planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm, "
-        f"left out {1000 * held_out_m:.1f} mm, corners {metrics.reprojection_px:.2f} px",
+        f"{_left_out(held_out_m)}corners {metrics.reprojection_px:.2f} px",
         f"  certificate  {'global minimum' if c.certificate.is_optimal else '[red]not proven[/]'}, "
         f"gap {c.certificate.gap:.0e}",
     ]

@@ -82,24 +82,26 @@ def _figures(found: Any) -> dict[str, float | None] | None:
     return {key: float(value) if math.isfinite(value) else None for key, value in found.quality.items()}
 
 
-# Heading, sensor, figure, scale to the heading's unit, digits.
+# Heading and unit, sensor, figure, scale to the unit, digits. Narrow enough for a terminal of 80 columns.
 _COLUMNS = (
-    ("dist m", "image", "distance_m", 1.0, 2),
-    ("tilt deg", "image", "tilt_deg", 1.0, 0),
-    ("corners px", "image", "corner_rms_px", 1.0, 2),
-    ("sharp", "image", "sharpness", 1.0, 2),
+    ("dist\nm", "image", "distance_m", 1.0, 2),
+    ("tilt\ndeg", "image", "tilt_deg", 1.0, 0),
+    ("corner\npx", "image", "corner_rms_px", 1.0, 2),
+    ("sharp", "image", "sharpness", 1.0, 1),
     ("rings", "lidar", "n_rings", 1.0, 0),
     ("points", "lidar", "n_points", 1.0, 0),
-    ("thick mm", "lidar", "thickness_m", 1000.0, 0),
-    ("width m", "lidar", "width_m", 1.0, 3),
-    ("height m", "lidar", "height_m", 1.0, 3),
-    ("ends mm", "lidar", "edge_rms_m", 1000.0, 1),
+    ("plane\nmm", "lidar", "plane_rms_m", 1000.0, 1),
+    ("width\nm", "lidar", "width_m", 1.0, 3),
+    ("height\nm", "lidar", "height_m", 1.0, 3),
+    ("edges\nmm", "lidar", "edge_rms_m", 1000.0, 1),
 )
+# A side of the plate that no ring end shows is not known better than this; the profile's is no measurement.
+_SIDE_KNOWN_M = 0.05
 
 
 def _table(detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> Any:
     table = show.plain_table(str(pair))
-    table.add_column("capture")
+    table.add_column("capture", no_wrap=True)
     for title, *_ in _COLUMNS:
         table.add_column(title, justify="right")
     table.add_column("")
@@ -114,17 +116,18 @@ def _table(detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -
 
 def _cell(figures: Mapping[str, float | None] | None, key: str, scale: float, digits: int) -> str:
     value = None if figures is None else figures.get(key)
-    return "-" if value is None else f"{scale * value:.{digits}f}"
+    sigma_m = (figures or {}).get(f"{key.removesuffix('_m')}_sigma_m") or 0.0
+    return "-" if value is None or sigma_m > _SIDE_KNOWN_M else f"{scale * value:.{digits}f}"
 
 
 def _summarise(n_captures: int, refused: Mapping[str, Refusal]) -> None:
     """Print each cause once, with the captures it holds for."""
-    show.note(f"{n_captures - len(refused)} of {n_captures} captures can be used")
+    show.say(f"{n_captures - len(refused)} of {n_captures} captures can be used")
     names: dict[Refusal, list[str]] = {}
     for name, refusal in sorted(refused.items()):
         names.setdefault(refusal, []).append(name)
     for refusal, captures in names.items():
-        show.note(f"  {', '.join(captures)}: {refusal.stage}: {refusal.cause}\n    -> {refusal.action}")
+        show.say(f"  {', '.join(captures)}: {refusal.stage}: {refusal.cause}\n    -> {refusal.action}")
     by_stage = Counter(refusal.stage for refusal in refused.values())
     if len(by_stage) > 1:
-        show.note("  refused by stage: " + ", ".join(f"{stage} {n}" for stage, n in sorted(by_stage.items())))
+        show.say("  refused by stage: " + ", ".join(f"{stage} {n}" for stage, n in sorted(by_stage.items())))

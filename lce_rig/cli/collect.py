@@ -45,7 +45,12 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 @click.option("--channel", help="Channel of it, such as events for pictures reconstructed from events.")
 @click.option("--lidar", help="LiDAR that a folder's clouds belong to, where the rig has several.")
 @click.option("--max-captures", type=click.IntRange(1), metavar="N", help="Leave the session at N captures.")
-@click.option("--target", type=click.IntRange(1), metavar="N", help="Stop reading at N captures.")
+@click.option(
+    "--target",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Stop reading bags once the session has N captures; say so where it stays short.",
+)
 def collect(
     rig_name: str,
     session: Path,

@@ -69,6 +69,7 @@ def reconstruct(
     """
     from lce_rig.core.errors import SourceError, UsageError
     from lce_rig.core.results import Refusal
+    from lce_rig.detect.flicker import measure_flicker
     from lce_rig.detect.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
     from lce_rig.sources.events import open_events
     from lce_rig.verify.writing import write_picture
@@ -82,6 +83,12 @@ def reconstruct(
         windows = WindowOptions("count", n_events=window_events)
     options = ReconstructionOptions(method=event_image, windows=windows, is_filtered=not no_filter)
     events = open_events(recording, topic=topic)
+    flicker = measure_flicker(events.read(events.start_ns, events.start_ns + 1_000_000_000))
+    if flicker.is_storm:
+        show.warn(
+            f"{recording.name}: most events come from light that flickers at {flicker.frequency_hz:.0f} Hz: "
+            "record by daylight or under lamps that do not flicker"
+        )
     every_ns = round(every * 1e9)
     n_expected = max(1, int(events.duration_s * 1e9) // every_ns)
     lines = ["picture,stamp_ns"]

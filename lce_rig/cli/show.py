@@ -16,6 +16,11 @@ def note(text: str) -> None:
     click.echo(text, err=True)
 
 
+def say(text: str) -> None:
+    """Print a line of the result on stdout."""
+    click.echo(text)
+
+
 def warn(text: str) -> None:
     """Say something the user should look at."""
     click.secho(f"warning: {text}", fg="yellow", err=True)
@@ -64,9 +69,12 @@ def progress_bar(title: str) -> Iterator[Progress]:
 
 
 def print_lines(lines: list[str]) -> None:
-    """Print lines with rich markup on stdout, broken only by the terminal itself."""
+    """Print lines with rich markup on stdout; a terminal gets them wrapped at words, indented alike."""
     from rich.console import Console
+    from rich.padding import Padding
 
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
     for line in lines:
-        console.print(line)
+        indent = len(line) - len(line.lstrip(" "))
+        is_wrapped = sys.stdout.isatty() and indent <= 2
+        console.print(Padding(line.lstrip(" "), (0, 0, 0, indent)) if is_wrapped else line)

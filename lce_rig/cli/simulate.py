@@ -22,9 +22,15 @@ TRUTH = "truth.json"
 @click.option(
     "--seed", default=0, show_default=True, type=click.IntRange(0), help="The same seed, the same bytes."
 )
-@click.option("--carrier", type=click.Choice(["stand", "person", "none"]), help="What holds the board.")
 @click.option(
-    "--noise-level", type=click.IntRange(1, 10), help="Range noise of the paper's simulated sets, 0 to 10 cm."
+    "--carrier",
+    type=click.Choice(["stand", "person", "none"]),
+    help="What holds the board [default: a person for rigs called rles..., nobody for sss..., else a stand].",
+)
+@click.option(
+    "--noise-level",
+    type=click.IntRange(1, 10),
+    help="Range noise of the paper's simulated sets: levels 1 (none) to 10 (10 cm).",
 )
 @click.option("--range-sigma", type=click.FloatRange(0), metavar="M", help="Range noise of the LiDAR.")
 @click.option("--range-offset", type=float, metavar="M", help="Constant offset of all ranges.")

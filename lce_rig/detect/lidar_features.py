@@ -169,6 +169,7 @@ def build_board(
         "n_ring_ends": float(len(edge)),
         "n_ring_ends_dropped": float(len(ends.beam) - len(edge)),
         "thickness_m": float(high_m - low_m),
+        "plane_rms_m": float(np.sqrt(np.mean(height**2))),
         "width_m": float(size_m[0]),
         "height_m": float(size_m[1]),
         "width_sigma_m": float(size_sigma_m[0]),

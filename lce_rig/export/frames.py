@@ -92,18 +92,18 @@ def _grow(root: str, chosen: list[Calibration], bodies: dict[str, str], placed: 
 
 
 def choose_channels(calibrations: Sequence[Calibration], rig: Rig) -> list[Calibration]:
-    """Keep one calibration of each camera and LiDAR: by verdict, then by the order of the profile's channels.
+    """Keep one calibration of each camera and LiDAR: by verdict, then by the smaller sigma.
 
     Raises:
         LceRigError: a calibration names a sensor or channel that the rig does not have.
     """
     best: dict[tuple[str, str], Calibration] = {}
-    ranks: dict[tuple[str, str], tuple[int, int]] = {}
+    ranks: dict[tuple[str, str], tuple[int, float, float]] = {}
     for calibration in calibrations:
         require_known(calibration, rig)
         pair = calibration.camera, calibration.lidar
-        channels = list(rig.cameras[calibration.camera].channels)
-        rank = _VERDICTS.index(calibration.verdict), channels.index(calibration.channel)
+        sigmas = calibration.sigma_rotation_deg, calibration.sigma_translation_m
+        rank = _VERDICTS.index(calibration.verdict), *sigmas
         if pair not in best or rank < ranks[pair]:
             best[pair], ranks[pair] = calibration, rank
     return list(best.values())

@@ -1,11 +1,12 @@
 """The story in order: captures -> detections -> extrinsics -> files and pictures. Start reading here.
 
     detections = detect(session)                            the board in every picture and scan
-    results = calibrate(rig, detections, options)           an extrinsic and verdict for every pair of sensors
+    results = calibrate(session.rig, detections, options)   an extrinsic and verdict for every pair of sensors
+    calibrations = [calibration for calibration, _ in results]
     write_results(session, calibrations, force=False)       result.json, YAML, URDF, camera_info, transforms
     verify(session, detections, calibrations)               the LiDAR drawn into the pictures
 
-Every step takes a session and what the step before it made. Results are frozen dataclasses; only the
+Every step takes what the step before it made. Results are frozen dataclasses; only the
 session and the export layer touch files.
 """
 

@@ -1,5 +1,6 @@
 """Estimate, judge and write the extrinsic of every camera channel with every LiDAR of a session."""
 
+import shutil
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from lce_rig.pipeline.progress import Progress, silent
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 
-CALIBRATION = "calibration"
+CALIBRATION, OVERLAYS = "calibration", "overlays"
 
 
 def calibrate(
@@ -133,6 +134,7 @@ def write_results(session: Session, calibrations: list[Calibration], *, force: b
 
     folder = session.path / CALIBRATION
     folder.mkdir(exist_ok=True)
+    shutil.rmtree(folder / OVERLAYS, ignore_errors=True)  # pictures of an earlier result
     result = folder / "result.json"
     write_result(result, session.rig.name, calibrations)
     if any(c.verdict == "fail" for c in calibrations) and not force:

@@ -8,12 +8,12 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError
 from lce_rig.core.results import Calibration
 from lce_rig.detect.detection import Detections
-from lce_rig.pipeline.calibration import CALIBRATION
+from lce_rig.pipeline.calibration import CALIBRATION, OVERLAYS
 from lce_rig.pipeline.progress import Progress, silent
 from lce_rig.session import Session
 from lce_rig.verify.session_check import SessionCheck, check_session
 
-OVERLAYS, DEBUG = "overlays", "debug"
+DEBUG = "debug"
 Sample = TypeVar("Sample", Image, Scan)
 
 

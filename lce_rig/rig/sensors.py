@@ -58,8 +58,8 @@ class LidarSettings(Settings):
         max_range_m: farther returns are ignored.
         beam_aperture_m: width of the light beam where it leaves the sensor; 0 for an ideal one.
         beam_divergence_rad: full angle by which the beam widens.
-        laser_bias_sigma_m: standard deviation of each laser's own constant range error.
-        range_offset_sigma_m: standard deviation of the constant range error that all lasers share.
+        laser_bias_sigma_m: standard deviation of the lasers' constant range errors about their mean.
+        range_offset_sigma_m: standard deviation of that mean, the range error common to all lasers.
     """
 
     model: str = "VLP-16"

@@ -1,4 +1,4 @@
-"""Covariance of an estimate: how its groups of residuals (captures) disagree, and what they have in common."""
+"""Covariance of an estimate: how its groups of residuals (captures) disagree, and what errors they share."""
 
 import numpy as np
 
@@ -45,22 +45,22 @@ def jackknife_covariance(gradients: Array, hessians: Array, prior: Array) -> Arr
 def systematic_covariance(sensitivities: Array, sigma_each: float, sigma_common: float) -> Array:
     """Propagate errors that every group shares, and that no scatter between groups can show.
 
-    Source r is off by e_r + e, with e_r of its own and e common to all sources; it moves the estimate by s_r
-    for each unit. With all of them independent
+    Source r is off by e + e_r, with e the mean error of all L sources and e_r its own deviation from it, and
+    moves the estimate by s_r for each unit. Independent deviations less their mean leave
 
-        cov = sigma_each^2 sum_r s_r s_r^T + sigma_common^2 (sum_r s_r) (sum_r s_r)^T
+        cov = sigma_each^2 sum_r (s_r - s) (s_r - s)^T + sigma_common^2 L^2 s s^T,   s = sum_r s_r / L
 
     Args:
         sensitivities: (p, L) s_r in columns.
-        sigma_each: standard deviation of e_r.
+        sigma_each: standard deviation of e_r, before their mean is taken off.
         sigma_common: standard deviation of e.
 
     Returns:
         (p, p).
     """
     common = sensitivities.sum(axis=1)
-    each = sensitivities @ sensitivities.T
-    return np.asarray(sigma_each**2 * each + sigma_common**2 * np.outer(common, common))
+    each = sensitivities - sensitivities.mean(axis=1, keepdims=True)
+    return np.asarray(sigma_each**2 * each @ each.T + sigma_common**2 * np.outer(common, common))
 
 
 def symmetric_inverse(H: Array) -> Array:

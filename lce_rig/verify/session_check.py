@@ -28,6 +28,7 @@ class SessionCheck:
     Attributes:
         pair: the sensors.
         verdict: of the calibration that is checked.
+        doubts: why these captures contradict it; empty where they agree.
         residuals: of each capture in which both sensors see the board.
         metrics: their summary; None without any.
         used: captures that the calibration was fitted to.
@@ -37,6 +38,7 @@ class SessionCheck:
 
     pair: Pair
     verdict: str
+    doubts: tuple[str, ...]
     residuals: tuple[CaptureResidual, ...]
     metrics: Metrics | None
     used: tuple[str, ...]
@@ -50,6 +52,7 @@ class SessionCheck:
             "channel": self.pair.channel,
             "lidar": self.pair.lidar,
             "verdict": self.verdict,
+            "doubts": list(self.doubts),
             "metrics": None
             if self.metrics is None
             else {**asdict(self.metrics), "mge_m": self.metrics.mge_m},
@@ -104,7 +107,32 @@ def check_session(
     metrics = summarise(residuals) if residuals else None
     used = calibration.captures_used
     sheet = files[-1] if files else None
-    return SessionCheck(pair, calibration.verdict, tuple(residuals), metrics, used, tuple(files[:-1]), sheet)
+    return SessionCheck(
+        pair,
+        calibration.verdict,
+        contradictions(metrics, session.rig),
+        tuple(residuals),
+        metrics,
+        used,
+        tuple(files[:-1]),
+        sheet,
+    )
+
+
+def contradictions(metrics: Metrics | None, rig: Rig) -> tuple[str, ...]:
+    """Say where captures contradict an extrinsic: residuals beyond the profile's limits, or no board at all."""
+    if metrics is None:
+        return ("no capture shows the board to both sensors",)
+    limits = rig.quality
+    pairs = (
+        ("LiDAR points lie off the board's planes", metrics.mpe_m, limits.max_mpe_m),
+        ("ring ends lie off the board's edges", metrics.mee_m, limits.max_mee_m),
+    )
+    return tuple(
+        f"{what} by {1000 * value:.0f} mm on average, limit {1000 * limit:.0f} mm"
+        for what, value, limit in pairs
+        if value > limit
+    )
 
 
 def _observe(

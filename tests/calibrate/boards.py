@@ -49,9 +49,9 @@ def simulate(
     scenario = scenario or Scenario()
     rng = np.random.default_rng(seed)
     # A generator of their own: the captures of a seed are otherwise the same with and without biases.
-    bias_m = scenario.range_offset_m + scenario.laser_bias_sigma_m * np.random.default_rng(
-        [seed, 1]
-    ).standard_normal(16)
+    laser_rng = np.random.default_rng([seed, 1])
+    bias_m = scenario.laser_bias_sigma_m * laser_rng.standard_normal(16)
+    bias_m += scenario.range_offset_m - bias_m.mean()
     captures: list[CaptureCandidates] = []
     while len(captures) < n:
         T_cam_board = random_pose(rng, scenario, board)
@@ -104,9 +104,12 @@ def scan_board(
     rng: np.random.Generator,
     scenario: Scenario,
     board: Board,
-    bias_m: np.ndarray,
+    bias_m: np.ndarray | float = 0.0,
 ) -> LidarBoard | None:
-    """Fire 16 rings at a board; ring ends lie up to `footprint_m` outside it, some are lost, and each ring's ranges are off by `bias_m`."""
+    """Fire 16 rings at a board; ring ends lie up to `footprint_m` outside it, some are lost.
+
+    Each ring's ranges are off by its `bias_m`.
+    """
     R, centre = T_lidar_board[:3, :3], T_lidar_board[:3, 3]
     step = np.radians(scenario.step_deg)
     middle, reach = np.arctan2(centre[1], centre[0]), 0.7 / np.hypot(centre[0], centre[1])
@@ -134,7 +137,9 @@ def scan_board(
     columns = np.arange(is_hit.shape[1])
     is_hit &= (columns >= first[:, None]) & (columns <= last[:, None])
     is_hit[np.setdiff1d(np.arange(16), rings)] = False
-    measured = ranges + bias_m[:, None] + scenario.range_sigma_m * rng.standard_normal(ranges.shape)
+    measured = (
+        ranges + np.reshape(bias_m, (-1, 1)) + scenario.range_sigma_m * rng.standard_normal(ranges.shape)
+    )
     points = rays * measured[..., None]
     plane, rms = fit_plane(points[is_hit])
     in_plane = exp_so3(

@@ -44,6 +44,16 @@ def test_a_deviation_above_the_target_is_marginal_and_far_above_it_fails(estimat
     assert all("weakest" in reason for reason in reasons)
 
 
+def test_where_the_lidar_itself_misses_the_target_more_captures_are_not_advised(estimate):
+    cov = np.diag([0.015**2 / 3] * 3 + [1e-8] * 3)
+    by_scatter = replace(estimate, cov=cov)
+    figures = dict(estimate.diagnostics) | {"sigma_systematic_translation_m": 0.014}
+    by_lidar = replace(by_scatter, diagnostics=figures)
+    assert "collect more captures" in verdict_of(by_scatter)[1][0]
+    assert "collect more captures" not in verdict_of(by_lidar)[1][0]
+    assert "range_offset_sigma_m" in verdict_of(by_lidar)[1][0]
+
+
 def test_a_result_far_from_the_nominal_extrinsic_fails_with_both_figures(estimate):
     moved = perturb(estimate.T_cam_lidar, np.array([0.3, 0, 0, 0, 0, np.radians(20)]))
     verdict, reasons = verdict_of(replace(estimate, T_cam_lidar=moved))

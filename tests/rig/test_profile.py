@@ -13,6 +13,7 @@ from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import exp_so3
 from lce_rig.rig import CalibrationSettings, QualitySettings, find_profile, load_rig, parse_rig
 from lce_rig.rig.explaining import all_keys
+from lce_rig.rig.sensors import LidarSettings
 
 RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 
@@ -50,6 +51,19 @@ def test_nominal_pose_puts_the_lidars_forward_axis_before_the_camera() -> None:
     assert entry is not None
     np.testing.assert_allclose(entry.to_matrix()[:3, :3], [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(entry.to_matrix()[:3, 3], [0.126, -0.065, -0.080])
+
+
+def test_only_the_ideal_lidar_has_ranges_without_systematic_error() -> None:
+    for name in ("rlfs", "rles", "sss"):
+        lidar = load_rig(name).lidars["lidar"]
+        expected = (0.0, 0.0) if name == "sss" else (0.008, 0.005)
+        assert (lidar.laser_bias_sigma_m, lidar.range_offset_sigma_m) == expected
+
+
+def test_a_range_error_in_millimetres_is_refused() -> None:
+    said = refusal(("    rate_hz: 10\n", "    rate_hz: 10\n    laser_bias_sigma_m: 8\n"))
+    assert "lidars.lidar.laser_bias_sigma_m" in said
+    assert f"mine.yaml:{line_of('rate_hz: 10') + 1}" in said
 
 
 def test_profile_cannot_be_changed() -> None:
@@ -235,6 +249,7 @@ def test_documented_defaults_are_those_of_the_code() -> None:
         keys, _, rest = line.removeprefix("| ").partition(" | ")
         values = rest.partition(" | ")[0].split(", ")
         documented |= dict(zip(re.findall(r"`(\w+)`", keys), values, strict=False))
-    for model in (QualitySettings, CalibrationSettings):
+    for model in (QualitySettings, CalibrationSettings, LidarSettings):
         for key, field in model.model_fields.items():
-            assert float(documented[key]) == field.default, key
+            if isinstance(field.default, int | float):
+                assert float(documented[key]) == field.default, key

@@ -1,0 +1,74 @@
+"""Flicker of lamps in a stream of events: regular bursts of one polarity that drown the scene."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.data import Events
+
+_MAX_FLICKER_BINS = 20_000
+# Motion in the scene lies below, lamps and screens above.
+_MIN_FLICKER_HZ = 20.0
+# A storm: this share of all events comes in bursts of one polarity, and these bursts are regular.
+_STORM_COHERENCE = 0.5
+_STORM_PEAK_SHARE = 0.3
+# Or nearly all are of one polarity at a time, as when a light is switched; a board's edges make both.
+_ONE_SIDED_COHERENCE = 0.9
+
+
+@dataclass(frozen=True)
+class Flicker:
+    """How much of a stretch of events is lamps that flicker.
+
+    Attributes:
+        frequency_hz: of the strongest regular alternation of polarity above 20 Hz; 0 in too short a stretch.
+        coherence: how much one polarity outweighs the other in a millisecond; near 1 where the whole picture
+            brightens and darkens at once, near 0 where edges move.
+        peak_share: share of that alternation's power at the frequency and its multiples.
+    """
+
+    frequency_hz: float
+    coherence: float
+    peak_share: float
+
+    @property
+    def is_storm(self) -> bool:
+        """Whether flicker, or events of one polarity alone, drown the scene."""
+        is_regular = self.coherence > _STORM_COHERENCE and self.peak_share > _STORM_PEAK_SHARE
+        return is_regular or self.coherence > _ONE_SIDED_COHERENCE
+
+
+def measure_flicker(events: Events, bin_ns: int = 1_000_000) -> Flicker:
+    """Measure the flicker of lamps in a stretch of about a second.
+
+    Mains lamps flicker at 100 or 120 Hz: all pixels that see them turn brighter together, then darker.
+
+    Args:
+        events: at least 0.2 s; of longer stretches the first 20 s are looked at.
+        bin_ns: twice the bins' length is the shortest period seen.
+    """
+    if len(events) < 2:
+        return Flicker(0.0, 0.0, 0.0)
+    bins = (events.t_ns - events.t_ns[0]) // bin_ns
+    is_used = bins < _MAX_FLICKER_BINS
+    bins, polarity = bins[is_used], events.polarity[is_used]
+    signed = np.bincount(bins, weights=np.where(polarity, 1.0, -1.0))
+    coherence = _coherence(signed, np.bincount(bins))
+    power = np.abs(np.fft.rfft(signed - signed.mean())) ** 2
+    duration_s = len(signed) * bin_ns * 1e-9
+    slowest = int(np.ceil(_MIN_FLICKER_HZ * duration_s))
+    # Below four periods a line and its leakage are most of the spectrum.
+    if slowest < 4 or len(power) <= slowest + 1 or power.sum() == 0:
+        return Flicker(0.0, coherence, 0.0)
+    peak = slowest + int(np.argmax(power[slowest:]))
+    # A line that falls between two frequencies leaks into both.
+    lines = np.unique(np.clip(np.arange(peak, len(power), peak)[:, None] + (-1, 0, 1), 1, len(power) - 1))
+    return Flicker(peak / duration_s, coherence, float(power[lines].sum() / power.sum()))
+
+
+def _coherence(signed: NDArray[Any], counts: NDArray[np.intp]) -> float:
+    """Mean product of the polarities of two events in one bin, as a root: few events do not look coherent."""
+    n_pairs = float((counts * (counts - 1)).sum())
+    return float(np.sqrt(max((signed**2 - counts).sum() / n_pairs, 0.0))) if n_pairs else 0.0
