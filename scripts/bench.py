@@ -103,7 +103,7 @@ def _real_row(recorded: RecordedSet, folder: Path, n_splits: int) -> tuple[objec
     names = detections.captures(pair)
     n_image = sum(isinstance(detections.of(pair, name)[0], ImageBoard) for name in names)
     n_lidar = sum(isinstance(detections.of(pair, name)[1], list) for name in names)
-    calibration, estimate = pipeline.calibrate(rig, detections, CalibrateOptions())[0]
+    calibration, estimate = pipeline.calibrate(rig, detections, CalibrateOptions())[0][0]
     error = compare(estimate.T_cam_lidar, reference_of(folder))
     candidates = candidates_of(detections, pair)
     split = split_halves(candidates, rig, n_splits)
@@ -233,7 +233,7 @@ def _simulated_runs(name: str, n_seeds: int, n_captures: int) -> Iterator[tuple[
             scans[f"{capture.index:06d}"] = pipeline.detect_scan(rig, capture.scans[0])
         camera, lidar = next(iter(rig.cameras)), next(iter(rig.lidars))
         detections = pipeline.Detections({(camera, "frames"): images}, {lidar: scans})
-        calibration, estimate = pipeline.calibrate(rig, detections, CalibrateOptions(seed=seed))[0]
+        calibration, estimate = pipeline.calibrate(rig, detections, CalibrateOptions(seed=seed))[0][0]
         error = difference(estimate.T_cam_lidar, truth_extrinsics(rig, seed, options)[camera, lidar])
         nees = float(error @ np.linalg.solve(estimate.cov, error))
         yield (

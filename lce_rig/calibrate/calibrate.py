@@ -19,6 +19,7 @@ from lce_rig.calibrate.metrics import capture_residual, error_to_reference, summ
 from lce_rig.calibrate.observability import describe_weakest, linearise, require_observable
 from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates
 from lce_rig.calibrate.outliers import reject_outliers
+from lce_rig.calibrate.placements import group_placements
 from lce_rig.calibrate.problem import Problem, Solutions, Weights
 from lce_rig.calibrate.systematic import ring_sensitivities
 from lce_rig.core.board import Board
@@ -148,7 +149,11 @@ def _report(
         weak_direction=describe_weakest(cov[:6, :6], features),
         # The paper's code counts every ring end twice, which halves its mean.
         diagnostics=_diagnostics(problem, solution, covariances, draws, consensus)
-        | {"paper_mee_m": metrics.mee_m / 2},
+        | {
+            "paper_mee_m": metrics.mee_m / 2,
+            "held_out_m": float(np.mean(held_out)),
+            "n_placements": float(group_placements(observations).max() + 1),
+        },
     )
 
 
@@ -169,7 +174,13 @@ def _covariances(
     prior = np.zeros_like(hessians[0])
     if problem.weights.shift_prior is not None:
         prior[6, 6] = problem.weights.shift_prior
-    scatter = jackknife_covariance(gradients, hessians, prior)
+    # Captures of one placement share its errors: they are left out together.
+    placement = group_placements(observations)
+    n_placements = int(placement.max()) + 1
+    together_g, together_H = (np.zeros((n_placements, *a.shape[1:])) for a in (gradients, hessians))
+    np.add.at(together_g, placement, gradients)
+    np.add.at(together_H, placement, hessians)
+    scatter = jackknife_covariance(together_g, together_H, prior)
     laser_m, offset_m = options.laser_bias_sigma_m, options.range_offset_sigma_m
     if laser_m == 0 and offset_m == 0:
         return scatter, np.zeros_like(scatter)

@@ -52,18 +52,19 @@ def judge(
         n_captures: captures looked at, with those in which no board was found.
 
     Returns:
-        The verdict, and the reasons for anything but a pass, worst first.
+        The verdict, and the reasons for anything but a pass: worst first, causes before symptoms.
     """
     doubts = [
         *_certificate(estimate),
-        *_precision(estimate, rig),
-        *_residuals(estimate, rig),
-        *_motion(estimate),
-        *_refusals(estimate),
-        *_detected(estimate, n_captures, rig.quality.min_detected_fraction),
-        *_nominal(estimate, rig.nominal(camera, lidar)),
         *_scale(estimate, rig.board.to_board()),
         *_plate(estimate, rig.board.to_board()),
+        *_motion(estimate),
+        *_residuals(estimate, rig),
+        *_refusals(estimate),
+        *_detected(estimate, n_captures, rig.quality.min_detected_fraction),
+        *_placements(estimate, rig.quality.min_captures),
+        *_nominal(estimate, rig.nominal(camera, lidar)),
+        *_precision(estimate, rig),
     ]
     doubts.sort(key=lambda doubt: -_ORDER.index(doubt.verdict))
     verdict = doubts[0].verdict if doubts else "pass"
@@ -142,6 +143,14 @@ def _detected(estimate: CalibrationEstimate, n_captures: int, min_fraction: floa
         return []
     text = f"only {len(estimate.used)} of {n_captures} captures could be used"
     return [Doubt("marginal", f"{text}: see the causes with `lce-rig check`")]
+
+
+def _placements(estimate: CalibrationEstimate, needed: int) -> list[Doubt]:
+    n = int(estimate.diagnostics.get("n_placements", len(estimate.used)))
+    if n >= needed:
+        return []
+    text = f"{len(estimate.used)} captures show only {n} different placements ({needed} needed)"
+    return [Doubt("marginal", f"{text}: move the board between captures")]
 
 
 def _nominal(estimate: CalibrationEstimate, nominal: NominalExtrinsic | None) -> list[Doubt]:

@@ -23,7 +23,9 @@ _COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 )
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export a failed result too, marked as failed.")
-@click.option("--seed", default=0, show_default=True, help="Seed of the draws over subsets.")
+@click.option(
+    "--seed", default=0, show_default=True, type=click.IntRange(0), help="Seed of the draws over subsets."
+)
 @click.option(
     "--draws",
     "n_draws",
@@ -95,11 +97,18 @@ def calibrate(
         raise UsageError("--no-ptpl and --no-ptl together leave nothing to fit")
     options = CalibrateOptions(**switches)
     truth = None if reference is None else read_reference(reference)
+    pipeline.remove_results(opened)
     with show.progress_bar("detecting") as progress:
         detections = pipeline.detect(opened, progress=progress)
     with show.progress_bar("calibrating") as progress:
-        results = pipeline.calibrate(opened.rig, detections, options, reference=truth, progress=progress)
+        results, troubles = pipeline.calibrate(
+            opened.rig, detections, options, reference=truth, progress=progress
+        )
+    for trouble in troubles:
+        show.warn(str(trouble))
     calibrations = [calibration for calibration, _ in results]
+    if truth is not None and any(c.egt_rotation_deg is None for c in calibrations):
+        show.warn(f"{reference} holds no T_cam_lidar of these sensors")
     files = pipeline.write_results(opened, calibrations, force=force)
     if as_json:
         from lce_rig.export.result import to_json_dict
@@ -153,6 +162,6 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
             f"  reference    off by {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
         )
     for name, why in c.captures_refused.items():
-        lines.append(f"  [dim]{name} {why.stage}: {why.cause}: {why.action}[/]")
-    lines += [f"  [{colour}]{reason}[/]" for reason in c.reasons]
+        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.cause}: {why.action}')}[/]")
+    lines += [f"  [{colour}]{show.escape(reason)}[/]" for reason in c.reasons]
     return lines

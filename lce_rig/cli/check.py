@@ -27,6 +27,8 @@ def check(session: Path, as_json: bool, debug_images: bool) -> None:
     from lce_rig.session import Session
 
     opened = Session.open(session)
+    if not opened.captures:
+        raise NotEnoughDataError(f"{session} holds no captures", "Collect some first: lce-rig collect --help")
     with show.progress_bar("detecting") as progress:
         detections = pipeline.detect(opened, progress=progress)
     if debug_images:

@@ -71,10 +71,11 @@ def collect(
     """
     from lce_rig.collect import CollectOptions
     from lce_rig.collect import collect as fill
+    from lce_rig.core.errors import NotEnoughDataError
     from lce_rig.rig import load_rig
     from lce_rig.session import Session
     from lce_rig.sources import open_recording
-    from lce_rig.sources.base import SourceOptions
+    from lce_rig.sources.base import PairedRecording, SourceOptions
 
     rig = load_rig(rig_name)
     options = SourceOptions(camera, channel, lidar, pair, pair_tolerance, topics)
@@ -87,7 +88,14 @@ def collect(
             lambda done, total, _message: progress(done, total),
         )
         n_captures = len(writer.captures)
+    if topics and any(isinstance(recording, PairedRecording) for recording in recordings):
+        show.warn("--topic means nothing for a folder of pictures and clouds")
     _tell(report, session, n_captures)
+    if n_captures == 0:
+        raise NotEnoughDataError(
+            f"{session}: no capture could be made of {', '.join(map(str, paths))}",
+            "The board must stand still for a second in both sensors at once; do their clocks agree?",
+        )
 
 
 def _tell(report: Any, session: Path, n_captures: int) -> None:

@@ -120,6 +120,11 @@ def run(arguments: list[str]) -> int:
         click.secho(f"error: the package '{error.name}' is missing", fg="red", err=True)
         click.echo(f"  pip install {error.name}", err=True)
         return 5
+    except OSError as error:
+        if show_traceback:
+            traceback.print_exc()
+        click.secho(f"error: {error}", fg="red", err=True)
+        return LceRigError.exit_code
     except Exception:
         traceback.print_exc()
         click.secho("this is a bug in lce-rig: please report it with these lines", fg="red", err=True)

@@ -68,6 +68,13 @@ def progress_bar(title: str) -> Iterator[Progress]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
+def escape(text: str) -> str:
+    """Keep rich from reading brackets in names as markup."""
+    from rich.markup import escape as escape_markup
+
+    return escape_markup(text)
+
+
 def print_lines(lines: list[str]) -> None:
     """Print lines with rich markup on stdout; a terminal gets them wrapped at words, indented alike."""
     from rich.console import Console

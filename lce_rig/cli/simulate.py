@@ -52,11 +52,16 @@ def simulate(
     """
     from dataclasses import replace
 
+    from lce_rig.core.errors import SessionError
     from lce_rig.rig import load_rig
     from lce_rig.session import Session
     from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrinsics
 
     rig = load_rig(rig_name)
+    if session.exists():
+        raise SessionError(
+            f"{session} exists already", "Name another folder: a simulation is never continued."
+        )
     options = SimulationOptions.for_rig(rig.name)
     lidar_noise = options.lidar
     if range_sigma is not None:

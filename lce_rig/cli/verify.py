@@ -21,19 +21,37 @@ from lce_rig.cli import show
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the residuals as JSON.")
 def verify(session: Path, result: Path | None, output: Path | None, as_json: bool) -> None:
-    """Draw the LiDAR of each capture of SESSION (default: session/) into its picture, print residuals."""
+    """Draw the LiDAR of each capture of SESSION (default: session/) into its picture, print residuals.
+
+    Pictures and one contact sheet go to SESSION/calibration/overlays/. Exits with 7 where the verdict is fail
+    or these captures contradict the extrinsic.
+    """
+    from dataclasses import replace
+
     from lce_rig import pipeline
     from lce_rig.cli.calibrate import exit_by_verdict
+    from lce_rig.core.errors import ResultRefusedError, SessionError
     from lce_rig.export.result import read_result
     from lce_rig.pipeline.calibration import CALIBRATION
     from lce_rig.session import Session
 
     opened = Session.open(session)
     saved = read_result(result or session / CALIBRATION / "result.json")
+    if saved.rig != opened.rig.name or not saved.calibrations:
+        what = (
+            f"the result is of rig {saved.rig!r}"
+            if saved.calibrations
+            else "the result holds no pair of sensors"
+        )
+        raise SessionError(f"{what}; the session {session} is of rig {opened.rig.name!r}")
+    calibrations = list(saved.calibrations)
+    if result is not None:
+        # Names of captures say nothing across sessions: none of these was fitted.
+        calibrations = [replace(c, captures_used=(), captures_refused={}) for c in calibrations]
     with show.progress_bar("detecting") as progress:
         detections = pipeline.detect(opened, progress=progress)
     with show.progress_bar("drawing") as progress:
-        checks = pipeline.verify(opened, detections, saved.calibrations, folder=output, progress=progress)
+        checks = pipeline.verify(opened, detections, calibrations, folder=output, progress=progress)
     if as_json:
         show.print_json(
             {"format_version": 1, "rig": opened.rig.name, "pairs": [c.document() for c in checks]}
@@ -42,7 +60,13 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
         for checked in checks:
             show.print_table(_table(checked))
             show.print_lines(_summary(checked))
-    exit_by_verdict(saved.calibrations)
+    exit_by_verdict(calibrations)
+    contradicted = [checked for checked in checks if checked.doubts]
+    if contradicted:
+        raise ResultRefusedError(
+            f"the captures of {session} contradict the extrinsic of {contradicted[0].pair}",
+            "\n".join(contradicted[0].doubts),
+        )
 
 
 def _table(checked: Any) -> Any:
@@ -66,7 +90,8 @@ def _summary(checked: Any) -> list[str]:
             f"mean over captures: planes {1000 * m.mpe_m:.1f} mm, edges {1000 * m.mee_m:.1f} mm, "
             f"together {1000 * m.mge_m:.1f} mm; corners {m.reprojection_px:.2f} px"
         )
-    lines.append(f"verdict: {checked.verdict}")
+    lines.append(f"verdict of the calibration: {checked.verdict}")
+    lines.append(f"these captures: {'; '.join(checked.doubts) or 'agree'}")
     if checked.contact_sheet is not None:
-        lines.append(f"pictures: {checked.contact_sheet}")
+        lines.append(f"pictures: {show.escape(str(checked.contact_sheet))}")
     return lines

@@ -95,6 +95,8 @@ def _nearest_line(rho: Array, z: Array, lines: Array) -> tuple[NDArray[np.intp],
 def _refine_lines(rho: Array, z: Array, lines: Array, n_rounds: int = 3) -> Array:
     """Fit z / rho = slope + offset / rho to the points of each line, least squares in elevation."""
     n = len(lines)
+    if n < 2:
+        return lines
     x, y = 1.0 / rho, z / rho
     for _ in range(n_rounds):
         ring, _ = _nearest_line(rho, z, lines)

@@ -1,7 +1,7 @@
 """The story in order: captures -> detections -> extrinsics -> files and pictures. Start reading here.
 
     detections = detect(session)                            the board in every picture and scan
-    results = calibrate(session.rig, detections, options)   an extrinsic and verdict for every pair of sensors
+    results, troubles = calibrate(session.rig, detections, options)     an extrinsic and verdict a pair
     calibrations = [calibration for calibration, _ in results]
     write_results(session, calibrations, force=False)       result.json, YAML, URDF, camera_info, transforms
     verify(session, detections, calibrations)               the LiDAR drawn into the pictures
@@ -11,7 +11,7 @@ session and the export layer touch files.
 """
 
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
-from lce_rig.pipeline.calibration import calibrate, refusals, write_results
+from lce_rig.pipeline.calibration import calibrate, refusals, remove_results, write_results
 from lce_rig.pipeline.detection import detect, detect_image, detect_scan
 from lce_rig.pipeline.verification import verify, write_debug_images
 
@@ -25,6 +25,7 @@ __all__ = [
     "detect_image",
     "detect_scan",
     "refusals",
+    "remove_results",
     "verify",
     "write_debug_images",
     "write_results",

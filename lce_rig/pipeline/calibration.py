@@ -29,7 +29,7 @@ def calibrate(
     *,
     reference: Reference | None = None,
     progress: Progress = silent,
-) -> list[tuple[Calibration, CalibrationEstimate]]:
+) -> tuple[list[tuple[Calibration, CalibrationEstimate]], list[NotEnoughDataError]]:
     """Estimate and judge the extrinsic of every camera channel with every LiDAR.
 
     Args:
@@ -39,32 +39,57 @@ def calibrate(
         reference: extrinsics to report errors against; they never enter the estimate or the verdict.
         progress: called with (done, total) for each pair in turn.
 
+    Returns:
+        The pairs that could be calibrated; and for each other pair why not.
+
     Raises:
-        NotEnoughDataError: a pair has too few captures, or a direction stays open; the causes are named.
+        NotEnoughDataError: every pair has too few captures or leaves a direction open; the causes are named.
     """
-    results = []
+    results, troubles = [], []
     for pair in detections.pairs:
-        candidates, refused = _candidates(detections, pair)
-        needed = rig.quality.min_captures
-        if len(candidates) < needed:
-            raise NotEnoughDataError(
-                f"{pair}: the board was found by both sensors in {len(candidates)} of "
-                f"{len(candidates) + len(refused)} captures, at least {needed} are needed",
-                _commonest(refused) or "collect more captures",
+        try:
+            results.append(_calibrate_pair(rig, detections, pair, options, reference, progress))
+        except NotEnoughDataError as error:
+            troubles.append(error)
+    if not results:
+        raise (
+            troubles[0]
+            if troubles
+            else NotEnoughDataError(
+                "the session holds no capture with a picture and a scan", "Collect captures first."
             )
-        lidar = rig.lidars[pair.lidar]
-        pair_options = replace(
-            options,
-            laser_bias_sigma_m=lidar.laser_bias_sigma_m,
-            range_offset_sigma_m=lidar.range_offset_sigma_m,
         )
-        estimate = estimate_extrinsic(candidates, rig.board.to_board(), pair_options, progress)
-        calibration = _judged(rig, pair, estimate, n_captures=len(candidates) + len(refused), refused=refused)
-        truth = reference.of(pair.camera, pair.lidar) if reference else None
-        if truth is not None:
-            calibration = compare_with_reference(calibration, truth)
-        results.append((calibration, estimate))
-    return results
+    return results, troubles
+
+
+def _calibrate_pair(
+    rig: Rig,
+    detections: Detections,
+    pair: Pair,
+    options: CalibrateOptions,
+    reference: Reference | None,
+    progress: Progress,
+) -> tuple[Calibration, CalibrationEstimate]:
+    candidates, refused = _candidates(detections, pair)
+    needed = rig.quality.min_captures
+    if len(candidates) < needed:
+        raise NotEnoughDataError(
+            f"{pair}: the board was found by both sensors in {len(candidates)} of "
+            f"{len(candidates) + len(refused)} captures, at least {needed} are needed",
+            _commonest(refused) or "collect more captures",
+        )
+    lidar = rig.lidars[pair.lidar]
+    pair_options = replace(
+        options,
+        laser_bias_sigma_m=lidar.laser_bias_sigma_m,
+        range_offset_sigma_m=lidar.range_offset_sigma_m,
+    )
+    estimate = estimate_extrinsic(candidates, rig.board.to_board(), pair_options, progress)
+    calibration = _judged(rig, pair, estimate, n_captures=len(candidates) + len(refused), refused=refused)
+    truth = reference.of(pair.camera, pair.lidar) if reference else None
+    if truth is not None:
+        calibration = compare_with_reference(calibration, truth)
+    return calibration, estimate
 
 
 def compare_with_reference(calibration: Calibration, reference: Array) -> Calibration:
@@ -134,10 +159,21 @@ def write_results(session: Session, calibrations: list[Calibration], *, force: b
 
     folder = session.path / CALIBRATION
     folder.mkdir(exist_ok=True)
-    shutil.rmtree(folder / OVERLAYS, ignore_errors=True)  # pictures of an earlier result
     result = folder / "result.json"
     write_result(result, session.rig.name, calibrations)
-    if any(c.verdict == "fail" for c in calibrations) and not force:
+    usable = [c for c in calibrations if force or c.verdict != "fail"]
+    if not usable:
         remove_exports(folder)
         return [result]
-    return [result, *write_exports(calibrations, session.rig, folder, is_forced=force)]
+    return [result, *write_exports(usable, session.rig, folder, is_forced=force)]
+
+
+def remove_results(session: Session) -> None:
+    """Remove the result, exports and pictures of an earlier run: they must not pass for this one's."""
+    from lce_rig.export import remove_exports
+
+    folder = session.path / CALIBRATION
+    if folder.is_dir():
+        remove_exports(folder)
+        (folder / "result.json").unlink(missing_ok=True)
+        shutil.rmtree(folder / OVERLAYS, ignore_errors=True)

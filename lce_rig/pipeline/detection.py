@@ -26,7 +26,7 @@ def detect(session: Session, *, progress: Progress = silent, n_threads: int = 2)
         n_threads: detectors at work side by side.
     """
     digest = _detection_digest(session.rig)
-    sensors = [(capture, *_sensors(session.rig, capture)) for capture in session.captures]
+    sensors = _sensors(session.captures)
     image_jobs = [(capture, *channel) for capture, channels, _ in sensors for channel in channels]
     scan_jobs = [(capture, lidar) for capture, _, names in sensors for lidar in names]
     total = len(image_jobs) + len(scan_jobs)
@@ -48,14 +48,20 @@ def detect(session: Session, *, progress: Progress = silent, n_threads: int = 2)
     return Detections(images, lidars)
 
 
-def _sensors(rig: Rig, capture: Capture) -> tuple[list[tuple[str, str]], list[str]]:
-    """Name the (camera, channel) pairs and the LiDARs that a capture holds samples of."""
-    try:
-        return capture.image_keys, capture.lidars
-    except SessionError:
-        # Its manifest is damaged: every sensor is asked, so that every pair says so.
-        channels = [(name, channel) for name, camera in rig.cameras.items() for channel in camera.channels]
-        return sorted(channels), sorted(rig.lidars)
+def _sensors(captures: list[Capture]) -> list[tuple[Capture, list[tuple[str, str]], list[str]]]:
+    """Name the (camera, channel) pairs and the LiDARs that each capture holds samples of.
+
+    A capture whose manifest is damaged is asked for what the others hold, so that every pair says so.
+    """
+    known: dict[str, tuple[list[tuple[str, str]], list[str]]] = {}
+    for capture in captures:
+        with suppress(SessionError):
+            known[capture.name] = capture.image_keys, capture.lidars
+    if captures and not known:
+        captures[0].image_keys  # noqa: B018  raises what is wrong with it
+    channels = sorted({channel for held, _ in known.values() for channel in held})
+    lidars = sorted({lidar for _, held in known.values() for lidar in held})
+    return [(capture, *known.get(capture.name, (channels, lidars))) for capture in captures]
 
 
 def _image_detection(

@@ -92,6 +92,7 @@ class Session:
             raise SessionError(
                 f"{path / PROFILE}: the session's profile cannot be used: {error.what}", error.hint
             ) from error
+        _check_rig(path, rig)
         if not writable:
             return cls(path, rig, None)
         try:
@@ -268,6 +269,16 @@ class Session:
         for scan in scans:
             if scan.sensor not in self.rig.lidars:
                 raise SessionError(f"rig {self.rig.name!r} has no lidar {scan.sensor!r}")
+
+
+def _check_rig(path: Path, rig: Rig) -> None:
+    """Refuse a session whose marker names another rig than its profile."""
+    named = json.loads((path / MARKER).read_text(encoding="utf-8")).get("rig")
+    if named != rig.name:
+        raise SessionError(
+            f"{path}: {MARKER} is of rig {named!r}, {PROFILE} of rig {rig.name!r}",
+            "Put back the profile that the session was made with.",
+        )
 
 
 def _take_lock(path: Path) -> WriterLock:

@@ -120,7 +120,7 @@ def check_session(
 
 
 def contradictions(metrics: Metrics | None, rig: Rig) -> tuple[str, ...]:
-    """Say where captures contradict an extrinsic: residuals beyond the profile's limits, or no board at all."""
+    """Say where captures contradict an extrinsic: residuals beyond the limits, or no board at all."""
     if metrics is None:
         return ("no capture shows the board to both sensors",)
     limits = rig.quality

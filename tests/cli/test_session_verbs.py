@@ -13,7 +13,7 @@ def test_check_shows_a_row_a_capture_and_counts_the_usable_ones(lce_rig, simulat
     outcome = lce_rig("check", simulated)
     assert outcome.code == 0
     assert sum(line.startswith("0000") for line in outcome.out.splitlines()) == 16
-    assert "16 of 16 captures can be used" in outcome.err
+    assert "16 of 16 captures can be used" in outcome.out
 
 
 def test_check_gives_machines_every_figure_and_cause(lce_rig, simulated):
@@ -92,6 +92,63 @@ def test_verify_tells_a_wrong_extrinsic_by_its_residuals(lce_rig, session):
     assert wrong["mee_m"] > right["mee_m"] + 0.01
 
 
+def test_verify_refuses_an_extrinsic_that_the_captures_contradict(lce_rig, session):
+    lce_rig("calibrate", session)
+    path = session / "calibration" / "result.json"
+    result = read(path)
+    result["pairs"][0]["T_cam_lidar"][2][3] += 0.12
+    path.write_text(json.dumps(result))
+    outcome = lce_rig("verify", session)
+    assert outcome.code == 7
+    assert "contradict the extrinsic of davis.frames and lidar" in outcome.err
+    assert "limit 30 mm" in outcome.err
+
+
+def test_verify_refuses_the_result_of_another_rig(lce_rig, session):
+    lce_rig("calibrate", session)
+    path = session / "calibration" / "result.json"
+    path.write_text(json.dumps(read(path) | {"rig": "other"}))
+    assert lce_rig("verify", session).code == 4
+
+
+def test_captures_of_another_session_never_count_as_used(lce_rig, session, tmp_path):
+    lce_rig("calibrate", session)
+    foreign = tmp_path / "deployed.json"
+    foreign.write_bytes((session / "calibration" / "result.json").read_bytes())
+    pair = json.loads(lce_rig("verify", session, "--result", foreign, "--json").out)["pairs"][0]
+    assert not any(figures["was_used"] for figures in pair["captures"].values())
+
+
+def test_nothing_to_fit_is_a_usage_error(lce_rig, session):
+    outcome = lce_rig("calibrate", session, "--no-ptpl", "--no-ptl")
+    assert outcome.code == 2
+    assert "leave nothing to fit" in outcome.err
+
+
+def test_a_failed_calibration_leaves_no_earlier_result_behind(lce_rig, session):
+    import shutil
+
+    lce_rig("calibrate", session)
+    lce_rig("verify", session)
+    for k in range(4, 16):
+        shutil.rmtree(session / "captures" / f"{k:06d}")
+    assert lce_rig("calibrate", session).code == 6
+    assert list((session / "calibration").iterdir()) == []
+
+
+def test_a_capture_without_manifest_does_not_hinder_the_others(lce_rig, session):
+    (session / "captures" / "000003" / "meta.json").write_bytes(b"")
+    outcome = lce_rig("calibrate", session)
+    assert outcome.code == 0, outcome.err
+    assert "000003" in outcome.out
+
+
+def test_a_session_whose_profile_was_exchanged_is_refused(lce_rig, session):
+    marker = session / "session.json"
+    marker.write_text(marker.read_text().replace("rles", "rlfs"))
+    assert lce_rig("check", session).code == 4
+
+
 def test_a_nominal_extrinsic_far_off_fails_with_7_and_nothing_is_exported(lce_rig, session):
     profile = session / "rig.yaml"
     text = profile.read_text()
@@ -107,7 +164,7 @@ def test_a_nominal_extrinsic_far_off_fails_with_7_and_nothing_is_exported(lce_ri
     profile.write_text(turned)
     outcome = lce_rig("calibrate", session)
     assert outcome.code == 7
-    assert "from the nominal extrinsic" in outcome.err
+    assert "from the nominal extrinsic" in outcome.out
     assert read(session / "calibration" / "result.json")["pairs"][0]["verdict"] == "fail"
     assert not (session / "calibration" / "extrinsics.yaml").exists()
     assert lce_rig("verify", session).code == 7
@@ -129,9 +186,9 @@ def test_a_damaged_capture_is_named_and_the_others_still_count(lce_rig, session)
     (session / "captures" / "000004" / "lidar.pcd").write_bytes(b"# .PCD v0.7")
     outcome = lce_rig("check", session)
     assert outcome.code == 0
-    assert "15 of 16 captures can be used" in outcome.err
-    assert "000004: read:" in outcome.err
-    assert "lidar.pcd" in outcome.err
+    assert "15 of 16 captures can be used" in outcome.out
+    assert "000004: read:" in outcome.out
+    assert "lidar.pcd" in outcome.out
 
 
 def test_switched_off_terms_still_calibrate(lce_rig, session):
@@ -142,4 +199,4 @@ def test_switched_off_terms_still_calibrate(lce_rig, session):
 def test_simulating_into_a_session_that_exists_exits_with_4(lce_rig, session):
     outcome = lce_rig("simulate", "--rig", "rles", session, "--captures", "1")
     assert outcome.code == 4
-    assert "session already" in outcome.err
+    assert "exists already" in outcome.err

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -182,9 +183,10 @@ def test_a_loop_of_calibrations_stays_a_tree(three_sensor_rig: Rig, make: Make, 
     assert write_exports(calibrations, three_sensor_rig, tmp_path)
 
 
-def test_of_two_channels_the_better_verdict_and_then_the_first_gives_the_place(rles: Rig, make: Make) -> None:
+def test_of_two_channels_the_better_verdict_and_then_the_surer_gives_the_place(rles: Rig, make: Make) -> None:
     events = make(random_pose(1), channel="events")
-    for frames, wanted in ((make(), "frames"), (make(verdict="marginal"), "events")):
+    surer = replace(make(), cov=events.cov / 4)
+    for frames, wanted in ((surer, "frames"), (replace(surer, verdict="marginal"), "events")):
         (tree,) = build_trees([events, frames], rles)
         chosen = frames if wanted == "frames" else events
         T_lidar_body = invert(chosen.T_cam_lidar) @ invert(T_BODY_OPTICAL)
