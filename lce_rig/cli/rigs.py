@@ -23,7 +23,6 @@ def rigs(ctx: click.Context) -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def list_profiles(as_json: bool) -> None:
     """List the shipped profiles."""
-    from rich.table import Table
 
     from lce_rig.rig import load_rig, shipped_profiles
 
@@ -31,7 +30,7 @@ def list_profiles(as_json: bool) -> None:
     if as_json:
         screen.print_json({"rigs": [_summary(rig) for rig in profiles]})
         return
-    table = Table("rig", "LiDARs", "cameras (channels)", "board", "description")
+    table = screen.plain_table("", "rig", "LiDARs", "cameras (channels)", "board", "description")
     for rig in profiles:
         summary = _summary(rig)
         cameras = ", ".join(
@@ -76,10 +75,9 @@ def show_profile(rig_name: str, as_json: bool, as_yaml: bool) -> None:
 
 
 def _sensor_table(rig: "Rig") -> Any:
-    from rich.table import Table
 
-    table = Table(
-        "sensor", "model", "frame", "lens", "topic", "stamps", title=f"{rig.name}: {rig.description}"
+    table = screen.plain_table(
+        f"{rig.name}: {rig.description}", "sensor", "model", "frame", "lens", "topic", "stamps"
     )
     for name, lidar in rig.lidars.items():
         lens = f"{lidar.min_range_m:g}-{lidar.max_range_m:g} m"
@@ -104,11 +102,10 @@ def _stamps(settings: Any) -> str:
 
 
 def _board_table(rig: "Rig") -> Any:
-    from rich.table import Table
 
     board = rig.board
     (cols, rows), (x, y) = board.inner_corners, board.pattern_offset_m
-    table = Table("board", "")
+    table = screen.plain_table("", "board", "")
     table.add_row("inner corners", f"{cols} x {rows}")
     table.add_row("square", f"{1e3 * board.square_m:g} mm")
     table.add_row("plate", f"{board.width_m:g} x {board.height_m:g} m")
@@ -120,9 +117,8 @@ def _board_table(rig: "Rig") -> Any:
 
 
 def _limit_table(rig: "Rig") -> Any:
-    from rich.table import Table
 
-    table = Table("threshold or weight", "value", "default")
+    table = screen.plain_table("", "threshold or weight", "value", "default")
     for block in ("quality", "calibration"):
         settings = getattr(rig, block)
         for key, field in type(settings).model_fields.items():

@@ -31,11 +31,20 @@ def print_json(document: Any) -> None:
     click.echo(json.dumps(document, indent=2, allow_nan=False))
 
 
-def plain_table(title: str) -> Any:
+def plain_table(title: str, *headings: str) -> Any:
     """Start a rich table without lines, which survives copying into a message."""
     from rich.table import Table
 
-    return Table(title=title, title_justify="left", pad_edge=False, box=None, header_style="bold")
+    narrow = (0, 1, 0, 0)
+    return Table(
+        *headings,
+        title=title or None,
+        title_justify="left",
+        pad_edge=False,
+        box=None,
+        header_style="bold",
+        padding=narrow,
+    )
 
 
 def print_table(table: Any) -> None:
