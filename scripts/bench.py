@@ -13,6 +13,7 @@ import argparse
 import csv
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -306,6 +307,7 @@ def milliseconds(work: Callable[[int], object], n: int = 18) -> str:
 
 def _command_speed(session: Path) -> Iterator[tuple[str, str]]:
     for words in (["calibrate", str(session)], ["--help"]):
+        shutil.rmtree(session / "detections", ignore_errors=True)
         start = time.perf_counter()
         subprocess.run([sys.executable, "-m", "lce_rig", *words], check=False, capture_output=True)
         what = "lce-rig calibrate on rlfs01 from cold" if words[0] == "calibrate" else "lce-rig --help"
