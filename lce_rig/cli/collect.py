@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
+from lce_rig.cli.options import FiniteRange
 
 
 def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
@@ -37,7 +38,7 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     show_default=True,
     help="How a folder's pictures and clouds belong together: equal names, sorted order, nearest time.",
 )
-@click.option("--pair-tolerance", type=click.FloatRange(0), metavar="S", help="Largest difference of a pair.")
+@click.option("--pair-tolerance", type=FiniteRange(0), metavar="S", help="Largest difference of a pair.")
 @click.option(
     "--topic", "topics", multiple=True, callback=_topics, metavar="SENSOR=/TOPIC", help="Topic of a sensor."
 )
@@ -49,7 +50,7 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     "--target",
     type=click.IntRange(1),
     metavar="N",
-    help="Stop reading bags once the session has N captures; say so where it stays short.",
+    help="Stop reading once the session has N captures; say so where it stays short.",
 )
 def collect(
     rig_name: str,

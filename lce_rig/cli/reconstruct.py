@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
+from lce_rig.cli.options import FiniteRange
 
 STAMPS = "stamps.csv"
 
@@ -24,14 +25,14 @@ STAMPS = "stamps.csv"
     "--every",
     default=0.05,
     show_default=True,
-    type=click.FloatRange(0.001),
+    type=FiniteRange(0.001),
     metavar="S",
     help="One picture every so many seconds.",
 )
 @click.option("--topic", metavar="/TOPIC", help="Events topic of a bag with several.")
 @click.option(
     "--window-s",
-    type=click.FloatRange(0.001, 10),
+    type=FiniteRange(0.001, 10),
     metavar="S",
     help="Windows of this duration (the paper: 0.05).",
 )

@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
+from lce_rig.cli.options import FiniteRange
 
 TRUTH = "truth.json"
 
@@ -32,8 +33,8 @@ TRUTH = "truth.json"
     type=click.IntRange(1, 10),
     help="Range noise of the paper's simulated sets: levels 1 (none) to 10 (10 cm).",
 )
-@click.option("--range-sigma", type=click.FloatRange(0), metavar="M", help="Range noise of the LiDAR.")
-@click.option("--range-offset", type=float, metavar="M", help="Constant offset of all ranges.")
+@click.option("--range-sigma", type=FiniteRange(0, 1), metavar="M", help="Range noise of the LiDAR.")
+@click.option("--range-offset", type=FiniteRange(-1, 1), metavar="M", help="Constant offset of all ranges.")
 @click.option("--decoy", is_flag=True, help="Stand a blank plate of the board's size in the room.")
 def simulate(
     rig_name: str,

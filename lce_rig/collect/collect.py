@@ -23,7 +23,7 @@ class CollectOptions:
 
     Attributes:
         max_captures: the session is never filled beyond this; None for no limit.
-        target: number of captures wanted: continuous recordings are read until the session has as many.
+        target: number of captures wanted: recordings are read until the session has as many.
         min_move_m, min_turn_deg: a board differs from one captured before when it moved or turned as far; for
             continuous recordings only.
         stillness: when a board stands still; None takes the profile's `quality.max_motion_m`.
@@ -115,7 +115,7 @@ class _Collector:
         n_left_out = 0
         for done, files in enumerate(recording.pairs):
             message = files.label
-            if self._is_full():
+            if self._is_enough():
                 n_left_out += 1
                 continue
             try:
@@ -128,7 +128,9 @@ class _Collector:
                 message = f"{files.label} refused: {error.what}"
             self._progress(done + 1, len(recording.pairs), message)
         if n_left_out:
-            self.note([f"{n_left_out} pairs left out: the session is full ({self._options.max_captures})"])
+            self.note(
+                [f"{n_left_out} pairs left out: the session holds {self._n_captures} captures, as wanted"]
+            )
         if failures and len(failures) == len(recording.pairs):
             raise failures[0]
 

@@ -90,8 +90,9 @@ def test_the_cap_is_kept_and_what_is_left_out_is_counted(tmp_path, folder, rig):
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, folder, rig, max_captures=2, target=3)
         assert len(session.captures) == 2 and report.n_missing == 1
-        assert "3 pairs left out: the session is full (2)" in report.notes
-        assert len(run(session, folder, rig).captured) == 3
+        assert "3 pairs left out: the session holds 2 captures, as wanted" in report.notes
+        assert len(run(session, folder, rig, target=4).captured) == 2
+        assert len(run(session, folder, rig).captured) == 1
 
 
 def test_pictures_of_another_size_are_said(tmp_path, folder, rig):
