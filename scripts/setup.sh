@@ -32,8 +32,8 @@ if [ ! -x "$venv/bin/python" ]; then
   "$python" -m venv "$venv" || fail "could not make the virtual environment $venv"
 fi
 
-# The stamp holds what was installed, so that a second run starts at once.
-wanted="$1 $(cksum <pyproject.toml)"
+# The stamp holds what was installed from where, so that a second run starts at once.
+wanted="$1 $PWD $(cksum <pyproject.toml)"
 if [ "$(cat "$venv/.lce-rig-installed" 2>/dev/null)" != "$wanted" ]; then
   echo "installing lce-rig and what it needs into $venv (some minutes the first time)" >&2
   "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -e ".$1" ||
