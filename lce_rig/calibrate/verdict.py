@@ -9,7 +9,8 @@ from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.scale import ScaleCheck, compare_scales
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import rotation_angle
-from lce_rig.rig import NominalExtrinsic, Rig
+from lce_rig.core.results import Metrics
+from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 
 Verdict = Literal["pass", "marginal", "fail"]
 _ORDER: tuple[Verdict, ...] = ("pass", "marginal", "fail")
@@ -99,17 +100,21 @@ def _precision(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
     return doubts
 
 
+def residuals_beyond(metrics: Metrics, limits: QualitySettings) -> list[str]:
+    """Say which mean residuals of an extrinsic exceed the profile's limits, and by how much."""
+    return [
+        f"{what} by {1000 * value:.0f} mm on average, limit {1000 * limit:.0f} mm"
+        for value, limit, what in (
+            (metrics.mpe_m, limits.max_mpe_m, "LiDAR points lie off the camera's board planes"),
+            (metrics.mee_m, limits.max_mee_m, "ring ends lie off the board's edges"),
+        )
+        if value > limit
+    ]
+
+
 def _residuals(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
-    doubts = []
-    metrics, limits = estimate.metrics, rig.quality
-    for value, limit, what in (
-        (metrics.mpe_m, limits.max_mpe_m, "LiDAR points lie off the camera's board planes"),
-        (metrics.mee_m, limits.max_mee_m, "ring ends lie off the board's edges"),
-    ):
-        if value > limit:
-            text = f"{what} by {1000 * value:.0f} mm on average, limit {1000 * limit:.0f} mm"
-            text += ": was the board moving, or are board size or intrinsics wrong?"
-            doubts.append(Doubt("fail", text))
+    advice = "was the board moving, or are board size or intrinsics wrong?"
+    doubts = [Doubt("fail", f"{text}: {advice}") for text in residuals_beyond(estimate.metrics, rig.quality)]
     fitted = float(np.mean([np.hypot(r.plane_rms_m, r.edge_rms_m) for r in estimate.residuals]))
     if np.isfinite(estimate.held_out_m) and estimate.held_out_m > HELD_OUT_MARGINAL * fitted:
         text = f"captures left out fit worse ({1000 * estimate.held_out_m:.1f} mm) than captures used"

@@ -9,6 +9,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.core.results import Calibration
+from lce_rig.detect.detection import Pair
 
 _COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 
@@ -131,7 +132,7 @@ def exit_by_verdict(calibrations: Sequence[Calibration], *, are_told: bool = Fal
 
     failed = [c for c in calibrations if c.verdict == "fail"]
     if failed:
-        pairs = ", ".join(f"{c.camera}.{c.channel} and {c.lidar}" for c in failed)
+        pairs = ", ".join(str(Pair.of(c)) for c in failed)
         causes = "\n".join(reason for c in failed for reason in c.reasons)
         raise ResultRefusedError(f"do not use the result of {pairs}", "" if are_told else causes)
 
@@ -145,7 +146,7 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
     colour = _COLOURS[c.verdict]
     metrics = c.metrics
     lines = [
-        f"[bold]{c.camera}.{c.channel} and {c.lidar}[/]: [bold {colour}]{c.verdict.upper()}[/]",
+        f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/]",
         "  T_cam_lidar (p_cam = R p_lidar + t)",
         *("    " + "  ".join(f"{value: .6f}" for value in row) for row in c.T_cam_lidar[:3]),
         f"  known to     {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, Refusal
 
 Arrays = dict[str, NDArray[Any]]
 LidarDetection = list[LidarBoard] | Refusal
@@ -72,6 +72,16 @@ class Pair:
     camera: str
     channel: str
     lidar: str
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> "Pair":
+        """Name the sensors that a calibration is about."""
+        return cls(calibration.camera, calibration.channel, calibration.lidar)
+
+    @property
+    def folder_name(self) -> str:
+        """What a folder of this pair's files is called where there are several."""
+        return f"{self.camera}.{self.channel}.{self.lidar}"
 
     def __str__(self) -> str:
         return f"{self.camera}.{self.channel} and {self.lidar}"

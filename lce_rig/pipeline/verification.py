@@ -7,7 +7,7 @@ from typing import TypeVar
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError
 from lce_rig.core.results import Calibration
-from lce_rig.detect.detection import Detections
+from lce_rig.detect.detection import Detections, Pair
 from lce_rig.pipeline.calibration import CALIBRATION, OVERLAYS
 from lce_rig.pipeline.progress import Progress, silent
 from lce_rig.session import Session
@@ -38,7 +38,7 @@ def verify(
     base = folder or session.path / CALIBRATION / OVERLAYS
     checks = []
     for c in calibrations:
-        own = base if len(calibrations) == 1 else base / f"{c.camera}.{c.channel}.{c.lidar}"
+        own = base if len(calibrations) == 1 else base / Pair.of(c).folder_name
         checks.append(check_session(session, detections, c, own, progress))
     return checks
 
@@ -67,7 +67,7 @@ def write_debug_images(
             intrinsics=session.rig.cameras[pair.camera].to_intrinsics(),
             title=f"{pair}  {name}",
         )
-        own = base if len(detections.pairs) == 1 else base / f"{pair.camera}.{pair.channel}.{pair.lidar}"
+        own = base if len(detections.pairs) == 1 else base / pair.folder_name
         write_picture(own / f"{name}.png", picture)
         progress(done, len(jobs))
     return base

@@ -9,6 +9,7 @@ from lce_rig.calibrate.estimate import CaptureResidual
 from lce_rig.calibrate.matching import match_candidates
 from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.calibrate.options import CaptureCandidates
+from lce_rig.calibrate.verdict import residuals_beyond
 from lce_rig.core.errors import SessionError
 from lce_rig.core.results import Calibration, ImageBoard, Metrics, Observation
 from lce_rig.detect.detection import Detections, Pair
@@ -85,7 +86,7 @@ def check_session(
     Raises:
         SessionError: the session has no such sensors, or a picture cannot be written.
     """
-    pair = _pair(calibration)
+    pair = Pair.of(calibration)
     if pair not in detections.pairs:
         hint = "The result belongs to another session."
         raise SessionError(f"{session.path} holds no captures of {pair}", hint)
@@ -123,16 +124,7 @@ def contradictions(metrics: Metrics | None, rig: Rig) -> tuple[str, ...]:
     """Say where captures contradict an extrinsic: residuals beyond the limits, or no board at all."""
     if metrics is None:
         return ("no capture shows the board to both sensors",)
-    limits = rig.quality
-    pairs = (
-        ("LiDAR points lie off the board's planes", metrics.mpe_m, limits.max_mpe_m),
-        ("ring ends lie off the board's edges", metrics.mee_m, limits.max_mee_m),
-    )
-    return tuple(
-        f"{what} by {1000 * value:.0f} mm on average, limit {1000 * limit:.0f} mm"
-        for what, value, limit in pairs
-        if value > limit
-    )
+    return tuple(residuals_beyond(metrics, rig.quality))
 
 
 def _observe(
@@ -167,7 +159,7 @@ def _draw(
         image_board=None if observation is None else observation.image,
         board=rig.board.to_board(),
         residuals=_legend(capture.name, residual, calibration),
-        title=f"{rig.name}  {_pair(calibration)}  {capture.name}",
+        title=f"{rig.name}  {Pair.of(calibration)}  {capture.name}",
     )
     yield capture.name, picture, camera_part(picture, image)
 
@@ -188,7 +180,3 @@ def _legend(name: str, residual: CaptureResidual | None, calibration: Calibratio
     )
     figures["verdict"] = calibration.verdict
     return figures
-
-
-def _pair(calibration: Calibration) -> Pair:
-    return Pair(calibration.camera, calibration.channel, calibration.lidar)
