@@ -7,6 +7,7 @@ References:
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -52,16 +53,34 @@ def calibrate(
             direction undetermined, which is named.
     """
     options = options or CalibrateOptions()
-    consensus = _agree(candidates, board, options)
-    refused: dict[str, Refusal] = dict(consensus.refused)
-    observations = list(consensus.observations)
+    consensus = agree(candidates, board, options)
+    estimate = calibrate_observations(consensus.observations, board, options, progress)
+    return with_consensus(estimate, consensus)
+
+
+def calibrate_observations(
+    observations: Sequence[Observation],
+    board: Board,
+    options: CalibrateOptions,
+    progress: Callable[[int, int], None] | None = None,
+) -> CalibrationEstimate:
+    """Estimate T_cam_lidar from boards whose pairing is settled.
+
+    Args:
+        observations: one a capture.
+        board: its specification.
+        options: switches of the algorithm.
+        progress: called with (subsets done, subsets in all).
+
+    Raises:
+        NotEnoughDataError: the captures leave a direction undetermined, which is named.
+    """
     features = [extract_features(observation, board, options) for observation in observations]
     problem = Problem(features, board, _weights(options, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
     T_planes = solve_planes(features, problem)
     require_observable(features, problem, T_planes)
 
     outliers, sigmas = reject_outliers(features, problem, T_planes, options)
-    refused.update(outliers)
     features = [f for f in features if f.capture not in outliers]
     observations = [o for o in observations if o.capture not in outliers]
     keep = drop_uncertain(features, T_planes) if options.use_uncertainty else None
@@ -73,11 +92,24 @@ def calibrate(
     T_start = T_planes if draws is None else draws.T_mean[draws.best]
     solution = problem.solve(np.ones((1, problem.n_captures)), T_start, options.n_rounds)
     covariances = _covariances(observations, board, options, problem, solution)
-    return _report(observations, features, board, problem, solution, covariances, draws, refused, consensus)
+    return _report(observations, features, board, problem, solution, covariances, draws, outliers)
 
 
-def _agree(candidates: Sequence[CaptureCandidates], board: Board, options: CalibrateOptions) -> Consensus:
-    """Find the consensus, or explain why there is none."""
+def with_consensus(estimate: CalibrationEstimate, consensus: Consensus) -> CalibrationEstimate:
+    """Add to an estimate what the consensus had refused before."""
+    return replace(
+        estimate,
+        refused=dict(sorted({**consensus.refused, **estimate.refused}.items())),
+        diagnostics={**estimate.diagnostics, "n_alternative_poses": float(consensus.n_alternative_poses)},
+    )
+
+
+def agree(candidates: Sequence[CaptureCandidates], board: Board, options: CalibrateOptions) -> Consensus:
+    """Find the consensus, or explain why there is none.
+
+    Raises:
+        NotEnoughDataError: too few captures, or captures that agree with no extrinsic.
+    """
     needed = max(3, options.min_captures)
     if len(candidates) < needed:
         raise NotEnoughDataError(
@@ -126,7 +158,6 @@ def _report(
     covariances: tuple[Array, Array],
     draws: Draws | None,
     refused: dict[str, Refusal],
-    consensus: Consensus,
 ) -> CalibrationEstimate:
     T = solution.T[0]
     cov = covariances[0] + covariances[1]
@@ -148,7 +179,7 @@ def _report(
         held_out_m=float(np.mean(held_out)),
         weak_direction=describe_weakest(cov[:6, :6], features),
         # The paper's code counts every ring end twice, which halves its mean.
-        diagnostics=_diagnostics(problem, solution, covariances, draws, consensus)
+        diagnostics=_diagnostics(problem, solution, covariances, draws)
         | {
             "paper_mee_m": metrics.mee_m / 2,
             "held_out_m": float(np.mean(held_out)),
@@ -194,7 +225,6 @@ def _diagnostics(
     solution: Solutions,
     covariances: tuple[Array, Array],
     draws: Draws | None,
-    consensus: Consensus,
 ) -> dict[str, float]:
     plane, edge = problem.errors(solution.x)
     figures = {
@@ -202,7 +232,6 @@ def _diagnostics(
         "edge_weight": problem.weights.edge * NOMINAL_SIGMA_M**2,
         "fit_plane_rms_m": float(np.sqrt(np.mean(plane**2))),
         "fit_edge_rms_m": float(np.sqrt(np.mean(edge**2))),
-        "n_alternative_poses": float(consensus.n_alternative_poses),
     }
     for name, cov in zip(("scatter", "systematic"), covariances, strict=True):
         figures[f"sigma_{name}_rotation_deg"] = float(np.degrees(np.sqrt(np.trace(cov[3:6, 3:6]))))

@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 
+from lce_rig.calibrate.channels import ChannelsEstimate
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.scale import ScaleCheck, compare_scales
 from lce_rig.core.board import Board
@@ -21,6 +22,8 @@ SCALE_MARGINAL, SCALE_FAIL = 0.01, 0.025
 PLATE_KNOWN_M, PLATE_FAIL = 0.03, 0.05
 # Planes of both sensors agree to 6-8 mm where boards stand still, to 20-30 mm where they are hand-held.
 MOVING_M = 0.012
+# 99 % of the chi-squared distribution of six freedoms.
+CHANNELS_CHI2 = 16.81
 # What helps where more captures do not.
 MEASURE_RANGES = (
     "the LiDAR's constant range errors alone exceed it: measure them, correct them in its driver and lower "
@@ -41,12 +44,12 @@ class Doubt:
 
 
 def judge(
-    estimate: CalibrationEstimate, rig: Rig, camera: str, lidar: str, n_captures: int
+    result: ChannelsEstimate, rig: Rig, camera: str, lidar: str, n_captures: int
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Weigh everything known about an extrinsic.
 
     Args:
-        estimate: the extrinsic with its residuals and refusals.
+        result: the extrinsic with its residuals and refusals, and what each channel says.
         rig: thresholds, targets and the nominal extrinsic.
         camera: name of the camera.
         lidar: name of the LiDAR.
@@ -55,11 +58,13 @@ def judge(
     Returns:
         The verdict, and the reasons for anything but a pass: worst first, causes before symptoms.
     """
+    estimate = result.estimate
     doubts = [
         *_certificate(estimate),
         *_scale(estimate, rig.board.to_board()),
         *_plate(estimate, rig.board.to_board()),
-        *_motion(estimate),
+        *_motion(result),
+        *_channels(result, rig),
         *_residuals(estimate, rig),
         *_refusals(estimate),
         *_detected(estimate, n_captures, rig.quality.min_detected_fraction),
@@ -122,13 +127,40 @@ def _residuals(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
     return doubts
 
 
-def _motion(estimate: CalibrationEstimate) -> list[Doubt]:
-    rms_m = estimate.diagnostics.get("fit_plane_rms_m", 0.0)
+def _motion(result: ChannelsEstimate) -> list[Doubt]:
+    rms_m = result.estimate.diagnostics.get("fit_plane_rms_m", 0.0)
     if rms_m <= MOVING_M:
         return []
-    text = f"camera and LiDAR see the planes {1000 * rms_m:.0f} mm apart (rms; under 10 mm for still boards)"
+    is_compensated = any(channel.time_offset_s is not None for channel in result.channels)
+    still = "with their motion taken off" if is_compensated else "under 10 mm for still boards"
+    text = f"camera and LiDAR see the planes {1000 * rms_m:.0f} mm apart (rms; {still})"
     advice = "did the board move, or do pictures and scans not belong together in time?"
+    if is_compensated:
+        advice = "move the board more slowly and evenly, about 10 cm/s"
     return [Doubt("marginal", f"{text}: {advice}")]
+
+
+def _channels(result: ChannelsEstimate, rig: Rig) -> list[Doubt]:
+    """Hold the channels of one camera against each other: it cannot sit in two places."""
+    if result.difference is None or result.difference_cov is None:
+        return []
+    apart = result.difference
+    surprise = float(apart @ np.linalg.solve(result.difference_cov, apart))
+    rotation_deg, translation_m = (
+        float(np.degrees(np.linalg.norm(apart[3:]))),
+        float(np.linalg.norm(apart[:3])),
+    )
+    target = rig.calibration
+    excess = max(rotation_deg / target.target_sigma_deg, translation_m / target.target_sigma_m)
+    if surprise <= CHANNELS_CHI2 or excess <= 1:
+        return []
+    names = " and ".join(channel.channel for channel in result.channels)
+    verdict: Verdict = "fail" if excess > SIGMA_FAIL else "marginal"
+    text = f"{names} of one camera disagree by {rotation_deg:.2f} deg, {1000 * translation_m:.0f} mm"
+    advice = (
+        "beyond their uncertainty: calibrate each alone (--channels) and see which captures contradict it"
+    )
+    return [Doubt(verdict, f"{text}, {advice}")]
 
 
 def _refusals(estimate: CalibrationEstimate) -> list[Doubt]:

@@ -39,6 +39,11 @@ class ImageBoard:
         reprojection_px: rms of the corner residuals.
         sigma_px: corner noise per coordinate, from the residuals and their degrees of freedom.
         quality: figures by name: sharpness, tilt_deg, distance_m, square_px, border_px, ...
+        stamp_ns: of the picture; None where the recording carries no time.
+        track_ns: (K,) int64 stamps of further pictures of this channel, shortly before and after, in which
+            the board was followed; None where there are none.
+        track_T_cam_board: (K, 4, 4) its poses there, corners in the same order as here.
+        track_cov: (K, 6, 6) of those poses, as `cov`.
     """
 
     corners_px: Array
@@ -50,6 +55,10 @@ class ImageBoard:
     reprojection_px: float
     sigma_px: float
     quality: Mapping[str, float] = field(default_factory=dict)
+    stamp_ns: int | None = None
+    track_ns: NDArray[np.int64] | None = None
+    track_T_cam_board: Array | None = None
+    track_cov: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +79,7 @@ class LidarBoard:
         offset_ns: (N,) int64 firing time of each point after the scan's stamp; None without.
         quality: figures by name: n_rings, n_points, thickness_m, width_m, height_m, edge_rms_m, template_m,
             distance_m, ...
+        stamp_ns: of the scan; None where the recording carries no time.
     """
 
     points: Array
@@ -83,6 +93,7 @@ class LidarBoard:
     T_lidar_board: Array
     offset_ns: NDArray[np.int64] | None = None
     quality: Mapping[str, float] = field(default_factory=dict)
+    stamp_ns: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,10 +150,40 @@ class Metrics:
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
-    """The extrinsic of one camera channel and one LiDAR, with everything needed to judge it.
+class ChannelResult:
+    """What one channel of a camera says alone, and how well it is timed.
 
     Attributes:
+        channel: its name.
+        n_captures: captures in which it shows the board and agrees with the others.
+        noise_px: corner noise per coordinate, from the residuals of all its pictures.
+        T_cam_lidar: (4, 4) extrinsic from this channel's pictures; from others' only how boards moved.
+        cov: (6, 6) of it, as `Calibration.cov`.
+        depth_scatter_m: standard deviation over captures of the LiDAR's distance from the board's plane.
+        depth_scatter_still_m: the same if boards are taken to have stood still.
+        time_offset_s: what to add to its stamps beyond the profile's expected offset to come to the LiDAR's
+            time; pictures without stamps count from the scan's first firing. None where nothing moved.
+        time_offset_sigma_s: standard deviation of that.
+    """
+
+    channel: str
+    n_captures: int
+    noise_px: float
+    T_cam_lidar: Array
+    cov: Array
+    depth_scatter_m: float
+    depth_scatter_still_m: float
+    time_offset_s: float | None = None
+    time_offset_sigma_s: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The extrinsic of one camera and one LiDAR, with everything needed to judge it.
+
+    Attributes:
+        channel: of the camera, or several joined by "+".
+        channel_results: what each of these says alone.
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
         egt_rotation_deg, egt_translation_m: error against a reference given by the user; None without.
@@ -168,6 +209,12 @@ class Calibration:
     egt_rotation_deg: float | None = None
     egt_translation_m: float | None = None
     diagnostics: Mapping[str, float] = field(default_factory=dict)
+    channel_results: tuple[ChannelResult, ...] = ()
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the channels behind the result."""
+        return tuple(self.channel.split("+"))
 
     @property
     def sigma_rotation_deg(self) -> float:

@@ -116,7 +116,8 @@ def require_known(calibration: Calibration, rig: Rig) -> None:
         LceRigError: a sensor or channel that the rig does not have.
     """
     camera = rig.cameras.get(calibration.camera)
-    if camera is None or calibration.lidar not in rig.lidars or calibration.channel not in camera.channels:
+    is_known = camera is not None and set(calibration.channels) <= set(camera.channels)
+    if not is_known or calibration.lidar not in rig.lidars:
         pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
         what = f"the result is about {pair}, which rig {rig.name} does not have"
         raise LceRigError(what, "use the profile the session was made with")

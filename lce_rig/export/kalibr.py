@@ -49,7 +49,8 @@ def _text(chain: Sequence[Calibration], rig: Rig) -> str:
         coefficients = (*intrinsics.distortion, 0.0, 0.0, 0.0, 0.0)[:4]
         model = "equidistant" if intrinsics.model == "equidistant" else "radtan"
         topic = (
-            rig.cameras[calibration.camera].channels[calibration.channel].topic or f"/{calibration.camera}"
+            rig.cameras[calibration.camera].channels[calibration.channels[0]].topic
+            or f"/{calibration.camera}"
         )
         camera_matrix = (intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px)
         lines += [f"cam{index}:"]

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 
 from lce_rig.core.errors import ResultRefusedError, SessionError
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration
-from lce_rig.export.result_schema import PairRecord, ResultRecord
+from lce_rig.core.results import Calibration, ChannelResult
+from lce_rig.export.result_schema import ChannelRecord, PairRecord, ResultRecord
 from lce_rig.export.writing import MADE_BY, write_atomically
 
 FORMAT_VERSION = 1
@@ -67,6 +67,21 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
         "verdict": calibration.verdict,
         "reasons": list(calibration.reasons),
         "diagnostics": {name: _figure(value) for name, value in sorted(calibration.diagnostics.items())},
+        "channels": [_channel(result, calibration) for result in calibration.channel_results],
+    }
+
+
+def _channel(result: ChannelResult, calibration: Calibration) -> dict[str, Any]:
+    return {
+        "channel": result.channel,
+        "n_captures": int(result.n_captures),
+        "noise_px": float(result.noise_px),
+        "T_cam_lidar": _matrix(result.T_cam_lidar, f"T_cam_lidar of {result.channel}", calibration),
+        "cov": _matrix(result.cov, f"cov of {result.channel}", calibration),
+        "depth_scatter_m": float(result.depth_scatter_m),
+        "depth_scatter_still_m": float(result.depth_scatter_still_m),
+        "time_offset_s": _figure(result.time_offset_s),
+        "time_offset_sigma_s": _figure(result.time_offset_sigma_s),
     }
 
 
@@ -176,4 +191,11 @@ def _calibration(pair: PairRecord) -> Calibration:
         egt_rotation_deg=pair.egt_rotation_deg,
         egt_translation_m=pair.egt_translation_m,
         diagnostics={name: figure(value) for name, value in pair.diagnostics.items()},
+        channel_results=tuple(_channel_result(record) for record in pair.channels),
     )
+
+
+def _channel_result(record: ChannelRecord) -> ChannelResult:
+    figures = record.model_dump()
+    figures |= {name: np.array(figures[name], dtype=np.float64) for name in ("T_cam_lidar", "cov")}
+    return ChannelResult(**figures)

@@ -30,8 +30,22 @@ class CertificateRecord(_Record):
     gap: float | None
 
 
+class ChannelRecord(_Record):
+    """What one channel says alone; time offsets are null where nothing moved."""
+
+    channel: str
+    n_captures: _Count
+    noise_px: _NotNegative
+    T_cam_lidar: Annotated[list[_Row4], Field(min_length=4, max_length=4)]
+    cov: Annotated[list[_Row6], Field(min_length=6, max_length=6)]
+    depth_scatter_m: _NotNegative
+    depth_scatter_still_m: _NotNegative
+    time_offset_s: float | None = None
+    time_offset_sigma_s: _NotNegative | None = None
+
+
 class PairRecord(_Record):
-    """One camera channel and one LiDAR; figures that could not be computed are null."""
+    """One camera and one LiDAR; figures that could not be computed are null."""
 
     camera: str
     channel: str
@@ -54,6 +68,7 @@ class PairRecord(_Record):
     verdict: Literal["pass", "marginal", "fail"]
     reasons: list[str]
     diagnostics: dict[str, float | None] = Field(default_factory=dict)
+    channels: list[ChannelRecord] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "PairRecord":

@@ -1,16 +1,25 @@
-"""Estimate, judge and write the extrinsic of every camera channel with every LiDAR of a session."""
+"""Estimate, judge and write the extrinsic of every camera with every LiDAR of a session."""
 
 import shutil
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate, CaptureCandidates
-from lce_rig.calibrate import calibrate as estimate_extrinsic
+import numpy as np
+
+from lce_rig.calibrate import (
+    CalibrateOptions,
+    CalibrationEstimate,
+    CaptureCandidates,
+    ChannelsEstimate,
+    Clocks,
+    calibrate_channels,
+)
 from lce_rig.calibrate.consensus import find_consensus
 from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.calibrate.verdict import judge
-from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.errors import NotEnoughDataError, UsageError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Calibration, Refusal
 from lce_rig.detect.detection import Detections, Pair
@@ -27,28 +36,33 @@ def calibrate(
     detections: Detections,
     options: CalibrateOptions,
     *,
+    channels: Sequence[str] | None = None,
     reference: Reference | None = None,
     progress: Progress = silent,
 ) -> tuple[list[tuple[Calibration, CalibrationEstimate]], list[NotEnoughDataError]]:
-    """Estimate and judge the extrinsic of every camera channel with every LiDAR.
+    """Estimate and judge the extrinsic of every camera with every LiDAR.
+
+    Channels of one camera share pixels and lens: together they give one extrinsic.
 
     Args:
         rig: thresholds, targets and nominal extrinsics.
         detections: of one session.
         options: switches of the algorithm.
+        channels: of the cameras, to use; None takes all that the session holds.
         reference: extrinsics to report errors against; they never enter the estimate or the verdict.
-        progress: called with (done, total) for each pair in turn.
+        progress: called with (done, total) for each camera and LiDAR in turn.
 
     Returns:
-        The pairs that could be calibrated; and for each other pair why not.
+        The sensors that could be calibrated; and for each other pair why not.
 
     Raises:
         NotEnoughDataError: every pair has too few captures or leaves a direction open; the causes are named.
+        UsageError: no capture holds one of the channels.
     """
     results, troubles = [], []
-    for pair in detections.pairs:
+    for pairs in _pairs_by_sensors(detections, channels):
         try:
-            results.append(_calibrate_pair(rig, detections, pair, options, reference, progress))
+            results.append(_calibrate_sensors(rig, detections, pairs, options, reference, progress))
         except NotEnoughDataError as error:
             troubles.append(error)
     if not results:
@@ -62,34 +76,84 @@ def calibrate(
     return results, troubles
 
 
-def _calibrate_pair(
+def _pairs_by_sensors(detections: Detections, channels: Sequence[str] | None) -> list[list[Pair]]:
+    """Bring together the pairs of one camera and LiDAR, whose channels are calibrated as one."""
+    held = sorted({pair.channel for pair in detections.pairs})
+    unknown = sorted(set(channels or ()) - set(held))
+    if unknown:
+        raise UsageError(
+            f"no capture of the session holds channel {unknown[0]!r}", f"there is {', '.join(held)}"
+        )
+    wanted = [pair for pair in detections.pairs if channels is None or pair.channel in channels]
+    groups: dict[tuple[str, str], list[Pair]] = {}
+    for pair in wanted:
+        groups.setdefault((pair.camera, pair.lidar), []).append(pair)
+    return list(groups.values())
+
+
+def _calibrate_sensors(
     rig: Rig,
     detections: Detections,
-    pair: Pair,
+    pairs: Sequence[Pair],
     options: CalibrateOptions,
     reference: Reference | None,
     progress: Progress,
 ) -> tuple[Calibration, CalibrationEstimate]:
-    candidates, refused = _candidates(detections, pair)
-    needed = rig.quality.min_captures
-    if len(candidates) < needed:
-        raise NotEnoughDataError(
-            f"{pair}: the board was found by both sensors in {len(candidates)} of "
-            f"{len(candidates) + len(refused)} captures, at least {needed} are needed",
-            _commonest(refused) or "collect more captures",
-        )
-    lidar = rig.lidars[pair.lidar]
+    candidates, refused = _usable(rig, detections, pairs)
+    camera, lidar = pairs[0].camera, pairs[0].lidar
+    settings = rig.lidars[lidar]
     pair_options = replace(
         options,
-        laser_bias_sigma_m=lidar.laser_bias_sigma_m,
-        range_offset_sigma_m=lidar.range_offset_sigma_m,
+        laser_bias_sigma_m=settings.laser_bias_sigma_m,
+        range_offset_sigma_m=settings.range_offset_sigma_m,
     )
-    estimate = estimate_extrinsic(candidates, rig.board.to_board(), pair_options, progress)
-    calibration = _judged(rig, pair, estimate, n_captures=len(candidates) + len(refused), refused=refused)
-    truth = reference.of(pair.camera, pair.lidar) if reference else None
+    clocks = _clocks(rig, camera, lidar)
+    result = calibrate_channels(candidates, rig.board.to_board(), pair_options, clocks, progress)
+    n_captures = len({name for pair in pairs for name in detections.captures(pair)})
+    calibration = _judged(rig, camera, lidar, result, n_captures=n_captures, refused=refused)
+    truth = reference.of(camera, lidar) if reference else None
     if truth is not None:
         calibration = compare_with_reference(calibration, truth)
-    return calibration, estimate
+    return calibration, result.estimate
+
+
+def _usable(
+    rig: Rig, detections: Detections, pairs: Sequence[Pair]
+) -> tuple[dict[str, list[CaptureCandidates]], dict[str, Refusal]]:
+    """Gather the candidates of each channel that has captures enough, and refusals of captures of no use.
+
+    Raises:
+        NotEnoughDataError: no channel has.
+    """
+    candidates: dict[str, list[CaptureCandidates]] = {}
+    refused: dict[str, Refusal] = {}
+    needed = rig.quality.min_captures
+    trouble: NotEnoughDataError | None = None
+    for pair in pairs:
+        own, own_refused = _candidates(detections, pair)
+        refused |= {name: why for name, why in own_refused.items() if name not in refused}
+        if len(own) >= needed:
+            candidates[pair.channel] = own
+        elif trouble is None:
+            trouble = NotEnoughDataError(
+                f"{pair}: the board was found by both sensors in {len(own)} of "
+                f"{len(own) + len(own_refused)} captures, at least {needed} are needed",
+                _commonest(own_refused) or "collect more captures",
+            )
+    if not candidates and trouble is not None:
+        raise trouble
+    found = {item.capture for items in candidates.values() for item in items}
+    return candidates, {name: why for name, why in refused.items() if name not in found}
+
+
+def _clocks(rig: Rig, camera: str, lidar: str) -> Clocks:
+    stamps = {name: channel.timestamps for name, channel in rig.cameras[camera].channels.items()}
+    return Clocks(
+        sweep_s=1 / rig.lidars[lidar].rate_hz,
+        lidar_offset_s=rig.lidars[lidar].timestamps.expected_offset_s,
+        channel_offset_s={name: settings.expected_offset_s for name, settings in stamps.items()},
+        tolerance_s={name: settings.tolerance_s for name, settings in stamps.items()},
+    )
 
 
 def compare_with_reference(calibration: Calibration, reference: Array) -> Calibration:
@@ -127,25 +191,51 @@ def _commonest(refused: dict[str, Refusal]) -> str:
 
 
 def _judged(
-    rig: Rig, pair: Pair, estimate: CalibrationEstimate, *, n_captures: int, refused: dict[str, Refusal]
+    rig: Rig,
+    camera: str,
+    lidar: str,
+    result: ChannelsEstimate,
+    *,
+    n_captures: int,
+    refused: dict[str, Refusal],
 ) -> Calibration:
-    verdict, reasons = judge(estimate, rig, pair.camera, pair.lidar, n_captures)
+    verdict, reasons = judge(result, rig, camera, lidar, n_captures)
+    estimate = result.estimate
+    diagnostics = dict(estimate.diagnostics)
+    if result.difference is not None:
+        diagnostics["channels_rotation_deg"] = float(np.degrees(np.linalg.norm(result.difference[3:])))
+        diagnostics["channels_translation_m"] = float(np.linalg.norm(result.difference[:3]))
     return Calibration(
-        camera=pair.camera,
-        channel=pair.channel,
-        lidar=pair.lidar,
+        camera=camera,
+        channel="+".join(channel.channel for channel in result.channels),
+        lidar=lidar,
         T_cam_lidar=estimate.T_cam_lidar,
         cov=estimate.cov,
         certificate=estimate.certificate,
         metrics=estimate.metrics,
         n_captures=n_captures,
         n_detected=n_captures - len(refused),
-        captures_used=estimate.used,
-        captures_refused=dict(sorted({**refused, **estimate.refused}.items())),
+        captures_used=tuple(sorted(_single(estimate.used))),
+        captures_refused=_still_refused(estimate, refused),
         verdict=verdict,
         reasons=reasons,
-        diagnostics=estimate.diagnostics,
+        diagnostics=diagnostics,
+        channel_results=result.channels,
     )
+
+
+def _single(names: Iterable[str]) -> set[str]:
+    """Take names of captures that share a scan ("000003+000060") apart."""
+    return {single for name in names for single in name.split("+")}
+
+
+def _still_refused(estimate: CalibrationEstimate, refused: dict[str, Refusal]) -> dict[str, Refusal]:
+    """List refusals by capture, less what another channel of the same scan made up for."""
+    used = _single(estimate.used)
+    every = dict(refused)
+    for name, why in estimate.refused.items():
+        every |= dict.fromkeys(_single([name]), why)
+    return {name: every[name] for name in sorted(every) if name not in used}
 
 
 def write_results(session: Session, calibrations: list[Calibration], *, force: bool) -> list[Path]:

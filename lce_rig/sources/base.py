@@ -5,10 +5,30 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Events, Image, Scan
 
-Sample: TypeAlias = Image | Scan
+Sample: TypeAlias = Image | Scan | Events
 PairMethod: TypeAlias = Literal["auto", "stem", "order", "time"]
+Span: TypeAlias = tuple[int, int]
+"""First and last stamp, ns, the sensor's own clock."""
+
+
+@dataclass(frozen=True, order=True)
+class Stream:
+    """What one sensor sends.
+
+    Attributes:
+        sensor: the camera or LiDAR.
+        channel: of a camera; "" for a LiDAR.
+        kind: a channel of events may also bring pictures that others reconstructed.
+    """
+
+    sensor: str
+    channel: str
+    kind: Literal["pictures", "events", "scans"]
+
+    def __str__(self) -> str:
+        return f"{self.sensor}.{self.channel}" if self.channel else self.sensor
 
 
 @dataclass(frozen=True)
@@ -20,6 +40,7 @@ class SourceOptions:
         pair: how a folder's pictures and clouds are matched.
         pair_tolerance_s: largest difference in time of a pair; None takes the profile's.
         topics: topic by sensor ("cam", "cam.events", "lidar"), in place of the profile's.
+        is_part: whether other recordings of the same moment hold what this one lacks.
     """
 
     camera: str | None = None
@@ -28,6 +49,7 @@ class SourceOptions:
     pair: PairMethod = "auto"
     pair_tolerance_s: float | None = None
     topics: Mapping[str, str] = field(default_factory=dict)
+    is_part: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,12 +111,14 @@ class ContinuousRecording(Recording, Protocol):
 
     Attributes:
         key: fingerprint of the recording.
-        n_samples: number of samples to come, for progress.
+        n_samples: number of pictures and scans to come, for progress.
+        streams: what is in it, with the span of its stamps where that is known without reading everything.
     """
 
     key: str
     n_samples: int
+    streams: Mapping[Stream, Span | None]
 
     def samples(self) -> Iterator[Sample]:
-        """Yield what the sensors saw, in order of time, one sample at a time."""
+        """Yield what the sensors saw, in order of time; events in packets."""
         ...

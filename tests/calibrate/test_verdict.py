@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, calibrate
+from lce_rig.calibrate import CalibrateOptions, ChannelsEstimate, calibrate
 from lce_rig.calibrate.scale import compare_scales
 from lce_rig.calibrate.verdict import judge
 from lce_rig.core.geometry import perturb
@@ -22,7 +22,7 @@ def estimate():
 
 
 def verdict_of(estimate, rig=RIG, n_captures=20):
-    return judge(estimate, rig, "cam", "lidar", n_captures)
+    return judge(ChannelsEstimate(estimate, ()), rig, "cam", "lidar", n_captures)
 
 
 def test_a_sound_result_passes_without_reasons(estimate):

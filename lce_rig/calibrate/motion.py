@@ -1,0 +1,284 @@
+"""The motion of a hand-held board in front of one camera, capture by capture, from all pictures of it.
+
+Pictures of one capture, of one channel or several, see the board at different times. About each scan its pose
+is taken to change steadily,
+
+    c(t) = c_0 + v t,    R(t) = exp((w t)^) R_0,    v ~ N(0, s_v^2 I),    w ~ N(0, s_w^2 I)               (1)
+
+The four vectors of each capture follow from its pictures by linear least squares in the tangent space of one
+of their poses; the hand's habits s_v and s_w follow from all captures together.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.geometry import Array, difference, fit_plane, perturb, rotation_angle, skew
+from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.solvers.covariance import symmetric_inverse
+
+# Habits of a hand before any capture is seen: (speed m/s, turn rad/s) for each axis; worth so many captures.
+USUAL_HABITS = np.array([0.15, np.radians(10.0)])
+_USUAL_WEIGHT = 3.0
+_N_LEARNING = 15
+# What pictures err beyond their corners' noise: lens, board and reconstruction.
+POSE_FLOOR = np.r_[np.full(3, 1e-3), np.full(3, np.radians(0.1))]
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSamples:
+    """Poses of the board in the pictures of F captures, J of each at most.
+
+    Attributes:
+        channels: names of the channels.
+        T_cam_board: (F, J, 4, 4).
+        information: (F, J, 6, 6) inverse covariance, zero where there is no picture.
+        time_s: (F, J) after the scan's stamp, by the clocks as the profile has them.
+        channel: (F, J) index into `channels`.
+    """
+
+    channels: tuple[str, ...]
+    T_cam_board: Array
+    information: Array
+    time_s: Array
+    channel: NDArray[np.intp]
+
+    @property
+    def is_followed(self) -> NDArray[np.bool_]:
+        """Whether a sample (F, J) is of a channel that has pictures of several times in its capture."""
+        known = self.information[..., 0, 0] > 0
+        mates = known[:, :, None] & known[:, None] & (self.channel[:, :, None] == self.channel[:, None])
+        return np.asarray(np.any(mates & (self.time_s[:, :, None] != self.time_s[:, None]), axis=2))
+
+    @property
+    def tells_motion(self) -> NDArray[np.bool_]:
+        """Whether a capture (F,) has pictures of two times, or of two channels whose offset may differ."""
+        known = self.information[..., 0, 0] > 0
+        differs = (self.time_s != self.time_s[:, :1]) | (self.channel != self.channel[:, :1])
+        return np.asarray(np.any(known & differs, axis=1))
+
+    def select(self, keep: Sequence[int]) -> "PoseSamples":
+        """Keep captures by index."""
+        k = np.asarray(keep, dtype=np.intp)
+        return PoseSamples(
+            self.channels, self.T_cam_board[k], self.information[k], self.time_s[k], self.channel[k]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class BoardMotions:
+    """Equation (1) for F captures.
+
+    Attributes:
+        T_cam_board: (F, 4, 4) at the scan's stamp.
+        rates: (F, 6) tangent per second (m/s, rad/s).
+        cov: (F, 12, 12) of pose and rates.
+        misfit, log_volume: (F,) each, their sum is -2 ln p(poses) up to a constant: how ill (1) at a hand's
+            speed explains them, and in how wide a range of motions.
+    """
+
+    T_cam_board: Array
+    rates: Array
+    cov: Array
+    misfit: Array
+    log_volume: Array
+
+    @property
+    def significance(self) -> float:
+        """Mean squared rate in units of its variance: large where boards moved, about 1 for noise alone."""
+        rates = self.rates
+        squares = np.einsum("fi,fik,fk->f", rates, np.linalg.inv(self.cov[:, 6:, 6:]), rates)
+        return float(np.mean(squares)) / 6
+
+    def at(self, time_s: Array) -> Array:
+        """Compute T_cam_board (F, 4, 4) at a time (F,) of each capture after its scan's stamp."""
+        return perturb(self.T_cam_board, self.rates * time_s[:, None])
+
+    def cov_at(self, time_s: Array) -> Array:
+        """Compute the covariance (F, 6, 6) of `at`."""
+        t = time_s[:, None, None]
+        cross = self.cov[:, :6, 6:]
+        both = cross + np.swapaxes(cross, 1, 2)
+        return np.asarray(self.cov[:, :6, :6] + t * both + t**2 * self.cov[:, 6:, 6:])
+
+
+def sample_poses(
+    captures: Sequence[Sequence[tuple[str, ImageBoard, float]]], noise_px: Mapping[str, float]
+) -> PoseSamples:
+    """Gather the poses of captures.
+
+    The pictures of one channel in one capture, reconstructed from one stream, share much of their error:
+    together they weigh as one.
+
+    Args:
+        captures: (channel, board, time in s of its picture after the scan's stamp) of each; the first board's
+            corners say which way up the others are taken to be.
+        noise_px: corner noise by channel, in place of what each picture shows by itself.
+    """
+    channels = tuple(sorted({channel for capture in captures for channel, *_ in capture}))
+    rows = [
+        [sample for channel, board, time_s in capture for sample in _samples_of(channel, board, time_s)]
+        for capture in captures
+    ]
+    shape = len(rows), max(len(row) for row in rows)
+    T = np.broadcast_to(np.eye(4), (*shape, 4, 4)).copy()
+    information, time_s = np.zeros((*shape, 6, 6)), np.zeros(shape)
+    channel_id = np.zeros(shape, dtype=np.intp)
+    floor = np.diag(POSE_FLOOR**2)
+    for f, row in enumerate(rows):
+        for j, (channel, n_alike, sigma_px, T_cam_board, cov, t) in enumerate(row):
+            scale = (noise_px[channel] / max(sigma_px, 1e-6)) ** 2
+            T[f, j], time_s[f, j], channel_id[f, j] = T_cam_board, t, channels.index(channel)
+            information[f, j] = symmetric_inverse(n_alike * (scale * cov + floor))
+        turned = rotation_angle(T[f, 1:, :3, :3], T[f, 0, :3, :3]) > np.pi / 2
+        T[f, 1:, :3, :3][turned] = T[f, 1:, :3, :3][turned] @ _HALF_TURN
+    return PoseSamples(channels, T, information, time_s, channel_id)
+
+
+def _samples_of(
+    channel: str, board: ImageBoard, time_s: float
+) -> list[tuple[str, int, float, Array, Array, float]]:
+    main = (board.T_cam_board, board.cov, time_s)
+    if board.track_ns is None or board.track_T_cam_board is None or board.track_cov is None:
+        return [(channel, 1, board.sigma_px, *main)]
+    assert board.stamp_ns is not None
+    times_s = time_s + (board.track_ns - board.stamp_ns) * 1e-9
+    followed = zip(board.track_T_cam_board, board.track_cov, times_s.tolist(), strict=True)
+    n_alike = 1 + len(times_s)
+    return [(channel, n_alike, board.sigma_px, *each) for each in (main, *followed)]
+
+
+def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) -> BoardMotions:
+    """Fit equation (1) to each capture, with the habits that make all of them likeliest.
+
+    Args:
+        samples: of F captures.
+        offset_s: (C,) what to add to the pictures' times, by channel.
+        only: a channel that alone places the board; the others then only tell how it moves.
+
+    References:
+        The habits are found by expectation maximisation: Dempster, Laird, Rubin, "Maximum likelihood from
+        incomplete data via the EM algorithm", J. Royal Statistical Society B, 1977.
+    """
+    time_s = samples.time_s + offset_s[samples.channel]
+    base = samples.T_cam_board[:, 0]
+    y = difference(samples.T_cam_board, base[:, None])
+    # Where a channel was followed, it alone tells the motion: how channels differ must not pass for motion.
+    is_followed = samples.is_followed
+    is_heard = is_followed | ~np.any(is_followed, axis=1, keepdims=True)
+    heard = samples.information * is_heard[..., None, None]
+    lines = _Lines.through(y, heard, time_s)
+    habits = USUAL_HABITS
+    for _ in range(_N_LEARNING):
+        mean, cov, _ = lines.fit(habits)
+        second = mean[:, 6:] ** 2 + np.diagonal(cov, axis1=1, axis2=2)[:, 6:]
+        total = second.reshape(-1, 2, 3).mean(axis=2).sum(axis=0)
+        habits = np.sqrt((_USUAL_WEIGHT * USUAL_HABITS**2 + total) / (_USUAL_WEIGHT + len(y)))
+    mean, cov, prior = lines.fit(habits)
+    moved = y - mean[:, None, :6] - time_s[..., None] * mean[:, None, 6:]
+    misfit = np.einsum("fji,fjik,fjk->f", moved, heard, moved)
+    misfit += np.einsum("fi,ik,fk->f", mean, prior, mean)
+    log_volume = -np.linalg.slogdet(cov)[1] - np.linalg.slogdet(prior[6:, 6:])[1]
+    misfit += _disagreement(samples, moved, cov, time_s, ~is_heard)
+    if only is not None or not np.all(is_heard):
+        is_placing = np.ones(1) if only is None else samples.channel == samples.channels.index(only)
+        information = samples.information * is_placing[..., None, None]
+        mean, cov = _place(y, information, time_s, mean[:, 6:], cov[:, 6:, 6:])
+    return BoardMotions(perturb(base, mean[:, :6]), mean[:, 6:], cov, misfit, log_volume)
+
+
+def _disagreement(
+    samples: PoseSamples, moved: Array, cov: Array, time_s: Array, is_silent: NDArray[np.bool_]
+) -> Array:
+    """Measure how ill pictures fit motions that were found without them, (F,), as squared deviations.
+
+    Another place of the camera, the same in all captures, is no misfit: a tangent (tau, phi) of it moves the
+    board at c by tau + phi x c.
+    """
+    f, j = np.nonzero(is_silent & (samples.information[..., 0, 0] > 0))
+    misfit = np.zeros(len(moved))
+    if len(f) == 0:
+        return misfit
+    powers = np.stack([np.ones(len(f)), time_s[f, j]], axis=1)
+    line_cov = np.einsum("na,nakbl,nb->nkl", powers, cov[f].reshape(-1, 2, 6, 2, 6), powers)
+    weight = np.linalg.inv(np.linalg.inv(samples.information[f, j]) + line_cov)
+    A = np.zeros((len(f), 6, 6))
+    A[:] = np.eye(6)
+    A[:, :3, 3:] = -skew(samples.T_cam_board[f, j, :3, 3])
+    A_w = np.swapaxes(A, 1, 2) @ weight
+    apart = np.linalg.lstsq((A_w @ A).sum(axis=0), (A_w @ moved[f, j, :, None]).sum(axis=0), rcond=None)[0]
+    left = moved[f, j] - (A @ apart)[..., 0]
+    np.add.at(misfit, f, np.einsum("ni,nik,nk->n", left, weight, left))
+    return misfit
+
+
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """Normal equations of y_j = p + t_j r, before what is known of r: (F, 12, 12) and (F, 12)."""
+
+    H: Array
+    g: Array
+
+    @classmethod
+    def through(cls, y: Array, information: Array, time_s: Array) -> "_Lines":
+        powers = np.stack([np.ones_like(time_s), time_s], axis=-1)
+        pulled = (information @ y[..., None])[..., 0]
+        H = np.einsum("fja,fjb,fjkl->fakbl", powers, powers, information).reshape(-1, 12, 12)
+        return cls(H, np.einsum("fja,fjk->fak", powers, pulled).reshape(-1, 12))
+
+    def fit(self, habits: Array) -> tuple[Array, Array, Array]:
+        """Solve for (p, r) (F, 12), its covariance (F, 12, 12), and give the prior's precision (12, 12)."""
+        prior = np.zeros((12, 12))
+        prior[6:, 6:] = np.diag(np.repeat(habits, 3) ** -2.0)
+        cov = np.asarray(np.linalg.inv(self.H + prior), dtype=np.float64)
+        return (cov @ self.g[..., None])[..., 0], cov, prior
+
+
+def _place(
+    y: Array, information: Array, time_s: Array, rates: Array, cov_rates: Array
+) -> tuple[Array, Array]:
+    """Solve y_j = p + t_j r for p with the rates r known to cov_rates."""
+    total = information.sum(axis=1)
+    cov = symmetric_inverse(total)
+    moved = y - time_s[..., None] * rates[:, None]
+    p = (cov @ np.einsum("fjkl,fjl->fk", information, moved)[..., None])[..., 0]
+    lever = -cov @ np.einsum("fj,fjkl->fkl", time_s, information)  # d p / d r
+    full = np.zeros((len(y), 12, 12))
+    full[:, :6, :6] = cov + lever @ cov_rates @ np.swapaxes(lever, 1, 2)
+    full[:, :6, 6:] = lever @ cov_rates
+    full[:, 6:, :6] = np.swapaxes(full[:, :6, 6:], 1, 2)
+    full[:, 6:, 6:] = cov_rates
+    return np.concatenate([p, rates], axis=1), full
+
+
+def board_time_s(lidar: LidarBoard, sweep_s: float) -> float:
+    """Average the firing times of a board's points, s after the scan's stamp; mid sweep where unknown."""
+    return sweep_s / 2 if lidar.offset_ns is None else float(np.mean(lidar.offset_ns)) * 1e-9
+
+
+def deskew(lidar: LidarBoard, rates_lidar: Array) -> LidarBoard:
+    """Move a board's points to where they would have been met at the points' mean firing time.
+
+    Args:
+        lidar: with firing times; without them nothing is moved.
+        rates_lidar: (6,) tangent per second (m/s, rad/s) of the board about its middle, frame lidar.
+    """
+    if lidar.offset_ns is None:
+        return lidar
+    since_s = lidar.offset_ns * 1e-9 - float(np.mean(lidar.offset_ns)) * 1e-9
+    arms = lidar.points - lidar.T_lidar_board[:3, 3]
+    moved = -since_s[:, None] * (rates_lidar[:3] + np.cross(rates_lidar[3:], arms))
+    # A ring end is one of the points, or lies within a step of one.
+    nearest = np.argmin(_squared_distances(lidar.edge_points, lidar.points), axis=1)
+    points = lidar.points + moved
+    plane, rms_m = fit_plane(points)
+    return replace(
+        lidar, points=points, edge_points=lidar.edge_points + moved[nearest], plane=plane, sigma_m=rms_m
+    )
+
+
+def _squared_distances(a: Array, b: Array) -> Array:
+    return np.asarray(np.sum(a**2, axis=1)[:, None] - 2 * a @ b.T + np.sum(b**2, axis=1))

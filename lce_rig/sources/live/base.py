@@ -1,0 +1,144 @@
+"""What every attached sensor offers, and the queue between its reader thread and its taker."""
+
+import threading
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Generic, Protocol, TypeVar
+
+from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.errors import SourceError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """One edge that a trigger line made or a sensor saw.
+
+    Attributes:
+        sensor: name of the line: a camera that it triggers, or the sensor that saw it.
+        stamp_ns: device time of the board or sensor that reports it.
+        count: running number of its line; gaps are lost pulses.
+        host_ns: arrival at the host.
+    """
+
+    sensor: str
+    stamp_ns: int
+    count: int
+    host_ns: int
+
+
+LiveSample = Image | Scan | Events | Pulse
+
+
+@dataclass(frozen=True)
+class SourceStatus:
+    """How an attached sensor does.
+
+    Attributes:
+        sensor: its name in the profile.
+        n_samples: samples handed on since it was opened.
+        n_dropped: samples that nobody took in time.
+        n_lost: samples or packets that never arrived, by the device's own counters or stamps.
+        rate_hz: samples a second over the last seconds; 0 before two have come.
+        clock: whose time the stamps are, and how it is tied to others, in words.
+        problems: what is wrong now, each a sentence with what to do.
+        figures: further figures by name.
+    """
+
+    sensor: str
+    n_samples: int = 0
+    n_dropped: int = 0
+    n_lost: int = 0
+    rate_hz: float = 0.0
+    clock: str = ""
+    problems: tuple[str, ...] = ()
+    figures: dict[str, float] = field(default_factory=dict)
+
+
+class LiveSource(Protocol):
+    """An attached sensor; open while its `with` block lasts.
+
+    Attributes:
+        sensor: its name in the profile.
+    """
+
+    sensor: str
+
+    def __enter__(self) -> "LiveSource":
+        """Open the device and start reading.
+
+        Raises:
+            SourceError: it is absent, busy or of another model; the hint says what to check.
+        """
+        ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop reading and close the device; never raises."""
+        ...
+
+    def samples(self) -> Iterator[LiveSample]:
+        """Yield samples as they come, until the source is closed.
+
+        Raises:
+            SourceError: the sensor fell silent, or failed for good.
+        """
+        ...
+
+    def status(self) -> SourceStatus:
+        """Say how the sensor does; may be called from any thread."""
+        ...
+
+
+class Mailbox(Generic[T]):
+    """A bounded queue from one reader thread to one taker; when full, the oldest is dropped and counted."""
+
+    def __init__(self, n_slots: int) -> None:
+        self.n_dropped = 0
+        self.n_put = 0
+        self._items: deque[T] = deque()
+        self._n_slots = n_slots
+        self._is_closed = False
+        self._error: SourceError | None = None
+        self._changed = threading.Condition()
+
+    def put(self, item: T) -> None:
+        """Hand an item over; never blocks."""
+        with self._changed:
+            if len(self._items) >= self._n_slots:
+                self._items.popleft()
+                self.n_dropped += 1
+            self._items.append(item)
+            self.n_put += 1
+            self._changed.notify()
+
+    def close(self, error: SourceError | None = None) -> None:
+        """End the queue; what is in it can still be taken, then `error` is raised if there is one."""
+        with self._changed:
+            self._is_closed = True
+            self._error = self._error or error
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float) -> T | None:
+        """Take the oldest item; None where nothing came in time, or the queue has ended.
+
+        Raises:
+            SourceError: the reader failed, and all that it read before has been taken.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._items or self._is_closed, timeout_s)
+            if self._items:
+                return self._items.popleft()
+            if self._error is not None:
+                raise self._error
+            return None
+
+    @property
+    def is_ended(self) -> bool:
+        """Whether the queue was closed and everything taken."""
+        with self._changed:
+            return self._is_closed and not self._items
