@@ -1,27 +1,75 @@
-"""`lce-rig simulate`: a session of a simulated rig, with exact truth beside it."""
+"""`lce-rig simulate`: a session or a recording of a simulated rig, with exact truth beside it."""
 
 import json
+import re
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange
 
+if TYPE_CHECKING:
+    from lce_rig.rig import Rig
+    from lce_rig.simulate import SimulationOptions
+
 TRUTH = "truth.json"
+_CAPTURES, _DURATION_S = 30, 20.0
 
 
 @click.command()
 @click.option(
     "--rig", "rig_name", required=True, metavar="NAME|FILE", help="Rig profile: a shipped name or a file."
 )
-@click.argument("session", type=click.Path(path_type=Path), default="session")
+@click.argument("session", type=click.Path(path_type=Path), required=False)
+@click.option("--captures", type=click.IntRange(1, 10_000), help=f"Board placements [default: {_CAPTURES}].")
 @click.option(
-    "--captures", default=30, show_default=True, type=click.IntRange(1, 10_000), help="Board placements."
+    "--recording",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Make a recording instead of a session: recording.bag with pictures, scans and events, and "
+    "events.aedat4.",
+)
+@click.option(
+    "--duration",
+    type=FiniteRange(0.1, 3600),
+    metavar="S",
+    help=f"Of the recording [default: {_DURATION_S:g}]; each second takes about ten to simulate.",
+)
+@click.option(
+    "--ros", type=click.Choice(["1", "2"]), help="The recording's bag: of ROS 1 [default] or ROS 2 (mcap)."
 )
 @click.option(
     "--seed", default=0, show_default=True, type=click.IntRange(0), help="The same seed, the same bytes."
+)
+@click.option(
+    "--motion",
+    type=click.Choice(["still", "moving"]),
+    help="Board held still, or moved by hand. Events are stored of a moving board only: a still one makes "
+    "none [default: still; moving for rigs without frames].",
+)
+@click.option(
+    "--speed",
+    type=FiniteRange(0, 3),
+    nargs=2,
+    metavar="MIN MAX",
+    help="Of the moving board, m/s; of a recording MAX is the speed between placements "
+    "[default: 0.05 0.3; recording 0.6].",
+)
+@click.option(
+    "--frame-offset",
+    default=0.0,
+    type=FiniteRange(-10, 10),
+    metavar="S",
+    help="How much more the stamps of pictures read than the LiDAR's clock.",
+)
+@click.option(
+    "--event-offset", type=FiniteRange(-10, 10), metavar="S", help="The same for the stamps of events."
+)
+@click.option(
+    "--flicker", type=FiniteRange(0, 0.9), metavar="DEPTH", help="Lamps whose light swings, 100 Hz."
 )
 @click.option(
     "--carrier",
@@ -38,59 +86,133 @@ TRUTH = "truth.json"
 @click.option("--decoy", is_flag=True, help="Stand a blank plate of the board's size in the room.")
 def simulate(
     rig_name: str,
-    session: Path,
-    captures: int,
+    session: Path | None,
+    captures: int | None,
+    recording: Path | None,
+    duration: float | None,
+    ros: str | None,
     seed: int,
-    carrier: Any,
-    noise_level: int | None,
-    range_sigma: float | None,
-    range_offset: float | None,
-    decoy: bool,
+    **choices: Any,
 ) -> None:
     """Make SESSION (default: session/) with a simulated rig: pictures, scans and exact truth.
 
-    The truth stands in SESSION/truth.json and goes to `lce-rig calibrate --reference`.
+    With `--motion moving` each capture holds the raw events about it, too. With `--recording FOLDER` it makes
+    files for `lce-rig collect`, `lce-rig reconstruct` and other programs instead.
+
+    The truth stands in truth.json beside them: SESSION/truth.json goes to `lce-rig calibrate --reference`.
+    """
+    from lce_rig.core.errors import UsageError
+    from lce_rig.rig import load_rig
+
+    rig = load_rig(rig_name)
+    if recording is None:
+        if duration is not None or ros is not None:
+            raise UsageError("--duration and --ros belong to a recording", "Add --recording FOLDER.")
+        options = _options(rig, choices["motion"] or _usual_motion(rig), choices)
+        _simulate_session(session or Path("session"), rig, captures or _CAPTURES, seed, options)
+        return
+    if session is not None or captures is not None:
+        given = f"the session {session}" if session is not None else "--captures"
+        raise UsageError(f"--recording and {given} exclude each other", "Run it twice, with the same --seed.")
+    if choices["motion"] == "still":
+        raise UsageError("--motion still: the board of a recording is carried from place to place")
+    options = _options(rig, "moving", choices)
+    if options.hand.carry_mps <= 0:
+        raise UsageError("--speed: the board of a recording must move", "Give a MAX above 0.")
+    _simulate_recording(recording, rig, duration or _DURATION_S, seed, options, int(ros or 1))
+
+
+def _usual_motion(rig: "Rig") -> Any:
+    kinds = {channel.kind for camera in rig.cameras.values() for channel in camera.channels.values()}
+    return "moving" if kinds == {"events"} else "still"
+
+
+def _options(rig: "Rig", motion: Any, choices: dict[str, Any]) -> "SimulationOptions":
+    """Apply what was chosen to what the rig's recordings show.
+
+    Raises:
+        UsageError: something that only a moving board has was chosen for a still one.
     """
     from dataclasses import replace
 
-    from lce_rig.core.errors import SessionError
-    from lce_rig.rig import load_rig
-    from lce_rig.session import Session
-    from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrinsics
+    from lce_rig.core.errors import UsageError
+    from lce_rig.simulate import SimulationOptions
 
-    rig = load_rig(rig_name)
-    if session.exists():
-        raise SessionError(
-            f"{session} exists already", "Name another folder: a simulation is never continued."
-        )
-    options = SimulationOptions.for_rig(rig.name)
-    lidar_noise = options.lidar
-    if range_sigma is not None:
-        lidar_noise = replace(lidar_noise, range_sigma_m=range_sigma)
-    if range_offset is not None:
-        lidar_noise = replace(lidar_noise, range_offset_m=range_offset)
-    options = replace(
+    of_motion = [name for name in ("speed", "event_offset", "flicker") if choices[name] is not None]
+    if motion == "still" and of_motion:
+        option = of_motion[0].replace("_", "-")
+        raise UsageError(f"--{option} is of a moving board", "Add --motion moving.")
+    options = SimulationOptions.for_rig(rig.name, motion)
+    hand, lidar = options.hand, options.lidar
+    if choices["speed"] is not None:
+        slow, fast = choices["speed"]
+        if slow > fast:
+            raise UsageError(f"--speed {slow:g} {fast:g}: the slowest comes first")
+        hand = replace(hand, speed_mps=(slow, fast), carry_mps=fast)
+    if choices["range_sigma"] is not None:
+        lidar = replace(lidar, range_sigma_m=choices["range_sigma"])
+    if choices["range_offset"] is not None:
+        lidar = replace(lidar, range_offset_m=choices["range_offset"])
+    return replace(
         options,
-        lidar=lidar_noise,
-        noise_level=noise_level,
-        has_decoy_plate=decoy,
-        carrier=carrier or options.carrier,
+        hand=hand,
+        lidar=lidar,
+        noise_level=choices["noise_level"],
+        has_decoy_plate=choices["decoy"],
+        carrier=choices["carrier"] or options.carrier,
+        frame_offset_s=choices["frame_offset"],
+        event_offset_s=choices["event_offset"] or 0.0,
+        flicker_depth=choices["flicker"] or 0.0,
     )
-    with Session.create(session, rig) as writer, show.progress_bar("simulating") as progress:
-        truth = truth_extrinsics(rig, seed, options)
-        _write_truth(session / TRUTH, truth, seed)
-        for done, capture in enumerate(
-            simulate_captures(rig, n_captures=captures, seed=seed, options=options), 1
-        ):
-            writer.add_capture(capture.images, capture.scans, {"source": f"simulated, seed {seed}"})
-            progress(done, captures)
-    show.note(f"{session}: {captures} simulated captures of rig {rig.name}; truth in {session / TRUTH}")
 
 
-def _write_truth(path: Path, truth: dict[tuple[str, str], Any], seed: int) -> None:
-    pairs = [
-        {"camera": camera, "lidar": lidar, "T_cam_lidar": T.tolist()}
-        for (camera, lidar), T in sorted(truth.items())
-    ]
-    document = {"seed": seed, "T_cam_lidar": pairs[0]["T_cam_lidar"], "pairs": pairs}
-    path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+def _simulate_session(
+    path: Path, rig: "Rig", n_captures: int, seed: int, options: "SimulationOptions"
+) -> None:
+    from lce_rig.core.errors import SessionError
+    from lce_rig.session import Session
+    from lce_rig.simulate import capture_truth, rig_truth, simulate_captures
+
+    if path.exists():
+        raise SessionError(f"{path} exists already", "Name another folder: a simulation is never continued.")
+    with Session.create(path, rig) as writer, show.progress_bar("simulating") as progress:
+        truth = rig_truth(rig, seed, options) | {"captures": {}}
+        try:
+            for done, capture in enumerate(
+                simulate_captures(rig, n_captures=n_captures, seed=seed, options=options), 1
+            ):
+                source = {"source": f"simulated, seed {seed}"}
+                name = writer.add_capture(capture.images, capture.scans, source, capture.events)
+                truth["captures"][name] = capture_truth(rig, capture, options)
+                progress(done, n_captures)
+        except BaseException:
+            with suppress(OSError):
+                _write_truth(path / TRUTH, truth)
+            raise
+        _write_truth(path / TRUTH, truth)
+    show.note(f"{path}: {n_captures} simulated captures of rig {rig.name}; truth in {path / TRUTH}")
+
+
+def _simulate_recording(
+    folder: Path, rig: "Rig", duration_s: float, seed: int, options: "SimulationOptions", ros: int
+) -> None:
+    from lce_rig.simulate import recording_truth, rig_truth, simulate_recording
+    from lce_rig.simulate.recording import stamp_of
+    from lce_rig.sources.folder_recorder import FolderRecorder
+
+    recording = simulate_recording(rig, duration_s=duration_s, seed=seed, options=options)
+    with FolderRecorder(folder, rig, ros) as recorder, show.progress_bar("simulating, s") as progress:
+        _write_truth(folder / TRUTH, rig_truth(rig, seed, options) | recording_truth(recording))
+        for sample in recording:
+            recorder.write(sample)
+            progress(max(0, stamp_of(sample) - recording.start_ns) // 10**9, round(duration_s))
+    names = ", ".join(sorted(path.name for path in folder.iterdir()))
+    show.note(f"{folder}: {duration_s:g} s of rig {rig.name}: {names}")
+    show.note(f"next: lce-rig collect --rig {rig.name} --from {recorder.bag}")
+
+
+def _write_truth(path: Path, document: dict[str, Any]) -> None:
+    """Write indented JSON with each innermost list, such as a row of a matrix, on a line of its own."""
+    text = json.dumps(document, indent=1)
+    text = re.sub(r"\[([^\[\]{}\"]+)\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+    path.write_text(text + "\n", encoding="utf-8")

@@ -17,6 +17,7 @@ class Image:
         stamp_ns: mid exposure, device time; None where the recording carries no time.
         host_ns: arrival at the host; None where unknown.
         pixels: (H, W) grey or (H, W, 3) BGR, uint8.
+        count: the camera's running number of the picture; gaps are lost ones; None where it does not count.
     """
 
     sensor: str
@@ -24,6 +25,7 @@ class Image:
     stamp_ns: int | None
     pixels: NDArray[np.uint8]
     host_ns: int | None = None
+    count: int | None = None
 
     @property
     def grey(self) -> NDArray[np.uint8]:

@@ -1,9 +1,9 @@
 """A session folder: the frozen rig profile, captures, a journal and a cache of detections.
 
 Layout, every file plain: rig.yaml, session.json, journal.jsonl, detections/ and
-captures/000012/{meta.json, cam.frames.png, lidar.pcd}. A capture is written to captures/.new-000012/, its
-files are flushed, the folder is renamed and its parent flushed: it exists whole or not at all, whenever the
-power goes.
+captures/000012/{meta.json, cam.frames.png, lidar.pcd, cam.events.npz}. A capture is written to
+captures/.new-000012/, its files are flushed, the folder is renamed and its parent flushed: it exists whole or
+not at all, whenever the power goes.
 """
 
 import json
@@ -17,13 +17,15 @@ from typing import Any
 from numpy.typing import NDArray
 
 from lce_rig import __version__
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import cache
-from lce_rig.session.capture import SAFE_NAME, Capture, content_hash, write_capture
+from lce_rig.session.capture import SAFE_NAME, Capture
 from lce_rig.session.durable import WriterLock, append_line, flush_folder, replace_file
 from lce_rig.session.identity import MARKER, check_marker, differing_keys, marker_of
+from lce_rig.session.membership import check_samples, event_channel
+from lce_rig.session.writing import content_hash, write_capture
 
 PROFILE, JOURNAL, LOCK = "rig.yaml", "journal.jsonl", ".lock"
 CAPTURES, DETECTIONS, DRAFT_PREFIX = "captures", "detections", ".new-"
@@ -157,29 +159,39 @@ class Session:
                 return capture
         raise SessionError(f"{self.path} has no capture {name!r}; it has {len(self.captures)}")
 
-    def find_duplicate(self, images: Iterable[Image], scans: Iterable[Scan]) -> str | None:
+    def find_duplicate(
+        self, images: Iterable[Image], scans: Iterable[Scan], events: Iterable[Events] = ()
+    ) -> str | None:
         """Name the capture that holds exactly this data already; None where it is new."""
-        return self._contents().get(content_hash(images, scans))
+        return self._contents().get(content_hash(images, scans, events))
 
-    def add_capture(self, images: Iterable[Image], scans: Iterable[Scan], meta: Mapping[str, Any]) -> str:
+    def add_capture(
+        self,
+        images: Iterable[Image],
+        scans: Iterable[Scan],
+        meta: Mapping[str, Any],
+        events: Iterable[Events] = (),
+    ) -> str:
         """Store one capture so that it survives whatever happens after this returns.
 
         Args:
             images: at most one for each camera channel.
             scans: at most one for each LiDAR.
             meta: JSON values to keep with it.
+            events: at most one stretch for each camera that has a channel of events.
 
         Returns:
             The capture's name.
 
         Raises:
-            SessionError: the session is open for reading only, a sensor is not in the rig, or the disk is
-                full; what was captured before is not affected.
+            SessionError: the session is open for reading only, a sensor is not in the rig, events are out of
+                order or off their sensor, or the disk is full; what was captured before is not affected.
         """
-        images, scans = list(images), list(scans)
+        images, scans, events = list(images), list(scans), list(events)
         if self._lock is None:
             raise SessionError(f"{self.path} is open for reading only")
-        self._check_sensors(images, scans)
+        check_samples(self.rig, images, scans, events)
+        recorded = [(event_channel(self.rig, stretch.sensor), stretch) for stretch in events]
         contents = self._contents()
         captures = self.captures
         name = f"{int(captures[-1].name) + 1 if captures else 0:06d}"
@@ -187,7 +199,7 @@ class Session:
         draft = folder.with_name(DRAFT_PREFIX + name)
         try:
             draft.mkdir()
-            write_capture(draft, images, scans, meta)
+            write_capture(draft, images, scans, meta, recorded)
             draft.rename(folder)
             flush_folder(folder.parent)
         except (OSError, ValueError) as error:
@@ -253,22 +265,6 @@ class Session:
                     # A damaged capture is named when it is read; nothing is a duplicate of it.
                     continue
         return self._names_by_content
-
-    def _check_sensors(self, images: list[Image], scans: list[Scan]) -> None:
-        keys = [(i.sensor, i.channel) for i in images] + [(s.sensor, "") for s in scans]
-        if len(set(keys)) < len(keys) or not keys:
-            raise SessionError(
-                "a capture needs one picture a camera channel and one scan a lidar at most, and not nothing"
-            )
-        for image in images:
-            camera = self.rig.cameras.get(image.sensor)
-            if camera is None or image.channel not in camera.channels:
-                raise SessionError(
-                    f"rig {self.rig.name!r} has no camera channel {image.sensor}.{image.channel}"
-                )
-        for scan in scans:
-            if scan.sensor not in self.rig.lidars:
-                raise SessionError(f"rig {self.rig.name!r} has no lidar {scan.sensor!r}")
 
 
 def _check_rig(path: Path, rig: Rig) -> None:

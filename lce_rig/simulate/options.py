@@ -131,14 +131,15 @@ class HandMotion:
     """How a hand moves the board.
 
     Attributes:
-        speed_mps: range of the board's mean speed, drawn anew for each capture.
+        speed_mps: range of the board's mean speed, drawn anew for each capture; from the slowest that events
+            tell of to the fastest that hands move a board which is to be seen.
         turn_deg_s: how fast it turns at most at the greatest speed.
         tremor_m: amplitude of the hand's trembling, 5 to 9 Hz.
         carry_mps: greatest speed on the way from one placement of a recording to the next.
         rest_s: how long it rests at each placement of a recording.
     """
 
-    speed_mps: tuple[float, float] = (0.0, 0.3)
+    speed_mps: tuple[float, float] = (0.05, 0.3)
     turn_deg_s: float = 12.0
     tremor_m: float = 3e-4
     carry_mps: float = 0.6

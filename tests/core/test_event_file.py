@@ -48,6 +48,9 @@ def test_whole_microseconds_are_stored_as_such() -> None:
         ({"t": [1, 2], "x": [1], "y": [1], "p": [1]}, "unequal length"),
         ({"t": [1], "x": [-1], "y": [1], "p": [1]}, "beyond any sensor"),
         ({"t": np.array([None]), "x": [1], "y": [1], "p": [1]}, "archive of events"),
+        ({"t": [1], "x": 1, "y": [1], "p": [1]}, "column x is no list of numbers"),
+        ({"t": [1], "x": [1], "y": [1], "p": ["on"]}, "column polarity is no list of numbers"),
+        ({"t": [1], "x": [1], "y": [1], "p": [1], "resolution_px": 346}, "no width and height"),
     ],
 )
 def test_what_is_no_archive_of_events_is_refused_in_words(columns: dict[str, object], cause: str) -> None:

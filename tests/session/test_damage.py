@@ -15,17 +15,19 @@ from lce_rig.session import Session
 
 WRITER = """
 import sys, numpy as np
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Events, Image, Scan
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
-session = Session.resume(sys.argv[1], load_rig("rlfs"))
+session = Session.resume(sys.argv[1], load_rig("rles"))
 print("ready", flush=True)
 rng = np.random.default_rng(len(session.captures))
 while True:
-    image = Image("cam", "frames", 1, rng.integers(0, 256, (120, 160), dtype=np.uint8))
+    image = Image("davis", "frames", 1, rng.integers(0, 256, (120, 160), dtype=np.uint8))
     points = rng.normal(size=(5000, 3)).astype(np.float32)
     scan = Scan("lidar", 1, points, points[:, 0].copy(), np.zeros(5000, np.int16))
-    print(session.add_capture([image], [scan], {}), flush=True)
+    x, y = (rng.integers(0, 260, 5000).astype(np.uint16) for _ in range(2))
+    events = Events("davis", np.sort(rng.integers(0, 10**9, 5000)), x, y, x > y, 346, 260)
+    print(session.add_capture([image], [scan], {}, [events]), flush=True)
 """
 
 
@@ -47,7 +49,8 @@ def test_a_writer_killed_at_any_moment_leaves_only_whole_captures(tmp_path):
         captures = Session.open(path).captures
         for capture in captures:
             capture.check()
-            assert capture.image("cam", "frames").pixels.shape == (120, 160)
+            assert capture.image("davis", "frames").pixels.shape == (120, 160)
+            assert len(capture.events("davis")) == 5000
         assert promised <= {c.name for c in captures}
     assert len(promised) >= 6
     Session.open(path, writable=True).close()

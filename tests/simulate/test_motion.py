@@ -38,9 +38,9 @@ def test_speed_is_the_one_asked_for_over_the_second_before(speed_mps: float) -> 
         assert rms_mps == pytest.approx(speed_mps, rel=0.02, abs=1e-6)
 
 
-def test_speeds_fill_their_range_from_still_to_fast() -> None:
+def test_speeds_fill_their_range_from_slow_to_fast() -> None:
     means = [sway(HandMotion(), seed).speed_mps(BEFORE_NS).mean() for seed in range(40)]
-    assert min(means) < 0.04 and 0.24 < max(means) < 0.32
+    assert 0.04 < min(means) < 0.08 and 0.24 < max(means) < 0.32
 
 
 def test_motion_is_smooth_and_stays_near_the_placement() -> None:

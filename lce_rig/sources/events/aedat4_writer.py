@@ -10,6 +10,7 @@ References:
 
 import struct
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
@@ -95,16 +96,16 @@ class Aedat4Writer:
             self._file.write(data)
 
     def close(self) -> None:
-        """Write the table of packets and say where it is."""
+        """Write the table of packets and say where it is; the file is closed even where the disk is full."""
         if self._file.closed:
             return
         from lz4.frame import compress
 
-        end = self._file.tell()
-        self._file.write(compress(_table(self._records)))
-        self._file.seek(_END_AT)
-        self._file.write(struct.pack("<q", end))
-        self._file.close()
+        with self._file as file:
+            end = file.tell()
+            file.write(compress(_table(self._records)))
+            file.seek(_END_AT)
+            file.write(struct.pack("<q", end))
 
     def __enter__(self) -> "Aedat4Writer":
         return self
@@ -112,7 +113,10 @@ class Aedat4Writer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        if error is None:
+            self.close()
+        with suppress(OSError):
+            self.close()
 
 
 def write_aedat4(path: Path, stretches: Iterable[Events], camera_name: str = "lce_rig") -> None:

@@ -71,7 +71,7 @@ def event_messages(
     """Cut events into messages of 33 ms.
 
     Yields:
-        Time of receipt, the last event's, in ns, and the message.
+        Time of receipt in ns, that of the last event where the host's clock is not known, and the message.
     """
     if not len(events):
         return
@@ -82,5 +82,8 @@ def event_messages(
     for start_ns in edges_ns[:-1]:
         part = events.between(int(start_ns), int(start_ns) + _MESSAGE_NS)
         if len(part):
-            yield int(part.t_ns[-1]), encode_event_array(part, frame_id, encoding, number)
+            received_ns = int(part.t_ns[-1])
+            if events.host_ns is not None:
+                received_ns = events.host_ns + int(part.t_ns[0]) - first_ns
+            yield received_ns, encode_event_array(part, frame_id, encoding, number)
             number += 1

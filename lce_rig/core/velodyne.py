@@ -1,0 +1,63 @@
+"""What a VLP-16 sends: the layout of its packets, their timing, and the names in their factory bytes.
+
+References:
+    VLP-16 User Manual, Velodyne 63-9243 Rev. D, chapters 6 and 9, appendix E.
+"""
+
+import numpy as np
+
+DATA_PORT = 2368
+POSITION_PORT = 8308
+DATA_BYTES = 1206
+POSITION_BYTES = 512
+#: Address on leaving the factory.
+FACTORY_ADDRESS = "192.168.1.201"
+
+N_LASERS = 16
+N_BLOCKS = 12
+BLOCK_FLAG = 0xEEFF
+RANGE_STEP_M = 0.002
+#: Azimuths count 0.01 deg, clockwise from the y axis of the manual, which is the x axis of the lidar frame.
+AZIMUTH_STEPS = 36_000
+AZIMUTH_STEP_RAD = 2 * np.pi / AZIMUTH_STEPS
+FIRING_NS = 2_304
+SEQUENCE_NS = 55_296
+#: A block holds two sequences of all lasers, or one return of two sequences in dual mode.
+BLOCK_NS = 2 * SEQUENCE_NS
+HOUR_US = 3_600_000_000
+
+STRONGEST, LAST, DUAL = 0x37, 0x38, 0x39
+RETURN_MODES = {STRONGEST: "strongest", LAST: "last", DUAL: "dual"}
+VLP16 = 0x22
+PRODUCTS = {
+    0x21: "HDL-32E",
+    VLP16: "VLP-16",
+    0x24: "Puck Hi-Res",
+    0x28: "VLP-32C",
+    0x31: "Velarray",
+    0xA1: "VLS-128",
+}
+
+_RETURN = np.dtype([("range", "<u2"), ("reflectivity", "u1")])
+DATA_BLOCK = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("returns", _RETURN, (2 * N_LASERS,))])
+#: `us` counts from the full hour to the first firing; even blocks of dual packets hold last returns.
+DATA_PACKET = np.dtype(
+    [("blocks", DATA_BLOCK, (N_BLOCKS,)), ("us", "<u4"), ("mode", "u1"), ("product", "u1")]
+)
+
+PPS_STATES = ("absent", "synchronising", "locked", "error")
+PPS_LOCKED = 2
+#: `nmea` is padded with zeros; fields between these are of no use here, and not filled by older firmware.
+POSITION_PACKET = np.dtype(
+    {
+        "names": ["us", "pps", "nmea"],
+        "formats": ["<u4", "u1", "S306"],
+        "offsets": [0xC6, 0xCA, 0xCE],
+        "itemsize": POSITION_BYTES,
+    }
+)
+
+
+def packet_ns(is_dual: bool) -> int:
+    """Give the time from the first firing of a packet to the first firing of the next."""
+    return N_BLOCKS * BLOCK_NS // (2 if is_dual else 1)

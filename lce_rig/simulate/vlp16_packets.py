@@ -1,0 +1,213 @@
+"""Scans as the packets a VLP-16 would have sent: data packets, and position packets with PPS and NMEA."""
+
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core import velodyne
+from lce_rig.core.data import Scan
+from lce_rig.core.geometry import Array
+from lce_rig.simulate.lidar import VLP16, LidarModel
+
+#: A revolution of whole blocks, 10.0025 Hz: scans follow each other without a gap, as a real rotor's do.
+STREAMED_VLP16 = replace(VLP16, name="vlp16 of whole blocks", period_ns=904 * velodyne.BLOCK_NS)
+# Between one packet in five and one in fourteen is a position packet, depending on the firmware.
+_DATA_PER_POSITION = 14
+# A GPS sends its sentence for a pulse a while after that pulse.
+_SENTENCE_DELAY_NS = 300_000_000
+_NS_PER_S = 1_000_000_000
+# Each simulated scan begins anywhere within a step; a rotor goes on evenly. The step is spread over 12 deg.
+_EASED_BLOCKS = 30
+
+
+@dataclass(frozen=True)
+class SensorPacket:
+    """One UDP packet of the sensor.
+
+    Attributes:
+        port: it is sent to: data or position packets.
+        sent_ns: when it leaves the sensor, true time: after its last firing.
+        payload: what it carries.
+    """
+
+    port: int
+    sent_ns: int
+    payload: bytes
+
+
+@dataclass(frozen=True)
+class Vlp16Clock:
+    """How the sensor's clock is kept.
+
+    Attributes:
+        pps: one of PPS_STATES.
+        has_nmea: whether sentences arrive.
+        is_valid: whether the sentences say so (status A; V otherwise).
+        error_us: by how much the sensor's counter is ahead of true time past the hour; a sensor without
+            pulses counts from when it was switched on.
+    """
+
+    pps: str = "locked"
+    has_nmea: bool = True
+    is_valid: bool = True
+    error_us: int = 0
+
+
+class Vlp16Packets:
+    """Cuts scans into packets; what does not fill one waits for the next scan.
+
+    Scans simulated with STREAMED_VLP16 and stamped one period apart come out as they went in, within the
+    steps of range and azimuth, but for the first 12 deg behind the cut: there the azimuth is eased from
+    the phase of the scan before, by 0.2 deg at most.
+
+    Attributes:
+        clock: how the sensor's clock is kept; may be replaced between scans.
+    """
+
+    def __init__(
+        self,
+        mode: int = velodyne.STRONGEST,
+        clock: Vlp16Clock | None = None,
+        model: LidarModel = STREAMED_VLP16,
+    ) -> None:
+        self.clock = clock or Vlp16Clock()
+        self._mode = mode
+        self._model = model
+        self._blocks = np.zeros(0, velodyne.DATA_BLOCK)
+        self._starts_ns = np.zeros(0, np.int64)
+        self._n_data = 0
+        self._rotor: tuple[int, float] | None = None
+
+    def feed(self, scan: Scan, last: Scan | None = None) -> list[SensorPacket]:
+        """Send a scan; returns the packets that are full.
+
+        A scan that does not follow the one before at once begins a new packet, as after a break.
+
+        Args:
+            scan: the strongest returns, on the model's grid of firings (as `simulate_scan` makes them).
+            last: the last returns of the same revolution, in dual mode; None for the same.
+
+        Raises:
+            ValueError: a point lies on no firing, or the scan has no stamp, times or points.
+        """
+        if scan.stamp_ns is None or scan.offset_ns is None or len(scan.points) == 0:
+            raise ValueError("a scan without points or their times cannot be sent")
+        packets = []
+        if self._rotor is not None and scan.stamp_ns != self._rotor[0]:
+            packets = self.finish()
+            self._rotor = None
+        blocks, starts_ns = self._to_blocks(scan, last or scan)
+        self._blocks = np.concatenate([self._blocks, blocks])
+        self._starts_ns = np.concatenate([self._starts_ns, starts_ns])
+        n_whole = len(self._blocks) // velodyne.N_BLOCKS
+        return packets + [packet for _ in range(n_whole) for packet in self._pop()]
+
+    def finish(self) -> list[SensorPacket]:
+        """Send what waits, filled up with blocks that follow without returns."""
+        n_missing = -len(self._blocks) % velodyne.N_BLOCKS
+        if not n_missing:
+            return []
+        n_returns = 2 if self._is_dual else 1
+        ahead = np.arange(1, n_missing + 1) + (len(self._blocks) - 1) % n_returns
+        step = velodyne.AZIMUTH_STEPS * velodyne.BLOCK_NS / self._model.period_ns
+        padding = np.zeros(n_missing, velodyne.DATA_BLOCK)
+        padding["flag"] = velodyne.BLOCK_FLAG
+        azimuth = self._blocks["azimuth"][-1] + np.rint(ahead // n_returns * step).astype(np.int64)
+        padding["azimuth"] = azimuth % velodyne.AZIMUTH_STEPS
+        self._blocks = np.concatenate([self._blocks, padding])
+        self._starts_ns = np.concatenate([self._starts_ns, np.repeat(self._starts_ns[-1:], n_missing)])
+        return self._pop()
+
+    @property
+    def _is_dual(self) -> bool:
+        return self._mode == velodyne.DUAL
+
+    def _to_blocks(self, strongest: Scan, last: Scan) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+        """Lay a revolution out as blocks (B,) with the time (B,) of each one's first firing."""
+        n_blocks = -(-int(self._model.period_ns // velodyne.SEQUENCE_NS) // 2)
+        starts_ns = int(strongest.stamp_ns or 0) + velodyne.BLOCK_NS * np.arange(n_blocks)
+        blocks = np.zeros(n_blocks, velodyne.DATA_BLOCK)
+        blocks["flag"] = velodyne.BLOCK_FLAG
+        steps = np.rint(self._azimuths_rad(strongest, n_blocks) / velodyne.AZIMUTH_STEP_RAD)
+        blocks["azimuth"] = steps.astype(np.int64) % velodyne.AZIMUTH_STEPS
+        if self._is_dual:
+            blocks, starts_ns = np.repeat(blocks, 2), np.repeat(starts_ns, 2)
+            blocks["returns"][0::2] = _returns(last, self._model, n_blocks)
+            blocks["returns"][1::2] = _returns(strongest, self._model, n_blocks)
+        else:
+            chosen = last if self._mode == velodyne.LAST else strongest
+            blocks["returns"] = _returns(chosen, self._model, n_blocks)
+        return blocks, starts_ns
+
+    def _azimuths_rad(self, scan: Scan, n_blocks: int) -> Array:
+        """Find the sensor's azimuth (n_blocks,) at each block's first firing, eased from the last scan."""
+        start_rad = _start_azimuth_rad(scan, self._model)
+        turned_rad = 2 * np.pi * velodyne.BLOCK_NS / self._model.period_ns * np.arange(n_blocks + 1)
+        ease_rad = np.zeros(n_blocks)
+        if self._rotor is not None:
+            jump_rad = np.angle(np.exp(1j * (self._rotor[1] - start_rad)))
+            ease_rad = jump_rad * np.clip(1 - np.arange(n_blocks) / _EASED_BLOCKS, 0, None)
+        next_ns = int(scan.stamp_ns or 0) + n_blocks * velodyne.BLOCK_NS
+        self._rotor = next_ns, start_rad + float(turned_rad[-1])
+        return np.asarray(start_rad + turned_rad[:-1] + ease_rad)
+
+    def _pop(self) -> list[SensorPacket]:
+        """Take one data packet, and the position packet that follows it now and then."""
+        start_ns = int(self._starts_ns[0])
+        sent_ns = start_ns + velodyne.packet_ns(self._is_dual)
+        data = np.zeros((), velodyne.DATA_PACKET)
+        data["blocks"], data["us"] = self._blocks[: velodyne.N_BLOCKS], self._count_us(start_ns)
+        data["mode"], data["product"] = self._mode, velodyne.VLP16
+        self._blocks = self._blocks[velodyne.N_BLOCKS :]
+        self._starts_ns = self._starts_ns[velodyne.N_BLOCKS :]
+        packets = [SensorPacket(velodyne.DATA_PORT, sent_ns, data.tobytes())]
+        if self._n_data % _DATA_PER_POSITION == 0:
+            packets.append(SensorPacket(velodyne.POSITION_PORT, sent_ns, self._position(sent_ns)))
+        self._n_data += 1
+        return packets
+
+    def _position(self, now_ns: int) -> bytes:
+        packet = np.zeros((), velodyne.POSITION_PACKET)
+        packet["us"] = self._count_us(now_ns)
+        packet["pps"] = velodyne.PPS_STATES.index(self.clock.pps)
+        if self.clock.has_nmea:
+            packet["nmea"] = gprmc(now_ns - _SENTENCE_DELAY_NS, self.clock.is_valid).encode() + b"\r\n"
+        return packet.tobytes()
+
+    def _count_us(self, time_ns: int) -> int:
+        return (time_ns // 1000 + self.clock.error_us) % velodyne.HOUR_US
+
+
+def gprmc(time_ns: int, is_valid: bool = True) -> str:
+    """Word the sentence for the pulse that came last before a time, without its line end."""
+    when = datetime.fromtimestamp(time_ns // _NS_PER_S, timezone.utc)
+    status = "A" if is_valid else "V"
+    body = f"GPRMC,{when:%H%M%S},{status},2219.9000,N,11415.9000,E,000.0,000.0,{when:%d%m%y},,,A"
+    checksum = int(np.bitwise_xor.reduce(np.frombuffer(body.encode(), np.uint8)))
+    return f"${body}*{checksum:02X}"
+
+
+def _start_azimuth_rad(scan: Scan, model: LidarModel) -> float:
+    """Find the sensor's azimuth at the first firing from all points: the rotor turns evenly."""
+    assert scan.offset_ns is not None
+    azimuth_rad = np.arctan2(-scan.points[:, 1].astype(float), scan.points[:, 0].astype(float))
+    turned_rad = 2 * np.pi * scan.offset_ns / model.period_ns
+    return float(np.angle(np.exp(1j * (azimuth_rad - turned_rad)).mean()))
+
+
+def _returns(scan: Scan, model: LidarModel, n_blocks: int) -> NDArray[np.void]:
+    """Lay the points out as returns (n_blocks, 32)."""
+    assert scan.offset_ns is not None
+    laser = np.argsort(model.rings)[scan.ring]
+    sequence, rest_ns = np.divmod(scan.offset_ns - laser * velodyne.FIRING_NS, velodyne.SEQUENCE_NS)
+    if rest_ns.any() or sequence.min() < 0 or sequence.max() >= 2 * n_blocks:
+        raise ValueError("the scan has points that lie on no firing of the model")
+    from_laser: Array = scan.points.astype(np.float64)
+    from_laser[:, 2] -= model.vertical_offsets_m[laser]
+    steps = np.rint(np.linalg.norm(from_laser, axis=1) / velodyne.RANGE_STEP_M)
+    returns = np.zeros((2 * n_blocks, velodyne.N_LASERS), velodyne.DATA_BLOCK["returns"].base)
+    returns["range"][sequence, laser] = np.minimum(steps, np.iinfo(np.uint16).max)
+    returns["reflectivity"][sequence, laser] = np.clip(np.rint(scan.intensity), 0, 255)
+    return returns.reshape(n_blocks, 2 * velodyne.N_LASERS)

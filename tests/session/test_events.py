@@ -1,0 +1,266 @@
+"""A session keeps the raw events about each capture, exactly, and vouches for them."""
+
+import hashlib
+import io
+import json
+import resource
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.errors import SessionError
+from lce_rig.core.event_file import encode_events
+from lce_rig.rig import Rig, load_rig
+from lce_rig.session import Session, content_hash
+
+T0_NS = 1_700_000_000_123_456_000
+FILE = "davis.events.npz"
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig("rles")
+
+
+def noise_events(seed: int, n: int = 500) -> Events:
+    rng = np.random.default_rng(seed)
+    t_ns = T0_NS + 1000 * np.sort(rng.integers(0, 1_350_000, n))
+    x, y = rng.integers(0, 346, n).astype(np.uint16), rng.integers(0, 260, n).astype(np.uint16)
+    return Events("davis", t_ns, x, y, rng.random(n) < 0.5, 346, 260, T0_NS + 77)
+
+
+def noise_samples(seed: int) -> tuple[list[Image], list[Scan]]:
+    rng = np.random.default_rng(seed)
+    pixels = rng.integers(0, 256, (24, 32), dtype=np.uint8)
+    points = rng.normal(size=(50, 3)).astype(np.float32)
+    scan = Scan("lidar", T0_NS, points, np.zeros(50, np.float32), np.zeros(50, np.int16))
+    return [Image("davis", "frames", T0_NS, pixels)], [scan]
+
+
+def make_session(path: Path, rig: Rig) -> Session:
+    """A session with one capture that has events and one that has none."""
+    session = Session.create(path, rig)
+    session.add_capture(*noise_samples(0), {}, [noise_events(0)])
+    session.add_capture(*noise_samples(1), {})
+    return session
+
+
+def assert_equal(found: Events, given: Events) -> None:
+    for column in ("t_ns", "x", "y", "polarity"):
+        assert getattr(found, column).dtype == getattr(given, column).dtype
+        assert np.array_equal(getattr(found, column), getattr(given, column)), column
+    for name in ("sensor", "width_px", "height_px", "host_ns"):
+        assert getattr(found, name) == getattr(given, name), name
+
+
+def test_events_come_back_to_the_microsecond(tmp_path: Path, rig: Rig) -> None:
+    make_session(tmp_path / "s", rig).close()
+    with_events, without = Session.open(tmp_path / "s").captures
+    assert_equal(with_events.events("davis"), noise_events(0))
+    assert (with_events.event_cameras, without.event_cameras) == (["davis"], [])
+    assert with_events.image_keys == [("davis", "frames")], "a picture of events is made at detection"
+    with_events.check()
+
+
+@pytest.mark.parametrize("stamps_us", [[], [0], [-7, -7, 2**50]])
+def test_any_stretch_of_events_survives(tmp_path: Path, rig: Rig, stamps_us: list[int]) -> None:
+    zeros = np.zeros(len(stamps_us), np.uint16)
+    events = Events("davis", 1000 * np.array(stamps_us, np.int64), zeros, zeros, zeros > 0, 346, 260)
+    with Session.create(tmp_path / "s", rig) as session:
+        session.add_capture([], [], {}, [events])
+        assert_equal(session.captures[0].events("davis"), events)
+
+
+def test_the_file_is_plain_and_the_manifest_vouches_for_it(tmp_path: Path, rig: Rig) -> None:
+    capture = make_session(tmp_path / "s", rig).captures[0]
+    events, data = noise_events(0), (capture.path / FILE).read_bytes()
+    with np.load(capture.path / FILE) as archive:
+        assert np.array_equal(archive["t_us"] * 1000, events.t_ns)
+    manifest = json.loads((capture.path / "meta.json").read_text())
+    assert manifest["files"][-1] == {
+        "kind": "events",
+        "camera": "davis",
+        "channel": "events",
+        "file": FILE,
+        "bytes": len(data),
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "first_ns": int(events.t_ns[0]),
+        "last_ns": int(events.t_ns[-1]),
+        "host_ns": events.host_ns,
+    }
+
+
+def test_captures_without_events_are_written_as_before_and_both_are_read(tmp_path: Path, rig: Rig) -> None:
+    captures = make_session(tmp_path / "s", rig).captures
+    manifests = [json.loads((capture.path / "meta.json").read_text()) for capture in captures]
+    assert [manifest["format_version"] for manifest in manifests] == [2, 1]
+    assert sorted(path.name for path in captures[1].path.iterdir()) == [
+        "davis.frames.png", "lidar.pcd", "meta.json",
+    ]  # fmt: skip
+    assert captures[1].content_sha256 == content_hash(*noise_samples(1))
+
+
+def test_the_same_events_give_the_same_bytes(tmp_path: Path, rig: Rig) -> None:
+    one, other = (make_session(tmp_path / name, rig).captures[0].path for name in ("one", "other"))
+    for name in (FILE, "meta.json"):
+        assert (one / name).read_bytes() == (other / name).read_bytes()
+
+
+def test_captures_that_differ_in_their_events_alone_are_no_duplicates(tmp_path: Path, rig: Rig) -> None:
+    session = make_session(tmp_path / "s", rig)
+    images, scans = noise_samples(0)
+    events = noise_events(0)
+    later = replace(events, t_ns=events.t_ns + 5_000_000_000, host_ns=None)
+    assert session.find_duplicate(images, scans, [later]) == "000000", "stamps are left aside"
+    assert session.find_duplicate(images, scans) is None
+    for other in (
+        noise_events(7),
+        replace(events, polarity=~events.polarity),
+        replace(events, t_ns=np.append(events.t_ns[:-1], events.t_ns[-1] + 1000)),
+    ):
+        assert session.find_duplicate(images, scans, [other]) is None
+    session.close()
+    assert Session.open(tmp_path / "s").find_duplicate(images, scans, [events]) == "000000"
+
+
+@pytest.mark.parametrize(
+    ("changes", "cause"),
+    [
+        ({"sensor": "front"}, "has no camera 'front' with events"),
+        ({"width_px": 640, "height_px": 480}, "are of 640x480 pixels; rig 'rles' gives it 346x260"),
+        ({"t_ns": noise_events(0).t_ns[::-1]}, "not in order of time"),
+        ({"x": np.full(500, 346, np.uint16)}, "lie off its 346x260 pixels"),
+    ],
+)
+def test_events_that_cannot_be_the_rigs_are_refused(
+    tmp_path: Path, rig: Rig, changes: dict[str, Any], cause: str
+) -> None:
+    session = Session.create(tmp_path / "s", rig)
+    with pytest.raises(SessionError, match=cause):
+        session.add_capture(*noise_samples(0), {}, [replace(noise_events(0), **changes)])
+    assert list((tmp_path / "s" / "captures").iterdir()) == []
+
+
+def test_a_rig_without_event_camera_takes_none(tmp_path: Path) -> None:
+    session = Session.create(tmp_path / "s", load_rig("rlfs"))
+    with pytest.raises(SessionError, match="has no camera 'cam' with events") as caught:
+        session.add_capture([], [], {}, [replace(noise_events(0), sensor="cam")])
+    assert "cameras.cam.channels" in caught.value.hint
+    with pytest.raises(SessionError, match="at most"):
+        Session.create(tmp_path / "t", load_rig("rles")).add_capture([], [], {}, [noise_events(0)] * 2)
+
+
+def test_every_damaged_byte_is_noticed_and_the_file_named(tmp_path: Path, rig: Rig) -> None:
+    session = make_session(tmp_path / "s", rig)
+    file = session.captures[0].path / FILE
+    whole = file.read_bytes()
+    for position in (0, 30, len(whole) // 2, len(whole) - 1):
+        file.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
+        for read in (session.captures[0].check, lambda: session.captures[0].events("davis")):
+            with pytest.raises(SessionError, match=rf"capture 000000 is damaged: {FILE}"):
+                read()
+    for damaged in (b"", whole[:-1], whole + b"x"):
+        file.write_bytes(damaged)
+        with pytest.raises(SessionError, match=rf"{FILE} has {len(damaged)} of {len(whole)} bytes"):
+            session.captures[0].check()
+    file.unlink()
+    with pytest.raises(SessionError, match=f"{FILE}: No such file"):
+        session.captures[0].events("davis")
+    assert session.captures[0].scan("lidar").points.shape == (50, 3), "the other files are not affected"
+
+
+def rewrite(session: Session, data: bytes | None = None, **changes: Any) -> None:
+    """Put other data in place of the events, checksum included, and change the manifest."""
+    folder = session.captures[0].path
+    manifest = json.loads((folder / "meta.json").read_text())
+    if data is not None:
+        (folder / FILE).write_bytes(data)
+        changes |= {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    manifest["files"][-1].update(changes)
+    (folder / "meta.json").write_text(json.dumps(manifest))
+
+
+def archive_of(**columns: Any) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **columns)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"no zip at all",
+        archive_of(),
+        archive_of(t_us=np.array([{}]), x=[1], y=[1], polarity=[1]),
+        archive_of(t_us=[1, 2], x=[1], y=[1], polarity=[1]),
+        archive_of(t_us=7, x=1, y=1, polarity=1),
+        archive_of(t_us=[1], x=[[1]], y=["a"], polarity=[1]),
+        archive_of(t_us=[1], x=[1], y=[1], polarity=[1], resolution_px=[1]),
+        encode_events(replace(noise_events(0), t_ns=noise_events(0).t_ns[::-1].copy())),
+        encode_events(replace(noise_events(0), width_px=3)),
+        encode_events(noise_events(0).select(slice(0, 100))),
+    ],
+)
+def test_a_file_whose_checksum_was_adapted_is_still_judged_by_what_it_holds(
+    tmp_path: Path, rig: Rig, data: bytes
+) -> None:
+    session = make_session(tmp_path / "s", rig)
+    rewrite(session, data)
+    with pytest.raises(SessionError, match=rf"capture 000000 is damaged: {FILE}"):
+        session.captures[0].events("davis")
+
+
+@pytest.mark.parametrize("name", ["../../../secret.npz", "/etc/passwd", "a/b.npz", "..", ".hidden", ""])
+def test_a_manifest_never_leads_out_of_its_folder(tmp_path: Path, rig: Rig, name: str) -> None:
+    session = make_session(tmp_path / "s", rig)
+    (tmp_path / "secret.npz").write_bytes(encode_events(noise_events(0)))
+    rewrite(session, file=name)
+    with pytest.raises(SessionError, match="outside the capture's folder"):
+        session.captures[0].events("davis")
+
+
+def test_a_link_in_place_of_the_events_is_not_followed(tmp_path: Path, rig: Rig) -> None:
+    session = make_session(tmp_path / "s", rig)
+    file = session.captures[0].path / FILE
+    file.rename(tmp_path / "secret.npz")
+    file.symlink_to(tmp_path / "secret.npz")
+    with pytest.raises(SessionError, match="outside the capture's folder"):
+        session.captures[0].events("davis")
+
+
+@pytest.mark.parametrize(
+    "changes", [{"kind": "film"}, {"kind": []}, {"first_ns": "now"}, {"last_ns": 1.5}, {"channel": None}]
+)
+def test_a_manifest_that_says_nonsense_about_events_is_named(
+    tmp_path: Path, rig: Rig, changes: dict[str, Any]
+) -> None:
+    session = make_session(tmp_path / "s", rig)
+    rewrite(session, **changes)
+    with pytest.raises(SessionError, match=r"capture 000000 is damaged: meta\.json"):
+        session.captures[0].events("davis")
+
+
+def test_what_a_capture_lacks_is_named_with_what_it_has(tmp_path: Path, rig: Rig) -> None:
+    captures = make_session(tmp_path / "s", rig).captures
+    with pytest.raises(SessionError, match=r"000001 has no events from davis; it has davis\.frames, lidar$"):
+        captures[1].events("davis")
+    with pytest.raises(SessionError, match=r"it has davis\.frames, lidar, events of davis"):
+        captures[0].image("davis", "events")
+
+
+def test_a_disk_too_small_for_the_events_loses_nothing_captured_before(tmp_path: Path, rig: Rig) -> None:
+    session = make_session(tmp_path / "s", rig)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(SessionError, match="cannot be written") as caught:
+            session.add_capture(*noise_samples(2), {}, [noise_events(2, 20_000)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "The 2 captures before it are safe" in caught.value.hint
+    assert [path.name for path in sorted((tmp_path / "s" / "captures").iterdir())] == ["000000", "000001"]
+    assert session.add_capture(*noise_samples(2), {}, [noise_events(2)]) == "000002"
