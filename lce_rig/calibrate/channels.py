@@ -35,6 +35,7 @@ from lce_rig.core.results import ChannelResult, Observation
 _MIN_MOVING = 6
 # Rates are this much larger than noise makes them, as mean squares, where boards moved.
 _MOVED = 1.0
+_N_SHARES = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +115,8 @@ class _Mover:
     T_cam_lidar: Array
     sweep_s: float
 
-    def observations(self, only: str | None = None, every: slice = slice(None)) -> list[Observation]:
-        kept = [k for k, scan in enumerate(self.scans) if only is None or only in scan.images][every]
+    def observations(self, only: str | None = None) -> list[Observation]:
+        kept = [k for k, scan in enumerate(self.scans) if only is None or only in scan.images]
         scans = [self.scans[k] for k in kept]
         if self.offsets is None:
             return [_still_observation(scan, only) for scan in scans]
@@ -248,7 +249,8 @@ def _difference(
     """Hold two channels' extrinsics against each other: the tangent (6,) between them and its covariance.
 
     Where only the two channels together tell how boards moved, each pose depends on both; then one channel's
-    extrinsic from every other capture is held against the other's from the captures between.
+    extrinsic from half of the scans is held against the other's from the other half, and of several ways to
+    share them out the median counts.
     """
     if len(results) != 2:
         return None, None
@@ -256,9 +258,17 @@ def _difference(
     if mover.offsets is None or mover.is_motion_own:
         return difference(first.T_cam_lidar, second.T_cam_lidar), first.cov + second.cov
     fast = replace(options, n_draws=0)
-    halves = [
-        calibrate_observations(mover.observations(result.channel, slice(k, None, 2)), board, fast)
-        for k, result in enumerate(results)
-    ]
-    apart = difference(halves[0].T_cam_lidar, halves[1].T_cam_lidar)
-    return apart, halves[0].cov + halves[1].cov
+    seen = [mover.observations(result.channel) for result in results]
+    rng = np.random.default_rng(options.seed)
+    ways: list[tuple[float, Array, Array]] = []
+    for _ in range(_N_SHARES):
+        mine = set(rng.permutation(len(mover.scans))[: len(mover.scans) // 2].tolist())
+        names = {mover.scans[k].capture for k in mine}
+        halves = [
+            calibrate_observations([o for o in own if (o.capture in names) == is_first], board, fast)
+            for own, is_first in zip(seen, (True, False), strict=True)
+        ]
+        apart = difference(halves[0].T_cam_lidar, halves[1].T_cam_lidar)
+        cov = halves[0].cov + halves[1].cov
+        ways.append((float(apart @ np.linalg.solve(cov, apart)), apart, cov))
+    return sorted(ways, key=lambda way: way[0])[_N_SHARES // 2][1:]

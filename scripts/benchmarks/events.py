@@ -1,0 +1,157 @@
+"""The simulated rig with an event camera and boards moved by hand: frames, events and both against truth."""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.tables import compare, print_head, print_row, rms
+from lce_rig import pipeline
+from lce_rig.calibrate import CalibrateOptions
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.geometry import Array, difference, transform
+from lce_rig.core.results import ImageBoard
+from lce_rig.pipeline import Detections
+from lce_rig.rig import Rig, load_rig
+from lce_rig.session import Session
+from lce_rig.simulate import (
+    HandMotion,
+    SimulatedCapture,
+    SimulationOptions,
+    simulate_captures,
+    truth_extrinsics,
+)
+
+CAMERA, LIDAR = "davis", "lidar"
+# By how much more stamps read than the LiDAR's clock, unknown to the calibration.
+FRAME_OFFSET_S, EVENT_OFFSET_S = 0.012, -0.008
+CHOICES: tuple[tuple[str, ...], ...] = (("frames",), ("events",), ("events", "frames"))
+
+
+@dataclass(frozen=True)
+class ChannelRun:
+    """What one choice of channels gave in one session."""
+
+    deg: float
+    mm: float
+    sigma_deg: float
+    sigma_mm: float
+    nees: float
+
+
+@dataclass
+class SessionRun:
+    """What one simulated session gave: errors by choice of channels, and corners by channel."""
+
+    runs: dict[str, ChannelRun] = field(default_factory=dict)
+    corner_px: dict[str, list[float]] = field(default_factory=dict)
+    n_captures: int = 0
+    clock_error_s: dict[str, float] = field(default_factory=dict)
+
+
+def bench_events(n_seeds: int, n_captures: int = 30) -> None:
+    """Tabulate frames, events, both, and the network against the event map."""
+    work = partial(_session, n_captures=n_captures)
+    with ProcessPoolExecutor(2) as pool:
+        sessions = list(pool.map(work, range(n_seeds)))
+    head = "channels, sessions, boards found, corner rms px, rms deg, rms mm, claimed deg / mm, NEES"
+    print_head(*head.split(", "), "clock rms ms")
+    for name in ("frames", "events", "events+frames"):
+        print_row(*_row(name, [network for network, _ in sessions]))
+    print()
+    print_head("pictures from events by", "boards found", "corner rms px", "rms deg", "rms mm")
+    for title, index in (("network", 0), ("event map", 1)):
+        found, corners, deg, mm = _row("events", [session[index] for session in sessions])[2:6]
+        print_row(title, found, corners, deg, mm)
+
+
+def _row(name: str, sessions: Sequence[SessionRun]) -> tuple[object, ...]:
+    runs = [session.runs[name] for session in sessions if name in session.runs]
+    corners = [px for session in sessions for px in session.corner_px.get(name, [])]
+    n = sum(session.n_captures for session in sessions)
+    clocks = [session.clock_error_s[name] for session in sessions if name in session.clock_error_s]
+    errors = (
+        ("-",) * 4
+        if not runs
+        else (
+            f"{rms(np.array([run.deg for run in runs])):.3f}",
+            f"{rms(np.array([run.mm for run in runs])):.2f}",
+            f"{rms(np.array([run.sigma_deg for run in runs])):.3f} / "
+            f"{rms(np.array([run.sigma_mm for run in runs])):.2f}",
+            f"{np.mean([run.nees for run in runs]):.1f}",
+        )
+    )
+    return (
+        name,
+        len(runs),
+        f"{len(corners)} of {n}" if corners else "-",
+        f"{rms(np.array(corners)):.3f}" if corners else "-",
+        *errors,
+        f"{1000 * rms(np.array(clocks)):.1f}" if clocks else "-",
+    )
+
+
+def _session(seed: int, n_captures: int) -> tuple[SessionRun, SessionRun]:
+    """Simulate, detect and calibrate one session: with the network, and with the event map."""
+    rig = load_rig("rles")
+    options = replace(
+        SimulationOptions.for_rig("rles", "moving"),
+        hand=HandMotion(speed_mps=(0.08, 0.3)),
+        frame_offset_s=FRAME_OFFSET_S,
+        event_offset_s=EVENT_OFFSET_S,
+    )
+    truth = truth_extrinsics(rig, seed, options)[CAMERA, LIDAR]
+    with tempfile.TemporaryDirectory() as scratch:
+        captures: dict[str, SimulatedCapture] = {}
+        with Session.create(Path(scratch) / "session", rig) as session:
+            for capture in simulate_captures(rig, n_captures=n_captures, seed=seed, options=options):
+                name = session.add_capture(capture.images, capture.scans, {}, events=capture.events)
+                captures[name] = capture
+            network = _assess(rig, pipeline.detect(session, n_threads=1), captures, truth, CHOICES)
+            by_map = pipeline.detect(session, event_image="map", n_threads=1)
+            return network, _assess(rig, by_map, captures, truth, (("events",),))
+
+
+def _assess(
+    rig: Rig,
+    detections: Detections,
+    captures: dict[str, SimulatedCapture],
+    truth: Array,
+    choices: Sequence[tuple[str, ...]],
+) -> SessionRun:
+    run = SessionRun(n_captures=len(captures))
+    for channel in ("frames", "events"):
+        found = detections.images.get((CAMERA, channel), {})
+        run.corner_px[channel] = list(_corner_errors(rig, channel, found, captures))
+    for channels in choices:
+        try:
+            calibration, _ = pipeline.calibrate(rig, detections, CalibrateOptions(), channels=channels)[0][0]
+        except NotEnoughDataError:
+            continue
+        deg, mm = compare(calibration.T_cam_lidar, truth)
+        off = difference(calibration.T_cam_lidar, truth)
+        nees = float(off @ np.linalg.solve(calibration.cov, off))
+        sigmas = calibration.sigma_rotation_deg, 1000 * calibration.sigma_translation_m
+        run.runs["+".join(sorted(channels))] = ChannelRun(deg, mm, *sigmas, nees)
+        for result in calibration.channel_results:
+            expected_s = -(FRAME_OFFSET_S if result.channel == "frames" else EVENT_OFFSET_S)
+            if result.time_offset_s is not None:
+                run.clock_error_s[result.channel] = result.time_offset_s - expected_s
+    return run
+
+
+def _corner_errors(
+    rig: Rig, channel: str, found: dict[str, ImageBoard], captures: dict[str, SimulatedCapture]
+) -> Iterator[float]:
+    """Give the rms corner error of each picture in which the board was found, px for each coordinate."""
+    intrinsics, corners = rig.cameras[CAMERA].to_intrinsics(), rig.board.to_board().corners()
+    offset_s = FRAME_OFFSET_S if channel == "frames" else EVENT_OFFSET_S
+    for name, board in found.items():
+        if isinstance(board, ImageBoard) and board.stamp_ns is not None:
+            T = captures[name].T_sensor_board(CAMERA, board.stamp_ns - round(1e9 * offset_s))
+            true_px, _ = intrinsics.project(transform(T, corners))
+            yield min(rms(board.corners_px - true_px), rms(board.corners_px[::-1] - true_px))

@@ -1,0 +1,78 @@
+"""Recordings by others, in the folder that LCE_RIG_DATA names, as sessions."""
+
+import csv
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lce_rig import pipeline
+from lce_rig.core.geometry import Array, exp_so3, invert, pose
+from lce_rig.rig import Rig
+
+RIGS = Path(__file__).resolve().parents[2] / "tests" / "rigs"
+
+
+@dataclass(frozen=True)
+class RecordedSet:
+    """Folders of recordings, the profile that fits them, and the channels whose pictures they hold."""
+
+    name: str
+    rig: str
+    folders: tuple[tuple[str, str], ...]
+
+    @property
+    def is_there(self) -> bool:
+        """Whether all of its folders are there."""
+        return all((recordings() / folder).is_dir() for folder, _ in self.folders)
+
+    def collect(self, session: Path) -> None:
+        """Build a session with the commands a user would type."""
+        for folder, channel in self.folders:
+            words = ["collect", "--rig", self.rig, "--channel", channel, "--from", recordings() / folder]
+            command = [sys.executable, "-m", "lce_rig", *map(str, words), str(session)]
+            subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+
+    def reference(self) -> Array:
+        """Read the reference extrinsic that comes with it."""
+        from lce_rig.export.reference import read_reference
+
+        folder = recordings() / self.folders[0][0]
+        if (folder / "reference.json").exists():
+            T = read_reference(folder / "reference.json").of("", "")
+            assert T is not None
+            return T
+        # 50 runs of another tool, LiDAR <- camera: roll, pitch, yaw about fixed axes and a translation.
+        with (folder / "reference_50_runs.csv").open() as file:
+            runs = np.array([[float(cell) for cell in row] for row in list(csv.reader(file))[1:]])
+        roll, pitch, yaw, *t = np.median(runs, axis=0)
+        x, y, z = np.eye(3)
+        return invert(pose(exp_so3(yaw * z) @ exp_so3(pitch * y) @ exp_so3(roll * x), np.array(t)))
+
+
+SETS = (
+    RecordedSet("rlfs01", "rlfs", (("rlfs01", "frames"),)),
+    RecordedSet("sss_noise15mm", "sss", (("sss_noise15mm", "frames"),)),
+    RecordedSet("rles01", "rles", (("rles01_lf", "frames"), ("rles01_le", "events"))),
+    RecordedSet("rles02", str(RIGS / "rles02.yaml"), (("rles02_lf", "frames"), ("rles02_le", "events"))),
+    RecordedSet("acfr_vlp16", str(RIGS / "acfr.yaml"), (("acfr_vlp16", "frames"),)),
+)
+
+
+def recordings() -> Path:
+    """Find the recordings by others."""
+    folder = os.environ.get("LCE_RIG_DATA")
+    if not folder or not Path(folder).is_dir():
+        sys.exit("LCE_RIG_DATA names no folder of recordings")
+    return Path(folder)
+
+
+def detect(path: Path) -> tuple[Rig, pipeline.Detections]:
+    """Detect the boards of a session."""
+    from lce_rig.session import Session
+
+    session = Session.open(path)
+    return session.rig, pipeline.detect(session)

@@ -1,0 +1,58 @@
+"""The simulated rig with boards held still: errors against exact truth over many seeds."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from benchmarks.tables import print_head, print_row, rms
+from lce_rig import pipeline
+from lce_rig.calibrate import CalibrateOptions
+from lce_rig.core.geometry import difference
+from lce_rig.rig import load_rig
+
+
+def bench_simulated(n_seeds: int, n_captures: int = 30) -> None:
+    """Tabulate errors against exact truth."""
+    head = "rig, seeds, captures, found by both, rms deg, rms mm, claimed deg / mm, NEES, not passed"
+    print_head(*head.split(", "))
+    for name in ("rlfs",):
+        rows = list(_simulated_runs(name, n_seeds, n_captures))
+        deg, mm, nees, sigma_deg, sigma_mm, found, passed = np.array(rows).T
+        print_row(
+            name,
+            n_seeds,
+            n_captures,
+            f"{int(found.sum())} of {n_seeds * n_captures}",
+            f"{rms(deg):.4f}",
+            f"{rms(mm):.2f}",
+            f"{rms(sigma_deg):.4f} / {rms(sigma_mm):.2f}",
+            f"{nees.mean():.1f}",
+            int(n_seeds - passed.sum()),
+        )
+
+
+def _simulated_runs(name: str, n_seeds: int, n_captures: int) -> Iterator[tuple[float, ...]]:
+    from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrinsics
+
+    rig = load_rig(name)
+    options = SimulationOptions.for_rig(name)
+    for seed in range(n_seeds):
+        images: dict[str, pipeline.ImageDetection] = {}
+        scans: dict[str, pipeline.LidarDetection] = {}
+        for capture in simulate_captures(rig, n_captures=n_captures, seed=seed, options=options):
+            images[f"{capture.index:06d}"] = pipeline.detect_image(rig, capture.images[0])
+            scans[f"{capture.index:06d}"] = pipeline.detect_scan(rig, capture.scans[0])
+        camera, lidar = next(iter(rig.cameras)), next(iter(rig.lidars))
+        detections = pipeline.Detections({(camera, "frames"): images}, {lidar: scans})
+        calibration, estimate = pipeline.calibrate(rig, detections, CalibrateOptions(seed=seed))[0][0]
+        error = difference(estimate.T_cam_lidar, truth_extrinsics(rig, seed, options)[camera, lidar])
+        nees = float(error @ np.linalg.solve(estimate.cov, error))
+        yield (
+            float(np.degrees(np.linalg.norm(error[3:]))),
+            float(1000 * np.linalg.norm(error[:3])),
+            nees,
+            calibration.sigma_rotation_deg,
+            1000 * calibration.sigma_translation_m,
+            calibration.n_detected,
+            calibration.verdict == "pass",
+        )

@@ -1,0 +1,83 @@
+"""Times of one core and memory."""
+
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.recordings import SETS
+from benchmarks.tables import print_head, print_row
+from lce_rig import pipeline
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates
+from lce_rig.calibrate import calibrate as estimate_extrinsic
+from lce_rig.core.results import ImageBoard
+
+
+def bench_speed() -> None:
+    """Tabulate times, processor seconds of one core, and the memory of the command line."""
+    print_head("what", "figure")
+    with tempfile.TemporaryDirectory() as scratch:
+        session = Path(scratch) / "session"
+        SETS[0].collect(session)
+        for what, figure in (*_detector_speed(session), *_command_speed(session)):
+            print_row(what, figure)
+
+
+def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
+    from lce_rig.detect.lidar_track import track_lidar_board
+    from lce_rig.session import Session
+
+    session = Session.open(path)
+    rig, board = session.rig, session.rig.board.to_board()
+    scans = [capture.scan("lidar") for capture in session.captures]
+    found = [pipeline.detect_scan(rig, scan) for scan in scans]
+    pictures = [capture.image("cam", "frames") for capture in session.captures]
+    yield (
+        "board in a full VLP-16 scan, no prior, median",
+        milliseconds(lambda k: pipeline.detect_scan(rig, scans[k])),
+    )
+    yield "tracked, median", milliseconds(lambda k: track_lidar_board(scans[k], board, found[k][0]))  # type: ignore[index]
+    yield (
+        "board in a 1280x720 picture, median",
+        milliseconds(lambda k: pipeline.detect_image(rig, pictures[k])),
+    )
+    detections = pipeline.detect(session)
+    pair = detections.pairs[0]
+    both = ((name, *detections.of(pair, name)) for name in detections.captures(pair))
+    candidates = [
+        CaptureCandidates(n, i, s) for n, i, s in both if isinstance(i, ImageBoard) and isinstance(s, list)
+    ]
+    thirty = (candidates * 2)[:30]
+    thirty = [CaptureCandidates(f"{k:06d}", c.image, c.lidar) for k, c in enumerate(thirty)]
+    start = time.process_time()
+    estimate_extrinsic(thirty, board, CalibrateOptions(n_draws=100))
+    yield "Algorithm 1, N = 30, I = 100, with certificates", f"{time.process_time() - start:.2f} s"
+
+
+def milliseconds(work: Callable[[int], object], n: int = 18) -> str:
+    """Time `work(k)` for k < n and give the median."""
+    work(0)
+    times = []
+    for k in range(n):
+        start = time.process_time()
+        work(k)
+        times.append(time.process_time() - start)
+    return f"{1000 * float(np.median(times)):.1f} ms"
+
+
+def _command_speed(session: Path) -> Iterator[tuple[str, str]]:
+    for words in (["calibrate", str(session)], ["--help"]):
+        shutil.rmtree(session / "detections", ignore_errors=True)
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "lce_rig", *words], check=False, capture_output=True)
+        what = "lce-rig calibrate on rlfs01 from cold" if words[0] == "calibrate" else "lce-rig --help"
+        yield what, f"{time.perf_counter() - start:.2f} s"
+        if words[0] == "calibrate":
+            peak_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+            yield "its peak memory", f"{peak_mb:.0f} MB"
