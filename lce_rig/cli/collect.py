@@ -29,7 +29,8 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     multiple=True,
     type=click.Path(path_type=Path),
     metavar="PATH",
-    help="A folder with img/ and pcd/, a ROS 1 bag, a ROS 2 bag or an mcap file; may be repeated.",
+    help="A folder with img/ and pcd/, a ROS 1 or ROS 2 bag, an mcap or pcap file, or an event camera's file "
+    "(AEDAT4, Prophesee RAW, HDF5); may be repeated, also for several recorders of one moment.",
 )
 @click.option(
     "--pair",
@@ -68,7 +69,9 @@ def collect(
     """Build or continue SESSION (default: session/) from recordings.
 
     Every pair of a folder becomes a capture. Bags are cut where the board stands still in both sensors and is
-    somewhere new. Run it again to continue: what is captured already is not captured twice.
+    somewhere new; where they hold raw events, where it moves slowly, and the events are kept. Recordings of
+    one moment, such as --from lidar.bag --from events.aedat4, are read as one: each adds a sensor to those
+    before it. Run it again to continue: what is captured already is not captured twice.
     """
     from lce_rig.collect import CollectOptions
     from lce_rig.collect import collect as fill
@@ -79,7 +82,7 @@ def collect(
     from lce_rig.sources.base import PairedRecording, SourceOptions
 
     rig = load_rig(rig_name)
-    options = SourceOptions(camera, channel, lidar, pair, pair_tolerance, topics)
+    options = SourceOptions(camera, channel, lidar, pair, pair_tolerance, topics, is_part=len(paths) > 1)
     recordings = [open_recording(path, rig, options) for path in paths]
     with Session.resume(session, rig) as writer, show.progress_bar("collecting") as progress:
         report = fill(
@@ -95,8 +98,15 @@ def collect(
     if n_captures == 0:
         raise NotEnoughDataError(
             f"{session}: no capture could be made of {', '.join(map(str, paths))}",
-            "The board must stand still for a second in both sensors at once; do their clocks agree?",
+            _remedy(report),
         )
+
+
+def _remedy(report: Any) -> str:
+    """Say what to do where nothing could be captured."""
+    if report.has_events:
+        return "The board must move slowly, about 10 cm/s, and be seen by both sensors; the causes are above."
+    return "The board must stand still for a second in both sensors at once; do their clocks agree?"
 
 
 def _tell(report: Any, session: Path, n_captures: int) -> None:
@@ -112,7 +122,7 @@ def _tell(report: Any, session: Path, n_captures: int) -> None:
     for label, refusal in report.refused.items():
         show.warn(f"{label}: {refusal.cause}: {refusal.action}")
     if report.counts:
-        show.note("not captured: " + ", ".join(f"{n} x {why}" for why, n in report.counts.most_common()))
+        show.note("not captured:\n" + "\n".join(f"  {n} x {why}" for why, n in report.counts.most_common()))
     if report.n_missing:
         show.warn(f"{report.n_missing} captures short of the target")
     new = f"{len(report.captured)} new" + (f", {report.n_resumed} known already" if report.n_resumed else "")

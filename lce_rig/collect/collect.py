@@ -4,14 +4,18 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from lce_rig.collect.novelty import KnownPoses, board_figures
-from lce_rig.collect.pairing import PairingCounts, pair_by_time
-from lce_rig.collect.stillness import BoardWatcher, Still, StillnessOptions, find_still_moments
-from lce_rig.core.data import Image, Scan
+from lce_rig.collect.event_moment import MotionOptions
+from lce_rig.collect.moments import MomentSearch
+from lce_rig.collect.novelty import Placements, board_figures, known_placements
+from lce_rig.collect.stillness import StillnessOptions
+from lce_rig.collect.stored_events import StoredEvents
+from lce_rig.collect.watching import Moment
+from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.results import Refusal
 from lce_rig.session import Session
 from lce_rig.sources.base import ContinuousRecording, PairedRecording, PairFiles, Recording, Sample
+from lce_rig.sources.joining import join_recordings, require_sensors
 
 Progress = Callable[[int, int, str], None]
 """Told (samples done, samples in all, what happened)."""
@@ -27,6 +31,7 @@ class CollectOptions:
         min_move_m, min_turn_deg: a board differs from one captured before when it moved or turned as far; for
             continuous recordings only.
         stillness: when a board stands still; None takes the profile's `quality.max_motion_m`.
+        motion: how a moving board is judged, where events are recorded.
     """
 
     max_captures: int | None = None
@@ -34,6 +39,7 @@ class CollectOptions:
     min_move_m: float = 0.15
     min_turn_deg: float = 10.0
     stillness: StillnessOptions | None = None
+    motion: MotionOptions = field(default_factory=MotionOptions)
 
 
 @dataclass
@@ -49,6 +55,7 @@ class CollectReport:
         notes: what was chosen, assumed or left out, in words.
         errors: recordings that could not be read to their end; what was captured before is kept.
         n_missing: captures short of the target.
+        has_events: whether any recording held events, which make the board's motion wanted.
     """
 
     captured: list[str] = field(default_factory=list)
@@ -59,6 +66,7 @@ class CollectReport:
     notes: list[str] = field(default_factory=list)
     errors: list[SourceError] = field(default_factory=list)
     n_missing: int = 0
+    has_events: bool = False
 
 
 def collect(
@@ -70,15 +78,16 @@ def collect(
     """Fill a session from recordings.
 
     A folder's pairs become captures as they are. A continuous recording is cut where the board stands still
-    in every sensor that sees it, and differs from what the session holds. What an earlier run captured is not
-    captured again.
+    in every sensor that sees it, and differs from what the session holds; where it holds events, at the best
+    moment of every place that the board passes slowly, and the raw events about it are kept. Recordings of
+    the same moment by several recorders are read as one. What an earlier run captured is not captured again.
 
     Raises:
         SourceError: nothing could be read at all; it names the first file and the cause.
         SessionError: the session cannot be written; what was captured before is safe.
     """
     collector = _Collector(session, options or CollectOptions(), progress or _silent)
-    for recording in recordings:
+    for recording in join_recordings(recordings, session.rig):
         collector.note(recording.notes)
         try:
             if isinstance(recording, PairedRecording):
@@ -102,6 +111,7 @@ class _Collector:
         self._session = session
         self._options = options
         self._progress = progress
+        self._stored = StoredEvents()
         self._names_by_key = _known_keys(session)
         self._n_captures = len(session.captures)
 
@@ -135,27 +145,33 @@ class _Collector:
             raise failures[0]
 
     def take_moments(self, recording: ContinuousRecording) -> None:
-        """Capture a continuous recording's still moments.
+        """Capture the moments of a continuous recording that are worth it.
 
         Raises:
-            SourceError: the recording is torn; what came before it has been captured.
+            SourceError: it lacks a LiDAR or a camera, or their clocks do not overlap; or it is torn: what
+                came before has been captured.
         """
-        rig = self._session.rig
-        stillness = self._options.stillness or StillnessOptions(max_motion_m=rig.quality.max_motion_m)
-        board = rig.board.to_board()
-        known = KnownPoses(self._session, self._options.min_move_m, self._options.min_turn_deg)
-        counts = PairingCounts()
-        watcher = BoardWatcher(rig, stillness)
+        require_sensors(recording)
+        rig, options = self._session.rig, self._options
+        known = known_placements(self._session, options.min_move_m, options.min_turn_deg)
+        search = MomentSearch(
+            rig,
+            frozenset(recording.streams),
+            options.stillness,
+            options.motion,
+            options.min_move_m,
+            options.min_turn_deg,
+        )
+        self.report.has_events |= search.has_events
         torn: list[SourceError] = []
         samples = self._counted(_until_torn(recording.samples(), torn), recording.n_samples)
-        sightings = (watcher.sight(frame) for frame in pair_by_time(samples, rig, counts))
-        for still in find_still_moments(sightings, board, stillness):
+        for moment in search.moments(samples):
             if self._is_enough():
                 self.note(["stopped early: the session has as many captures as wanted"])
                 break
-            self._take_moment(recording.key, still, known)
-        self.report.counts.update(watcher.counts)
-        self._note_pairing(counts)
+            self._take_moment(recording.key, moment, search.kept_images(moment), known)
+        self.report.counts.update(search.counts())
+        self.note(search.notes())
         if torn:
             raise torn[0]
 
@@ -170,6 +186,7 @@ class _Collector:
             SourceError: nothing could be read and the session is empty.
         """
         report = self.report
+        self.note(self._stored.notes())
         if self._options.target is not None:
             report.n_missing = max(0, self._options.target - self._n_captures)
         self._session.journal(
@@ -195,32 +212,40 @@ class _Collector:
         self._note_sizes(pair.images)
         return self._store(key, files.label, pair.images, pair.scans, {})
 
-    def _take_moment(self, recording_key: str, still: Still, known: KnownPoses) -> None:
-        frame = still.sighting.frame
-        stamps = [scan.stamp_ns for scan in frame.scans] + [image.stamp_ns for image in frame.images]
+    def _take_moment(
+        self, recording_key: str, moment: Moment, images: Sequence[Image], known: Placements
+    ) -> None:
+        frame, boards = moment.sighting.frame, moment.sighting.images
+        stamps = [scan.stamp_ns for scan in frame.scans] + [image.stamp_ns for image in images]
         key = f"{recording_key}:{'/'.join(str(stamp) for stamp in stamps)}"
         label = f"at {stamps[0]} ns"
         if key in self._names_by_key:
             self.report.n_resumed += 1
             return
-        same = known.find_like(still.sighting.images)
-        if same is not None:
+        if known.find_like(boards) is not None:
             self.report.counts["the board stood as in a capture before"] += 1
             return
-        self._note_sizes(frame.images)
-        figures = {"motion_m": round(still.motion_m, 6), **board_figures(still.sighting.images)}
-        self._store(key, label, frame.images, frame.scans, figures)
-        known.add(self._names_by_key.get(key, label), still.sighting.images)
+        self._note_sizes(images)
+        events = self._stored.join(frame.events)
+        figures = {**moment.figures, **board_figures(boards)}
+        self._store(key, label, images, frame.scans, figures, events)
+        known.add(self._names_by_key.get(key, label), boards)
 
     def _store(
-        self, key: str, label: str, images: Sequence[Image], scans: Sequence[Scan], figures: dict[str, object]
+        self,
+        key: str,
+        label: str,
+        images: Sequence[Image],
+        scans: Sequence[Scan],
+        figures: dict[str, object],
+        events: Sequence[Events] = (),
     ) -> str:
-        duplicate = self._session.find_duplicate(images, scans)
+        duplicate = self._session.find_duplicate(images, scans, events)
         if duplicate is not None:
             self.report.duplicates[label] = duplicate
             return f"{label} is a duplicate of {duplicate}"
         meta = {"source": {"key": key, "label": label}, **figures}
-        name = self._session.add_capture(images, scans, meta)
+        name = self._session.add_capture(images, scans, meta, events)
         self._names_by_key[key] = name
         self._n_captures += 1
         self.report.captured.append(name)
@@ -235,9 +260,12 @@ class _Collector:
         return self._is_full() or (target is not None and self._n_captures >= target)
 
     def _counted(self, samples: Iterable[Sample], n_samples: int) -> Iterator[Sample]:
-        for done, sample in enumerate(samples):
+        done = 0
+        for sample in samples:
             yield sample
-            self._progress(done + 1, n_samples, f"{len(self.report.captured)} captured")
+            if not isinstance(sample, Events):
+                done += 1
+                self._progress(done, n_samples, f"{len(self.report.captured)} captured")
 
     def _note_sizes(self, images: Iterable[Image]) -> None:
         for image in images:
@@ -248,16 +276,6 @@ class _Collector:
                 self.note(
                     [f"camera {image.sensor}: pictures of {width}x{height} where the profile says {size}"]
                 )
-
-    def _note_pairing(self, counts: PairingCounts) -> None:
-        if counts.n_alone == 0:
-            return
-        self.report.counts["no picture at the time of the scan"] += counts.n_alone
-        if counts.nearest_ns is None:
-            self.note(["no picture could be compared with a scan: one of the two has none"])
-        else:
-            apart_s = counts.nearest_ns * 1e-9
-            self.note([f"{counts.n_alone} scans without a picture; the nearest was {apart_s:.3f} s away"])
 
 
 def _until_torn(samples: Iterable[Sample], torn: list[SourceError]) -> Iterator[Sample]:

@@ -15,21 +15,25 @@ ImageKey = tuple[str, str]
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
-class KnownPoses:
-    """Poses of the board in a session's captures, as each camera saw it.
+class Placements:
+    """Poses of the board that were taken already, as each camera saw it.
 
-    Captures made from folders carry no poses: their pictures are searched for the board once.
+    Args:
+        min_move_m, min_turn_deg: a board that moved or turned as far stands somewhere new.
     """
 
-    def __init__(self, session: Session, min_move_m: float, min_turn_deg: float) -> None:
+    def __init__(self, min_move_m: float, min_turn_deg: float) -> None:
         self._min_move_m = min_move_m
         self._min_turn_rad = float(np.radians(min_turn_deg))
         self._poses: list[tuple[str, ImageKey, Array]] = []
-        for capture in session.captures:
-            try:
-                self._poses.extend((capture.name, *entry) for entry in _poses_of(capture, session))
-            except LceRigError:
-                continue  # A damaged capture is named when it is used.
+
+    def add(self, name: str, boards: Mapping[ImageKey, ImageBoard]) -> None:
+        """Remember the poses of a capture."""
+        self.add_poses(name, {key: board.T_cam_board for key, board in boards.items()})
+
+    def add_poses(self, name: str, poses: Mapping[ImageKey, Array]) -> None:
+        """Remember poses T_cam_board (4, 4) of a capture."""
+        self._poses.extend((name, key, T_cam_board) for key, T_cam_board in poses.items())
 
     def find_like(self, boards: Mapping[ImageKey, ImageBoard]) -> str | None:
         """Name a capture in which every camera saw the board where it is now; None where it is new."""
@@ -39,9 +43,11 @@ class KnownPoses:
                 likes.setdefault(name, []).append(self._is_like(T_cam_board, boards[key].T_cam_board))
         return next((name for name in sorted(likes) if all(likes[name])), None)
 
-    def add(self, name: str, boards: Mapping[ImageKey, ImageBoard]) -> None:
-        """Remember the poses of a new capture."""
-        self._poses.extend((name, key, board.T_cam_board) for key, board in boards.items())
+    def are_alike(self, one: Mapping[ImageKey, ImageBoard], two: Mapping[ImageKey, ImageBoard]) -> bool:
+        """Tell whether every camera that saw both boards saw them at one place; False where none did."""
+        shared = one.keys() & two.keys()
+        likes = (self._is_like(one[key].T_cam_board, two[key].T_cam_board) for key in shared)
+        return bool(shared) and all(likes)
 
     def _is_like(self, T_1: Array, T_2: Array) -> bool:
         if float(np.linalg.norm(T_1[:3, 3] - T_2[:3, 3])) >= self._min_move_m:
@@ -51,25 +57,37 @@ class KnownPoses:
         return float(min(turns)) < self._min_turn_rad
 
 
+def known_placements(session: Session, min_move_m: float, min_turn_deg: float) -> Placements:
+    """Gather where the board was in a session's captures.
+
+    Captures made from folders carry no poses: their pictures are searched for the board once.
+    """
+    known = Placements(min_move_m, min_turn_deg)
+    for capture in session.captures:
+        try:
+            known.add_poses(capture.name, _poses_of(capture, session))
+        except LceRigError:
+            continue  # A damaged capture is named when it is used.
+    return known
+
+
 def board_figures(boards: Mapping[ImageKey, ImageBoard]) -> dict[str, Any]:
     """List where each camera saw the board, for a capture's meta data."""
     poses = {".".join(key): np.round(board.T_cam_board, 9).tolist() for key, board in sorted(boards.items())}
     return {"T_cam_board": poses}
 
 
-def _poses_of(capture: Capture, session: Session) -> list[tuple[ImageKey, Array]]:
+def _poses_of(capture: Capture, session: Session) -> dict[ImageKey, Array]:
     stored = capture.meta.get("T_cam_board")
-    found: list[tuple[ImageKey, Array]] = []
+    if isinstance(stored, dict):
+        poses = {tuple(key.split(".", 1)): np.array(pose, dtype=np.float64) for key, pose in stored.items()}
+        return {(key[0], key[-1]): pose for key, pose in poses.items() if pose.shape == (4, 4)}
+    found = {}
     for camera, channel in capture.image_keys:
         if camera not in session.rig.cameras:
-            continue
-        if isinstance(stored, dict):
-            pose = np.array(stored.get(f"{camera}.{channel}", []), dtype=np.float64)
-            if pose.shape == (4, 4):
-                found.append(((camera, channel), pose))
             continue
         intrinsics = session.rig.cameras[camera].to_intrinsics()
         board = find_image_board(capture.image(camera, channel), session.rig.board.to_board(), intrinsics)
         if isinstance(board, ImageBoard):
-            found.append(((camera, channel), board.T_cam_board))
+            found[camera, channel] = board.T_cam_board
     return found

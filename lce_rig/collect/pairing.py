@@ -3,11 +3,18 @@
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import TypeAlias
 
-from lce_rig.core.data import Image, Scan
+from lce_rig.collect.event_buffer import AFTER_NS, BEFORE_NS, EventBuffer, EventCut
+from lce_rig.core.data import Events, Image, Scan
 from lce_rig.rig import Rig
+from lce_rig.sources.base import Sample
+from lce_rig.sources.rig_time import rig_time_ns
 
 PATIENCE_NS = 1_000_000_000
+# Scans wait for others and come late in bags; what lies this far back no scan asks for any more.
+_KEPT_NS = BEFORE_NS + AFTER_NS + 3 * PATIENCE_NS
+_Buffers: TypeAlias = dict[tuple[str, str], deque[tuple[int, Image | Scan]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,11 +25,13 @@ class Frame:
         time_ns: middle of the first LiDAR's sweep, rig time (stamps plus the profile's expected offsets).
         images: the picture of each camera channel that has one within the tolerance.
         scans: the scan of the first LiDAR, and of each other that has one within the tolerance.
+        events: of each event camera, 1.2 s before the first scan's first firing to 0.15 s after its last.
     """
 
     time_ns: int
     images: tuple[Image, ...]
     scans: tuple[Scan, ...]
+    events: tuple[EventCut, ...] = ()
 
 
 @dataclass
@@ -31,97 +40,129 @@ class PairingCounts:
 
     Attributes:
         n_alone: scans with no picture within the tolerance.
-        nearest_ns: smallest difference in time of any picture to a scan; None where none could be compared.
+        nearest_ns: smallest difference in time of any picture to one of those; None where there was none.
     """
 
     n_alone: int = 0
     nearest_ns: int | None = None
 
 
-def pair_by_time(samples: Iterable[Image | Scan], rig: Rig, counts: PairingCounts) -> Iterator[Frame]:
-    """Give each scan of the first LiDAR heard the nearest picture of each camera channel.
+def pair_by_time(samples: Iterable[Sample], rig: Rig, counts: PairingCounts) -> Iterator[Frame]:
+    """Give each scan of the first LiDAR heard the nearest picture of each camera channel, and its events.
 
     Samples come in order of receipt: a scan waits until every other sensor has passed its time, or a second
     has gone by. Where clocks are set back, what waits is given up.
 
     Args:
-        samples: pictures and scans; each sensor's stamps rise.
+        samples: pictures, scans and packets of events; each sensor's stamps rise.
         rig: its timestamps say what to add to stamps, and how far pairs may lie apart.
         counts: filled as frames are made.
     """
-    waiting: deque[tuple[int, Scan]] = deque()
-    buffers: dict[tuple[str, str], deque[tuple[int, Image | Scan]]] = {}
-    anchor: str | None = None
-    newest_ns = -(2**62)
+    pairing = _Pairing(rig, counts)
     for sample in samples:
-        time_ns = _rig_time_ns(sample, rig)
+        pairing.take(sample)
+        yield from pairing.due_frames()
+    yield from pairing.remaining_frames()
+
+
+class _Pairing:
+    """Scans that wait, and what has come of the other sensors."""
+
+    def __init__(self, rig: Rig, counts: PairingCounts) -> None:
+        self._rig = rig
+        self._counts = counts
+        self._waiting: deque[tuple[int, Scan]] = deque()
+        self._buffers: _Buffers = {}
+        self._events = EventBuffer(rig)
+        self._anchor: str | None = None
+        # How far pictures and scans have come, and all of them.
+        self._newest_ns = self._position_ns = -(2**62)
+
+    def take(self, sample: Sample) -> None:
+        """Put a sample where it waits to be paired."""
+        time_ns = rig_time_ns(sample, self._rig)
         if time_ns is None:
-            continue
-        if time_ns < newest_ns - 2 * PATIENCE_NS:
-            waiting.clear()
-            buffers.clear()
-            newest_ns = time_ns
-        newest_ns = max(newest_ns, time_ns)
-        if isinstance(sample, Scan) and sample.sensor == (anchor or sample.sensor):
-            anchor = sample.sensor
-            waiting.append((time_ns, sample))
+            return
+        if isinstance(sample, Events):
+            self._events.add(sample)
+        else:
+            time_ns += _half_sweep_ns(sample, self._rig) if isinstance(sample, Scan) else 0
+            self._take_frame_part(sample, time_ns)
+        self._position_ns = max(self._position_ns, time_ns)
+        self._events.forget_before(self._position_ns - _KEPT_NS)
+
+    def due_frames(self) -> Iterator[Frame]:
+        """Yield the frames that nothing more can come for."""
+        while self._waiting and self._is_due(*self._waiting[0]):
+            yield from self._frame(*self._waiting.popleft())
+
+    def remaining_frames(self) -> Iterator[Frame]:
+        """Yield what waits when the streams have ended."""
+        while self._waiting:
+            yield from self._frame(*self._waiting.popleft())
+
+    def _take_frame_part(self, sample: Image | Scan, time_ns: int) -> None:
+        if time_ns < self._newest_ns - 2 * PATIENCE_NS:
+            self._waiting.clear()
+            self._buffers.clear()
+            self._events.clear()
+            self._newest_ns = self._position_ns = time_ns
+        self._newest_ns = max(self._newest_ns, time_ns)
+        if isinstance(sample, Scan) and sample.sensor == (self._anchor or sample.sensor):
+            self._anchor = sample.sensor
+            self._waiting.append((time_ns, sample))
         else:
             key = (sample.sensor, sample.channel if isinstance(sample, Image) else "")
-            buffers.setdefault(key, deque()).append((time_ns, sample))
-        while waiting and _is_due(waiting[0][0], newest_ns, buffers):
-            yield from _frame(*waiting.popleft(), buffers, rig, counts)
-    while waiting:
-        yield from _frame(*waiting.popleft(), buffers, rig, counts)
+            self._buffers.setdefault(key, deque()).append((time_ns, sample))
 
+    def _is_due(self, time_ns: int, scan: Scan) -> bool:
+        if self._position_ns > time_ns + PATIENCE_NS:
+            return True
+        have_passed = all(buffer and buffer[-1][0] >= time_ns for buffer in self._buffers.values())
+        last_firing_ns = time_ns + _half_sweep_ns(scan, self._rig)
+        return bool(self._buffers) and have_passed and self._events.has_passed(last_firing_ns + AFTER_NS)
 
-def _rig_time_ns(sample: Image | Scan, rig: Rig) -> int | None:
-    """Find the rig's time of a picture, or of the middle of a sweep."""
-    if sample.stamp_ns is None:
-        return None
-    if isinstance(sample, Image):
-        stamps = rig.cameras[sample.sensor].channels[sample.channel].timestamps
-        return sample.stamp_ns + round(stamps.expected_offset_s * 1e9)
-    lidar = rig.lidars[sample.sensor]
-    sweep_ns = 1e9 / lidar.rate_hz if sample.offset_ns is None else float(sample.offset_ns.max())
-    return sample.stamp_ns + round(lidar.timestamps.expected_offset_s * 1e9 + sweep_ns / 2)
-
-
-def _is_due(
-    time_ns: int, newest_ns: int, buffers: dict[tuple[str, str], deque[tuple[int, Image | Scan]]]
-) -> bool:
-    has_all_passed = bool(buffers) and all(buffer[-1][0] >= time_ns for buffer in buffers.values() if buffer)
-    return newest_ns > time_ns + PATIENCE_NS or (has_all_passed and all(buffers.values()))
-
-
-def _frame(
-    time_ns: int,
-    scan: Scan,
-    buffers: dict[tuple[str, str], deque[tuple[int, Image | Scan]]],
-    rig: Rig,
-    counts: PairingCounts,
-) -> Iterator[Frame]:
-    images: list[Image] = []
-    scans = [scan]
-    for key in sorted(buffers):
-        buffer = buffers[key]
-        # What lies before the nearest sample cannot be nearest to any later scan.
-        while len(buffer) > 1 and abs(buffer[1][0] - time_ns) <= abs(buffer[0][0] - time_ns):
-            buffer.popleft()
-        if not buffer:
-            continue
-        apart_ns, sample = abs(buffer[0][0] - time_ns), buffer[0][1]
-        if isinstance(sample, Image):
-            counts.nearest_ns = apart_ns if counts.nearest_ns is None else min(apart_ns, counts.nearest_ns)
-        if apart_ns > _tolerance_ns(sample, scan, rig):
-            continue
-        if isinstance(sample, Image):
-            images.append(sample)
+    def _frame(self, time_ns: int, scan: Scan) -> Iterator[Frame]:
+        images: list[Image] = []
+        scans = [scan]
+        nearest_ns: int | None = None
+        for key in sorted(self._buffers):
+            buffer = self._buffers[key]
+            # What lies before the nearest sample cannot be nearest to any later scan.
+            while len(buffer) > 1 and abs(buffer[1][0] - time_ns) <= abs(buffer[0][0] - time_ns):
+                buffer.popleft()
+            if not buffer:
+                continue
+            apart_ns, sample = abs(buffer[0][0] - time_ns), buffer[0][1]
+            if isinstance(sample, Image):
+                nearest_ns = apart_ns if nearest_ns is None else min(apart_ns, nearest_ns)
+            if apart_ns > _tolerance_ns(sample, scan, self._rig):
+                continue
+            if isinstance(sample, Image):
+                images.append(sample)
+            else:
+                scans.append(sample)
+        if images:
+            half_ns = _half_sweep_ns(scan, self._rig)
+            events = self._events.cut(time_ns - half_ns - BEFORE_NS, time_ns + half_ns + AFTER_NS)
+            yield Frame(time_ns, tuple(images), tuple(scans), events)
         else:
-            scans.append(sample)
-    if images:
-        yield Frame(time_ns, tuple(images), tuple(scans))
-    else:
-        counts.n_alone += 1
+            self._counts.n_alone += 1
+            known_ns = self._counts.nearest_ns
+            if nearest_ns is not None:
+                self._counts.nearest_ns = nearest_ns if known_ns is None else min(nearest_ns, known_ns)
+
+
+def middle_of_sweep_ns(scan: Scan, rig: Rig) -> int | None:
+    """Find the rig's time at the middle of a sweep; None where the scan carries no stamp."""
+    time_ns = rig_time_ns(scan, rig)
+    return None if time_ns is None else time_ns + _half_sweep_ns(scan, rig)
+
+
+def _half_sweep_ns(scan: Scan, rig: Rig) -> int:
+    if scan.offset_ns is None or not len(scan.offset_ns):
+        return round(0.5e9 / rig.lidars[scan.sensor].rate_hz)
+    return int(scan.offset_ns.max()) // 2
 
 
 def _tolerance_ns(sample: Image | Scan, scan: Scan, rig: Rig) -> float:

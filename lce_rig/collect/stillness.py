@@ -1,22 +1,15 @@
 """Moments at which the board stands still in every sensor that sees it."""
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.collect.pairing import Frame
+from lce_rig.collect.watching import Moment, Sighting
 from lce_rig.core.board import Board
-from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
-from lce_rig.detect.image_board import find_image_board, region_around
-from lce_rig.detect.lidar_board import find_lidar_boards
-from lce_rig.detect.lidar_track import track_lidar_board
-from lce_rig.rig import Rig
-
-ImageKey = tuple[str, str]
+from lce_rig.core.results import LidarBoard
 
 
 @dataclass(frozen=True)
@@ -36,104 +29,17 @@ class StillnessOptions:
     search_interval_s: float = 0.3
 
 
-@dataclass(frozen=True, eq=False)
-class Sighting:
-    """The board in one frame.
-
-    Attributes:
-        images: by (camera, channel), where it was found.
-        lidars: candidates by LiDAR; things of the board's size may be among them.
-    """
-
-    frame: Frame
-    images: dict[ImageKey, ImageBoard]
-    lidars: dict[str, list[LidarBoard]]
-
-
-@dataclass(frozen=True, eq=False)
-class Still:
-    """A moment worth a capture: the middle of a window in which nothing moved more than `motion_m`."""
-
-    sighting: Sighting
-    motion_m: float
-
-
-@dataclass
-class BoardWatcher:
-    """Finds the board frame by frame, near where it was, so that a long recording is searched quickly."""
-
-    rig: Rig
-    options: StillnessOptions
-    counts: Counter[str] = field(default_factory=Counter)
-    _seen: dict[ImageKey, ImageBoard] = field(default_factory=dict)
-    _candidates: dict[str, list[LidarBoard]] = field(default_factory=dict)
-    _searched_ns: dict[ImageKey | str, int] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self._board: Board = self.rig.board.to_board()
-
-    def sight(self, frame: Frame) -> Sighting:
-        """Find the board in every picture and scan of a frame."""
-        images = {}
-        for image in frame.images:
-            key = (image.sensor, image.channel)
-            found = self._find_in_image(image, key, frame.time_ns)
-            if found is not None:
-                images[key] = found
-        lidars = {}
-        # Nothing is gained from scans while no camera sees the board.
-        for scan in frame.scans if images else ():
-            candidates = self._find_in_scan(scan, frame.time_ns)
-            if candidates:
-                lidars[scan.sensor] = candidates
-        if not images:
-            self.counts["no board in any picture"] += 1
-        elif not lidars:
-            self.counts["no board in the scan"] += 1
-        return Sighting(frame, images, lidars)
-
-    def _find_in_image(self, image: Image, key: ImageKey, time_ns: int) -> ImageBoard | None:
-        last = self._seen.pop(key, None)
-        if last is None and not self._is_search_due(key, time_ns):
-            return None
-        region = None if last is None else region_around(last, image)
-        intrinsics = self.rig.cameras[image.sensor].to_intrinsics()
-        found = find_image_board(image, self._board, intrinsics, region=region)
-        if isinstance(found, Refusal):
-            return None
-        self._seen[key] = found
-        return found
-
-    def _find_in_scan(self, scan: Scan, time_ns: int) -> list[LidarBoard]:
-        tracked = (track_lidar_board(scan, self._board, old) for old in self._candidates.get(scan.sensor, []))
-        found = [board for board in tracked if isinstance(board, LidarBoard)]
-        if self._is_search_due(scan.sensor, time_ns) or not found:
-            settings = self.rig.lidars[scan.sensor]
-            reach_m = min(settings.max_range_m, self.rig.quality.max_distance_m)
-            search = find_lidar_boards(
-                scan, self._board, min_range_m=settings.min_range_m, max_range_m=reach_m
-            )
-            found = [] if isinstance(search, Refusal) else search
-        self._candidates[scan.sensor] = found
-        return found
-
-    def _is_search_due(self, key: ImageKey | str, time_ns: int) -> bool:
-        last_ns = self._searched_ns.get(key)
-        if last_ns is not None and 0 <= time_ns - last_ns < self.options.search_interval_s * 1e9:
-            return False
-        self._searched_ns[key] = time_ns
-        return True
-
-
 def find_still_moments(
     sightings: Iterable[Sighting], board: Board, options: StillnessOptions
-) -> Iterator[Still]:
+) -> Iterator[Moment]:
     """Yield the stillest moment of every stretch in which the board stands still.
 
-    A stretch ends when the board moves, is lost, or has stood for `dwell_s`; it is then reported once.
+    It is the middle of a window in which nothing moved more than its figure `motion_m`. A stretch ends when
+    the board moves, is lost, or has stood for `dwell_s`; it is then reported once.
     """
     window: deque[Sighting] = deque()
-    best: Still | None = None
+    best: Moment | None = None
+    best_m = np.inf
     since_ns = 0
     for sighting in sightings:
         if not sighting.images or not sighting.lidars or _is_gap(window, sighting, options):
@@ -147,8 +53,9 @@ def find_still_moments(
         now_ns = sighting.frame.time_ns
         if motion_m <= options.max_motion_m:
             since_ns = since_ns if best is not None else now_ns
-            if best is None or motion_m < best.motion_m:
-                best = Still(window[len(window) // 2], motion_m)
+            if best is None or motion_m < best_m:
+                best = Moment(window[len(window) // 2], {"motion_m": round(motion_m, 6)})
+                best_m = motion_m
         if best is not None and (
             motion_m > options.max_motion_m or now_ns - since_ns > options.dwell_s * 1e9
         ):

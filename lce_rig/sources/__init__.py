@@ -12,12 +12,21 @@ RECORDINGS = {
     ".bag": "lce_rig.sources.rosbag:BagRecording",
     ".db3": "lce_rig.sources.rosbag:BagRecording",
     ".mcap": "lce_rig.sources.rosbag:BagRecording",
+    ".pcap": "lce_rig.sources.pcap:PcapRecording",
+    ".pcapng": "lce_rig.sources.pcap:PcapRecording",
+    ".aedat4": "lce_rig.sources.event_camera_file:EventCameraFile",
+    ".raw": "lce_rig.sources.event_camera_file:EventCameraFile",
+    ".h5": "lce_rig.sources.event_camera_file:EventCameraFile",
+    ".hdf5": "lce_rig.sources.event_camera_file:EventCameraFile",
+    ".npz": "lce_rig.sources.event_camera_file:EventCameraFile",
+    ".txt": "lce_rig.sources.event_camera_file:EventCameraFile",
+    ".zip": "lce_rig.sources.event_camera_file:EventCameraFile",
 }
 """Reader by suffix, or "folder"; imported when wanted."""
 
 
 def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = None) -> Recording:
-    """Open what lies at a path: a folder of pictures and clouds, or a bag (ROS 1, sqlite3, mcap).
+    """Open what lies at a path: a folder of pictures and clouds, a bag, or a file of an event camera.
 
     Raises:
         SourceError: nothing is there, or nothing that can be read.
@@ -28,7 +37,7 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
     kind = _kind(path)
     if kind not in RECORDINGS:
         known = ", ".join(suffix for suffix in RECORDINGS if suffix != "folder")
-        hint = f"Give a folder with img/ and pcd/, or a bag ({known})."
+        hint = f"Give a folder with img/ and pcd/, a bag, or a file of events ({known})."
         raise SourceError(f"{path} is no recording this program reads", hint)
     module, name = RECORDINGS[kind].split(":")
     recording: Recording = getattr(import_module(module), name)(path, rig, options or SourceOptions())

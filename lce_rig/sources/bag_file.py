@@ -1,17 +1,17 @@
 """Bags as streams of raw messages: ROS 1, ROS 2 sqlite3 and mcap, whole or torn."""
 
-import hashlib
 from collections.abc import Collection, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.bag_salvage import salvage
+from lce_rig.sources.fingerprint import fingerprint
 
 SUFFIXES = (".bag", ".db3", ".mcap")
-_FINGERPRINT_BYTES = 65536
+_FIRST_LOOK_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +49,7 @@ class BagFile:
         self.path = path
         self.damage = ""
         self.topics: dict[str, tuple[str, int]] = {}
+        self._ends_ns: dict[str, int] = {}
         self._parts = self._find_parts()
         try:
             for part in self._parts:
@@ -65,19 +66,20 @@ class BagFile:
 
     def fingerprint(self) -> str:
         """Hash names, sizes and both ends of the files: enough to know a recording again."""
-        digest = hashlib.sha256()
-        for file in self._files():
-            size = file.stat().st_size
-            with file.open("rb") as stream:
-                head = stream.read(_FINGERPRINT_BYTES)
-                stream.seek(max(size - _FINGERPRINT_BYTES, 0))
-                digest.update(f"{file.name} {size}".encode() + head + stream.read(_FINGERPRINT_BYTES))
-        return digest.hexdigest()
+        return fingerprint(self._files())
 
     def unmerged_journals(self) -> list[Path]:
         """List write-ahead journals of sqlite that a recorder left behind when it was killed."""
         journals = (file.with_name(file.name + "-wal") for file in self._files())
         return [journal for journal in journals if journal.exists() and journal.stat().st_size > 0]
+
+    def end_ns(self, topic: str) -> int | None:
+        """Find when the recorder received a topic's last message, from the back; None where it has none."""
+        for part in reversed(self._parts):
+            if topic not in self._ends_ns and not self.damage:
+                with suppress(Exception), _reader(part) as reader:  # Damage is said when the bag is read.
+                    self._ends_ns |= _find_end(reader, topic)
+        return self._ends_ns.get(topic)
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Yield the messages of some topics in the order the recorder received them.
@@ -124,8 +126,9 @@ class BagFile:
         self.topics.clear()
         for part in self._parts:
             if not part.is_dir():
-                for topic, msgtype, *_ in salvage(part):
+                for topic, msgtype, _, log_ns, _ in salvage(part):
                     self._count(topic, msgtype, 1)
+                    self._ends_ns[topic] = log_ns
         if not self.topics:
             raise SourceError(
                 f"{self.path} cannot be read: {self.damage}", "Record again, or try to reindex it."
@@ -154,6 +157,19 @@ def _reader(part: Path) -> AbstractContextManager[Any]:
     from rosbags.rosbag2 import Reader as Ros2Reader
 
     return Ros2Reader(part)
+
+
+def _find_end(reader: Any, topic: str) -> dict[str, int]:
+    """Look for a topic's last message in ever longer stretches of the bag's end."""
+    wanted = [connection for connection in reader.connections if connection.topic == topic]
+    length_ns, begin_ns = _FIRST_LOOK_NS, reader.end_time
+    while wanted and begin_ns > reader.start_time:
+        begin_ns = reader.end_time - length_ns
+        found = [log_ns for _, log_ns, _ in reader.messages(connections=wanted, start=begin_ns)]
+        if found:
+            return {topic: max(found)}
+        length_ns *= 4
+    return {}
 
 
 def _short_type(msgtype: str) -> str:

@@ -15,6 +15,8 @@ INTENSITY_FIELDS = ("intensity", "reflectivity", "intensities", "i", "signal")
 RING_FIELDS = ("ring", "channel", "laser_id", "laserid", "line")
 TIME_FIELDS = ("time", "t", "timestamp", "offset", "offset_time", "time_offset", "timeoffset")
 MIN_RANGE_M = 1e-3
+# Half of a room's or a street's returns come from well within a LiDAR's reach, unless metres are millimetres.
+_FARTHEST_MEDIAN = 3.0
 # A sweep lasts 0.02 to 1.5 s whatever the spinning LiDAR; the same figure in another unit is far outside.
 SWEEP_S = (0.02, 1.5)
 NS_PER_UNIT = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
@@ -55,7 +57,8 @@ def to_scan(
         host_ns: arrival at the host.
 
     Raises:
-        SourceError: no coordinates, no valid point, or no rings and none that could be told from elevations.
+        SourceError: no coordinates, no valid point, coordinates that are no metres, or no rings and none that
+            could be told from elevations.
     """
     fields = {name.lower(): name for name in reversed(cloud.dtype.names or ())}
     missing = [axis for axis in "xyz" if axis not in fields]
@@ -65,16 +68,25 @@ def to_scan(
     with np.errstate(over="ignore"):
         points = np.stack([cloud[fields[axis]].astype(np.float32) for axis in "xyz"], axis=1)
     is_finite = np.isfinite(points).all(axis=1)
-    is_far = np.zeros(len(points), dtype=bool)
-    is_far[is_finite] = np.linalg.norm(points[is_finite].astype(np.float64), axis=1) > MIN_RANGE_M
-    keep = np.flatnonzero(is_far)
+    range_m = np.zeros(len(points))
+    range_m[is_finite] = np.linalg.norm(points[is_finite].astype(np.float64), axis=1)
+    keep = np.flatnonzero(range_m > MIN_RANGE_M)
     if len(keep) == 0:
         raise SourceError(f"{where}: the cloud has no valid point ({len(points)} in all)")
+    _check_unit(float(np.median(range_m[keep])), settings, where)
     points, cloud, notes = points[keep], cloud[keep], list[str]()
     ring = _ring(cloud, fields, points, where, notes)
     offset_ns, stamp_ns = _times(cloud, fields, settings, stamp_ns, notes)
     scan = Scan(lidar, stamp_ns, points, _intensity(cloud, fields, notes), ring, offset_ns, host_ns)
     return CloudReading(scan, int((~is_finite).sum()), int(is_finite.sum() - len(keep)), tuple(notes))
+
+
+def _check_unit(median_m: float, settings: LidarSettings, where: str) -> None:
+    if median_m > _FARTHEST_MEDIAN * settings.max_range_m:
+        raise SourceError(
+            f"{where}: half of the points lie {median_m:.0f} m away or farther, the LiDAR reaches "
+            f"{settings.max_range_m:g} m: are the points in millimetres? Metres are needed"
+        )
 
 
 def _find(fields: dict[str, str], candidates: tuple[str, ...]) -> str | None:

@@ -1,24 +1,34 @@
-"""A bag as a stream of pictures and scans, by the stamps in their headers."""
+"""A bag as a stream of pictures, scans and events, by the stamps in their headers."""
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.sources.bag_file import BagFile, RawMessage
-from lce_rig.sources.base import Sample, SourceOptions
+from lce_rig.sources.base import Sample, SourceOptions, Span, Stream
 from lce_rig.sources.cloud import to_scan
+from lce_rig.sources.events.bag import BagEvents
+from lce_rig.sources.events.camera import CameraEvents
+from lce_rig.sources.events.recording import EventRecording
+from lce_rig.sources.events.stream import NoEventsError
+from lce_rig.sources.merging import merge_by_time
+from lce_rig.sources.overlap import check_overlap
 from lce_rig.sources.pointcloud2 import decode_pointcloud2
 from lce_rig.sources.ros_image import decode_ros_compressed_image, decode_ros_image
-from lce_rig.sources.topics import Target, choose_topics
+from lce_rig.sources.topics import Target, choose_topics, list_topics
 
 # A stamp this much earlier than the one before is a clock that was set, not a message that came late.
 CLOCK_JUMP_NS = 1_000_000_000
+# Drivers start within this many messages of each other; who comes later has no span told beforehand.
+_N_PROBED = 500
 
 
 @dataclass
@@ -33,13 +43,14 @@ class _Stream:
 
 
 class BagRecording:
-    """A ROS 1 or ROS 2 bag; one message is in memory at a time.
+    """A ROS 1 or ROS 2 bag; one message of each kind is in memory at a time.
 
     Attributes:
         path: the bag's file or folder.
         notes: topics taken, and after reading what was left out and why.
         key: fingerprint of the bag.
-        n_samples: number of messages on the topics taken.
+        n_samples: number of messages with pictures and scans on the topics taken.
+        streams: what is read, with its span where the bag holds events or is a part of a recording.
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
@@ -53,8 +64,14 @@ class BagRecording:
         self._rig = rig
         self._bag = BagFile(path)
         self._targets = choose_topics(path, self._bag.topics, rig, options, self.notes)
+        self._events = self._open_events()
         self.n_samples = sum(self._bag.topics[topic][1] for topic in self._targets)
         self.key = self._bag.fingerprint()
+        self.streams = self._list_streams(is_spanned=bool(self._events) or options.is_part)
+        events, scans = (
+            {s: span for s, span in self.streams.items() if s.kind == kind} for kind in ("events", "scans")
+        )
+        self.notes += check_overlap(scans, events, rig)
         for journal in self._bag.unmerged_journals():
             hint = "its last messages are not read; opening the bag once with sqlite3 merges them"
             self.notes.append(f"{journal.name} lies beside the bag: {hint}")
@@ -62,15 +79,24 @@ class BagRecording:
             self.notes.append(f"{path.name}: damaged ({self._bag.damage}); read as far as it goes")
 
     def samples(self) -> Iterator[Sample]:
-        """Yield pictures and scans in the order the recorder received them; each sensor's stamps rise.
+        """Yield pictures and scans in the order the recorder received them, and events by their stamps.
 
-        Messages sent twice, late, or damaged are left out and counted in `notes`. Where a sensor's clock is
-        set back by more than a second its stamps start again from there.
+        Each sensor's stamps rise. Messages sent twice, late, or damaged are left out and counted in `notes`.
+        Where the clock of a camera or LiDAR is set back by more than a second its stamps start again from
+        there.
 
         Raises:
             SourceError: no message of a topic could be decoded; or, after all that can be read, the bag is
                 torn.
         """
+        parts = [self._messages(), *(events.samples() for events in self._events.values())]
+        try:
+            yield from merge_by_time(parts, self._rig)
+        finally:
+            for events in self._events.values():
+                self.notes += [note for note in events.notes if note not in self.notes]
+
+    def _messages(self) -> Iterator[Sample]:
         streams = {topic: _Stream() for topic in self._targets}
         try:
             for message in self._bag.messages(self._targets.keys()):
@@ -86,11 +112,61 @@ class BagRecording:
                 cause = stream.first_failure or "its stamps do not rise"
                 raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}")
 
-    def _decode(self, message: RawMessage, stream: _Stream) -> Sample | None:
+    def _open_events(self) -> dict[Stream, CameraEvents]:
+        """Take the topics of raw events out of the others and open them.
+
+        Raises:
+            SourceError: events of another resolution; or no events, and no pictures either.
+        """
+        opened: dict[Stream, CameraEvents] = {}
+        for topic, target in list(self._targets.items()):
+            stream = target.stream(self._bag.topics[topic][0])
+            if stream.kind != "events":
+                continue
+            del self._targets[topic]
+            size = self._rig.cameras[target.sensor].resolution_px
+            try:
+                events = BagEvents(self.path, topic, self._bag)
+                opened[stream] = CameraEvents(EventRecording(self.path, events, target.sensor, size))
+            except NoEventsError as error:
+                if all(other.channel is None for other in self._targets.values()):
+                    raise SourceError(f"{topic} of {error.what}", list_topics(self._bag.topics)) from None
+                self.notes.append(f"{topic} of {error.what}; read without")
+        return opened
+
+    def _list_streams(self, is_spanned: bool) -> dict[Stream, Span | None]:
+        streams: dict[Stream, Span | None] = {s: events.span_ns for s, events in self._events.items()}
+        begun = self._first_stamps() if is_spanned else {}
+        for topic, target in self._targets.items():
+            stamp_ns, log_ns = begun.get(topic, (None, None))
+            end_ns = self._bag.end_ns(topic) if topic in begun else None
+            stream = target.stream(self._bag.topics[topic][0])
+            if stamp_ns is None or log_ns is None or end_ns is None:
+                streams[stream] = None
+            else:
+                streams[stream] = stamp_ns, stamp_ns + end_ns - log_ns
+        return streams
+
+    def _first_stamps(self) -> dict[str, tuple[int, int]]:
+        """Find (stamp, time of receipt) of the first message of each topic, as far as they come early."""
+        found: dict[str, tuple[int, int]] = {}
+        try:
+            for message in islice(self._bag.messages(self._targets.keys()), _N_PROBED):
+                if message.topic not in found:
+                    with suppress(ValueError):
+                        stamp_ns = _header_stamp_ns(_deserialize(message)) or message.log_ns
+                        found[message.topic] = stamp_ns, message.log_ns
+                if len(found) == len(self._targets):
+                    break
+        except SourceError:
+            pass  # It is said when everything in front of the damage has been read.
+        return found
+
+    def _decode(self, message: RawMessage, stream: _Stream) -> Image | Scan | None:
         target = self._targets[message.topic]
         try:
             content = _deserialize(message)
-            stamp_ns = content.header.stamp.sec * 10**9 + content.header.stamp.nanosec
+            stamp_ns = _header_stamp_ns(content)
             if stamp_ns == 0:
                 stream.notes.add("headers carry no stamps: time of receipt taken")
                 stamp_ns = message.log_ns
@@ -103,10 +179,13 @@ class BagRecording:
 
     def _to_sample(
         self, message: RawMessage, content: Any, target: Target, stamp_ns: int, stream: _Stream
-    ) -> Sample:
+    ) -> Image | Scan:
         if target.channel is not None:
             is_compressed = message.msgtype.endswith("CompressedImage")
             pixels = decode_ros_compressed_image(content) if is_compressed else decode_ros_image(content)
+            channel = self._rig.cameras[target.sensor].channels[target.channel]
+            if channel.timestamps.reference == "start":
+                stream.notes.add("messages carry no exposure: stamps of its start are taken for its middle")
             return Image(target.sensor, target.channel, stamp_ns, pixels, message.log_ns)
         settings = self._rig.lidars[target.sensor]
         cloud = decode_pointcloud2(content)
@@ -124,6 +203,10 @@ class BagRecording:
                 cause = f" ({stream.first_failure})" if what == "could not be decoded" else ""
                 if count:
                     self.notes.append(f"{topic}: {count} {what}{cause}")
+
+
+def _header_stamp_ns(content: Any) -> int:
+    return int(content.header.stamp.sec * 10**9 + content.header.stamp.nanosec)
 
 
 def _deserialize(message: RawMessage) -> Any:
@@ -146,7 +229,7 @@ def _typestore(is_ros1: bool) -> Any:
     return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
 
 
-def _is_in_order(sample: Sample, stream: _Stream) -> bool:
+def _is_in_order(sample: Image | Scan, stream: _Stream) -> bool:
     """Tell whether a sample's stamp is later than its predecessor's; count it where it is not."""
     stamp_ns = sample.stamp_ns
     if stamp_ns is None or stream.last_ns is None or stamp_ns > stream.last_ns:

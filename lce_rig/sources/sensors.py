@@ -3,6 +3,7 @@
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.sources.base import SourceOptions
+from lce_rig.sources.rig_time import event_channel
 
 
 def choose_camera(rig: Rig, options: SourceOptions, notes: list[str]) -> tuple[str, str]:
@@ -35,3 +36,24 @@ def choose_lidar(rig: Rig, options: SourceOptions, notes: list[str]) -> str:
     if len(rig.lidars) > 1 and not options.lidar:
         notes.append(f"clouds taken as lidar {lidar}")
     return lidar
+
+
+def choose_event_camera(rig: Rig, options: SourceOptions, notes: list[str]) -> tuple[str, str]:
+    """Name the (camera, channel) that a file of events belongs to: as asked, else the first with events.
+
+    Raises:
+        SourceError: the rig has no camera with a channel of kind events, or not the one asked for.
+    """
+    with_events = {name: channel for name in rig.cameras if (channel := event_channel(rig, name))}
+    if not with_events:
+        raise SourceError(
+            f"rig {rig.name!r} has no camera with events",
+            "Give one a channel of `kind: events` in the profile, or start from the rig rles.",
+        )
+    if options.camera and options.camera not in with_events:
+        has = ", ".join(with_events)
+        raise SourceError(f"rig {rig.name!r} has no event camera {options.camera!r}; it has {has}")
+    camera = options.camera or next(iter(with_events))
+    if len(with_events) > 1 and not options.camera:
+        notes.append(f"events taken as camera {camera}")
+    return camera, with_events[camera]

@@ -66,3 +66,10 @@ def test_a_clock_set_back_does_not_mix_before_and_after(rig):
 def test_samples_without_a_stamp_are_passed_over(rig):
     timeless = Image("cam", "frames", None, np.zeros((2, 2), np.uint8))
     assert pairs([timeless, scan(1000), image(1000)], rig)[0] == [(1000, [1000])]
+
+
+def test_the_nearest_picture_is_told_of_scans_that_found_none(rig):
+    samples = sorted([image(1000), scan(1000), scan(1100), scan(1200)], key=lambda s: s.stamp_ns)
+    found, counts = pairs(samples, rig)
+    assert found == [(1000, [1000])]
+    assert (counts.n_alone, counts.nearest_ns) == (2, 100 * MS)

@@ -120,3 +120,18 @@ def test_intensity_may_be_called_reflectivity_or_be_absent(room):
     assert set(named.scan.intensity) == {30.0} and named.notes == ()
     absent = to_scan(drop_fields(room, "intensity"), "lidar", FIRST, "here")
     assert set(absent.scan.intensity) == {0.0} and absent.notes == ("no intensity",)
+
+
+@pytest.mark.parametrize("factor", [1000.0, 100.0])
+def test_coordinates_that_are_no_metres_are_refused_with_a_question(room, factor):
+    cloud = room.copy()
+    for axis in "xyz":
+        cloud[axis] *= factor
+    with pytest.raises(
+        SourceError, match=r"half of the points lie \d+ m away.*in millimetres\? Metres are needed"
+    ):
+        to_scan(cloud, "lidar", FIRST, "here")
+    far = room.copy()
+    for axis in "xyz":
+        far[axis] *= 20
+    assert len(to_scan(far, "lidar", FIRST, "here").scan.points) == len(room)

@@ -26,18 +26,29 @@ EVENT_TYPES = ARRAY_TYPES | PACKET_TYPES
 class BagEvents:
     """Events of one topic; see `EventStream`."""
 
-    def __init__(self, path: Path, topic: str | None) -> None:
+    def __init__(self, path: Path, topic: str | None, bag: BagFile | None = None) -> None:
         """Find the topic.
+
+        Args:
+            path: the bag.
+            topic: None takes the only one with events.
+            bag: the same one, where it is open already.
 
         Raises:
             SourceError: the bag cannot be read, or lacks the topic; the hint lists those that are there.
         """
-        self._bag = BagFile(path)
+        self._bag = bag or BagFile(path)
         self._topic = _choose_topic(self._bag, topic)
         self._is_array = self._bag.topics[self._topic][0] in ARRAY_TYPES
         self.notes = [f"{path.name}: events from {self._topic} ({self._bag.topics[self._topic][1]} messages)"]
         header = self._first_header()
         self.resolution_px = (header.width_px, header.height_px) if header and header.width_px else None
+
+    def duration_ns(self) -> int | None:
+        """Count from the receipt of the first message to that of the last."""
+        first = next((message for _, message in _messages(self._bag, self._topic, Findings())), None)
+        end_ns = self._bag.end_ns(self._topic)
+        return None if first is None or end_ns is None else end_ns - first.log_ns
 
     def stretches(self, findings: Findings) -> Iterator[EventColumns]:
         """Yield the events, one or several messages at a time."""

@@ -9,7 +9,15 @@ import numpy as np
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.events.order import in_time_order
-from lce_rig.sources.events.stream import NO_EVENTS, EventColumns, EventStream, Findings, join
+from lce_rig.sources.events.stream import (
+    NO_EVENTS,
+    EventColumns,
+    EventStream,
+    Findings,
+    KnowsItsLength,
+    NoEventsError,
+    join,
+)
 
 # More events off the sensor than this are another sensor's; fewer are damage.
 _MAX_OFF_SHARE = 0.01
@@ -41,7 +49,8 @@ class EventRecording:
             resolution_px: (width, height) of the profile; None takes the file's.
 
         Raises:
-            SourceError: no events, or those of a camera of another resolution.
+            NoEventsError: no events.
+            SourceError: those of a camera of another resolution.
         """
         self.path = path
         self.sensor = sensor
@@ -52,7 +61,7 @@ class EventRecording:
         self._window = _Window(self)
         if not any(len(stretch) for stretch in stream.stretches(self._findings)):
             said = "; ".join(self._findings.lines())
-            raise SourceError(f"{path} holds no events" + (f": {said}" if said else ""))
+            raise NoEventsError(f"{path} holds no events" + (f": {said}" if said else ""))
         self.resolution_px = self._settle_resolution(resolution_px)
 
     @property
@@ -75,6 +84,14 @@ class EventRecording:
         if self._span_ns is None:
             raise SourceError(f"{self.path} holds no events that could be put in order")
         return self._span_ns
+
+    def extent_ns(self) -> tuple[int, int]:
+        """First and last stamp; the last may be off by some ms where that saves reading the recording."""
+        duration_ns = self._stream.duration_ns() if isinstance(self._stream, KnowsItsLength) else None
+        if self._span_ns is not None or duration_ns is None:
+            return self.span_ns
+        start_ns = self.start_ns
+        return start_ns, start_ns + duration_ns
 
     @property
     def duration_s(self) -> float:

@@ -2,12 +2,18 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.errors import SourceError
+
 NS_PER_US = 1000
+
+
+class NoEventsError(SourceError):
+    """A recording that could hold events and holds none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +130,15 @@ class EventStream(Protocol):
         Raises:
             SourceError: nothing more can be read for a reason the user can repair.
         """
+        ...
+
+
+@runtime_checkable
+class KnowsItsLength(Protocol):
+    """A stream that can tell how long it is without being read."""
+
+    def duration_ns(self) -> int | None:
+        """Tell the time from the first event to the last, about; None where damage hides it."""
         ...
 
 

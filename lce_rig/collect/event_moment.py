@@ -1,0 +1,155 @@
+"""Whether a sighting is worth a capture for an event camera.
+
+Events need motion, LiDAR wants stillness. A sighting will do where, in a camera that sends events, the board
+
+- is not faster than `quality.max_board_speed_mps`,
+- made at least `quality.min_events_px` events a pixel of it in the second before,
+- and moves at 3 cm/s or more, or made plenty of events all the same: it has just stopped, or the rig moves.
+  Light that flickers does not count.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lce_rig.collect.event_buffer import EventCut
+from lce_rig.collect.watching import ImageKey, Moment, Sighting
+from lce_rig.core.data import Events
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Refusal
+from lce_rig.detect.event_figures import MEMORY_NS, event_figures, outline_px
+from lce_rig.detect.event_gate import explain_missing_board
+from lce_rig.detect.flicker import Flicker, measure_flicker
+from lce_rig.rig import Rig
+from lce_rig.sources.rig_time import rig_time_ns
+
+_LEAST_SIGHTINGS = 3
+_MOVE = "move it sideways slowly, about 10 cm/s"
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """How a moving board is judged.
+
+    Attributes:
+        window_s: over which its speed is measured.
+        min_speed_mps: slower boards make no events.
+        best_speed_mps: neither too few events nor smear.
+        plenty_events_px: events a pixel of the board in a second that are enough however slow it is.
+        patience_s: how long a moment waits for a better one of the same place.
+        search_interval_s: how often a whole picture is searched while no board is in sight.
+    """
+
+    window_s: float = 0.5
+    min_speed_mps: float = 0.03
+    best_speed_mps: float = 0.1
+    plenty_events_px: float = 4.0
+    patience_s: float = 2.0
+    search_interval_s: float = 0.3
+
+
+def judge_sighting(
+    sighting: Sighting, around: Sequence[Sighting], rig: Rig, options: MotionOptions
+) -> Moment | Refusal | None:
+    """Say whether a sighting is worth a capture.
+
+    Args:
+        sighting: what the sensors saw.
+        around: all sightings shortly before and after, itself among them.
+        rig: the profile.
+        options: how a moving board is judged.
+
+    Returns:
+        The moment with its figures speed_mps, unsteady_m (rms distance of the board's way from a straight and
+        steady one) and events_px; why it is none; or None where the watcher has counted why.
+    """
+    cuts = {cut.sensor: cut for cut in sighting.frame.events}
+    if sighting.images and not cuts:
+        action = "record events while the LiDAR runs; do their clocks agree?"
+        return Refusal("read", "no events at the time of the scan", action)
+    watched = [key for key in sorted(sighting.images) if key[0] in cuts]
+    if not watched:
+        return _explain_unseen(sighting, cuts, rig)
+    if not sighting.lidars:
+        return None
+    judged = [_judge_camera(key, sighting, around, cuts[key[0]], rig, options) for key in watched]
+    return next((found for found in judged if isinstance(found, Moment)), judged[0])
+
+
+def look_for_flicker(events: Events) -> Refusal | None:
+    """Name the lamps that make most of the events of about a second; None where none do."""
+    flicker: Flicker = measure_flicker(events)
+    if not flicker.is_storm:
+        return None
+    rhythm = f" at {flicker.frequency_hz:.0f} Hz" if flicker.frequency_hz else ""
+    cause = f"most events come from light that flickers{rhythm}"
+    return Refusal("image", cause, "record by daylight or under lamps that do not flicker")
+
+
+def _judge_camera(
+    key: ImageKey,
+    sighting: Sighting,
+    around: Sequence[Sighting],
+    cut: EventCut,
+    rig: Rig,
+    options: MotionOptions,
+) -> Moment | Refusal | None:
+    motion = _follow(key, around)
+    if motion is None:
+        return None
+    (speed_mps, unsteady_m), events_px = motion, _events_on_board(key, sighting, cut, rig)
+    limits, said = rig.quality, f"{events_px:.1f} events a pixel of it in a second"
+    if speed_mps > limits.max_board_speed_mps:
+        cause = f"the board moved at {speed_mps:.2f} m/s ({limits.max_board_speed_mps:g} allowed)"
+        return Refusal("image", cause, "move it slower, about 10 cm/s")
+    is_slow = speed_mps < options.min_speed_mps
+    if is_slow and events_px < max(options.plenty_events_px, limits.min_events_px):
+        return Refusal("image", f"the board stood still: {said}", _MOVE)
+    if events_px < limits.min_events_px:
+        action = f"{_MOVE}, rather than to and fro, and in better light"
+        return Refusal("image", f"the board made few events at {speed_mps:.2f} m/s: {said}", action)
+    if is_slow:
+        stamp_ns = sighting.frame.time_ns - cut.offset_ns
+        lamps = look_for_flicker(cut.between(stamp_ns - MEMORY_NS, stamp_ns))
+        if lamps is not None:
+            return lamps
+    figures = {"speed_mps": speed_mps, "unsteady_m": unsteady_m, "events_px": events_px}
+    return Moment(sighting, {name: round(value, 5) for name, value in figures.items()})
+
+
+def _follow(key: ImageKey, around: Sequence[Sighting]) -> tuple[float, float] | None:
+    """Fit a straight and steady way to the plate's middle: speed in m/s, and the rms distance from it in m.
+
+    The middle is well known even where the tilt is not. None where the board was seen too seldom.
+    """
+    seen = [s for s in around if key in s.images]
+    if len(seen) < _LEAST_SIGHTINGS:
+        return None
+    time_s = 1e-9 * np.array([s.frame.time_ns - seen[0].frame.time_ns for s in seen])
+    way: Array = np.stack([s.images[key].T_cam_board[:3, 3] for s in seen])
+    time_s, way = time_s - time_s.mean(), way - way.mean(axis=0)
+    velocity = time_s @ way / (time_s @ time_s)
+    rest = way - time_s[:, None] * velocity
+    return float(np.linalg.norm(velocity)), float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
+
+
+def _events_on_board(key: ImageKey, sighting: Sighting, cut: EventCut, rig: Rig) -> float:
+    """Count the events a pixel of the board in the second before its picture."""
+    image = next(i for i in sighting.frame.images if (i.sensor, i.channel) == key)
+    # Frames and events of one camera may have clocks, or delays, of their own.
+    time_ns = rig_time_ns(image, rig)
+    stamp_ns = (sighting.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
+    camera, board = rig.cameras[key[0]], sighting.images[key]
+    outline = outline_px(board.T_cam_board, rig.board.to_board(), camera.to_intrinsics())
+    return event_figures(cut.between(stamp_ns - MEMORY_NS, stamp_ns), stamp_ns, outline)["events_px"]
+
+
+def _explain_unseen(sighting: Sighting, cuts: Mapping[str, EventCut], rig: Rig) -> Refusal | None:
+    """Say what keeps the board from being seen in pictures that were made of events."""
+    for (camera, channel), refusal in sorted(sighting.unseen.items()):
+        if rig.cameras[camera].channels[channel].kind == "events" and camera in cuts:
+            stamp_ns = sighting.frame.time_ns - cuts[camera].offset_ns
+            recent = cuts[camera].between(stamp_ns - MEMORY_NS, stamp_ns)
+            return explain_missing_board(recent, stamp_ns, refusal, rig.quality)
+    return None

@@ -1,0 +1,116 @@
+"""Pictures for cameras that send events only: reconstructed as the stream runs, one for every scan."""
+
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator
+
+from lce_rig.collect.pairing import PATIENCE_NS, middle_of_sweep_ns
+from lce_rig.collect.tally import Tally
+from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.results import Refusal
+from lce_rig.detect.event_board import reconstructor_for
+from lce_rig.rig import Rig
+from lce_rig.sources.base import Sample, Stream
+from lce_rig.sources.rig_time import event_channel, rig_offset_ns, rig_time_ns
+
+_NOT_BEGUN = Refusal(
+    "read",
+    "no events yet at the time of the scan",
+    "start the event camera first, or check that both sensors' clocks agree",
+)
+_GONE_BY = Refusal(
+    "read",
+    "the scan comes after the events that follow it",
+    "was the LiDAR's clock set back? Split the recording there",
+)
+
+
+def with_event_pictures(
+    samples: Iterable[Sample], rig: Rig, cameras: Collection[str], tally: Tally
+) -> Iterator[Sample]:
+    """Pass samples on, and add a picture of each camera for the middle of every sweep.
+
+    The network's state runs through the whole stream. A picture follows the events it was made of.
+
+    Args:
+        samples: scans and packets of events, the earliest first.
+        rig: says how pictures are made.
+        cameras: of whose events pictures are wanted.
+        tally: receives why a scan got none.
+
+    Raises:
+        ProfileError: a network cannot be used.
+        SourceError: onnxruntime is not installed; or, from the samples, they are torn.
+    """
+    darkrooms = [_Darkroom(rig, camera, tally) for camera in sorted(cameras)]
+    for sample in samples:
+        yield sample
+        for darkroom in darkrooms:
+            yield from darkroom.take(sample)
+    for darkroom in darkrooms:
+        yield from darkroom.finish()
+
+
+class _Darkroom:
+    """Events of one camera that wait until it is known which pictures are wanted of them."""
+
+    def __init__(self, rig: Rig, camera: str, tally: Tally) -> None:
+        channel = event_channel(rig, camera) or ""
+        self._rig = rig
+        self._camera = camera
+        self._tally = tally
+        self._reconstructor = reconstructor_for(rig.cameras[camera].channels[channel].reconstruction, channel)
+        self._offset_ns = rig_offset_ns(Stream(camera, channel, "events"), rig)
+        self._wanted: deque[int] = deque()
+        self._packets: deque[Events] = deque()
+        self._fed_ns: int | None = None
+        self._newest_ns = -(2**62)
+
+    def take(self, sample: Sample) -> Iterator[Image]:
+        """Take the next sample and give the pictures that can be made by now."""
+        if isinstance(sample, Events) and sample.sensor == self._camera:
+            self._packets.append(sample)
+        elif isinstance(sample, Scan):
+            middle_ns = middle_of_sweep_ns(sample, self._rig)
+            # Two LiDARs may ask out of turn, by less than the events wait.
+            if middle_ns is not None and (not self._wanted or middle_ns > self._wanted[-1]):
+                self._wanted.append(middle_ns)
+        self._newest_ns = max(self._newest_ns, rig_time_ns(sample, self._rig) or self._newest_ns)
+        yield from self._develop()
+
+    def finish(self) -> Iterator[Image]:
+        """Give what is left when the stream has ended."""
+        self._newest_ns = 2**62
+        yield from self._develop()
+
+    def _develop(self) -> Iterator[Image]:
+        # Scans come late in bags: events wait for them before the network goes on.
+        while self._wanted and self._can_feed(self._wanted[0]):
+            stamp_ns = self._wanted.popleft() - self._offset_ns
+            picture = self._picture_at(stamp_ns)
+            if isinstance(picture, Refusal):
+                self._tally.add(picture)
+            else:
+                yield picture
+        if self._packets:
+            self._feed(min([self._newest_ns - PATIENCE_NS, *self._wanted]) - self._offset_ns)
+
+    def _picture_at(self, stamp_ns: int) -> Image | Refusal:
+        if self._fed_ns is not None and stamp_ns < self._fed_ns:
+            return _GONE_BY
+        self._feed(stamp_ns)
+        return _NOT_BEGUN if self._fed_ns is None else self._reconstructor.picture_at(stamp_ns)
+
+    def _can_feed(self, time_ns: int) -> bool:
+        has_passed = bool(self._packets) and self._packets[-1].t_ns[-1] + self._offset_ns >= time_ns
+        return has_passed or self._newest_ns > time_ns + PATIENCE_NS
+
+    def _feed(self, until_ns: int) -> None:
+        """Give the network all events before a stamp of their clock."""
+        while self._packets and self._packets[0].t_ns[0] < until_ns:
+            packet = self._packets.popleft()
+            rest = packet.between(until_ns, int(packet.t_ns[-1]) + 1)
+            if len(rest):
+                self._packets.appendleft(rest)
+            early = packet.select(slice(0, len(packet) - len(rest)))
+            self._reconstructor.feed(early)
+            self._fed_ns = int(early.t_ns[-1])

@@ -1,0 +1,82 @@
+"""`lce-rig collect` from recordings with raw events: what it captures, and what it says where it cannot."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from lce_rig.core.data import Events, Image
+from lce_rig.session import Session
+from lce_rig.sources.bag_recorder import BagRecorder
+from lce_rig.sources.base import Sample
+from lce_rig.sources.events.aedat4_writer import Aedat4Writer, write_aedat4
+from tests.collect import simulated_moves as moves
+from tests.sources.events.aedat4_files import RawFrame, write_davis
+
+
+def bag(path: Path, samples: list[Sample]) -> Path:
+    with BagRecorder(path, moves.rig()) as recorder:
+        for sample in samples:
+            recorder.write(sample)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A LiDAR's bag, and files of the DAVIS beside it: sound, of another time, of another camera, empty."""
+    path = tmp_path_factory.mktemp("recordings")
+    bag(path / "lidar.bag", moves.without(Image, Events))
+    frames = [s for s in moves.samples() if isinstance(s, Image)]
+    raw = [RawFrame(frame.stamp_ns // 1000 - 4000, 8000, frame.pixels) for frame in frames]
+    write_davis(path / "davis.aedat4", moves.events(), raw)
+    late_ns = 1_234_500_000_000
+    write_aedat4(path / "late.aedat4", [replace(e, t_ns=e.t_ns + late_ns) for e in moves.events()])
+    other = replace(moves.events()[0], width_px=640, height_px=480)
+    write_aedat4(path / "other.aedat4", [other])
+    Aedat4Writer(path / "none.aedat4", (346, 260)).close()
+    return path
+
+
+def collect(lce_rig, folder: Path, session: Path, *names: str):
+    sources = [word for name in names for word in ("--from", folder / name)]
+    return lce_rig("collect", "--rig", "rles", session, *sources)
+
+
+def test_a_lidars_bag_and_a_davis_file_make_a_session_that_a_second_run_leaves_alone(
+    lce_rig, folder, tmp_path
+) -> None:
+    outcome = collect(lce_rig, folder, tmp_path / "s", "lidar.bag", "davis.aedat4")
+    assert outcome.code == 0, outcome.err
+    assert "1 captures (1 new)" in outcome.err and "s of davis.events" in outcome.err
+    (capture,) = Session.open(tmp_path / "s").captures
+    assert capture.event_cameras == ["davis"] and capture.has_image("davis", "frames")
+    again = collect(lce_rig, folder, tmp_path / "s", "davis.aedat4", "lidar.bag")
+    assert again.code == 0 and "1 captures (0 new, 1 known already)" in again.err
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (
+            ["lidar.bag", "late.aedat4"],
+            ["s apart", "cameras.davis.channels.events.timestamps.expected_offset_s"],
+        ),
+        (["lidar.bag", "other.aedat4"], ["of a sensor of 640x480 pixels, camera 'davis' has 346x260"]),
+        (["lidar.bag", "none.aedat4"], ["none.aedat4 holds no events"]),
+        (["davis.aedat4"], ["no scans of a LiDAR", "--from lidar.bag --from events.aedat4"]),
+        (["lidar.bag"], ["no topic /davis/image_raw for davis.frames"]),
+    ],
+)
+def test_what_cannot_be_used_is_said_with_what_to_do(lce_rig, folder, tmp_path, names, said) -> None:
+    outcome = collect(lce_rig, folder, tmp_path / "s", *names)
+    assert outcome.code == 5
+    assert all(text in outcome.err for text in said)
+
+
+def test_a_board_that_makes_no_events_gives_no_captures_and_the_reason(lce_rig, tmp_path) -> None:
+    few = [s.select(slice(None, None, 400)) if isinstance(s, Events) else s for s in moves.samples()]
+    bag(tmp_path / "few.bag", few)
+    outcome = collect(lce_rig, tmp_path, tmp_path / "s", "few.bag")
+    assert outcome.code == 6
+    assert "not captured:" in outcome.err and "move it sideways slowly, about 10 cm/s" in outcome.err
+    assert "no capture could be made of" in outcome.err and "The board must move slowly" in outcome.err

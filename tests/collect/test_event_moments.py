@@ -1,0 +1,241 @@
+"""From recordings with raw events to captures, end to end, against the truth of the simulator."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig.collect import CollectReport, collect
+from lce_rig.core.data import Events, Image
+from lce_rig.core.errors import SourceError
+from lce_rig.core.geometry import rotation_angle
+from lce_rig.core.results import ImageBoard
+from lce_rig.detect.event_board import find_event_board, reconstructor_for
+from lce_rig.session import Session
+from lce_rig.sources import SourceOptions, open_recording
+from lce_rig.sources.bag_recorder import BagRecorder
+from lce_rig.sources.base import Sample
+from lce_rig.sources.events.aedat4_writer import write_aedat4
+from tests.sources.events.aedat4_files import RawFrame, write_davis
+
+from . import simulated_moves as moves
+
+EXPOSURE_US = 8000
+
+
+def bag(path: Path, samples: list[Sample]) -> Path:
+    with BagRecorder(path, moves.rig()) as recorder:
+        for sample in samples:
+            recorder.write(sample)
+    return path
+
+
+def run(folder: Path, *paths: Path) -> tuple[Session, CollectReport]:
+    options = SourceOptions(is_part=len(paths) > 1)
+    with Session.resume(folder, moves.rig()) as session:
+        recordings = [open_recording(path, session.rig, options) for path in paths]
+        return session, collect(session, recordings)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    return bag(tmp_path_factory.mktemp("whole") / "whole.bag", list(moves.samples()))
+
+
+@pytest.fixture(scope="module")
+def lidar(tmp_path_factory) -> Path:
+    return bag(tmp_path_factory.mktemp("lidar") / "lidar.bag", moves.without(Image, Events))
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory, whole) -> tuple[Session, CollectReport]:
+    return run(tmp_path_factory.mktemp("collected") / "s", whole)
+
+
+def whole_stream() -> Events:
+    parts = moves.events()
+    columns = {n: np.concatenate([getattr(e, n) for e in parts]) for n in ("t_ns", "x", "y", "polarity")}
+    return replace(parts[0], **columns, host_ns=None)
+
+
+def off_truth(T_cam_board: np.ndarray, stamp_ns: int) -> tuple[float, float]:
+    """Distance in m, and angle in rad, of a pose from the true one; the print may be read upside down."""
+    truth = moves.recording().T_sensor_board("davis", stamp_ns)
+    turns = [
+        rotation_angle(T_cam_board[:3, :3] @ flip, truth[:3, :3])
+        for flip in (np.eye(3), np.diag([-1, -1, 1]))
+    ]
+    return float(np.linalg.norm(T_cam_board[:3, 3] - truth[:3, 3])), float(min(turns))
+
+
+def test_a_slowly_moved_board_becomes_a_capture_with_the_events_around_its_scan(collected) -> None:
+    session, report = collected
+    assert report.captured == ["000000"] and not report.errors and report.has_events
+    (capture,) = session.captures
+    assert (capture.image_keys, capture.lidars) == ([("davis", "frames")], ["lidar"])
+    scan, image, events = capture.scan("lidar"), capture.image("davis", "frames"), capture.events("davis")
+    truth = whole_stream().between(
+        scan.stamp_ns - 1_200_000_000, scan.stamp_ns + int(scan.offset_ns.max()) + 150_000_000
+    )
+    for name in ("t_ns", "x", "y", "polarity"):
+        assert np.array_equal(getattr(events, name), getattr(truth, name)), name
+    assert abs(image.stamp_ns - scan.stamp_ns - 50_000_000) < 1_000_000
+    distance_m, angle_rad = off_truth(np.array(capture.meta["T_cam_board"]["davis.frames"]), image.stamp_ns)
+    assert distance_m < 0.02 and angle_rad < np.radians(2)
+    speed_mps = capture.meta["speed_mps"]
+    assert speed_mps == pytest.approx(float(moves.recording().trajectory.speed_mps(image.stamp_ns)), abs=0.06)
+    assert 1 < capture.meta["events_px"] < 50
+
+
+def test_a_second_run_captures_nothing_again(collected, whole) -> None:
+    session, _ = collected
+    _, report = run(session.path, whole)
+    assert (report.captured, report.n_resumed, len(session.captures)) == ([], 1, 1)
+
+
+def test_a_davis_file_beside_a_lidars_bag_gives_the_same_captures_as_one_bag(
+    tmp_path, collected, lidar
+) -> None:
+    frames = [s for s in moves.samples() if isinstance(s, Image)]
+    raw = [RawFrame(f.stamp_ns // 1000 - EXPOSURE_US // 2, EXPOSURE_US, f.pixels) for f in frames]
+    file = write_davis(tmp_path / "davis.aedat4", moves.events(), raw)
+    session, report = run(tmp_path / "s", lidar, file)
+    assert report.captured == ["000000"]
+    one, other = session.captures[0], collected[0].captures[0]
+    assert one.content_sha256 == other.content_sha256
+    for read in (lambda c: c.image("davis", "frames").stamp_ns, lambda c: c.scan("lidar").stamp_ns):
+        assert read(one) == read(other)
+    assert np.array_equal(one.events("davis").t_ns, other.events("davis").t_ns)
+    _, again = run(tmp_path / "s", file, lidar)
+    assert (again.captured, again.n_resumed) == ([], 1)
+
+
+def test_events_alone_are_watched_in_their_own_pictures_which_are_not_kept(tmp_path, lidar) -> None:
+    write_aedat4(tmp_path / "events.aedat4", _with_hot_pixels(moves.events()))
+    session, report = run(tmp_path / "s", lidar, tmp_path / "events.aedat4")
+    assert report.captured == ["000000"]
+    (capture,) = session.captures
+    assert (capture.image_keys, capture.event_cameras) == ([], ["davis"])
+    middle_ns = capture.scan("lidar").stamp_ns + 50_000_000
+    distance_m, angle_rad = off_truth(np.array(capture.meta["T_cam_board"]["davis.events"]), middle_ns)
+    assert distance_m < 0.03 and angle_rad < np.radians(3)
+    # What was kept is enough to see the board again, from a cold start.
+    rig = session.rig
+    seen = find_event_board(
+        capture.events("davis"),
+        middle_ns,
+        reconstructor_for(None, "events"),
+        rig.board.to_board(),
+        rig.cameras["davis"].to_intrinsics(),
+        rig.quality,
+    )
+    assert isinstance(seen.board, ImageBoard) and off_truth(seen.board.T_cam_board, middle_ns)[0] < 0.03
+
+
+def _with_hot_pixels(packets: list[Events]) -> list[Events]:
+    """Twenty pixels that fire 300 times a second, whatever they see."""
+    rng = np.random.default_rng(0)
+    x, y = rng.integers(0, 346, 20).astype(np.uint16), rng.integers(0, 260, 20).astype(np.uint16)
+    mixed = []
+    for packet in packets:
+        t_ns = np.arange(packet.t_ns[0], packet.t_ns[-1], 3_333_000)
+        which = np.arange(len(t_ns) * 20) % 20
+        noise = replace(packet, t_ns=np.repeat(t_ns, 20), x=x[which], y=y[which], polarity=which % 2 < 1)
+        names = ("t_ns", "x", "y", "polarity")
+        joined = {n: np.concatenate([getattr(packet, n), getattr(noise, n)]) for n in names}
+        mixed.append(replace(packet, **joined).select(np.argsort(joined["t_ns"], kind="stable")))
+    return mixed
+
+
+def test_a_file_that_ends_in_a_packet_gives_the_captures_before_its_end_and_says_so(tmp_path, lidar) -> None:
+    frames = [s for s in moves.samples() if isinstance(s, Image)]
+    raw = [RawFrame(f.stamp_ns // 1000 - EXPOSURE_US // 2, EXPOSURE_US, f.pixels) for f in frames]
+    file = write_davis(tmp_path / "davis.aedat4", moves.events(), raw)
+    file.write_bytes(file.read_bytes()[: int(0.9 * file.stat().st_size)])
+    _, report = run(tmp_path / "s", lidar, file)
+    assert report.captured == ["000000"] and not report.errors
+    assert any("torn ends of the file left out" in note for note in report.notes)
+
+
+def test_clocks_that_do_not_overlap_are_an_error_before_anything_is_searched(tmp_path, lidar) -> None:
+    late = [replace(e, t_ns=e.t_ns + 1_234_500_000_000) for e in moves.events()]
+    write_aedat4(tmp_path / "late.aedat4", late)
+    with pytest.raises(
+        SourceError, match=r"davis\.events: events run from .*, scans from .*: they lie \d+\.\d s apart"
+    ):
+        run(tmp_path / "s", lidar, tmp_path / "late.aedat4")
+    # What can be read of the others is captured all the same.
+    good = bag(tmp_path / "good.bag", list(moves.samples()))
+    _, report = run(tmp_path / "s", good, lidar, tmp_path / "late.aedat4")
+    assert report.captured == ["000000"] and len(report.errors) == 1
+
+
+def test_a_recording_of_one_kind_of_sensor_is_an_error_that_says_what_is_missing(tmp_path, lidar) -> None:
+    write_aedat4(tmp_path / "events.aedat4", moves.events())
+    for path, cause in (
+        (lidar, "no pictures and no events"),
+        (tmp_path / "events.aedat4", "no scans of a LiDAR"),
+    ):
+        part = open_recording(path, moves.rig(), SourceOptions(is_part=True))
+        with (
+            Session.create(tmp_path / f"session of {path.stem}", moves.rig()) as session,
+            pytest.raises(SourceError, match=cause),
+        ):
+            collect(session, [part])
+
+
+def test_captures_whose_events_begin_late_are_kept_and_counted(tmp_path) -> None:
+    start_ns = moves.recording().start_ns + 900_000_000
+    late = [s for s in moves.samples() if not isinstance(s, Events) or s.t_ns[0] >= start_ns]
+    session, report = run(tmp_path / "s", bag(tmp_path / "late.bag", late))
+    assert report.captured == ["000000"]
+    assert session.captures[0].events("davis").t_ns[0] >= start_ns
+    assert any(
+        note.startswith("davis: 1 captures with less than 1.2 s of events before their scan")
+        for note in report.notes
+    )
+
+
+def test_lamps_that_flicker_are_named_where_frames_make_a_capture_all_the_same(tmp_path) -> None:
+    lit = [
+        replace(s, polarity=(s.t_ns // 5_000_000) % 2 == 0) if isinstance(s, Events) else s
+        for s in moves.samples()
+    ]
+    _, report = run(tmp_path / "s", bag(tmp_path / "lit.bag", lit))
+    assert report.captured == ["000000"]
+    assert any(
+        "davis: 1 captures: most events come from light that flickers at 100 Hz" in n for n in report.notes
+    )
+
+
+def test_without_events_the_same_rig_still_wants_the_board_to_stand(tmp_path) -> None:
+    _, report = run(tmp_path / "s", bag(tmp_path / "a.bag", moves.without(Events)))
+    assert report.captured == [] and not report.has_events
+
+
+@pytest.mark.slow
+def test_a_person_who_carries_the_board_from_place_to_place_is_followed(tmp_path) -> None:
+    from lce_rig.simulate import SimulationOptions, simulate_recording
+
+    rig = moves.rig()
+    recording = simulate_recording(rig, duration_s=8.0, seed=1)
+    samples = list(recording)
+    for name, left_out in (("both", []), ("events", [Image])):
+        path = bag(tmp_path / f"{name}.bag", [s for s in samples if type(s) not in left_out])
+        session, report = run(tmp_path / name, path)
+        assert len(report.captured) >= 4, name
+        for capture in session.captures:
+            ((key, pose),) = capture.meta["T_cam_board"].items()
+            stamp_ns = capture.scan("lidar").stamp_ns + 50_000_000
+            truth = recording.T_sensor_board("davis", stamp_ns)
+            assert np.linalg.norm(np.array(pose)[:3, 3] - truth[:3, 3]) < 0.06, (name, key)
+            assert capture.meta["speed_mps"] <= 0.5
+    options = replace(SimulationOptions.for_rig("rles"), flicker_depth=0.3)
+    lit = [
+        s
+        for s in simulate_recording(rig, duration_s=2.0, seed=1, options=options)
+        if not isinstance(s, Image)
+    ]
+    _, report = run(tmp_path / "lit", bag(tmp_path / "lit.bag", lit))
+    assert any("flickers at 100 Hz" in said for said in [*report.counts, *report.notes])

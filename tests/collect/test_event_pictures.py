@@ -1,0 +1,116 @@
+"""Pictures for cameras without frames: one for the middle of every sweep, from all events up to it."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.collect.event_pictures import with_event_pictures
+from lce_rig.collect.tally import Tally
+from lce_rig.core.data import Events, Image, Scan
+from lce_rig.detect.event_board import reconstructor_for
+from lce_rig.rig import ReconstructionSettings, Rig, load_rig
+from lce_rig.sources.base import Sample
+from lce_rig.sources.merging import merge_by_time
+
+from .event_sightings import T0_NS, event_stream
+
+MS = 1_000_000
+MAP = ReconstructionSettings(method="map")
+
+
+def rig_with(offset_s: float = 0.0) -> Rig:
+    """The rig with sums of polarities in place of the network, which are quick."""
+    rig = load_rig("rles")
+    davis = rig.cameras["davis"]
+    channel = davis.channels["events"]
+    timestamps = channel.timestamps.model_copy(update={"expected_offset_s": offset_s})
+    channels = {
+        **davis.channels,
+        "events": channel.model_copy(update={"timestamps": timestamps, "reconstruction": MAP}),
+    }
+    return rig.model_copy(update={"cameras": {"davis": davis.model_copy(update={"channels": channels})}})
+
+
+def scan(time_ms: float) -> Scan:
+    """A sweep of 100 ms whose middle is at `time_ms`."""
+    offset_ns, zeros = np.array([0, 100 * MS]), np.zeros(2, np.float32)
+    stamp_ns = T0_NS + round((time_ms - 50) * MS)
+    return Scan("lidar", stamp_ns, np.ones((2, 3), np.float32), zeros, zeros.astype("i2"), offset_ns)
+
+
+EVENTS = event_stream([(0.0, 2.0, 0.5)])
+MIDDLES_MS = range(150, 1950, 100)
+
+
+def pictures(samples: Iterable[Sample], rig: Rig, tally: Tally | None = None) -> list[Image]:
+    found = list(with_event_pictures(samples, rig, ["davis"], tally or Tally()))
+    return [sample for sample in found if isinstance(sample, Image)]
+
+
+def test_pictures_are_those_of_the_whole_stream_at_the_middle_of_each_sweep() -> None:
+    rig = rig_with()
+    found = pictures(merge_by_time([EVENTS, map(scan, MIDDLES_MS)], rig), rig)
+    stamps_ns = [T0_NS + t * MS for t in MIDDLES_MS]
+    truth = list(reconstructor_for(MAP, "events").reconstruct(EVENTS, stamps_ns))
+    assert [(i.sensor, i.channel, i.stamp_ns) for i in found] == [("davis", "events", t) for t in stamps_ns]
+    for image, other in zip(found, truth, strict=True):
+        assert isinstance(other, Image) and np.array_equal(image.pixels, other.pixels)
+
+
+@pytest.mark.parametrize("late_ms", [0, 120, 700])
+def test_scans_that_come_late_and_packets_of_any_length_change_nothing(late_ms: int) -> None:
+    rig = rig_with()
+    whole = replace(
+        EVENTS[0],
+        **{n: np.concatenate([getattr(e, n) for e in EVENTS]) for n in ("t_ns", "x", "y", "polarity")},
+    )
+    cut = [whole.select(slice(k, k + 3000)) for k in range(0, len(whole), 3000)]
+    arrivals = [(int(e.t_ns[0]), k, e) for k, e in enumerate(cut)]
+    arrivals += [(T0_NS + (t - 50 + late_ms) * MS, 10_000 + t, scan(t)) for t in MIDDLES_MS]
+    late = pictures((sample for *_, sample in sorted(arrivals, key=lambda arrival: arrival[:2])), rig)
+    prompt = pictures(merge_by_time([EVENTS, map(scan, MIDDLES_MS)], rig), rig)
+    assert [i.stamp_ns for i in late] == [i.stamp_ns for i in prompt]
+    assert all(np.array_equal(a.pixels, b.pixels) for a, b in zip(late, prompt, strict=True))
+
+
+def test_every_sample_is_passed_on_and_pictures_follow_the_events_they_are_made_of() -> None:
+    rig = rig_with()
+    given = list(merge_by_time([EVENTS, map(scan, MIDDLES_MS)], rig))
+    found = list(with_event_pictures(given, rig, ["davis"], Tally()))
+    assert [s for s in found if not isinstance(s, Image)] == given
+    last_ns = 0
+    for sample in found:
+        if isinstance(sample, Events):
+            last_ns = int(sample.t_ns[-1])
+        elif isinstance(sample, Image) and sample.stamp_ns is not None:
+            assert last_ns >= sample.stamp_ns - 1_000_000
+
+
+def test_pictures_carry_stamps_of_the_events_own_clock() -> None:
+    rig = rig_with(offset_s=-10.0)
+    ahead = [replace(e, t_ns=e.t_ns + 10_000 * MS) for e in EVENTS]
+    found = pictures(merge_by_time([ahead, map(scan, MIDDLES_MS)], rig), rig)
+    assert [i.stamp_ns for i in found] == [T0_NS + (10_000 + t) * MS for t in MIDDLES_MS]
+
+
+def test_scans_before_the_first_event_get_no_picture_and_are_counted() -> None:
+    rig, tally = rig_with(), Tally()
+    scans = [scan(t) for t in range(-2950, 500, 100)]
+    found = pictures(merge_by_time([EVENTS, scans], rig), rig, tally)
+    assert [i.stamp_ns for i in found] == [T0_NS + t * MS for t in range(50, 500, 100)]
+    ((said, n),) = tally.counts().items()
+    assert said.startswith("no events yet at the time of the scan: start the event camera first") and n == 30
+
+
+def test_scans_of_a_clock_that_was_set_back_get_no_picture_of_other_times() -> None:
+    rig, tally = rig_with(), Tally()
+    given = [*EVENTS[:30], scan(1050), scan(1150), *EVENTS[30:], scan(550), scan(1950)]
+    found = pictures(given, rig, tally)
+    assert [i.stamp_ns for i in found] == [T0_NS + t * MS for t in (1050, 1150, 1950)]
+    ((said, n),) = tally.counts().items()
+    assert (
+        said.startswith("the scan comes after the events that follow it: was the LiDAR's clock set")
+        and n == 1
+    )

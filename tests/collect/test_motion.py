@@ -1,0 +1,171 @@
+"""Which moments of a moving board become captures for an event camera, and why others do not."""
+
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lce_rig.collect.event_moment import MotionOptions
+from lce_rig.collect.motion import _with_neighbours, find_moving_moments
+from lce_rig.collect.novelty import Placements
+from lce_rig.collect.pairing import Frame
+from lce_rig.collect.tally import Tally
+from lce_rig.collect.watching import Moment, Sighting
+from lce_rig.core.results import Refusal
+from lce_rig.rig import Rig, load_rig
+
+from .event_sightings import T0_NS, S, event_stream, watch
+
+PLENTY = event_stream([(-1.3, 6.0, 6.0)])
+SOME = event_stream([(-1.3, 6.0, 2.0)])
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig("rles")
+
+
+def choose(sightings: Iterable[Sighting], rig: Rig) -> tuple[list[Moment], dict[str, int]]:
+    tally = Tally()
+    moments = find_moving_moments(sightings, rig, MotionOptions(), Placements(0.15, 10.0), tally)
+    return list(moments), dict(tally.counts())
+
+
+def times_s(moments: list[Moment]) -> list[float]:
+    return [round((m.sighting.frame.time_ns - T0_NS) / S, 2) for m in moments]
+
+
+def places_m(moments: list[Moment]) -> list[float]:
+    return [float(m.sighting.images["davis", "frames"].T_cam_board[0, 3]) for m in moments]
+
+
+def test_a_board_that_passes_slowly_is_taken_once_a_place(rig: Rig) -> None:
+    moments, refused = choose(watch(rig, lambda t: (0.1 * t - 0.25, 0.0), 5.0, SOME), rig)
+    assert len(moments) in (3, 4) and not refused
+    assert np.diff(places_m(moments)).min() >= 0.15
+    for moment in moments:
+        assert moment.figures["speed_mps"] == pytest.approx(0.1, abs=0.001)
+        assert moment.figures["unsteady_m"] < 1e-3
+        assert moment.figures["events_px"] == pytest.approx(2.0, rel=0.05)
+
+
+def test_a_board_that_stands_still_is_refused_with_what_to_do(rig: Rig) -> None:
+    moments, refused = choose(watch(rig, lambda _t: (0.0, 0.0), 2.0, event_stream([(-1.3, 3.0, 0.2)])), rig)
+    ((said, n),) = refused.items()
+    assert moments == [] and n == 20
+    assert said.startswith(
+        "the board stood still: 0.2 events a pixel of it in a second: move it sideways slowly"
+    )
+    assert "10 cm/s" in said
+
+
+def test_a_board_that_moves_too_fast_is_refused_with_its_speed(rig: Rig) -> None:
+    moments, refused = choose(watch(rig, lambda t: (0.8 * t - 0.4, 0.0), 1.0, PLENTY), rig)
+    assert moments == []
+    assert refused == {"the board moved at 0.80 m/s (0.5 allowed): move it slower, about 10 cm/s": 10}
+
+
+def test_few_events_of_a_board_that_moves_are_named(rig: Rig) -> None:
+    few = event_stream([(-1.3, 3.0, 0.3)])
+    moments, refused = choose(watch(rig, lambda t: (0.1 * t, 0.0), 1.0, few), rig)
+    ((said, n),) = refused.items()
+    assert moments == [] and n == 10
+    assert said.startswith("the board made few events at 0.10 m/s: 0.3 events a pixel of it in a second")
+
+
+def test_a_board_that_has_just_stopped_or_a_rig_that_moves_will_do_where_events_are_plenty(rig: Rig) -> None:
+    moments, refused = choose(watch(rig, lambda _t: (0.0, 0.0), 2.0, PLENTY), rig)
+    assert len(moments) == 1 and not refused
+    assert moments[0].figures["speed_mps"] < 0.01 and moments[0].figures["events_px"] > 4
+
+
+def test_lamps_that_flicker_do_not_count_as_motion_and_are_named(rig: Rig) -> None:
+    lit = event_stream([(-1.3, 3.0, 8.0)], lamp_hz=100.0)
+    moments, refused = choose(watch(rig, lambda _t: (0.0, 0.0), 1.0, lit), rig)
+    ((said, n),) = refused.items()
+    assert moments == [] and n == 10
+    assert said == (
+        "most events come from light that flickers at 100 Hz: "
+        "record by daylight or under lamps that do not flicker"
+    )
+
+
+def test_the_slowest_part_of_a_way_is_preferred_to_a_fast_one_through_the_same_place(rig: Rig) -> None:
+    def way(t: float) -> tuple[float, float]:
+        """In at 0.4 m/s, then on at 0.1 m/s."""
+        return (0.4 * (t - 1.0) if t < 1.0 else 0.1 * (t - 1.0), 0.0)
+
+    moments, _ = choose(watch(rig, way, 2.2, SOME), rig)
+    near = [moment for moment in moments if abs(places_m([moment])[0]) < 0.15]
+    assert any(moment.figures["speed_mps"] == pytest.approx(0.1, abs=0.01) for moment in near)
+    assert all(np.diff(sorted(places_m(moments))) >= 0.15)
+
+
+def test_moments_with_all_their_events_are_preferred_to_those_before_the_stream_began(rig: Rig) -> None:
+    late = event_stream([(-0.4, 6.0, 4.0)])
+    moments, _ = choose(watch(rig, lambda t: (0.05 * t, 0.0), 1.6, late), rig)
+    assert times_s(moments)[0] >= 0.85
+
+
+def test_moments_before_the_stream_or_after_it_are_counted(rig: Rig) -> None:
+    stream = event_stream([(1.0, 2.0, 4.0)])
+    _, refused = choose(watch(rig, lambda t: (0.05 * t, 0.0), 6.0, stream), rig)
+    said = "no events at the time of the scan: record events while the LiDAR runs; do their clocks agree?"
+    # Scans 8 to 31 begin less than 1.2 s after its end and end less than 0.15 s before its beginning.
+    assert refused[said] == 8 + 28
+
+
+def test_a_board_that_the_lidar_does_not_see_is_no_moment(rig: Rig) -> None:
+    assert choose(watch(rig, lambda t: (0.1 * t, 0.0), 1.0, SOME, has_lidar=False), rig) == ([], {})
+
+
+def test_a_board_seen_in_single_frames_only_has_no_speed_and_is_no_moment(rig: Rig) -> None:
+    sightings = watch(
+        rig, lambda t: (0.1 * t, 0.0), 2.0, SOME, is_seen=lambda t: round(10 * t - 0.5) % 4 == 0
+    )
+    assert choose(sightings, rig) == ([], {})
+
+
+def test_a_board_that_comes_back_is_not_taken_twice(rig: Rig) -> None:
+    moments, _ = choose(watch(rig, lambda t: (0.1 * abs(t - 3.0), 0.0), 6.0, SOME), rig)
+    places = sorted(places_m(moments))
+    assert 2 <= len(places) <= 3 and np.diff(places).min() >= 0.15
+
+
+def test_the_moments_are_the_same_however_often_they_are_sought(rig: Rig) -> None:
+    sightings = watch(rig, lambda t: (0.1 * t - 0.2, 0.05 * np.sin(4 * t)), 4.0, SOME)
+    first, again = (times_s(choose(sightings, rig)[0]) for _ in range(2))
+    assert first == again and first
+    # Whoever stops early has had the first of them.
+    moments = find_moving_moments(sightings, rig, MotionOptions(), Placements(0.15, 10.0), Tally())
+    assert times_s([next(moments)]) == first[:1]
+
+
+def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rig: Rig) -> None:
+    lit = event_stream([(-1.3, 3.0, 8.0)], lamp_hz=60.0)
+    unseen = Refusal("image", "no board: 9x6 inner corners wanted, none seen", "show the whole print")
+    for stream, cause in [
+        (lit, "flickers at 60 Hz"),
+        (event_stream([(-1.3, 3.0, 0.3)]), "the board hardly moved"),
+    ]:
+        sightings = watch(rig, lambda _t: (0.0, 0.0), 1.0, stream, channel="events", is_seen=lambda _t: False)
+        told = [Sighting(s.frame, {}, {}, {("davis", "events"): unseen}) for s in sightings]
+        moments, refused = choose(told, rig)
+        assert moments == [] and len(refused) == 1 and cause in next(iter(refused))
+
+
+@given(steps=st.lists(st.integers(1, 400), min_size=1, max_size=40), set_back=st.integers(0, 40))
+def test_every_sighting_is_judged_once_with_all_that_lie_within_half_a_window(
+    steps: list[int], set_back: int
+) -> None:
+    times_ms = np.cumsum(steps)
+    times_ms[set_back:] -= 100_000
+    sightings = [Sighting(Frame(int(t) * 10**6, (), ()), {}, {}) for t in times_ms]
+    found = list(_with_neighbours(iter(sightings), 0.5))
+    assert [sighting for sighting, _ in found] == sightings
+    for k, (sighting, around) in enumerate(found):
+        same_clock = sightings[:set_back] if k < set_back else sightings[set_back:]
+        near = [s for s in same_clock if abs(s.frame.time_ns - sighting.frame.time_ns) <= 250_000_000]
+        assert around == near
