@@ -22,6 +22,16 @@ _COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
     metavar="FILE",
     help="JSON with a T_cam_lidar to report the error against; never used in the estimate.",
 )
+@click.option(
+    "--channels",
+    metavar="NAME[,NAME]",
+    help="Channels to use, such as frames or events [default: all; together they give one extrinsic].",
+)
+@click.option(
+    "--event-image",
+    type=click.Choice(["network", "map"]),
+    help="How events become pictures: by network, or sums of polarities [default: the profile's, network].",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export a failed result too, marked as failed.")
 @click.option(
@@ -74,6 +84,8 @@ _COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 def calibrate(
     session: Path,
     reference: Path | None,
+    channels: str | None,
+    event_image: Any,
     as_json: bool,
     force: bool,
     weights: str,
@@ -100,10 +112,11 @@ def calibrate(
     truth = None if reference is None else read_reference(reference)
     pipeline.remove_results(opened)
     with show.progress_bar("detecting") as progress:
-        detections = pipeline.detect(opened, progress=progress)
+        detections = pipeline.detect(opened, event_image=event_image, progress=progress)
+    wanted = None if channels is None else [name.strip() for name in channels.split(",")]
     with show.progress_bar("calibrating") as progress:
         results, troubles = pipeline.calibrate(
-            opened.rig, detections, options, reference=truth, progress=progress
+            opened.rig, detections, options, channels=wanted, reference=truth, progress=progress
         )
     for trouble in troubles:
         show.warn(str(trouble))
@@ -158,6 +171,7 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
         f"  certificate  {'global minimum' if c.certificate.is_optimal else '[red]not proven[/]'}, "
         f"gap {c.certificate.gap:.0e}",
     ]
+    lines += _channel_lines(c)
     if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
         lines.append(
             f"  reference    off by {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
@@ -166,3 +180,27 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.cause}: {why.action}')}[/]")
     lines += [f"  [{colour}]{show.escape(reason)}[/]" for reason in c.reasons]
     return lines
+
+
+def _channel_lines(calibration: Calibration) -> list[str]:
+    """Say what each channel contributes where there are several, or where boards moved."""
+    results = calibration.channel_results
+    if len(results) == 1 and results[0].time_offset_s is None:
+        return []
+    texts = []
+    for result in results:
+        text = f"{result.channel}: {result.n_captures} captures, corners to {result.noise_px:.2f} px"
+        if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
+            text += (
+                f", clock {1000 * result.time_offset_s:+.0f} +- {1000 * result.time_offset_sigma_s:.0f} ms, "
+                f"depth scatter {1000 * result.depth_scatter_m:.1f} mm "
+                f"({1000 * result.depth_scatter_still_m:.1f} with motion left in)"
+            )
+        texts.append(text)
+    figures = calibration.diagnostics
+    if "channels_rotation_deg" in figures:
+        texts.append(
+            f"they differ by {figures['channels_rotation_deg']:.2f} deg, "
+            f"{1000 * figures['channels_translation_m']:.1f} mm"
+        )
+    return [f"  {'channels' if k == 0 else '':<13}{text}" for k, text in enumerate(texts)]

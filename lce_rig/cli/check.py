@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
+from lce_rig.cli.options import event_image_option
 from lce_rig.core.results import Refusal
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 
@@ -17,7 +18,8 @@ from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection,
 @click.argument("session", type=click.Path(path_type=Path), default="session")
 @click.option("--json", "as_json", is_flag=True, help="Print every figure as JSON.")
 @click.option("--debug-images", is_flag=True, help="Write one picture a capture into SESSION/debug/.")
-def check(session: Path, as_json: bool, debug_images: bool) -> None:
+@event_image_option
+def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) -> None:
     """Show what was detected in each capture of SESSION (default: session/), and why not.
 
     Exits with 6 where no capture can be used.
@@ -30,10 +32,12 @@ def check(session: Path, as_json: bool, debug_images: bool) -> None:
     if not opened.captures:
         raise NotEnoughDataError(f"{session} holds no captures", "Collect some first: lce-rig collect --help")
     with show.progress_bar("detecting") as progress:
-        detections = pipeline.detect(opened, progress=progress)
+        detections = pipeline.detect(opened, event_image=event_image, progress=progress)
     if debug_images:
         with show.progress_bar("drawing") as progress:
-            folder = pipeline.write_debug_images(opened, detections, progress=progress)
+            folder = pipeline.write_debug_images(
+                opened, detections, event_image=event_image, progress=progress
+            )
         show.note(f"pictures of every capture: {folder}")
     refusals = {pair: pipeline.refusals(opened.rig, detections, pair) for pair in detections.pairs}
     if as_json:
@@ -84,17 +88,24 @@ def _figures(found: Any) -> dict[str, float | None] | None:
     return {key: float(value) if math.isfinite(value) else None for key, value in found.quality.items()}
 
 
-# Heading and unit, sensor, figure, scale to the unit, digits. Narrow enough for a terminal of 80 columns.
-_COLUMNS = (
+# Heading and unit, sensor, figure, scale to the unit, digits.
+Column = tuple[str, str, str, float, int]
+_IMAGE: tuple[Column, ...] = (
     ("dist\nm", "image", "distance_m", 1.0, 2),
     ("tilt\ndeg", "image", "tilt_deg", 1.0, 0),
     ("corner\npx", "image", "corner_rms_px", 1.0, 2),
     ("sharp", "image", "sharpness", 1.0, 1),
+)
+_EVENTS: tuple[Column, ...] = (
+    ("events\npx/s", "image", "events_px_s", 1.0, 1),
+    ("speed\ncm/s", "image", "speed_mps", 100.0, 0),
+)
+_POINTS: tuple[Column, ...] = (("points", "lidar", "n_points", 1.0, 0),)
+_LIDAR: tuple[Column, ...] = (
     ("rings", "lidar", "n_rings", 1.0, 0),
-    ("points", "lidar", "n_points", 1.0, 0),
     ("plane\nmm", "lidar", "plane_rms_m", 1000.0, 1),
-    ("width\nm", "lidar", "width_m", 1.0, 3),
-    ("height\nm", "lidar", "height_m", 1.0, 3),
+    ("wide\nm", "lidar", "width_m", 1.0, 3),
+    ("high\nm", "lidar", "height_m", 1.0, 3),
     ("edges\nmm", "lidar", "edge_rms_m", 1000.0, 1),
 )
 # A side of the plate that no ring end shows is not known better than this; the profile's is no measurement.
@@ -103,17 +114,27 @@ _SIDE_KNOWN_M = 0.05
 
 def _table(detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> Any:
     table = show.plain_table(str(pair))
+    columns = _columns(detections, pair)
     table.add_column("capture", no_wrap=True)
-    for title, *_ in _COLUMNS:
+    for title, *_ in columns:
         table.add_column(title, justify="right")
     table.add_column("")
     for name in detections.captures(pair):
         refusal = refused.get(name)
         record = _record(*detections.of(pair, name), refusal)
-        cells = [_cell(record[sensor], key, scale, digits) for _, sensor, key, scale, digits in _COLUMNS]
+        cells = [_cell(record[sensor], key, scale, digits) for _, sensor, key, scale, digits in columns]
         state = "[green]ok[/]" if refusal is None else f"[red]{refusal.stage}[/]"
         table.add_row(name, *cells, state)
     return table
+
+
+def _columns(detections: Detections, pair: Pair) -> tuple[Column, ...]:
+    """Choose what a terminal of 80 columns has room for; events have figures of their own."""
+    images = [detections.of(pair, name)[0] for name in detections.captures(pair)]
+    is_from_events = any(
+        not isinstance(image, Refusal) and "events_px_s" in image.quality for image in images
+    )
+    return (*_IMAGE, *(_EVENTS if is_from_events else _POINTS), *_LIDAR)
 
 
 def _cell(figures: Mapping[str, float | None] | None, key: str, scale: float, digits: int) -> str:

@@ -15,3 +15,10 @@ class FiniteRange(click.FloatRange):
         if not math.isfinite(number):
             self.fail(f"{value!r} is no finite number.", param, ctx)
         return number
+
+
+event_image_option = click.option(
+    "--event-image",
+    type=click.Choice(["network", "map"]),
+    help="How pictures are made from raw events; by default as the profile says, which is the network.",
+)

@@ -1,14 +1,21 @@
 """`lce-rig reconstruct`: pictures from an event recording."""
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange
 
+if TYPE_CHECKING:
+    from lce_rig.core.data import Events
+    from lce_rig.sources.events.recording import EventRecording
+
 STAMPS = "stamps.csv"
+# Enough for the network to settle before the first picture wanted.
+_WARM_UP_NS = 1_500_000_000
 
 
 @click.command()
@@ -29,6 +36,10 @@ STAMPS = "stamps.csv"
     metavar="S",
     help="One picture every so many seconds.",
 )
+@click.option(
+    "--start", default=0.0, type=FiniteRange(0), metavar="S", help="Begin so long after the first event."
+)
+@click.option("--duration", type=FiniteRange(0.001), metavar="S", help="End so long after that.")
 @click.option("--topic", metavar="/TOPIC", help="Events topic of a bag with several.")
 @click.option(
     "--window-s",
@@ -51,16 +62,24 @@ STAMPS = "stamps.csv"
     help="ONNX file in place of the shipped network.",
 )
 @click.option("--no-filter", is_flag=True, help="Keep hot pixels and background activity.")
+@click.option("--gif", type=click.Path(path_type=Path), metavar="FILE", help="An animation as well.")
+@click.option(
+    "--video", type=click.Path(path_type=Path), metavar="FILE", help="A video as well: .mp4, .avi or .mkv."
+)
 def reconstruct(
     recording: Path,
     output: Path,
     every: float,
+    start: float,
+    duration: float | None,
     topic: str | None,
     window_s: float | None,
     window_events: int | None,
     event_image: Any,
     model: Path | None,
     no_filter: bool,
+    gif: Path | None,
+    video: Path | None,
 ) -> None:
     """Turn the events of RECORDING into grey pictures in FOLDER, with their stamps in stamps.csv.
 
@@ -69,11 +88,8 @@ def reconstruct(
     The first pictures, from before the network has seen enough, are left out, and their number is told.
     """
     from lce_rig.core.errors import SourceError, UsageError
-    from lce_rig.core.results import Refusal
-    from lce_rig.detect.flicker import measure_flicker
     from lce_rig.detect.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
     from lce_rig.sources.events import open_events
-    from lce_rig.verify.writing import write_picture
 
     if window_s is not None and window_events is not None:
         raise UsageError("--window-s and --window-events exclude each other")
@@ -83,34 +99,95 @@ def reconstruct(
     elif window_events is not None:
         windows = WindowOptions("count", n_events=window_events)
     options = ReconstructionOptions(method=event_image, windows=windows, is_filtered=not no_filter)
+    reconstructor = Reconstructor(model, options)
     events = open_events(recording, topic=topic)
+    _warn_of_flicker(recording, events)
+    stamps_ns = _stamps(recording, events, start, duration, every)
+    files, refused = _write(output, reconstructor, events, stamps_ns)
+    for text in events.notes:
+        show.note(text)
+    if refused:
+        show.note(f"{len(refused)} pictures left out, the first because {refused[0]}")
+    if not files:
+        raise SourceError(
+            f"{recording}: no picture could be made", "It is too short for the network to warm up."
+        )
+    show.note(f"{len(files)} pictures in {output}, stamps in {output / STAMPS}")
+    _animate(files, every, gif, video)
+
+
+def _warn_of_flicker(recording: Path, events: "EventRecording") -> None:
+    from lce_rig.detect.flicker import measure_flicker
+
     flicker = measure_flicker(events.read(events.start_ns, events.start_ns + 1_000_000_000))
     if flicker.is_storm:
         show.warn(
             f"{recording.name}: most events come from light that flickers at {flicker.frequency_hz:.0f} Hz: "
             "record by daylight or under lamps that do not flicker"
         )
-    every_ns = round(every * 1e9)
-    n_expected = max(1, int(events.duration_s * 1e9) // every_ns)
+
+
+def _stamps(
+    recording: Path, events: "EventRecording", start_s: float, duration_s: float | None, every_s: float
+) -> range:
+    """List when pictures are wanted.
+
+    Raises:
+        UsageError: all of them after the recording's end.
+    """
+    from lce_rig.core.errors import UsageError
+
+    first_ns, last_ns = events.extent_ns()
+    begin_ns, every_ns = first_ns + round(1e9 * start_s), round(1e9 * every_s)
+    end_ns = last_ns if duration_s is None else min(last_ns, begin_ns + round(1e9 * duration_s))
+    if begin_ns >= last_ns:
+        raise UsageError(
+            f"--start {start_s:g}: {recording} ends {1e-9 * (last_ns - first_ns):.3f} s after its first event"
+        )
+    return range(begin_ns + every_ns, max(end_ns, begin_ns + every_ns) + 1, every_ns)
+
+
+def _write(
+    output: Path, reconstructor: Any, events: "EventRecording", stamps_ns: range
+) -> tuple[list[Path], list[str]]:
+    """Write the pictures and the list of their stamps; return the files, and causes of those left out."""
+    from lce_rig.core.results import Refusal
+    from lce_rig.verify.writing import write_picture
+
     lines = ["picture,stamp_ns"]
-    refused: list[Refusal] = []
-    pictures = Reconstructor(model, options).reconstruct(events, every_ns=every_ns)
+    files: list[Path] = []
+    refused: list[str] = []
+    pictures = reconstructor.reconstruct(_stretches(events, stamps_ns), stamps_ns)
     with show.progress_bar("reconstructing") as progress:
         for done, picture in enumerate(pictures, start=1):
             if isinstance(picture, Refusal):
-                refused.append(picture)
+                refused.append(picture.cause)
             else:
-                name = f"{len(lines) - 1:06d}.png"
-                write_picture(output / name, picture.pixels)
-                lines.append(f"{name},{picture.stamp_ns}")
-            progress(done, n_expected)
-    for text in events.notes:
-        show.note(text)
-    if refused:
-        show.note(f"{len(refused)} pictures left out: {refused[0].cause}")
-    if len(lines) == 1:
-        raise SourceError(
-            f"{recording}: no picture could be made", "It is too short for the network to warm up."
-        )
-    (output / STAMPS).write_text("\n".join(lines) + "\n", encoding="utf-8")
-    show.note(f"{len(lines) - 1} pictures in {output}, stamps in {output / STAMPS}")
+                files.append(write_picture(output / f"{len(files):06d}.png", picture.pixels))
+                lines.append(f"{files[-1].name},{picture.stamp_ns}")
+            progress(done, len(stamps_ns))
+    if files:
+        (output / STAMPS).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return files, refused
+
+
+def _stretches(events: "EventRecording", stamps_ns: range) -> "Iterator[Events]":
+    """Cut the recording down to what the pictures need."""
+    from_ns, until_ns = stamps_ns[0] - stamps_ns.step - _WARM_UP_NS, stamps_ns[-1] + 1
+    for stretch in events:
+        if stretch.t_ns[0] > until_ns:
+            return
+        yield stretch.between(from_ns, until_ns)
+
+
+def _animate(files: list[Path], period_s: float, gif: Path | None, video: Path | None) -> None:
+    import cv2
+    import numpy as np
+
+    from lce_rig.verify.animation import write_gif, write_video
+
+    for path, write in ((gif, write_gif), (video, write_video)):
+        if path is not None:
+            pictures = (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files)
+            write(path, (np.asarray(picture, dtype=np.uint8) for picture in pictures), period_s)
+            show.note(f"written: {path}")

@@ -69,8 +69,9 @@ def show_profile(rig_name: str, as_json: bool, as_yaml: bool) -> None:
     elif as_yaml:
         click.echo(dump_rig(rig), nl=False)
     else:
-        for table in (_sensor_table(rig), _board_table(rig), _limit_table(rig)):
-            screen.print_table(table)
+        for table in (_sensor_table(rig), _picture_table(rig), _board_table(rig), _limit_table(rig)):
+            if table.row_count:
+                screen.print_table(table)
         _warn_of_doubts(rig)
 
 
@@ -99,6 +100,25 @@ def _sensor_table(rig: "Rig") -> Any:
 
 def _stamps(settings: Any) -> str:
     return f"{settings.reference}, clock {settings.clock}, sync {settings.sync}"
+
+
+def _picture_table(rig: "Rig") -> Any:
+    """List how pictures are made of events."""
+    from lce_rig.rig import ReconstructionSettings
+
+    table = screen.plain_table("", "pictures from events", "method", "network", "windows")
+    for name, camera in rig.cameras.items():
+        for channel, stream in camera.channels.items():
+            if stream.kind == "events":
+                settings = stream.reconstruction or ReconstructionSettings()
+                windows = "by the rate of events"
+                if settings.window_s is not None:
+                    windows = f"{1e3 * settings.window_s:g} ms"
+                elif settings.window_events is not None:
+                    windows = f"{settings.window_events} events"
+                network = "-" if settings.method == "map" else settings.model or "shipped"
+                table.add_row(f"{name}/{channel}", settings.method, network, windows)
+    return table
 
 
 def _board_table(rig: "Rig") -> Any:
@@ -134,10 +154,12 @@ def _limit_table(rig: "Rig") -> Any:
 def check_profile(file: str, as_json: bool) -> None:
     """Check a profile; every problem is named with its line. Exits with 3 where there is one."""
     from lce_rig.core.errors import ProfileError
+    from lce_rig.pipeline.event_detection import check_networks
     from lce_rig.rig import find_profile, load_rig
 
     try:
         rig = load_rig(file)
+        check_networks(rig, file)
     except ProfileError as error:
         if as_json:
             problems = error.hint.splitlines() if error.hint else [error.what]

@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
+from lce_rig.cli.options import event_image_option
 
 
 @click.command()
@@ -20,7 +21,8 @@ from lce_rig.cli import show
     "-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the pictures go."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the residuals as JSON.")
-def verify(session: Path, result: Path | None, output: Path | None, as_json: bool) -> None:
+@event_image_option
+def verify(session: Path, result: Path | None, output: Path | None, as_json: bool, event_image: Any) -> None:
     """Draw the LiDAR of each capture of SESSION (default: session/) into its picture, print residuals.
 
     Pictures and one contact sheet go to SESSION/calibration/overlays/. Exits with 7 where the verdict is fail
@@ -49,9 +51,11 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
         # Names of captures say nothing across sessions: none of these was fitted.
         calibrations = [replace(c, captures_used=(), captures_refused={}) for c in calibrations]
     with show.progress_bar("detecting") as progress:
-        detections = pipeline.detect(opened, progress=progress)
+        detections = pipeline.detect(opened, event_image=event_image, progress=progress)
     with show.progress_bar("drawing") as progress:
-        checks = pipeline.verify(opened, detections, calibrations, folder=output, progress=progress)
+        checks = pipeline.verify(
+            opened, detections, calibrations, event_image=event_image, folder=output, progress=progress
+        )
     if as_json:
         show.print_json(
             {"format_version": 1, "rig": opened.rig.name, "pairs": [c.document() for c in checks]}

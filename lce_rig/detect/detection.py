@@ -9,20 +9,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.data import Image
 from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, Refusal
 
 Arrays = dict[str, NDArray[Any]]
 LidarDetection = list[LidarBoard] | Refusal
 ImageDetection = ImageBoard | Refusal
 
-_KINDS: dict[str, Any] = {kind.__name__: kind for kind in (ImageBoard, LidarBoard, Refusal)}
+_KINDS: dict[str, Any] = {kind.__name__: kind for kind in (Image, ImageBoard, LidarBoard, Refusal)}
 
 
-def to_arrays(detection: ImageDetection | LidarDetection) -> Arrays:
+def to_arrays(detection: ImageDetection | LidarDetection | Image) -> Arrays:
     """Flatten a detection into named arrays; figures and names travel as one JSON text.
 
     Args:
-        detection: one image board, the LiDAR candidates of a scan, or a refusal.
+        detection: one image board, the LiDAR candidates of a scan, a refusal, or the picture of one.
     """
     items = detection if isinstance(detection, list) else [detection]
     arrays: Arrays = {}
@@ -40,7 +41,7 @@ def to_arrays(detection: ImageDetection | LidarDetection) -> Arrays:
     return arrays
 
 
-def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> ImageDetection | LidarDetection:
+def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> ImageDetection | LidarDetection | Image:
     """Rebuild what `to_arrays` flattened.
 
     Raises:

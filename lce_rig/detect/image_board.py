@@ -28,6 +28,8 @@ _AMBIGUOUS_CHI2 = 9.0
 _CUT_FRACTION = 0.02
 # Corners that the finder misplaced, or that an artefact covers, at most.
 _MAX_MISPLACED = 0.08
+# A grid of corners of which fewer can be measured is none.
+_MIN_FITTED = 0.5
 # The outer squares of a line that is not on the board are all alike.
 _MIN_OUTER_CONTRAST = 0.35
 
@@ -41,6 +43,7 @@ def find_image_board(
     max_reprojection_px: float = 1.0,
     min_contrast: float = 12.0,
     min_sharpness: float = 1.5,
+    is_from_events: bool = False,
 ) -> ImageBoard | Refusal:
     """Find the board's inner corners in one picture and T_cam_board in both its minima.
 
@@ -56,20 +59,21 @@ def find_image_board(
         max_reprojection_px: refuse where the corners' rms distance from the board's picture is larger.
         min_contrast: refuse where black and white differ by fewer grey values.
         min_sharpness: refuse where fewer edge widths fit into a square.
+        is_from_events: whether the picture was made from events: what is to be done is another thing.
 
     Raises:
         ProfileError: the intrinsics belong to pictures of another size.
     """
     grey = crop_to_intrinsics(image, intrinsics)
     crossings = _find_in_region(grey, board, region) or find_grid(grey, board)
-    if crossings is None:
-        return explain_absence(image, grey, board)
+    if crossings is None or np.mean(crossings.is_fitted) < _MIN_FITTED:
+        return explain_absence(grey, board, is_from_events)
     quality = grid_quality(grey, crossings)
     outer_contrast, goes_on = extent(grey, crossings.grid_px)
     if outer_contrast < _MIN_OUTER_CONTRAST or goes_on:
         seen = seen_grid(grey)
         return explain_other_grid(grey, board, crossings.grid_px if seen is None else seen)
-    problem = quality_problem(quality, min_contrast, min_sharpness)
+    problem = quality_problem(quality, min_contrast, min_sharpness, is_from_events)
     if problem is not None:
         return problem
 

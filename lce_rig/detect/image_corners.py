@@ -127,6 +127,8 @@ def _attempts(grey: Grey, size: tuple[int, int], is_other_seen: bool) -> Iterato
         yield _classic(grey, size, 2.0)
         yield _classic(level, size, 2.0)
     yield _sector_based(level, size, 1.5, _SB_THOROUGH)
+    # Squares of 4 px in a picture of full contrast, as those made from events are.
+    yield _sector_based(grey, size, 2.0, _SB_THOROUGH)
 
 
 def level_contrast(grey: Grey) -> Grey:

@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
-from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
 from lce_rig.detect.image_corners import seen_grid, square_values
 from lce_rig.detect.image_saddle import Crossings
 
+#: What events need to show a board.
+MOVE_SLOWLY = "move the board sideways slowly, about 10 cm/s, from a second before the capture on"
 # 10 to 90 % of an edge blurred by a Gaussian span 2.56 sigma.
 _EDGE_WIDTH_PER_SIGMA = 2.56
 
@@ -87,7 +88,7 @@ def _alternation(values: Array, signs: Array) -> float:
     return float(values[signs > 0].mean() - values[signs < 0].mean())
 
 
-def explain_absence(image: Image, grey: NDArray[np.uint8], board: Board) -> Refusal:
+def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool = False) -> Refusal:
     """Say why the board was not found, from the grey values and from what checkerboard is there instead."""
     wanted = f"{board.cols}x{board.rows}"
     low, dark, bright = (float(value) for value in np.percentile(grey, (1, 50, 99)))
@@ -103,20 +104,20 @@ def explain_absence(image: Image, grey: NDArray[np.uint8], board: Board) -> Refu
         return explain_other_grid(grey, board, seen)
     if bright - low < 50:
         cause = f"contrast too low: grey values {low:.0f} to {bright:.0f}, no {wanted} inner corners seen"
-        action = (
-            "move the board while events are recorded: only moving edges make them"
-            if image.channel == "events"
-            else "light the board, expose longer"
-        )
-        return Refusal("image", cause, action)
+        too_few = "move the board while events are recorded: only moving edges make them"
+        return Refusal("image", cause, too_few if is_from_events else "light the board, expose longer")
     width_px = _strongest_edge_px(grey, bright - low)
     if width_px > 6:
         cause = f"too blurred: the sharpest edges are {width_px:.0f} px wide, no {wanted} inner corners seen"
-        return Refusal("image", cause, "hold the board still, expose shorter, focus the lens")
+        action = MOVE_SLOWLY if is_from_events else "hold the board still, expose shorter, focus the lens"
+        return Refusal("image", cause, action)
+    action = (
+        "show the whole print, uncovered; inner corners are where four squares meet, one less than squares"
+    )
     return Refusal(
         "image",
         f"no board: {wanted} inner corners wanted, none seen (median grey {dark:.0f})",
-        "show the whole print, uncovered; inner corners are where four squares meet, one less than squares",
+        f"{action}; {MOVE_SLOWLY}" if is_from_events else action,
     )
 
 
@@ -153,18 +154,19 @@ def explain_other_grid(grey: NDArray[np.uint8], board: Board, seen_px: Array) ->
 
 
 def quality_problem(
-    quality: Mapping[str, float], min_contrast: float, min_sharpness: float
+    quality: Mapping[str, float], min_contrast: float, min_sharpness: float, is_from_events: bool = False
 ) -> Refusal | None:
     """Judge the figures of a grid that was found; None where they will do."""
     if quality["contrast"] < min_contrast:
         cause = f"contrast too low: black and white differ by {quality['contrast']:.0f} grey values"
         cause += f" ({min_contrast:.0f} needed)"
-        action = "move the board faster" if quality["mean_grey"] > 60 else "expose longer or add light"
-        return Refusal("image", cause, action)
+        return Refusal("image", cause, MOVE_SLOWLY if is_from_events else "expose longer or add light")
     if quality["sharpness"] < min_sharpness:
         cause = f"too blurred: edges {quality['edge_width_px']:.1f} px wide on squares of"
         cause += f" {quality['square_px']:.1f} px"
-        return Refusal("image", cause, "hold the board still, expose shorter, come closer, focus the lens")
+        cause += f" ({min_sharpness:g} edge widths a square needed)" if is_from_events else ""
+        still = "hold the board still, expose shorter, come closer, focus the lens"
+        return Refusal("image", cause, f"{MOVE_SLOWLY}; come closer" if is_from_events else still)
     return None
 
 

@@ -1,6 +1,6 @@
 """The story in order: captures -> detections -> extrinsics -> files and pictures. Start reading here.
 
-    detections = detect(session)                            the board in every picture and scan
+    detections = detect(session)                            the board in all pictures, scans and events
     results, troubles = calibrate(session.rig, detections, options)     an extrinsic and verdict a pair
     calibrations = [calibration for calibration, _ in results]
     write_results(session, calibrations, force=False)       result.json, YAML, URDF, camera_info, transforms
@@ -12,7 +12,7 @@ session and the export layer touch files.
 
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.pipeline.calibration import calibrate, refusals, remove_results, write_results
-from lce_rig.pipeline.detection import detect, detect_image, detect_scan
+from lce_rig.pipeline.detection import detect, detect_image, detect_scan, event_picture
 from lce_rig.pipeline.verification import verify, write_debug_images
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "detect",
     "detect_image",
     "detect_scan",
+    "event_picture",
     "refusals",
     "remove_results",
     "verify",

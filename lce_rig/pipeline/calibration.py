@@ -107,7 +107,7 @@ def _calibrate_sensors(
         laser_bias_sigma_m=settings.laser_bias_sigma_m,
         range_offset_sigma_m=settings.range_offset_sigma_m,
     )
-    clocks = _clocks(rig, camera, lidar)
+    clocks = clocks_of(rig, camera, lidar)
     result = calibrate_channels(candidates, rig.board.to_board(), pair_options, clocks, progress)
     n_captures = len({name for pair in pairs for name in detections.captures(pair)})
     calibration = _judged(rig, camera, lidar, result, n_captures=n_captures, refused=refused)
@@ -146,7 +146,8 @@ def _usable(
     return candidates, {name: why for name, why in refused.items() if name not in found}
 
 
-def _clocks(rig: Rig, camera: str, lidar: str) -> Clocks:
+def clocks_of(rig: Rig, camera: str, lidar: str) -> Clocks:
+    """Read what the profile says of the time of a camera and a LiDAR."""
     stamps = {name: channel.timestamps for name, channel in rig.cameras[camera].channels.items()}
     return Clocks(
         sweep_s=1 / rig.lidars[lidar].rate_hz,

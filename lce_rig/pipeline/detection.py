@@ -1,9 +1,10 @@
-"""Find the board in every picture and scan of a session, once."""
+"""Find the board in every picture, every scan and all raw events of a session, once."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,114 +12,228 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import ProfileError, SessionError
 from lce_rig.core.results import Refusal
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, from_arrays, to_arrays
+from lce_rig.detect.event_board import EventImage, find_in_reconstruction
 from lce_rig.detect.gates import gate_image_board, gate_lidar_boards
+from lce_rig.pipeline.event_detection import event_channels, event_digest, see_events
 from lce_rig.pipeline.progress import Progress, silent
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 
+Key = tuple[str, str]
 
-def detect(session: Session, *, progress: Progress = silent, n_threads: int = 2) -> Detections:
-    """Find the board in every picture and scan of a session; what was found before is not sought again.
+
+def detect(
+    session: Session,
+    *,
+    event_image: EventImage | None = None,
+    progress: Progress = silent,
+    n_threads: int = 2,
+) -> Detections:
+    """Find the board in all samples of a session; what was found before is not sought again.
+
+    A capture's raw events are seen through pictures made for the time at which the LiDAR saw the board.
 
     Args:
         session: open for reading is enough.
+        event_image: how pictures are made of raw events; None as the profile says.
         progress: called with (done, total).
         n_threads: detectors at work side by side.
+
+    Raises:
+        ProfileError: a network that the profile names cannot be used.
     """
-    digest = _detection_digest(session.rig)
-    sensors = _sensors(session.captures)
-    image_jobs = [(capture, *channel) for capture, channels, _ in sensors for channel in channels]
-    scan_jobs = [(capture, lidar) for capture, _, names in sensors for lidar in names]
-    total = len(image_jobs) + len(scan_jobs)
-    images: dict[tuple[str, str], dict[str, ImageDetection]] = {}
+    finder = _Finder(session, event_image)
+    held = finder.held(session.captures)
+    scan_jobs = [(each.capture, lidar) for each in held for lidar in each.lidars]
+    image_jobs = [(each.capture, camera, channel) for each in held for camera, channel in each.images]
+    event_jobs = [(each.capture, camera, channel) for each in held for camera, channel in each.events]
+    total = len(scan_jobs) + len(image_jobs) + len(event_jobs)
+    images: dict[Key, dict[str, ImageDetection]] = {}
     lidars: dict[str, dict[str, LidarDetection]] = {}
     with ThreadPoolExecutor(n_threads) as pool:
-        seen = pool.map(lambda job: _image_detection(session, digest, *job), image_jobs)
-        scanned = pool.map(lambda job: _scan_detection(session, digest, *job), scan_jobs)
-        for done, ((capture, camera, channel), image) in enumerate(
-            zip(image_jobs, seen, strict=True), start=1
-        ):
-            images.setdefault((camera, channel), {})[capture.name] = image
-            progress(done, total)
-        for done, ((capture, lidar), scan) in enumerate(
-            zip(scan_jobs, scanned, strict=True), len(image_jobs) + 1
-        ):
+        scanned = pool.map(lambda job: finder.scan(*job), scan_jobs)
+        for (capture, lidar), scan in _counted(scan_jobs, scanned, progress, 0, total):
             lidars.setdefault(lidar, {})[capture.name] = scan
-            progress(done, total)
+        # What the LiDAR saw says when pictures of events are wanted.
+        pictured = pool.map(lambda job: finder.image(*job), image_jobs)
+        developed = pool.map(lambda job: finder.events(*job, scans=_in_capture(lidars, job[0])), event_jobs)
+        for jobs, seen, n_before in (
+            (image_jobs, pictured, len(scan_jobs)),
+            (event_jobs, developed, len(scan_jobs) + len(image_jobs)),
+        ):
+            for (capture, camera, channel), image in _counted(jobs, seen, progress, n_before, total):
+                images.setdefault((camera, channel), {})[capture.name] = image
     return Detections(images, lidars)
 
 
-def _sensors(captures: list[Capture]) -> list[tuple[Capture, list[tuple[str, str]], list[str]]]:
-    """Name the (camera, channel) pairs and the LiDARs that each capture holds samples of.
+def event_picture(
+    session: Session, capture: Capture, camera: str, channel: str, event_image: EventImage | None = None
+) -> Image | Refusal:
+    """Give the picture through which a capture's raw events were seen, or why there is none.
 
-    A capture whose manifest is damaged is asked for what the others hold, so that every pair says so.
+    Args:
+        session: open for reading is enough.
+        capture: holds events of the camera.
+        camera, channel: whose picture it is.
+        event_image: as in `detect`.
     """
-    known: dict[str, tuple[list[tuple[str, str]], list[str]]] = {}
-    for capture in captures:
-        with suppress(SessionError):
-            known[capture.name] = capture.image_keys, capture.lidars
-    if captures and not known:
-        captures[0].image_keys  # noqa: B018  raises what is wrong with it
-    channels = sorted({channel for held, _ in known.values() for channel in held})
-    lidars = sorted({lidar for _, held in known.values() for lidar in held})
-    return [(capture, *known.get(capture.name, (channels, lidars))) for capture in captures]
+    finder = _Finder(session, event_image)
+    scans = {lidar: finder.scan(capture, lidar) for lidar in capture.lidars}
+    return finder.picture(capture, camera, channel, scans=scans)
 
 
-def _image_detection(
-    session: Session, digest: str, capture: Capture, camera: str, channel: str
-) -> ImageDetection:
-    def find() -> ImageDetection:
+def _in_capture(
+    lidars: Mapping[str, Mapping[str, LidarDetection]], capture: Capture
+) -> dict[str, LidarDetection]:
+    return {lidar: found[capture.name] for lidar, found in lidars.items() if capture.name in found}
+
+
+def _counted(
+    jobs: list[Any], results: Iterable[Any], progress: Progress, n_before: int, total: int
+) -> Iterator[tuple[Any, Any]]:
+    for done, job_and_result in enumerate(zip(jobs, results, strict=True), start=n_before + 1):
+        yield job_and_result
+        progress(done, total)
+
+
+@dataclass(frozen=True)
+class _Held:
+    """What a capture holds: pictures and raw events by (camera, channel), and scans by LiDAR."""
+
+    capture: Capture
+    images: list[Key]
+    events: list[Key]
+    lidars: list[str]
+
+
+class _Finder:
+    """Finds boards, and remembers them in the session's cache."""
+
+    def __init__(self, session: Session, event_image: EventImage | None) -> None:
+        self._session = session
+        self._event_image = event_image
+        self._digest = _detection_digest(session.rig)
+        self._event_digests: dict[Key, str] = {}
+
+    def held(self, captures: list[Capture]) -> list[_Held]:
+        """List what each capture holds.
+
+        A capture whose manifest is damaged is asked for what the others hold, so that every pair says so.
+        """
+        known: dict[str, _Held] = {}
+        for capture in captures:
+            with suppress(SessionError):
+                made_here = event_channels(self._session.rig, capture, self._event_image)
+                stored = [key for key in capture.image_keys if key not in made_here]
+                known[capture.name] = _Held(capture, stored, made_here, capture.lidars)
+        if captures and not known:
+            captures[0].image_keys  # noqa: B018  raises what is wrong with it
+        every = list(known.values())
+        images = sorted({key for each in every for key in each.images})
+        events = sorted({key for each in every for key in each.events} - set(images))
+        lidars = sorted({lidar for each in every for lidar in each.lidars})
+        return [known.get(capture.name, _Held(capture, images, events, lidars)) for capture in captures]
+
+    def image(self, capture: Capture, camera: str, channel: str) -> ImageDetection:
+        """Find the board in a picture that the capture holds."""
+
+        def find() -> ImageDetection:
+            try:
+                return detect_image(self._session.rig, capture.image(camera, channel))
+            except ProfileError as error:
+                return Refusal("image", error.what, error.hint)
+
+        found: ImageDetection = self._remembered(self._digest, capture, f"{camera}.{channel}", find)
+        return found
+
+    def scan(self, capture: Capture, lidar: str) -> LidarDetection:
+        """Find the surfaces of the board's size in a scan."""
+
+        def find() -> LidarDetection:
+            return detect_scan(self._session.rig, capture.scan(lidar))
+
+        found: LidarDetection = self._remembered(self._digest, capture, lidar, find)
+        return found
+
+    def events(
+        self, capture: Capture, camera: str, channel: str, *, scans: Mapping[str, LidarDetection]
+    ) -> ImageDetection:
+        """Find the board in raw events, and keep the picture it was found in."""
+        digest = self._event_digest(camera, channel)
+
+        def find() -> ImageDetection:
+            seen = see_events(self._session, capture, camera, channel, scans, self._event_image)
+            self._keep(_cache_key(digest, capture, f"{camera}.{channel}.picture"), seen.picture)
+            return seen.board
+
+        found: ImageDetection = self._remembered(digest, capture, f"{camera}.{channel}", find)
+        return found
+
+    def picture(
+        self, capture: Capture, camera: str, channel: str, *, scans: Mapping[str, LidarDetection]
+    ) -> Image | Refusal:
+        """Give the picture that raw events were seen through."""
+
+        def find() -> Image | Refusal:
+            seen = see_events(self._session, capture, camera, channel, scans, self._event_image)
+            return seen.picture
+
+        digest = self._event_digest(camera, channel)
+        found: Image | Refusal = self._remembered(digest, capture, f"{camera}.{channel}.picture", find)
+        return found
+
+    def _event_digest(self, camera: str, channel: str) -> str:
+        if (camera, channel) not in self._event_digests:
+            self._event_digests[camera, channel] = event_digest(
+                self._session, camera, channel, self._event_image, self._digest
+            )
+        return self._event_digests[camera, channel]
+
+    def _remembered(
+        self,
+        digest: str,
+        capture: Capture,
+        sensor: str,
+        find: Callable[[], ImageDetection | LidarDetection | Image],
+    ) -> Any:
+        """Look a detection up in the session's cache, or make and keep it; a damaged sample is a refusal."""
         try:
-            return detect_image(session.rig, capture.image(camera, channel))
-        except ProfileError as error:
-            return Refusal("image", error.what, error.hint)
+            capture.check()
+            key = _cache_key(digest, capture, sensor)
+            cached = self._session.load_cached(key)
+            if cached is not None:
+                with suppress(ValueError):
+                    return from_arrays(cached.arrays)
+            detection = find()
+        except SessionError as error:
+            return Refusal("read", error.what, error.hint or "collect this placement again")
+        self._keep(key, detection)
+        return detection
 
-    found: ImageDetection = _remembered(session, digest, capture, f"{camera}.{channel}", find)
-    return found
+    def _keep(self, key: str, detection: ImageDetection | LidarDetection | Image) -> None:
+        self._session.store_cached(key, to_arrays(detection), {})
 
 
-def _scan_detection(session: Session, digest: str, capture: Capture, lidar: str) -> LidarDetection:
-    def find() -> LidarDetection:
-        return detect_scan(session.rig, capture.scan(lidar))
-
-    found: LidarDetection = _remembered(session, digest, capture, lidar, find)
-    return found
-
-
-def _remembered(
-    session: Session,
-    digest: str,
-    capture: Capture,
-    sensor: str,
-    find: Callable[[], ImageDetection | LidarDetection],
-) -> Any:
-    """Look a detection up in the session's cache, or make and keep it; a damaged sample is a refusal."""
-    try:
-        capture.check()
-        # The content is part of the key: a capture may be removed and another take its name.
-        key = f"{digest}/{capture.name}-{capture.content_sha256[:12]}.{sensor}"
-        cached = session.load_cached(key)
-        if cached is not None:
-            with suppress(ValueError):
-                return from_arrays(cached.arrays)
-        detection = find()
-    except SessionError as error:
-        return Refusal("read", error.what, error.hint or "collect this placement again")
-    session.store_cached(key, to_arrays(detection), {})
-    return detection
+def _cache_key(digest: str, capture: Capture, sensor: str) -> str:
+    # Samples and stamps are part of the key: a capture may be removed and another take its name.
+    return f"{digest}/{capture.name}-{capture.manifest_sha256[:12]}.{sensor}"
 
 
 def detect_image(rig: Rig, image: Image) -> ImageDetection:
-    """Find the board in one picture."""
+    """Find the board in one picture, of a camera or made from events by others."""
     from lce_rig.detect.image_board import find_image_board
 
-    found = find_image_board(
-        image,
-        rig.board.to_board(),
-        rig.cameras[image.sensor].to_intrinsics(),
-        max_reprojection_px=rig.quality.max_reprojection_px,
-    )
-    return found if isinstance(found, Refusal) else gate_image_board(found, rig.quality)
+    camera, limits, board = rig.cameras[image.sensor], rig.quality, rig.board.to_board()
+    channel = camera.channels.get(image.channel)
+    if channel is not None and channel.kind == "events":
+        found = find_in_reconstruction(image, board, camera.to_intrinsics(), limits)
+    else:
+        found = find_image_board(
+            image, board, camera.to_intrinsics(), max_reprojection_px=limits.max_reprojection_px
+        )
+    if isinstance(found, Refusal):
+        return found
+    return gate_image_board(replace(found, stamp_ns=image.stamp_ns), limits)
 
 
 def detect_scan(rig: Rig, scan: Scan) -> LidarDetection:
@@ -136,14 +251,18 @@ def detect_scan(rig: Rig, scan: Scan) -> LidarDetection:
         max_rms_m=limits.max_thickness_m,
         beam=Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad),
     )
-    return found if isinstance(found, Refusal) else gate_lidar_boards(found, board, limits)
+    if isinstance(found, Refusal):
+        return found
+    return gate_lidar_boards([replace(each, stamp_ns=scan.stamp_ns) for each in found], board, limits)
 
 
 def _detection_digest(rig: Rig) -> str:
     """Name the cache after everything a detection depends on beside the capture: the profile and the code."""
     digest = hashlib.sha256(rig.model_dump_json(include={"board", "cameras", "lidars", "quality"}).encode())
     package = Path(__file__).parents[1]
-    for folder in ("core", "detect", "solvers"):
-        for source in sorted((package / folder).glob("*.py")):
-            digest.update(source.read_bytes())
+    sources = [
+        source for folder in ("core", "detect", "solvers") for source in (package / folder).rglob("*.py")
+    ]
+    for source in sorted([*sources, Path(__file__), Path(__file__).with_name("event_detection.py")]):
+        digest.update(source.read_bytes())
     return digest.hexdigest()[:12]

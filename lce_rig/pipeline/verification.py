@@ -1,20 +1,22 @@
 """Pictures and residuals: an extrinsic held against captures, and what each sensor saw."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
-from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError
-from lce_rig.core.results import Calibration
+from lce_rig.core.results import Calibration, Refusal
 from lce_rig.detect.detection import Detections, Pair
-from lce_rig.pipeline.calibration import CALIBRATION, OVERLAYS
+from lce_rig.detect.event_board import EventImage
+from lce_rig.pipeline.calibration import CALIBRATION, OVERLAYS, clocks_of
+from lce_rig.pipeline.detection import event_picture
+from lce_rig.pipeline.event_detection import event_channels
 from lce_rig.pipeline.progress import Progress, silent
-from lce_rig.session import Session
+from lce_rig.session import Capture, Session
+from lce_rig.verify.event_picture import CameraView
 from lce_rig.verify.session_check import SessionCheck, check_session
 
 DEBUG = "debug"
-Sample = TypeVar("Sample", Image, Scan)
 
 
 def verify(
@@ -22,6 +24,7 @@ def verify(
     detections: Detections,
     calibrations: Sequence[Calibration],
     *,
+    event_image: EventImage | None = None,
     folder: Path | None = None,
     progress: Progress = silent,
 ) -> list[SessionCheck]:
@@ -31,25 +34,62 @@ def verify(
         session: may be another one than the calibrations come from.
         detections: of this session.
         calibrations: as a rule from its result.json.
+        event_image: as the detections were made.
         folder: for the pictures; the session's calibration/overlays/ where None. Several pairs get a
             folder each.
         progress: called with (done, total) for each pair in turn.
+
+    Raises:
+        SessionError: the session has no captures of a calibration's sensors.
     """
     base = folder or session.path / CALIBRATION / OVERLAYS
+    jobs = [(c, pair) for c in calibrations for pair in _pairs_held(session, detections, c)]
     checks = []
-    for c in calibrations:
-        own = base if len(calibrations) == 1 else base / Pair.of(c).folder_name
-        checks.append(check_session(session, detections, c, own, progress))
+    for c, pair in jobs:
+        checks.append(
+            check_session(
+                session,
+                detections,
+                c,
+                pair.channel,
+                base if len(jobs) == 1 else base / pair.folder_name,
+                clocks=clocks_of(session.rig, pair.camera, pair.lidar),
+                view_of=partial(_view, session, pair.camera, pair.channel, event_image),
+                progress=progress,
+            )
+        )
     return checks
 
 
+def _pairs_held(session: Session, detections: Detections, calibration: Calibration) -> list[Pair]:
+    """Name those pairs behind a calibration that the session holds captures of."""
+    pairs = [Pair(calibration.camera, channel, calibration.lidar) for channel in sorted(calibration.channels)]
+    held = [pair for pair in pairs if pair in detections.pairs]
+    if not held:
+        hint = "The result belongs to another session."
+        raise SessionError(f"{session.path} holds no captures of {Pair.of(calibration)}", hint)
+    return held
+
+
 def write_debug_images(
-    session: Session, detections: Detections, *, folder: Path | None = None, progress: Progress = silent
+    session: Session,
+    detections: Detections,
+    *,
+    event_image: EventImage | None = None,
+    folder: Path | None = None,
+    progress: Progress = silent,
 ) -> Path:
     """Draw for every capture what each sensor saw of the board, and why it was refused.
 
+    Args:
+        session: whose captures are drawn.
+        detections: of the session.
+        event_image: as the detections were made.
+        folder: for the pictures; the session's debug/ where None.
+        progress: called with (done, total).
+
     Returns:
-        The folder of the pictures; the session's debug/ by default.
+        The folder of the pictures.
     """
     from lce_rig.verify.debug_image import draw_debug
     from lce_rig.verify.writing import write_picture
@@ -58,14 +98,21 @@ def write_debug_images(
     jobs = [(pair, name) for pair in detections.pairs for name in detections.captures(pair)]
     for done, (pair, name) in enumerate(jobs, start=1):
         capture, (image, lidar) = session.capture(name), detections.of(pair, name)
+        view = _view(session, pair.camera, pair.channel, event_image, capture)
+        try:
+            scan = capture.scan(pair.lidar)
+        except SessionError:
+            # It is damaged, as its detection says.
+            scan = None
         picture = draw_debug(
-            _readable(capture.image, pair.camera, pair.channel),
-            _readable(capture.scan, pair.lidar),
+            None if view is None else view.image,
+            scan,
             image,
             lidar,
             board=session.rig.board.to_board(),
             intrinsics=session.rig.cameras[pair.camera].to_intrinsics(),
             title=f"{pair}  {name}",
+            events=None if view is None else view.events,
         )
         own = base if len(detections.pairs) == 1 else base / pair.folder_name
         write_picture(own / f"{name}.png", picture)
@@ -73,9 +120,14 @@ def write_debug_images(
     return base
 
 
-def _readable(read: Callable[..., Sample], *sensor: str) -> Sample | None:
-    """Read a sample; None where it is damaged, as its detection says."""
+def _view(
+    session: Session, camera: str, channel: str, event_image: EventImage | None, capture: Capture
+) -> CameraView | None:
+    """Give what a camera saw; None where it is damaged, or events gave no picture, as its detection says."""
     try:
-        return read(*sensor)
+        if (camera, channel) not in event_channels(session.rig, capture, event_image):
+            return CameraView(capture.image(camera, channel))
+        picture = event_picture(session, capture, camera, channel, event_image)
+        return None if isinstance(picture, Refusal) else CameraView.of_events(picture, capture.events(camera))
     except SessionError:
         return None

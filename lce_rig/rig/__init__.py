@@ -5,14 +5,17 @@ from lce_rig.rig.editing import derive_text, set_value
 from lce_rig.rig.extrinsics import NominalExtrinsic
 from lce_rig.rig.loading import dump_rig, find_profile, load_rig, parse_rig, shipped_profiles
 from lce_rig.rig.profile import Rig
+from lce_rig.rig.reconstruction import ReconstructionSettings
 from lce_rig.rig.sensors import (
     CameraSettings,
     ChannelSettings,
     DriverSettings,
+    FrameTimingSettings,
     IntrinsicsSettings,
     LidarSettings,
     TimestampSettings,
 )
+from lce_rig.rig.sync import SyncSettings, TriggerSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings
 
 __all__ = [
@@ -21,12 +24,16 @@ __all__ = [
     "CameraSettings",
     "ChannelSettings",
     "DriverSettings",
+    "FrameTimingSettings",
     "IntrinsicsSettings",
     "LidarSettings",
     "NominalExtrinsic",
     "QualitySettings",
+    "ReconstructionSettings",
     "Rig",
+    "SyncSettings",
     "TimestampSettings",
+    "TriggerSettings",
     "derive_text",
     "dump_rig",
     "find_profile",

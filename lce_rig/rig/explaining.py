@@ -3,6 +3,7 @@
 import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from types import UnionType
 from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
@@ -101,13 +102,22 @@ def valid_keys(path: KeyPath) -> list[str]:
         annotation = model.model_fields[key].annotation if key in model.model_fields else None
         model = _model_within(annotation)
         # The names of sensors and the places in lists lie between a block and its settings.
-        if parts and not _is_model(annotation):
+        if parts and not _is_block(annotation):
             parts.pop(0)
     return list(model.model_fields) if model is not None else []
 
 
 def _is_model(annotation: Any) -> bool:
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _is_block(annotation: Any) -> bool:
+    """Tell a block of settings, optional or not, from many by name or in a list."""
+    return _is_model(annotation) or any(_is_model(argument) for argument in _members(annotation))
+
+
+def _members(annotation: Any) -> tuple[Any, ...]:
+    return get_args(annotation) if isinstance(annotation, UnionType) else ()
 
 
 def _model_within(annotation: Any) -> type[BaseModel] | None:
@@ -125,5 +135,5 @@ def all_keys(model: type[BaseModel] = Rig, block: str = "") -> Iterator[tuple[st
         yield block, key
         inner = _model_within(field.annotation)
         if inner is not None:
-            name = "" if _is_model(field.annotation) else ".*"
+            name = "" if _is_block(field.annotation) else ".*"
             yield from all_keys(inner, f"{block}.{key}{name}".removeprefix("."))

@@ -51,7 +51,7 @@ def find_profile(name_or_path: str | Path) -> Path:
 
 
 def load_rig(name_or_path: str | Path) -> Rig:
-    """Load the profile of a rig.
+    """Load the profile of a rig; paths in it become absolute.
 
     Args:
         name_or_path: name of a shipped profile ("rlfs") or path of a YAML file.
@@ -66,7 +66,7 @@ def load_rig(name_or_path: str | Path) -> Rig:
         raise ProfileError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ProfileError(f"{path}: is not UTF-8 text (byte {error.start})") from error
-    return parse_rig(text, str(path))
+    return parse_rig(text, str(path)).located(path.parent)
 
 
 def parse_rig(text: str, source: str = "profile") -> Rig:

@@ -1,6 +1,7 @@
 """The whole profile of a rig: start reading the schema here."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -9,6 +10,7 @@ from lce_rig.rig.board import BoardSettings
 from lce_rig.rig.extrinsics import NominalExtrinsic
 from lce_rig.rig.sensors import CameraSettings, LidarSettings
 from lce_rig.rig.settings import FrameName, Name, RigName, Settings, problem
+from lce_rig.rig.sync import SyncSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings
 
 
@@ -23,6 +25,7 @@ class Rig(Settings):
         lidars: settings by the LiDAR's name.
         cameras: settings by the camera's name.
         nominal_extrinsics: what the CAD model says, a sanity check only.
+        sync: the board that makes the pulse per second and triggers cameras; None without.
     """
 
     format_version: Literal[1]
@@ -33,6 +36,7 @@ class Rig(Settings):
     lidars: Annotated[dict[Name, LidarSettings], Field(min_length=1)]
     cameras: Annotated[dict[Name, CameraSettings], Field(min_length=1)]
     nominal_extrinsics: tuple[NominalExtrinsic, ...] = ()
+    sync: SyncSettings | None = None
     quality: QualitySettings = QualitySettings()
     calibration: CalibrationSettings = CalibrationSettings()
 
@@ -68,12 +72,25 @@ class Rig(Settings):
             seen.add((entry.camera, entry.lidar))
         return self
 
+    @model_validator(mode="after")
+    def _triggered_cameras_are_known(self) -> "Rig":
+        for name in self.sync.triggers if self.sync else ():
+            if name not in self.cameras:
+                what = f"no camera is called {name}; there is {', '.join(self.cameras)}"
+                raise problem(what, f"sync.triggers.{name}")
+        return self
+
     def _frames(self) -> Iterator[tuple[str, str]]:
         for name, lidar in self.lidars.items():
             yield f"lidars.{name}.frame", lidar.frame
         for name, camera in self.cameras.items():
             yield f"cameras.{name}.frame", camera.frame
             yield f"cameras.{name}.optical_frame", camera.optical_frame
+
+    def located(self, folder: Path) -> "Rig":
+        """Make the paths in a profile absolute; relative ones start at the folder its file lies in."""
+        cameras = {name: camera.located(folder) for name, camera in self.cameras.items()}
+        return self.model_copy(update={"cameras": cameras})
 
     def doubts(self) -> list[str]:
         """List what is allowed but rarely meant, as sentences with their key."""

@@ -1,10 +1,12 @@
 """The sensors' blocks of a profile: LiDARs, cameras, their channels, drivers and clocks."""
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from lce_rig.core.camera import Intrinsics
+from lce_rig.rig.reconstruction import ReconstructionSettings
 from lce_rig.rig.settings import FrameName, Name, NotNegative, Positive, Settings, TopicName, problem
 
 # Beyond this the figure is in millimetres, or the sensor is broken.
@@ -31,19 +33,47 @@ class TimestampSettings(Settings):
     tolerance_s: Annotated[float, Field(gt=0, le=60)] = 0.05
 
 
+class FrameTimingSettings(Settings):
+    """What the kernel's stamp of a picture means, where the camera's driver does not say, or says wrong.
+
+    Attributes:
+        clock: the clock that stamps pictures; "auto" tries which one fits.
+        mark: the moment that is stamped; "auto" believes the driver's flags.
+        exposure_us: how long a row is exposed; None asks the camera.
+        line_time_us: time between rows of a rolling shutter; 0 for a global one.
+        trigger_delay_us: from the trigger's edge to the start of the first row's exposure.
+    """
+
+    clock: Literal["auto", "monotonic", "monotonic_raw", "tsc", "boottime", "realtime"] = "auto"
+    mark: Literal["auto", "start_of_exposure", "start_of_frame", "end_of_frame", "trigger"] = "auto"
+    exposure_us: Positive | None = None
+    line_time_us: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    trigger_delay_us: NotNegative = 0.0
+
+
 class DriverSettings(Settings):
     """How a live sensor is reached.
 
     Attributes:
+        type: which of the program's drivers; None takes the one that goes with the model.
         port: UDP port of a networked sensor.
         address: IP address of a networked sensor.
         device: device file or serial number of an attached sensor.
+        command: program and arguments whose standard output is the camera's pictures.
+        pixel_format: four characters of the wanted pixel format ("UYVY"); None takes the camera's first.
+        frame_rate_hz: wanted pictures a second; None leaves the camera's own.
+        frame_timing: what a picture's stamp means.
         controls: settings handed to the driver as they are.
     """
 
+    type: Name | None = None
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
     address: str | None = None
     device: str | None = None
+    command: tuple[str, ...] = ()
+    pixel_format: str | None = None
+    frame_rate_hz: Positive | None = None
+    frame_timing: FrameTimingSettings = FrameTimingSettings()
     controls: dict[str, bool | int | float | str] = Field(default_factory=dict)
 
 
@@ -117,11 +147,13 @@ class ChannelSettings(Settings):
     Attributes:
         kind: "frames", or "events" and the pictures reconstructed from them.
         topic: topic of its pictures or events in bags.
+        reconstruction: how pictures are made from events; None for the shipped network.
     """
 
     kind: Literal["frames", "events"] = "frames"
     topic: TopicName | None = None
     timestamps: TimestampSettings = TimestampSettings(reference="mid_exposure")
+    reconstruction: ReconstructionSettings | None = None
 
     @model_validator(mode="after")
     def _has_a_camera_reference(self) -> "ChannelSettings":
@@ -129,6 +161,18 @@ class ChannelSettings(Settings):
             what = f"{self.timestamps.reference} belongs to a LiDAR; a camera has start or mid_exposure"
             raise problem(what, "timestamps.reference")
         return self
+
+    @model_validator(mode="after")
+    def _only_events_are_reconstructed(self) -> "ChannelSettings":
+        if self.reconstruction is not None and self.kind != "events":
+            raise problem("belongs to a channel of kind events", "reconstruction")
+        return self
+
+    def located(self, folder: Path) -> "ChannelSettings":
+        """Make paths absolute; relative ones start at the profile's folder."""
+        if self.reconstruction is None:
+            return self
+        return self.model_copy(update={"reconstruction": self.reconstruction.located(folder)})
 
 
 class CameraSettings(Settings):
@@ -180,6 +224,11 @@ class CameraSettings(Settings):
     def _other_resolution(self) -> str:
         width, height = round(2 * self.intrinsics.cx_px), round(2 * self.intrinsics.cy_px)
         return f"; were the intrinsics measured at another resolution (about {width}x{height})?"
+
+    def located(self, folder: Path) -> "CameraSettings":
+        """Make paths absolute; relative ones start at the profile's folder."""
+        channels = {name: channel.located(folder) for name, channel in self.channels.items()}
+        return self.model_copy(update={"channels": channels})
 
     def to_intrinsics(self) -> Intrinsics:
         """Build the camera model as the algorithms know it."""

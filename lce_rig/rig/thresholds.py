@@ -25,6 +25,12 @@ class QualitySettings(Settings):
         min_distance_m: nearest board.
         max_distance_m: farthest board.
         max_motion_m: how far the board may move while it counts as still.
+        min_events_px: fewest events on the board in a second, per pixel of it.
+        min_event_contrast: least difference of black and white in a picture made from events, grey values.
+        min_event_sharpness: fewest widths of an edge in a square of such a picture.
+        max_board_speed_mps: fastest board that events may show.
+        max_turn_deg_s: fastest turn of such a board.
+        max_smear_m: how far such a board may move while the LiDAR sweeps it.
         min_captures: fewer captures make no calibration.
         min_detected_fraction: a smaller share of captures with the board found is marginal.
         max_mpe_m: largest mean distance of LiDAR points from the camera's board plane.
@@ -43,6 +49,12 @@ class QualitySettings(Settings):
     min_distance_m: NotNegative = 0.8
     max_distance_m: Positive = 6.0
     max_motion_m: Positive = 0.01
+    min_events_px: NotNegative = 1.0
+    min_event_contrast: NotNegative = 20.0
+    min_event_sharpness: NotNegative = 1.5
+    max_board_speed_mps: Positive = 0.5
+    max_turn_deg_s: Positive = 60.0
+    max_smear_m: Positive = 0.01
     min_captures: Annotated[int, Field(ge=3)] = 6
     min_detected_fraction: Fraction = 0.5
     max_mpe_m: Positive = 0.03

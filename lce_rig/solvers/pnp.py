@@ -74,19 +74,34 @@ def solve_planar_pose(corners_px: Array, corners_board: Array, intrinsics: Intri
     if not np.isfinite(cost):
         return None
 
-    _, J = _residuals_and_jacobian(T, corners_px, corners_board, intrinsics)
     n = len(corners_px)
     variance = max(cost / max(2 * n - 6, 1), 1e-12)
+    sigma_px = float(np.sqrt(variance))
     is_same = bool(rotation_angle(T[:3, :3], T_other[:3, :3]) < _SAME_POSE_RAD)
     has_other = np.isfinite(cost_other) and not is_same
     return PlanarPose(
         T_cam_board=T,
-        cov=variance * np.linalg.inv(J.T @ J),
+        cov=pose_covariance(T, corners_board, intrinsics, sigma_px),
         T_cam_board_alternative=T_other if has_other else None,
         chi2_gap=float((cost_other - cost) / variance) if has_other else float("inf"),
         reprojection_px=float(np.sqrt(cost / n)),
-        sigma_px=float(np.sqrt(variance)),
+        sigma_px=sigma_px,
     )
+
+
+def pose_covariance(
+    T_cam_board: Array, corners_board: Array, intrinsics: Intrinsics, sigma_px: float
+) -> Array:
+    """Compute the covariance (6, 6) of a pose, sigma^2 (J^T J)^-1, tangent (translation m, rotation rad).
+
+    Args:
+        T_cam_board: (4, 4).
+        corners_board: (N, 3) frame board, m.
+        intrinsics: the camera.
+        sigma_px: noise of a corner per coordinate.
+    """
+    _, J = _residuals_and_jacobian(T_cam_board, np.zeros((len(corners_board), 2)), corners_board, intrinsics)
+    return np.asarray(sigma_px**2 * np.linalg.inv(J.T @ J))
 
 
 def refine_pose(

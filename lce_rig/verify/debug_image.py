@@ -6,17 +6,19 @@ import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.detect.event_figures import outline_px
 from lce_rig.verify import canvas
 from lce_rig.verify.canvas import BLACK, BLUE, FAINT, INK, MAGENTA, ORANGE, WHITE, Picture
+from lce_rig.verify.event_picture import draw_event_key, draw_events
 from lce_rig.verify.overlay import draw_image_board, range_limits
 
 _PANE_PX = 800
 _PANORAMA_PX = 190
 _TEXT_PX = 12
-_REPORT_PX = 168
+_REPORT_PX = 190
 
 # Figures worth reading beside a picture, in this order, with how to write them.
 _IMAGE_FIGURES = {
@@ -27,6 +29,11 @@ _IMAGE_FIGURES = {
     "sharpness": "sharpness {:.1f}",
     "contrast": "contrast {:.0f}",
     "border_px": "{:.0f} px to the border",
+    "events_px_s": "{:.1f} events/px/s",
+    "events_px": "{:.1f} events/px in 1 s",
+    "speed_mps": "speed {:.2f} m/s",
+    "turn_deg_s": "turns {:.0f} deg/s",
+    "smear_m": "swept over {:.1f} mm",
 }
 _LIDAR_FIGURES = {
     "distance_m": "distance {:.2f} m",
@@ -49,6 +56,7 @@ def draw_debug(
     intrinsics: Intrinsics,
     title: str,
     chosen: int = 0,
+    events: Events | None = None,
 ) -> Picture:
     """Draw the camera's picture beside three views of the scan, with figures or cause and action below.
 
@@ -61,6 +69,7 @@ def draw_debug(
         intrinsics: the camera.
         title: one line above.
         chosen: which candidate is used; it is the one drawn enlarged.
+        events: those that shortly precede a picture made of events; they are drawn below it, over it.
 
     Returns:
         (H, 1600, 3) uint8 BGR.
@@ -79,8 +88,13 @@ def draw_debug(
     right = np.vstack([_panorama(points, candidates, chosen, limits_m, _PANE_PX), views])
     strip = canvas.panel(2 * _PANE_PX, 34)
     canvas.draw_text(strip, title, 14, 23, 13, INK)
-    reports = np.hstack([_image_report(image_result), _lidar_report(lidar_result, chosen)])
-    return np.vstack([strip, np.hstack([left, right]), reports])
+    reports = [_image_report(image_result), _lidar_report(lidar_result, chosen)]
+    above = np.hstack([left, right])
+    if image is None or events is None:
+        return np.vstack([strip, above, np.hstack(reports)])
+    below = _event_pane(image, events, image_result, board, intrinsics, left.shape[0])
+    filler = canvas.panel(_PANE_PX, left.shape[0] - 2 * _REPORT_PX)
+    return np.vstack([strip, above, np.hstack([below, np.vstack([*reports, filler])])])
 
 
 def _camera_pane(
@@ -95,6 +109,33 @@ def _camera_pane(
         draw_image_board(picture, factor, result, board, intrinsics)
         _draw_axes(picture, factor, result, board)
     return canvas.fitted(picture, _PANE_PX, height_px, BLACK)
+
+
+def _event_pane(
+    image: Image,
+    events: Events,
+    result: ImageBoard | Refusal,
+    board: Board,
+    intrinsics: Intrinsics,
+    height_px: int,
+) -> Picture:
+    """Draw recent events over the picture, and the way of the board while it was followed."""
+    picture, factor = draw_events(image, events)
+    if isinstance(result, ImageBoard):
+        poses = [result.T_cam_board]
+        if result.track_T_cam_board is not None:
+            poses = [result.track_T_cam_board[0], result.track_T_cam_board[-1], *poses]
+        for T_cam_board, colour in zip(
+            poses, ((110, 110, 110), (170, 170, 170), WHITE)[-len(poses) :], strict=True
+        ):
+            pixels = (outline_px(T_cam_board, board, intrinsics) + 0.5) * factor - 0.5
+            canvas.draw_line(picture, pixels, colour, 1, None)
+    pane = canvas.fitted(picture, _PANE_PX, height_px, BLACK)
+    pane[:24] = BLACK
+    draw_event_key(pane, events, 8, 16, 10)
+    if isinstance(result, ImageBoard) and result.track_ns is not None:
+        canvas.draw_text(pane, "grey: where it was followed from, and to", _PANE_PX - 8, 16, 10, FAINT, 1.0)
+    return pane
 
 
 def _draw_axes(picture: Picture, factor: int, found: ImageBoard, board: Board) -> None:

@@ -7,11 +7,13 @@ from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.detect.event_figures import outline_px
 from lce_rig.verify import canvas
 from lce_rig.verify.canvas import BLACK, FAINT, INK, MAGENTA, ORANGE, WHITE, Picture
+from lce_rig.verify.event_picture import draw_event_key, draw_events
 
 _FOLD_MARGIN = 0.9
 
@@ -27,6 +29,7 @@ def draw_overlay(
     board: Board,
     residuals: Mapping[str, float | str],
     title: str,
+    events: Events | None = None,
 ) -> Picture:
     """Draw a whole scan coloured by range into the picture, and what both sensors say of the board.
 
@@ -43,6 +46,8 @@ def draw_overlay(
         board: the board, for its outline.
         residuals: figures by name with unit, such as {"plane (mm)": 4.2}, in the order to be shown.
         title: one line above the picture.
+        events: those that shortly precede a picture made of events; drawn below it with the board's ring ends
+            and outline.
 
     Returns:
         (H, W, 3) uint8 BGR, with a strip above and a legend below the picture.
@@ -58,15 +63,33 @@ def draw_overlay(
         canvas.draw_discs(picture, on_board, MAGENTA, 1.9 * unit, WHITE)
         ends = _to_picture(lidar_board.edge_points, T_cam_lidar, intrinsics, factor)[0]
         canvas.draw_diamonds(picture, ends, ORANGE, 4.2 * unit)
-    return np.vstack(
-        [
-            _title_strip(title, picture.shape[1]),
-            picture,
-            _legend(
-                picture.shape[1], (low_m, high_m), residuals, lidar_board is not None, image_board is not None
-            ),
-        ]
-    )
+    width_px, has_lidar, has_image = picture.shape[1], lidar_board is not None, image_board is not None
+    legend = _legend(width_px, (low_m, high_m), residuals, has_lidar, has_image)
+    parts = [_title_strip(title, width_px), picture, legend]
+    if events is not None:
+        ends = np.zeros((0, 3)) if lidar_board is None else lidar_board.edge_points
+        ends = _to_picture(ends, T_cam_lidar, intrinsics, factor)[0]
+        parts.append(_event_picture(image, events, ends, image_board, board, intrinsics))
+    return np.vstack(parts)
+
+
+def _event_picture(
+    image: Image,
+    events: Events,
+    ends: Array,
+    image_board: ImageBoard | None,
+    board: Board,
+    intrinsics: Intrinsics,
+) -> Picture:
+    """Draw recent events with the LiDAR's ring ends (M, 2) px: a board's border makes events."""
+    picture, factor = draw_events(image, events)
+    unit = picture.shape[1] / 1000
+    if image_board is not None:
+        _draw_outline(picture, factor, image_board, board, intrinsics)
+    canvas.draw_diamonds(picture, ends, ORANGE, 4.2 * unit)
+    strip = canvas.panel(picture.shape[1], round(28 * unit))
+    draw_event_key(strip, events, 13 * unit, 20 * unit, 11 * unit)
+    return np.vstack([strip, picture])
 
 
 def camera_part(overlay: Picture, image: Image) -> Picture:
@@ -89,14 +112,18 @@ def draw_image_board(
     picture: Picture, factor: int, image_board: ImageBoard, board: Board, intrinsics: Intrinsics
 ) -> None:
     """Draw the board's outline at T_cam_board, bent as the lens bends it, and the corners as measured."""
-    corners = board.outline()
-    along = np.linspace(0, 1, 24)[:, None]
-    edges = [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
-    pixels, _ = intrinsics.project(transform(image_board.T_cam_board, np.concatenate(edges)))
+    _draw_outline(picture, factor, image_board, board, intrinsics)
     unit = picture.shape[1] / 1000
-    canvas.draw_line(picture, (pixels + 0.5) * factor - 0.5, WHITE, max(1, round(2 * unit)))
     at = (image_board.corners_px + 0.5) * factor - 0.5
     canvas.draw_discs(picture, at, WHITE, 1.6 * unit, BLACK)
+
+
+def _draw_outline(
+    picture: Picture, factor: int, image_board: ImageBoard, board: Board, intrinsics: Intrinsics
+) -> None:
+    pixels = outline_px(image_board.T_cam_board, board, intrinsics)
+    width_px = max(1, round(2e-3 * picture.shape[1]))
+    canvas.draw_line(picture, (pixels + 0.5) * factor - 0.5, WHITE, width_px)
 
 
 def _to_picture(

@@ -1,21 +1,27 @@
 """An extrinsic held against every capture of a session: residuals, one picture each, one sheet for all."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from lce_rig.calibrate import Clocks
 from lce_rig.calibrate.estimate import CaptureResidual
 from lce_rig.calibrate.matching import match_candidates
 from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.calibrate.options import CaptureCandidates
 from lce_rig.calibrate.verdict import residuals_beyond
+from lce_rig.core.data import Scan
 from lce_rig.core.errors import SessionError
-from lce_rig.core.results import Calibration, ImageBoard, Metrics, Observation
+from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, Metrics, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.verify.canvas import Picture
+from lce_rig.verify.event_picture import CameraView
+from lce_rig.verify.moving import Meeting, bring_together
 from lce_rig.verify.overlay import camera_part, draw_overlay
 from lce_rig.verify.writing import write_overlays
 
@@ -71,52 +77,62 @@ def check_session(
     session: Session,
     detections: Detections,
     calibration: Calibration,
+    channel: str,
     folder: Path,
+    *,
+    clocks: Clocks,
+    view_of: Callable[[Capture], CameraView | None],
     progress: Progress,
 ) -> SessionCheck:
-    """Measure and draw how an extrinsic fits every capture that both sensors have samples of.
+    """Measure and draw how an extrinsic fits what one channel and the LiDAR saw in every capture.
+
+    Boards are brought to the time at which the LiDAR saw them, where the calibration did so.
 
     Args:
         session: whose captures are looked at; the calibration may come from another of the same rig.
         detections: of the session.
         calibration: the extrinsic.
+        channel: of the calibration's channels.
         folder: receives `<capture>.png` and `contact_sheet.png`.
+        clocks: what the profile says of the two sensors' times.
+        view_of: gives the channel's picture in a capture; None where it cannot be read.
         progress: called with (done, total).
 
     Raises:
-        SessionError: the session has no such sensors, or a picture cannot be written.
+        SessionError: a picture cannot be written.
     """
-    pair = Pair.of(calibration)
-    if pair not in detections.pairs:
-        hint = "The result belongs to another session."
-        raise SessionError(f"{session.path} holds no captures of {pair}", hint)
+    pair = Pair(calibration.camera, channel, calibration.lidar)
     board = session.rig.board.to_board()
-    residuals: list[CaptureResidual] = []
+    meetings = _meetings(session.rig, detections, channel, calibration, clocks)
+    residuals = {
+        name: capture_residual(calibration.T_cam_lidar, meeting.at_sweep, board)
+        for name, meeting in meetings.items()
+    }
 
     def overlays() -> Iterator[tuple[str, Picture, Picture]]:
         names = detections.captures(pair)
         for done, name in enumerate(names, start=1):
-            observation = _observe(session.rig, detections, pair, name, calibration)
-            residual = None
-            if observation is not None:
-                residual = capture_residual(calibration.T_cam_lidar, observation, board)
-                residuals.append(residual)
-            yield from _draw(session.capture(name), session.rig, calibration, observation, residual)
+            capture = session.capture(name)
+            view, (image, _) = view_of(capture), detections.of(pair, name)
+            if view is not None:
+                title = f"{session.rig.name}  {pair}  {name}"
+                meeting = meetings.get(name)
+                legend = _legend(name, residuals.get(name), meeting, calibration)
+                seen = image if isinstance(image, ImageBoard) else None
+                yield from _draw(capture, session.rig, calibration, view, seen, meeting, legend, title)
             progress(done, len(names))
 
     files = write_overlays(folder, overlays())
-    metrics = summarise(residuals) if residuals else None
-    used = calibration.captures_used
-    sheet = files[-1] if files else None
+    metrics = summarise(list(residuals.values())) if residuals else None
     return SessionCheck(
         pair,
         calibration.verdict,
         contradictions(metrics, session.rig),
-        tuple(residuals),
+        tuple(residuals.values()),
         metrics,
-        used,
+        calibration.captures_used,
         tuple(files[:-1]),
-        sheet,
+        files[-1] if files else None,
     )
 
 
@@ -125,6 +141,20 @@ def contradictions(metrics: Metrics | None, rig: Rig) -> tuple[str, ...]:
     if metrics is None:
         return ("no capture shows the board to both sensors",)
     return tuple(residuals_beyond(metrics, rig.quality))
+
+
+def _meetings(
+    rig: Rig, detections: Detections, channel: str, calibration: Calibration, clocks: Clocks
+) -> dict[str, Meeting]:
+    """Bring both sensors' boards together in each capture of a channel in which they agree."""
+    observations = {}
+    for name in calibration.channels:
+        pair = Pair(calibration.camera, name, calibration.lidar)
+        if pair in detections.pairs:
+            captures = detections.captures(pair)
+            found = (_observe(rig, detections, pair, capture, calibration) for capture in captures)
+            observations[name] = [observation for observation in found if observation is not None]
+    return bring_together(observations, channel, calibration, clocks)
 
 
 def _observe(
@@ -141,30 +171,42 @@ def _draw(
     capture: Capture,
     rig: Rig,
     calibration: Calibration,
-    observation: Observation | None,
-    residual: CaptureResidual | None,
+    view: CameraView,
+    seen: ImageBoard | None,
+    meeting: Meeting | None,
+    legend: Mapping[str, float | str],
+    title: str,
 ) -> Iterator[tuple[str, Picture, Picture]]:
-    """Draw one capture; nothing where it cannot be read."""
+    """Draw one capture; nothing where its scan cannot be read."""
     try:
-        image = capture.image(calibration.camera, calibration.channel)
         scan = capture.scan(calibration.lidar)
     except SessionError:
         return
     picture = draw_overlay(
-        image,
-        scan,
+        view.image,
+        scan if meeting is None else _without(scan, meeting.measured.lidar),
         rig.cameras[calibration.camera].to_intrinsics(),
         calibration.T_cam_lidar,
-        lidar_board=None if observation is None else observation.lidar,
-        image_board=None if observation is None else observation.image,
+        lidar_board=None if meeting is None else meeting.in_picture,
+        image_board=seen if meeting is None else meeting.measured.image,
         board=rig.board.to_board(),
-        residuals=_legend(capture.name, residual, calibration),
-        title=f"{rig.name}  {Pair.of(calibration)}  {capture.name}",
+        residuals=legend,
+        title=title,
+        events=view.events,
     )
-    yield capture.name, picture, camera_part(picture, image)
+    yield capture.name, picture, camera_part(picture, view.image)
 
 
-def _legend(name: str, residual: CaptureResidual | None, calibration: Calibration) -> dict[str, float | str]:
+def _without(scan: Scan, lidar: LidarBoard) -> Scan:
+    """Leave out a board's points, which are drawn where they were when the picture was taken."""
+    points, on_board = (np.ascontiguousarray(p, dtype=np.float32) for p in (scan.points, lidar.points))
+    row = np.dtype((np.void, points.dtype.itemsize * 3))
+    return scan.select(~np.isin(points.view(row).ravel(), on_board.view(row).ravel()))
+
+
+def _legend(
+    name: str, residual: CaptureResidual | None, meeting: Meeting | None, calibration: Calibration
+) -> dict[str, float | str]:
     figures: dict[str, float | str] = {}
     if residual is not None:
         figures = {
@@ -172,6 +214,8 @@ def _legend(name: str, residual: CaptureResidual | None, calibration: Calibratio
             "edges (mm)": round(1000 * residual.edge_mean_m, 1),
             "corners (px)": round(residual.reprojection_px, 2),
         }
+    if meeting is not None and meeting.way_m > 0:
+        figures["moved (mm)"] = round(1000 * meeting.way_m, 1)
     refusal = calibration.captures_refused.get(name)
     is_used = name in calibration.captures_used
     figures["capture"] = "used" if is_used else f"refused, {refusal.stage}" if refusal else "not used"

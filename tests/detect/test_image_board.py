@@ -216,7 +216,7 @@ def test_dark_bright_empty_and_blurred_pictures_are_refused_with_their_figures()
 
 def test_an_empty_event_picture_asks_for_motion() -> None:
     grey = np.clip(140 + np.random.default_rng(0).normal(0, 3, (260, 346)), 0, 255).astype(np.uint8)
-    result = find_image_board(picture(grey, "events"), ASYMMETRIC, DAVIS)
+    result = find_image_board(picture(grey, "events"), ASYMMETRIC, DAVIS, is_from_events=True)
     assert isinstance(result, Refusal) and "move the board" in result.action
 
 

@@ -76,6 +76,7 @@ def overlay(camera: Intrinsics, points: Array, **boards: object) -> Picture:
         board=BOARD,
         residuals={"plane (mm)": 4.25, "verdict": "pass"},
         title="capture 000000",
+        events=boards.get("events"),  # type: ignore[arg-type]
     )
 
 

@@ -1,6 +1,6 @@
 """Pictures from events: voxel grids, the recurrent network, the event map, and pictures at any stamp."""
 
-from lce_rig.detect.reconstruct.model import ReconstructionModel
+from lce_rig.detect.reconstruct.model import ReconstructionModel, model_bytes
 from lce_rig.detect.reconstruct.reconstructor import ReconstructionOptions, Reconstructor
 from lce_rig.detect.reconstruct.voxels import event_map, normalise_voxels, voxel_grid
 from lce_rig.detect.reconstruct.windows import WindowOptions
@@ -11,6 +11,7 @@ __all__ = [
     "Reconstructor",
     "WindowOptions",
     "event_map",
+    "model_bytes",
     "normalise_voxels",
     "voxel_grid",
 ]

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Protocol
 
 from lce_rig.core.data import Events
+from lce_rig.detect.reconstruct.intensity import GreyScale, IntensityScale, SignedScale
 from lce_rig.detect.reconstruct.model import ReconstructionModel, States
 from lce_rig.detect.reconstruct.voxels import FloatArray, event_map, normalise_voxels, voxel_grid
 
@@ -18,6 +19,10 @@ class EventImager(Protocol):
 
     def initial_states(self, height_px: int, width_px: int) -> States:
         """Make the states before the first window."""
+        ...
+
+    def grey_scale(self) -> GreyScale:
+        """Make what maps the pictures of one stream to 8 bits."""
         ...
 
     def picture(
@@ -44,6 +49,10 @@ class NetworkImager:
         """Make zero states."""
         return self.model.initial_states(height_px, width_px)
 
+    def grey_scale(self) -> GreyScale:
+        """Follow the intensities' bounds."""
+        return IntensityScale()
+
     def picture(
         self, events: Events, start_ns: int, end_ns: int, states: States
     ) -> tuple[FloatArray, States]:
@@ -60,6 +69,10 @@ class MapImager:
     def initial_states(self, height_px: int, width_px: int) -> States:
         """Nothing is carried over."""
         return ()
+
+    def grey_scale(self) -> GreyScale:
+        """Draw no events as grey."""
+        return SignedScale()
 
     def picture(
         self, events: Events, start_ns: int, end_ns: int, states: States

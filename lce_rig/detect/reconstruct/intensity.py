@@ -1,4 +1,6 @@
-"""From the network's arbitrary intensity scale to 8 bits, without flicker."""
+"""From arbitrary scales to 8 bits, without flicker: intensities of the network, sums of polarities."""
+
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +10,31 @@ from lce_rig.detect.reconstruct.voxels import FloatArray
 _PERCENTILES = (1.0, 99.0)
 # Smallest spread that is stretched to the full range: below it there is noise, not contrast.
 _MIN_SPREAD = 0.05
+
+
+class GreyScale(Protocol):
+    """What maps the pictures of a stream to 8 bits."""
+
+    def follow(self, picture: FloatArray) -> None:
+        """Take the next picture of the stream into account, (H, W)."""
+        ...
+
+    def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
+        """Map (H, W) to uint8."""
+        ...
+
+
+class SignedScale:
+    """Nothing is grey 128, sums of polarities brighter and darker alike, but for the largest twentieth."""
+
+    def follow(self, picture: FloatArray) -> None:
+        """Every map stands for itself."""
+
+    def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
+        """Map (H, W) to uint8."""
+        sums = np.abs(picture[picture != 0])
+        largest = float(np.percentile(sums, 95)) if len(sums) else 1.0
+        return np.asarray(np.clip(np.rint(128 + 127 * picture / largest), 0, 255), dtype=np.uint8)
 
 
 class IntensityScale:

@@ -120,19 +120,34 @@ def _first_line(error: Exception) -> str:
     return next(iter(str(error).splitlines()), type(error).__name__)
 
 
+def model_bytes(path: Path | None) -> bytes:
+    """Read a network's file; None takes the one shipped with the package.
+
+    Raises:
+        ProfileError: there is no such file.
+    """
+    if path is None:
+        return (resources.files("lce_rig") / "models" / "reconstruction.onnx").read_bytes()
+    _require_file(path)
+    return path.read_bytes()
+
+
+def _require_file(path: Path) -> None:
+    if not path.is_file():
+        raise ProfileError(
+            f"reconstruction model {path}: no such file", "leave the key out for the shipped one"
+        )
+
+
 def _load(path: Path | None, name: str, n_threads: int) -> Any:
     try:
         import onnxruntime
     except ImportError as error:
         raise SourceError("onnxruntime is not installed", "pip install onnxruntime") from error
-    if path is None:
-        path_or_bytes: Any = (resources.files("lce_rig") / "models" / "reconstruction.onnx").read_bytes()
-    else:
-        if not path.is_file():
-            raise ProfileError(
-                f"reconstruction model {name}: no such file", "leave the key out for the shipped one"
-            )
-        path_or_bytes = str(path)
+    if path is not None:
+        _require_file(path)
+    # A network whose weights lie in files beside it must be named, not read.
+    path_or_bytes: Any = model_bytes(None) if path is None else str(path)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = n_threads
     options.inter_op_num_threads = 1

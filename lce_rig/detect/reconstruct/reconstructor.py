@@ -14,7 +14,6 @@ from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.results import Refusal
 from lce_rig.detect.reconstruct.filters import NoiseFilter
 from lce_rig.detect.reconstruct.imagers import EventImager, MapImager, NetworkImager
-from lce_rig.detect.reconstruct.intensity import IntensityScale
 from lce_rig.detect.reconstruct.model import States
 from lce_rig.detect.reconstruct.refusals import still_cold, too_early, too_late
 from lce_rig.detect.reconstruct.voxels import FloatArray
@@ -89,9 +88,10 @@ class Reconstructor:
     def reset(self) -> None:
         """Forget the stream."""
         self.n_steps = 0
-        self._scale = IntensityScale()
+        self._scale = self._imager.grey_scale()
         self._share = 1.0
         self._first_ns: int | None = None
+        self._fed_ns: int | None = None
         self._previous: _Window | None = None
         self._current: _Window | None = None
         self._noise = NoiseFilter()
@@ -155,6 +155,24 @@ class Reconstructor:
         for stamp_ns in wanted:
             is_covered = last_ns is not None and stamp_ns - last_ns <= _MAX_AFTER_END_NS
             yield self._picture_at(stamp_ns) if is_covered else too_late(stamp_ns, last_ns)
+
+    def feed(self, events: Events) -> None:
+        """Take the next events of a stream that runs on; `picture_at` gives its pictures.
+
+        Args:
+            events: up to the next stamp that a picture will be asked for, or shorter.
+
+        Raises:
+            SourceError: they are of another sensor or go back in time.
+        """
+        if len(events):
+            self._take(events, self._fed_ns)
+            self._fed_ns = int(events.t_ns[-1])
+            self._advance(self._fed_ns)
+
+    def picture_at(self, stamp_ns: int) -> Image | Refusal:
+        """Give the picture at a stamp up to which the stream was fed, or the reason for none."""
+        return too_late(stamp_ns, None) if self._first_ns is None else self._picture_at(stamp_ns)
 
     def _begin(self, events: Events) -> None:
         self._first_ns = int(events.t_ns[0]) if len(events) else 0

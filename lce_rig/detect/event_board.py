@@ -1,0 +1,165 @@
+"""The board in a stream of events: a picture at the time asked for, and the board followed through others."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Events, Image
+from lce_rig.core.geometry import Array, rotation_angle
+from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.detect.corner_order import align_corner_order, nearest_pose
+from lce_rig.detect.event_figures import event_figures, motion_figures, outline_px
+from lce_rig.detect.event_gate import explain_missing_board, gate_event_board
+from lce_rig.detect.gates import gate_image_board
+from lce_rig.detect.image_board import find_image_board, region_around
+from lce_rig.detect.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
+from lce_rig.rig import QualitySettings, ReconstructionSettings
+
+EventImage = Literal["network", "map"]
+
+#: When the board is looked for besides the main picture, ns after it.
+TRACK_NS = (-100_000_000, -50_000_000, 50_000_000, 100_000_000)
+# Between neighbouring pictures no hand turns the board by more: it is another board, or misread.
+_MAX_TURN_RAD = np.radians(45)
+
+
+@dataclass(frozen=True, eq=False)
+class EventSighting:
+    """What a stream of events shows.
+
+    Attributes:
+        picture: at the time asked for, or why there is none.
+        board: in that picture and, as its track, in those about it; or why it is not there.
+    """
+
+    picture: Image | Refusal
+    board: ImageBoard | Refusal
+
+
+def reconstructor_for(
+    settings: ReconstructionSettings | None, channel: str, method: EventImage | None = None
+) -> Reconstructor:
+    """Set up a reconstructor as a profile says.
+
+    Args:
+        settings: the channel's block; None for the shipped network and automatic windows.
+        channel: that the pictures are said to come from.
+        method: in place of the profile's.
+
+    Raises:
+        ProfileError: the network cannot be used.
+        SourceError: onnxruntime is not installed.
+    """
+    settings = settings or ReconstructionSettings()
+    windows = WindowOptions()
+    if settings.window_s is not None:
+        windows = WindowOptions("time", duration_s=settings.window_s)
+    elif settings.window_events is not None:
+        windows = WindowOptions("count", n_events=settings.window_events)
+    options = ReconstructionOptions(method=method or settings.method, windows=windows, channel=channel)
+    model = None if settings.model is None else Path(settings.model)
+    return Reconstructor(model, options)
+
+
+def find_event_board(
+    events: Events,
+    stamp_ns: int,
+    reconstructor: Reconstructor,
+    board: Board,
+    intrinsics: Intrinsics,
+    limits: QualitySettings,
+    *,
+    sweep_s: float | None = None,
+) -> EventSighting:
+    """Make a picture of the events up to a stamp, find the board in it and follow it to either side.
+
+    Args:
+        events: from long enough before the stamp for the network to settle.
+        stamp_ns: on the events' clock.
+        reconstructor: is reset.
+        board: the board as the profile describes it.
+        intrinsics: of the camera.
+        limits: `quality` of the rig profile.
+        sweep_s: how long the LiDAR sees the board; None where it does not.
+
+    Raises:
+        ProfileError: the intrinsics or the network are for pictures of another size.
+    """
+    last_ns = int(events.t_ns[-1]) if len(events) else stamp_ns
+    about = {min(stamp_ns + offset, max(last_ns, stamp_ns)) for offset in TRACK_NS}
+    stamps = sorted({stamp_ns, *about})
+    pictures = dict(zip(stamps, reconstructor.reconstruct([events], stamps), strict=True))
+    picture = pictures.pop(stamp_ns)
+    if isinstance(picture, Refusal):
+        return EventSighting(picture, explain_missing_board(events, stamp_ns, picture, limits))
+    found = find_in_reconstruction(picture, board, intrinsics, limits)
+    if isinstance(found, Refusal):
+        return EventSighting(picture, explain_missing_board(events, stamp_ns, found, limits))
+    found = _followed(replace(found, stamp_ns=stamp_ns), picture, pictures, board, intrinsics, limits)
+    made = event_figures(events, stamp_ns, outline_px(found.T_cam_board, board, intrinsics))
+    quality = {**found.quality, **made, **motion_figures(found, sweep_s)}
+    gated = gate_image_board(replace(found, quality=quality), limits)
+    return EventSighting(picture, gate_event_board(gated, limits) if isinstance(gated, ImageBoard) else gated)
+
+
+def find_in_reconstruction(
+    picture: Image,
+    board: Board,
+    intrinsics: Intrinsics,
+    limits: QualitySettings,
+    region: tuple[int, int, int, int] | None = None,
+) -> ImageBoard | Refusal:
+    """Find the board in a picture that was made from events, ours or another's."""
+    return find_image_board(
+        picture,
+        board,
+        intrinsics,
+        region=region,
+        max_reprojection_px=limits.max_reprojection_px,
+        min_contrast=limits.min_event_contrast,
+        min_sharpness=limits.min_event_sharpness,
+        is_from_events=True,
+    )
+
+
+def _followed(
+    main: ImageBoard,
+    picture: Image,
+    others: Mapping[int, Image | Refusal],
+    board: Board,
+    intrinsics: Intrinsics,
+    limits: QualitySettings,
+) -> ImageBoard:
+    """Follow the board from its main picture to either side, and keep its poses as the track."""
+    assert main.stamp_ns is not None
+    track: dict[int, tuple[Array, Array]] = {}
+    stamps = sorted(others)
+    earlier = [stamp for stamp in reversed(stamps) if stamp < main.stamp_ns]
+    later = [stamp for stamp in stamps if stamp > main.stamp_ns]
+    for way in (earlier, later):
+        last = main
+        for stamp in way:
+            other = others[stamp]
+            if isinstance(other, Refusal):
+                continue
+            seen = find_in_reconstruction(other, board, intrinsics, limits, region_around(last, picture))
+            if isinstance(seen, Refusal):
+                continue
+            seen = align_corner_order(seen, main, board)
+            T, cov = nearest_pose(seen, main.T_cam_board, board, intrinsics)
+            if rotation_angle(T[:3, :3], main.T_cam_board[:3, :3]) < _MAX_TURN_RAD:
+                track[stamp], last = (T, cov), seen
+    if not track:
+        return main
+    stamps = sorted(track)
+    return replace(
+        main,
+        track_ns=np.array(stamps, dtype=np.int64),
+        track_T_cam_board=np.stack([track[stamp][0] for stamp in stamps]),
+        track_cov=np.stack([track[stamp][1] for stamp in stamps]),
+    )

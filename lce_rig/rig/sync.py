@@ -1,0 +1,71 @@
+"""The sync board's block of a profile: how it is reached, and which camera each of its lines triggers."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from lce_rig.rig.settings import Name, Settings, problem
+
+_BAUD = {"lce1": 115_200, "nmea": 9_600, "simplesensorsync": 921_600, "tline": 921_600}
+
+
+class TriggerSettings(Settings):
+    """The pulses that trigger one camera.
+
+    Attributes:
+        channel: number of the board's line.
+        rate_hz: pulses a second; boards that decide by themselves are not told.
+        phase_us: first pulse of a second after that second's beginning.
+        pulse_us: length of a pulse.
+        max_delay_s: latest stamp of a frame after its pulse; as short as the camera allows.
+    """
+
+    channel: Annotated[int, Field(ge=0, le=15)]
+    rate_hz: Annotated[float, Field(gt=0, le=1000)]
+    phase_us: Annotated[int, Field(ge=0, lt=1_000_000)] = 0
+    pulse_us: Annotated[int, Field(ge=1, lt=1_000_000)] = 100
+    max_delay_s: Annotated[float, Field(gt=0, le=1)] = 0.1
+
+    @model_validator(mode="after")
+    def _pulses_fit_into_their_period(self) -> "TriggerSettings":
+        period_us = 1e6 / self.rate_hz
+        if self.pulse_us >= period_us:
+            what = f"pulses of {self.pulse_us} us do not fit into a period of {period_us:.0f} us"
+            raise problem(what, "pulse_us")
+        if self.phase_us >= period_us:
+            what = f"{self.phase_us} us is beyond the period of {period_us:.0f} us"
+            raise problem(what, "phase_us")
+        return self
+
+
+class SyncSettings(Settings):
+    """A board that makes the pulse per second and triggers cameras.
+
+    Attributes:
+        type: how it talks: lce-rig's own protocol, plain NMEA, SimpleSensorSync's JSON, or lines `T,n,us`.
+        device: its serial port.
+        baud: speed of the port; None takes what is usual for the type.
+        triggers: the lines it triggers cameras by, by the camera's name.
+    """
+
+    type: Literal["lce1", "nmea", "simplesensorsync", "tline"] = "lce1"
+    device: Annotated[str, Field(min_length=1)]
+    baud: Annotated[int, Field(ge=1200, le=4_000_000)] | None = None
+    triggers: dict[Name, TriggerSettings] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _lines_are_used_once(self) -> "SyncSettings":
+        seen: dict[int, str] = {}
+        for camera, trigger in self.triggers.items():
+            if trigger.channel in seen:
+                what = f"line {trigger.channel} triggers {seen[trigger.channel]} already"
+                raise problem(what, f"triggers.{camera}.channel")
+            seen[trigger.channel] = camera
+        if self.triggers and self.type == "nmea":
+            raise problem("a board of type nmea tells the time, and nothing of triggers", "triggers")
+        return self
+
+    @property
+    def port_baud(self) -> int:
+        """The speed to open the port with."""
+        return self.baud or _BAUD[self.type]

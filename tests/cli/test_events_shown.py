@@ -1,0 +1,140 @@
+"""Captures with raw events, as a user sees them: check, its pictures, verify, and rigs."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lce_rig import pipeline
+from lce_rig.core.geometry import invert
+from lce_rig.core.results import Calibration, Certificate, Metrics
+from lce_rig.export.result import write_result
+from lce_rig.rig import find_profile, load_rig
+from lce_rig.session import Session
+from lce_rig.simulate import SimulationOptions, simulate_captures
+from lce_rig.verify.event_picture import BRIGHTER, DARKER
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory) -> Path:
+    """A session of the rig rles with a capture of a moving board, and the truth; beside it one of frames."""
+    rig = load_rig("rles")
+    options = replace(SimulationOptions.for_rig("rles", "moving"), events_span_s=(0.9, 0.15))
+    path = tmp_path_factory.mktemp("moving") / "session"
+    with Session.create(path, rig) as session, Session.create(path.parent / "frames", rig) as frames:
+        for capture in simulate_captures(rig, n_captures=1, seed=12, options=options):
+            session.add_capture(capture.images, capture.scans, {}, capture.events)
+            frames.add_capture(capture.images, capture.scans, {})
+            T_cam_lidar = invert(capture.T_world_sensor["davis"]) @ capture.T_world_sensor["lidar"]
+    truth = Calibration(
+        camera="davis",
+        channel="events+frames",
+        lidar="lidar",
+        T_cam_lidar=T_cam_lidar,
+        cov=np.eye(6) * 1e-6,
+        certificate=Certificate(True, 0.0),
+        metrics=Metrics(0.01, 0.01, 0.1),
+        n_captures=1,
+        n_detected=1,
+        captures_used=("000000",),
+        captures_refused={},
+        verdict="pass",
+        reasons=(),
+    )
+    (path / "calibration").mkdir()
+    write_result(path / "calibration" / "result.json", rig.name, [truth])
+    return path
+
+
+def coloured(picture, colour) -> int:
+    return int(np.all(np.abs(picture.astype(int) - colour) < 20, axis=-1).sum())
+
+
+def test_check_shows_event_rate_and_speed_in_80_columns(lce_rig, moving):
+    outcome = lce_rig("check", moving)
+    assert outcome.code == 0, outcome.err
+    events, frames = outcome.out.split("davis.frames and lidar")
+    assert max(len(line.rstrip()) for line in outcome.out.splitlines()) <= 80
+    for heading in ("events", "px/s", "speed", "cm/s"):
+        assert heading in events and heading not in frames
+    (row,) = [line.split() for line in events.splitlines() if line.startswith("000000")]
+    assert row[-1] == "ok" and float(row[5]) > 1
+
+
+def test_check_as_json_has_every_figure_of_events_and_motion(lce_rig, moving):
+    document = json.loads(lce_rig("check", moving, "--json").out)
+    (pair,) = [pair for pair in document["pairs"] if pair["channel"] == "events"]
+    for capture in pair["captures"].values():
+        names = {"events_px_s", "events_px", "speed_mps", "turn_deg_s", "smear_m", "smear_depth_m"}
+        assert names <= capture["image"].keys()
+        assert 0 < capture["image"]["smear_m"] < 0.01
+
+
+def test_every_detection_carries_the_stamp_of_its_sample(lce_rig, moving):
+    session = Session.open(moving)
+    (capture,) = session.captures
+    detections = pipeline.detect(session)
+    frame = detections.images["davis", "frames"]["000000"]
+    assert frame.stamp_ns == capture.image("davis", "frames").stamp_ns
+    boards = detections.lidars["lidar"]["000000"]
+    assert {board.stamp_ns for board in boards} == {capture.scan("lidar").stamp_ns}
+    made = detections.images["davis", "events"]["000000"]
+    assert made.stamp_ns == boards[0].stamp_ns + round(np.median(boards[0].offset_ns))
+    assert np.linalg.norm(made.T_cam_board[:3, 3] - frame.T_cam_board[:3, 3]) < 0.05
+
+
+def test_debug_images_show_the_reconstruction_and_the_events(lce_rig, moving):
+    assert lce_rig("check", moving, "--debug-images").code == 0
+    drawn = cv2.imread(str(moving / "debug" / "davis.events.lidar" / "000000.png"))
+    frame = cv2.imread(str(moving / "debug" / "davis.frames.lidar" / "000000.png"))
+    assert drawn.shape[1] == frame.shape[1] == 1600 and drawn.shape[0] > frame.shape[0] + 300
+    lower = drawn[drawn.shape[0] // 2 :, :800]
+    assert coloured(lower, BRIGHTER) > 500 and coloured(lower, DARKER) > 500
+
+
+def test_the_event_map_is_refused_where_the_network_is_not(lce_rig, moving):
+    outcome = lce_rig("check", moving, "--event-image", "map")
+    assert outcome.code == 0  # the frames still serve
+    assert "0 of 1 captures can be used" in outcome.out and "1 of 1 captures can be used" in outcome.out
+
+
+def test_verify_draws_the_lidar_and_the_events_for_each_channel(lce_rig, moving, tmp_path):
+    outcome = lce_rig("verify", moving, "-o", tmp_path)
+    assert outcome.code == 0, outcome.err + outcome.out
+    heights = {}
+    for channel in ("events", "frames"):
+        assert f"davis.{channel} and lidar" in outcome.out
+        folder = tmp_path / f"davis.{channel}.lidar"
+        assert sorted(file.name for file in folder.iterdir()) == [
+            "000000.png",
+            "contact_sheet.png",
+        ]
+        drawn = cv2.imread(str(folder / "000000.png"))
+        heights[channel] = drawn.shape[0]
+        assert coloured(drawn, (235, 60, 255)) > 300  # magenta: the board in the LiDAR
+    assert heights["events"] > heights["frames"] + 260
+
+
+def test_verify_takes_the_channels_that_a_session_has(lce_rig, moving):
+    words = ["verify", moving.parent / "frames", "--result", moving / "calibration" / "result.json"]
+    outcome = lce_rig(*words)
+    assert outcome.code == 0, outcome.err
+    assert "davis.frames and lidar" in outcome.out and "davis.events and lidar" not in outcome.out
+
+
+def test_rigs_show_and_check_know_how_pictures_are_made(lce_rig, tmp_path):
+    text = find_profile("rles").read_text(encoding="utf-8")
+    block = "        kind: events\n        reconstruction: {model: mine.onnx, window_s: 0.05}\n"
+    (tmp_path / "mine.yaml").write_text(text.replace("        kind: events\n", block, 1), encoding="utf-8")
+    shown = lce_rig("rigs", "show", tmp_path / "mine.yaml")
+    assert "pictures from events" in shown.out and "50 ms" in shown.out and "mine.onnx" in shown.out
+    assert "pictures from events" not in lce_rig("rigs", "show", "rlfs").out
+    missing = lce_rig("rigs", "check", tmp_path / "mine.yaml")
+    assert missing.code == 3
+    for part in ("mine.yaml", "cameras.davis.channels.events.reconstruction.model", "no such file"):
+        assert part in missing.err
+    refused = json.loads(lce_rig("rigs", "check", tmp_path / "mine.yaml", "--json").out)
+    assert refused["is_valid"] is False

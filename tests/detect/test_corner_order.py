@@ -1,0 +1,94 @@
+"""Corners of the same board are counted from the same end in every picture, and poses follow."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import difference, perturb, pose, rotation_angle, transform
+from lce_rig.core.results import ImageBoard
+from lce_rig.detect.corner_order import align_corner_order, nearest_pose
+from lce_rig.solvers.pnp import mirror_tilt, solve_planar_pose
+
+DAVIS = Intrinsics(349.57, 349.18, 172.49, 126.24, 346, 260, "radtan", (-0.36, 0.18, 0.0, 0.0, 0.0))
+OBLONG = Board(9, 6, 0.068, 0.8, 0.6, pattern_offset_m=(0.03, -0.01))
+SQUARE = Board(6, 6, 0.068, 0.6, 0.6)
+
+
+def looking(tilt_rad=(0.3, -0.2, 0.4), position=(0.1, -0.05, 2.0)):
+    faced = pose(np.diag([1.0, -1.0, -1.0]), np.array(position))
+    return perturb(faced, np.array([0, 0, 0, *tilt_rad]))
+
+
+def seen(board, T_cam_board, noise_px=0.0, seed=0):
+    corners, _ = DAVIS.project(transform(T_cam_board, board.corners()))
+    corners = corners + noise_px * np.random.default_rng(seed).standard_normal(corners.shape)
+    solved = solve_planar_pose(corners, board.corners(), DAVIS)
+    return ImageBoard(
+        corners,
+        solved.T_cam_board,
+        solved.cov,
+        solved.T_cam_board_alternative,
+        solved.chi2_gap,
+        False,
+        solved.reprojection_px,
+        solved.sigma_px,
+    )
+
+
+def counted_from_elsewhere(found, board, n_quarters):
+    grid = found.corners_px.reshape(board.rows, board.cols, 2)
+    turned = np.rot90(grid, n_quarters).reshape(-1, 2)
+    solved = solve_planar_pose(turned, board.corners(), DAVIS)
+    return replace(found, corners_px=turned, T_cam_board=solved.T_cam_board, cov=solved.cov)
+
+
+@pytest.mark.parametrize(("board", "n_quarters"), [(OBLONG, 2), (SQUARE, 1), (SQUARE, 2), (SQUARE, 3)])
+def test_corners_counted_from_another_end_are_put_in_order_with_pose_and_covariance(board, n_quarters):
+    reference = seen(board, looking(), 0.1)
+    # A tenth of a second later the board has moved and turned a little.
+    later = seen(board, perturb(looking(), np.array([0.02, 0.01, 0.0, 0.05, -0.04, 0.03])), 0.1, seed=1)
+    aligned = align_corner_order(counted_from_elsewhere(later, board, n_quarters), reference, board)
+    np.testing.assert_allclose(aligned.corners_px, later.corners_px)
+    np.testing.assert_allclose(aligned.T_cam_board, later.T_cam_board, atol=1e-6)
+    np.testing.assert_allclose(aligned.cov, later.cov, rtol=1e-4, atol=1e-12)
+
+
+def test_corners_in_the_right_order_stay_as_they_are():
+    found = seen(OBLONG, looking())
+    assert align_corner_order(found, seen(OBLONG, looking((0.2, 0.1, 0.6))), OBLONG) is found
+
+
+def test_the_track_turns_with_its_board():
+    found = seen(OBLONG, looking(), 0.1)
+    followed = replace(
+        found,
+        stamp_ns=0,
+        track_ns=np.array([50]),
+        track_T_cam_board=found.T_cam_board[None],
+        track_cov=found.cov[None],
+    )
+    turned = counted_from_elsewhere(followed, OBLONG, 2)
+    turned = replace(turned, track_T_cam_board=turned.T_cam_board[None], track_cov=turned.cov[None])
+    aligned = align_corner_order(turned, found, OBLONG)
+    np.testing.assert_allclose(aligned.track_T_cam_board[0], found.T_cam_board, atol=1e-6)
+    np.testing.assert_allclose(aligned.track_cov[0], found.cov, rtol=1e-4, atol=1e-12)
+
+
+def test_of_two_poses_the_nearer_one_is_taken_with_the_covariance_it_has():
+    truth = looking((0.3, -0.25, 0.4), (0.0, 0.0, 3.5))
+    found = seen(OBLONG, truth, 0.2)
+    assert found.T_cam_board_alternative is not None
+    mirrored = mirror_tilt(truth, OBLONG.corners().mean(axis=0))
+    T, cov = nearest_pose(found, truth, OBLONG, DAVIS)
+    T_other, cov_other = nearest_pose(found, mirrored, OBLONG, DAVIS)
+    assert rotation_angle(T[:3, :3], truth[:3, :3]) < rotation_angle(T_other[:3, :3], truth[:3, :3])
+    # The errors of many noisy pictures, each about the pose chosen in it, are what the covariance says.
+    errors = []
+    for seed in range(60):
+        again = seen(OBLONG, truth, 0.2, seed)
+        errors.append(difference(nearest_pose(again, mirrored, OBLONG, DAVIS)[0], T_other))
+    assert np.std(errors, axis=0) == pytest.approx(np.sqrt(np.diag(cov_other)), rel=0.35)
+    assert cov.shape == cov_other.shape == (6, 6)

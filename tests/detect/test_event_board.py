@@ -1,0 +1,227 @@
+"""The board in raw events: followed where it truly is, and where it is not seen, the cause is named."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from moving_board import (
+    CENTRE_PX,
+    COLS,
+    HEIGHT_PX,
+    ROWS,
+    SQUARE_PX,
+    WIDTH_PX,
+    Motion,
+    board_events,
+    events_of,
+)
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image
+from lce_rig.core.errors import ProfileError
+from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.detect.event_board import (
+    TRACK_NS,
+    find_event_board,
+    find_in_reconstruction,
+    reconstructor_for,
+)
+from lce_rig.detect.event_gate import gate_event_board
+from lce_rig.rig import QualitySettings, ReconstructionSettings
+
+MS = 1_000_000
+SQUARE_M, DEPTH_M = 0.07, 1.0
+# The board of these scenes is 0.4 squares wider than its print on every side, and faces the camera.
+BOARD = Board(COLS - 1, ROWS - 1, SQUARE_M, (COLS + 0.8) * SQUARE_M, (ROWS + 0.8) * SQUARE_M)
+FOCAL_PX = SQUARE_PX / SQUARE_M * DEPTH_M
+CAMERA = Intrinsics(FOCAL_PX, FOCAL_PX, *CENTRE_PX, WIDTH_PX, HEIGHT_PX)
+LIMITS = QualitySettings(min_distance_m=0.5)
+STAMP = 1_200 * MS
+STEADY = Motion()
+
+
+@pytest.fixture(scope="module")
+def stream():
+    return board_events(STEADY, 1.4)
+
+
+@pytest.fixture(scope="module")
+def sighting(stream):
+    return find(stream, sweep_s=0.02)
+
+
+def find(events, stamp_ns=STAMP, limits=LIMITS, method="network", **more):
+    return find_event_board(
+        events, stamp_ns, reconstructor_for(None, "events", method), BOARD, CAMERA, limits, **more
+    )
+
+
+def truth_m(stamp_ns):
+    """Where the board's middle is in the camera's x and y."""
+    return STEADY.shift_px(stamp_ns * 1e-9) / FOCAL_PX * DEPTH_M
+
+
+def join(*streams):
+    columns = [[getattr(s, name) for s in streams] for name in ("t_ns", "x", "y", "polarity")]
+    return events_of(*(np.concatenate(column) for column in columns))
+
+
+def noise(rate_hz=0.5, duration_s=1.4, seed=1):
+    rng = np.random.default_rng(seed)
+    n = round(rate_hz * duration_s * WIDTH_PX * HEIGHT_PX)
+    t_us = rng.integers(0, round(duration_s * 1e6), n)
+    return events_of(
+        t_us * 1000, rng.integers(0, WIDTH_PX, n), rng.integers(0, HEIGHT_PX, n), rng.random(n) < 0.5
+    )
+
+
+def test_the_board_is_found_and_followed_to_either_side_where_it_truly_is(sighting):
+    board = sighting.board
+    assert isinstance(sighting.picture, Image) and isinstance(board, ImageBoard)
+    assert sighting.picture.stamp_ns == board.stamp_ns == STAMP
+    assert board.track_ns.tolist() == [STAMP + offset for offset in TRACK_NS]
+    assert board.track_T_cam_board.shape == (4, 4, 4) and board.track_cov.shape == (4, 6, 6)
+    for stamp_ns, T in zip(
+        [STAMP, *board.track_ns], [board.T_cam_board, *board.track_T_cam_board], strict=True
+    ):
+        # 0.5 px at this distance is 2.5 mm.
+        assert np.linalg.norm(T[:2, 3] - truth_m(stamp_ns)) < 0.0025
+        assert np.arccos(np.clip(-T[2, 2], -1, 1)) < np.radians(8)
+
+
+def test_speed_and_smear_are_those_of_the_true_motion(sighting):
+    # The mean motion over the track: the board turns on its figure of eight meanwhile.
+    stamps = STAMP + np.array([0, *TRACK_NS])
+    places = np.array([truth_m(stamp) for stamp in stamps])
+    seconds = (stamps - STAMP) * 1e-9
+    velocity = np.polyfit(seconds, places, 1)[0]
+    quality = sighting.board.quality
+    assert quality["speed_mps"] == pytest.approx(np.linalg.norm(velocity), abs=0.02)
+    assert quality["smear_m"] == pytest.approx(0.02 * quality["speed_mps"])
+    assert quality["smear_depth_m"] < 0.3 * quality["smear_m"]
+    assert quality["turn_deg_s"] < 25
+
+
+def test_events_are_counted_on_the_board_only(stream, sighting):
+    quality = sighting.board.quality
+    on_board = (BOARD.width_m * BOARD.height_m) * (FOCAL_PX / DEPTH_M) ** 2
+    recent = stream.between(STAMP - 100 * MS, STAMP)
+    # Nothing but the board makes events here, less 0.3 noise events a second and pixel.
+    assert quality["events_px_s"] * on_board == pytest.approx(len(recent) / 0.1, rel=0.1)
+    assert quality["events_px"] > 3
+
+
+def test_the_track_ends_with_the_stream(stream):
+    cut = stream.between(0, STAMP + 70 * MS)
+    board = find(cut).board
+    assert board.track_ns[-1] == cut.t_ns[-1]
+    assert len(board.track_ns) == 4
+
+
+def test_a_stream_that_ends_before_the_stamp_is_told_by_how_much(stream):
+    sighting = find(stream, stamp_ns=3_000 * MS)
+    assert isinstance(sighting.picture, Refusal)
+    assert "1.600 s after the last event" in sighting.board.cause
+    assert "clocks agree" in sighting.board.action
+
+
+def test_a_capture_without_events_says_so(stream):
+    sighting = find(stream.between(0, 0))
+    assert "holds no events" in sighting.board.cause
+    assert "lens" in sighting.board.action
+
+
+def test_a_stream_too_short_to_settle_is_told(stream):
+    board = find(stream.between(1_100 * MS, 1_400 * MS)).board
+    assert "windows of events" in board.cause
+
+
+def test_a_board_that_stands_still_is_told_to_move():
+    board = find(noise(0.8)).board
+    assert "hardly moved" in board.cause
+    assert "10 cm/s" in board.action
+    board = find(noise(0.005)).board
+    assert "no events to speak of" in board.cause
+
+
+def test_flickering_lamps_are_named_with_their_frequency():
+    lamp = np.repeat(np.arange(0, 1_400, 5) * MS, 600)
+    rng = np.random.default_rng(0)
+    storm = events_of(
+        lamp + rng.integers(0, 4_000, len(lamp)) * 1000,
+        rng.integers(0, WIDTH_PX, len(lamp)),
+        rng.integers(0, HEIGHT_PX, len(lamp)),
+        (lamp // (5 * MS)) % 2 == 0,
+    )
+    board = find(join(noise(0.3), storm)).board
+    assert "flickers at 100 Hz" in board.cause
+    assert "lamps" in board.action
+
+
+def test_hot_pixels_are_named_with_their_share_and_do_not_hide_a_moving_board(stream):
+    rng = np.random.default_rng(2)
+    n_each, n_hot = 1_500, 25
+    t_us = rng.integers(0, 1_400_000, n_each * n_hot)
+    x, y = rng.integers(0, WIDTH_PX, n_hot), rng.integers(0, HEIGHT_PX, n_hot)
+    hot = events_of(t_us * 1000, np.repeat(x, n_each), np.repeat(y, n_each), rng.random(len(t_us)) < 0.5)
+    board = find(join(noise(0.3), hot)).board
+    assert "25 hot pixels make" in board.cause and "%" in board.cause
+    assert isinstance(find(join(stream, hot)).board, ImageBoard)
+
+
+def test_the_event_map_does_not_show_the_board_though_it_moves(stream):
+    sighting = find(stream, method="map")
+    assert isinstance(sighting.picture, Image)
+    assert isinstance(sighting.board, Refusal)
+    # Nothing happened where the picture is grey; edges are brighter or darker than that.
+    values = sighting.picture.pixels
+    assert np.median(values) == 128 and values.min() < 40 and values.max() > 215
+
+
+@pytest.mark.parametrize(
+    ("limit", "said", "do"),
+    [
+        ({"max_board_speed_mps": 0.05}, r"moved at 0\.\d\d m/s while the LiDAR swept it", "about 10 cm/s"),
+        ({"max_smear_m": 1e-3}, r"moved \d+ mm while the LiDAR swept it \(1 allowed\)", "about 10 cm/s"),
+        ({"min_events_px": 1e3}, r"hardly moved: \d+\.\d events a pixel", "about 10 cm/s"),
+        ({"min_event_sharpness": 50.0}, "too blurred", "closer"),
+        ({"min_event_contrast": 300.0}, "contrast too low", "about 10 cm/s"),
+    ],
+)
+def test_limits_of_the_profile_refuse_with_what_to_do(sighting, limit, said, do):
+    limits = LIMITS.model_copy(update=limit)
+    board = find_in_reconstruction(sighting.picture, BOARD, CAMERA, limits)
+    if isinstance(board, ImageBoard):
+        board = gate_event_board(sighting.board, limits)
+    assert isinstance(board, Refusal)
+    assert re.search(said, board.cause) and do in board.action
+
+
+def test_speeds_that_could_be_noise_are_not_held_against_a_board(sighting):
+    for figures, said in (
+        ({"speed_mps": 0.6, "speed_sigma_mps": 0.1}, ""),
+        ({"speed_mps": 0.6, "speed_sigma_mps": 0.02}, "moved at 0.60 m/s"),
+        ({"turn_deg_s": 90.0, "turn_sigma_deg_s": 20.0}, ""),
+        ({"turn_deg_s": 90.0, "turn_sigma_deg_s": 5.0}, "turned at 90 deg/s"),
+    ):
+        board = gate_event_board(replace(sighting.board, quality=sighting.board.quality | figures), LIMITS)
+        assert isinstance(board, Refusal) == bool(said)
+        assert isinstance(board, ImageBoard) or said in board.cause
+
+
+def test_pictures_made_by_others_are_judged_without_figures_of_events(sighting):
+    bare = find_in_reconstruction(sighting.picture, BOARD, CAMERA, LIMITS)
+    assert gate_event_board(bare, LIMITS) is bare
+
+
+def test_the_profile_says_how_pictures_are_made(tmp_path):
+    by_count = reconstructor_for(ReconstructionSettings(window_events=5_000), "dvs").options
+    assert (by_count.windows.kind, by_count.windows.n_events, by_count.channel) == ("count", 5_000, "dvs")
+    by_time = reconstructor_for(ReconstructionSettings(window_s=0.03), "dvs").options
+    assert (by_time.windows.kind, by_time.windows.duration_s) == ("time", 0.03)
+    assert reconstructor_for(ReconstructionSettings(method="map"), "dvs").options.method == "map"
+    assert reconstructor_for(ReconstructionSettings(), "dvs", "map").options.method == "map"
+    with pytest.raises(ProfileError, match="no such file"):
+        reconstructor_for(ReconstructionSettings(model=str(tmp_path / "gone.onnx")), "dvs")

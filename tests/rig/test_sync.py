@@ -1,0 +1,65 @@
+"""The sync board's block of a profile."""
+
+import pytest
+
+from lce_rig.core.errors import ProfileError
+from lce_rig.rig import dump_rig, find_profile, parse_rig
+
+RLFS = find_profile("rlfs").read_text(encoding="utf-8")
+SYNC = """
+sync:
+  device: /dev/ttyACM0
+  triggers:
+    cam: {channel: 0, rate_hz: 20}
+"""
+
+
+def refusal(text: str) -> str:
+    with pytest.raises(ProfileError) as caught:
+        parse_rig(RLFS + text, "mine.yaml")
+    return str(caught.value)
+
+
+def test_a_board_needs_a_device_and_little_else():
+    sync = parse_rig(RLFS + SYNC).sync
+    assert sync is not None
+    assert (sync.type, sync.device, sync.port_baud) == ("lce1", "/dev/ttyACM0", 115200)
+    assert (sync.triggers["cam"].phase_us, sync.triggers["cam"].pulse_us) == (0, 100)
+    assert parse_rig(RLFS).sync is None
+    assert "sync.device: is missing" in refusal("\nsync: {type: lce1}\n")
+
+
+def test_every_type_has_its_usual_speed_unless_told():
+    speeds = {"lce1": 115200, "nmea": 9600, "simplesensorsync": 921600, "tline": 921600}
+    for kind, baud in speeds.items():
+        block = f"\nsync: {{type: {kind}, device: /dev/x}}\n"
+        assert parse_rig(RLFS + block).sync.port_baud == baud
+        assert parse_rig(RLFS + block.replace("}", ", baud: 38400}")).sync.port_baud == 38400
+
+
+def test_a_profile_with_a_board_reads_back_the_same():
+    rig = parse_rig(RLFS + SYNC)
+    assert parse_rig(dump_rig(rig)) == rig
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("cam: {", "kam: {", "sync.triggers.kam: no camera is called kam; there is cam"),
+        ("rate_hz: 20", "rate_hz: 20, pulse_us: 50000", "do not fit into a period of 50000 us"),
+        ("rate_hz: 20", "rate_hz: 20, phase_us: 50000", "beyond the period of 50000 us"),
+        ("rate_hz: 20", "rate: 20", "sync.triggers.cam.rate: unknown key; did you mean rate_hz?"),
+        ("channel: 0", "channel: 16", "sync.triggers.cam.channel: must be less than or equal to 15"),
+        ("device:", "type: nmea\n  device:", "tells the time, and nothing of triggers"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_with_its_key(old, new, said):
+    assert said in refusal(SYNC.replace(old, new))
+
+
+def test_one_line_cannot_trigger_two_cameras():
+    from lce_rig.rig.sync import SyncSettings
+
+    triggers = {name: {"channel": 3, "rate_hz": 10.0} for name in ("left", "right")}
+    with pytest.raises(ValueError, match="line 3 triggers left already"):
+        SyncSettings.model_validate({"device": "/dev/x", "triggers": triggers})
