@@ -9,6 +9,7 @@ from lce_rig.core.geometry import Array
 
 NS_PER_S = 1_000_000_000
 HOUR_NS = 3600 * NS_PER_S
+FOREVER_NS = 2**62
 # A crystal's drift changes by about a part in a million as it warms up; no data say so once they have ended.
 WANDER = 1e-6
 
@@ -45,6 +46,16 @@ class ClockModel:
     n_used: int
     n_left_out: int
     origin: str
+
+    @staticmethod
+    def identity(sigma_ns: float, origin: str) -> "ClockModel":
+        """Build the model of a clock that shows the reference's time already.
+
+        Args:
+            sigma_ns: how well it does.
+            origin: why, in words: "PPS locked".
+        """
+        return ClockModel(0, 0, 0.0, np.zeros((2, 2)), sigma_ns, 0.0, -FOREVER_NS, FOREVER_NS, 0, 0, origin)
 
     def convert(self, source_ns: int) -> int:
         """Read the reference's clock at a moment of the source's (1)."""

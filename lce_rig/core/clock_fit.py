@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.clock import NS_PER_S, ClockModel
+from lce_rig.core.clock_line import LineFit, median_slope
 from lce_rig.core.geometry import Array
 
 MIN_PAIRS = 4
@@ -16,9 +17,7 @@ ARRIVAL_BIAS_NS = 1_000_000.0
 
 _MAX_GROUP = 5
 _WANTED_GROUPS = 12
-_SHARP = 0.1
-_OUTLIER_SIGMAS = 3.5
-_N_ROUNDS = 10
+_QUICK = 0.4
 
 Stamps = NDArray[np.int64]
 
@@ -76,14 +75,15 @@ class TimePairs:
 def fit_clock(pairs: TimePairs, what: str, resolution_ns: float = RESOLUTION_NS) -> ClockModel | None:
     """Fit offset and drift to readings of two clocks.
 
-    A request that met no delay says more than the average of many that did. What reading i took beyond the
-    quickest, e_i = bound_i - min bound, was spent on one of the two ways or on both, and put the middle wrong
-    by up to +-e_i: it counts with
+    The quickest two fifths of the readings count. What one of them took beyond the very quickest,
+    e_i = bound_i - min bound, put its middle wrong by up to +-e_i: by all of it where one way had it, by
+    nothing where both had half. Which it was, a third unknown tells that is common to all,
 
-        sigma_i^2 = (e_0^2 + e_i^2) / 3,     e_0 the tenth part quantile of e                              (1)
+        reference_i - source_i = offset + drift t_i + a e_i + noise_i,      a ~ 0 +- 1 / sqrt(3)
 
-    The quickest round trip itself may have been all on one way, in the same manner every time: its share
-    does not scatter and is stated as bias_sigma = median bound of the sharper readings / sqrt(3).
+    or else a machine that becomes slower to answer while it is asked would pass for a drift. The quickest
+    round trip itself may have been all on one way, in the same manner every time: that does not scatter, and
+    is stated as bias_sigma = min bound / sqrt(3).
 
     Args:
         pairs: the readings.
@@ -95,12 +95,11 @@ def fit_clock(pairs: TimePairs, what: str, resolution_ns: float = RESOLUTION_NS)
     """
     if len(pairs) < MIN_PAIRS:
         return None
-    floor_ns = resolution_ns / np.sqrt(12)
-    excess_ns = pairs.bound_ns - pairs.bound_ns.min()
-    usual_ns = max(float(np.quantile(excess_ns, _SHARP)), np.sqrt(3) * floor_ns)
-    sigma_ns = np.sqrt((usual_ns**2 + excess_ns**2) / 3)  # equation (1)
-    sharp_bound_ns = np.median(pairs.bound_ns[excess_ns <= usual_ns])
-    return _model(pairs, sigma_ns, what, float(sharp_bound_ns) / np.sqrt(3))
+    n_quick = max(MIN_PAIRS, int(np.ceil(_QUICK * len(pairs))))
+    quick = pairs.select(pairs.bound_ns <= np.sort(pairs.bound_ns)[n_quick - 1])
+    least_ns = float(quick.bound_ns.min())
+    origin = f"{len(pairs)} {what}"
+    return _model(quick, quick.bound_ns - least_ns, origin, resolution_ns, least_ns / np.sqrt(3))
 
 
 def fit_arrivals(
@@ -122,9 +121,9 @@ def fit_arrivals(
     late_ns = ((arrival_ns - arrival_ns[0]) - (stamp_ns - stamp_ns[0])).astype(np.float64)
     elapsed_s = (stamp_ns - stamp_ns[0]) / NS_PER_S
     # Without its drift, the lateness of messages seconds apart can be compared.
-    late_ns = late_ns - _median_slope(elapsed_s, late_ns) * elapsed_s
+    late_ns = late_ns - median_slope(elapsed_s, late_ns) * elapsed_s
     pairs = TimePairs.from_edges(stamp_ns, arrival_ns).select(_quickest(late_ns))
-    return _model(pairs, np.full(len(pairs), RESOLUTION_NS / np.sqrt(12)), what, bias_sigma_ns)
+    return _model(pairs, np.zeros(len(pairs)), f"{len(stamp_ns)} {what}", RESOLUTION_NS, bias_sigma_ns)
 
 
 def match_edges(
@@ -170,66 +169,32 @@ def _quickest(late: Array) -> NDArray[np.intp]:
     return np.asarray(np.arange(len(groups)) * size + groups.argmin(axis=1))
 
 
-def _median_slope(x: Array, y: Array) -> float:
-    """Compute the median slope between points half the data apart; bears a quarter of outliers.
-
-    References:
-        Theil, "A rank-invariant method of linear and polynomial regression analysis", 1950 (method I).
-    """
-    half = len(x) // 2
-    dx = x[half:] - x[: len(x) - half]
-    return float(np.median((y[half:] - y[: len(y) - half])[dx > 0] / dx[dx > 0])) if (dx > 0).any() else 0.0
-
-
-def _model(pairs: TimePairs, sigma_ns: Array, what: str, bias_sigma_ns: float) -> ClockModel | None:
-    """Fit a weighted line without outliers.
-
-    Its covariance is s^2 (X^T W X)^-1, where the readings scatter s times as much as their sigmas say, and is
-    never taken for smaller than the sigmas make it.
-    """
+def _model(
+    pairs: TimePairs, excess_ns: Array, origin: str, resolution_ns: float, bias_sigma_ns: float
+) -> ClockModel | None:
+    """Fit a line without outliers; where there is a bias, readings were delayed and err together."""
     source_ns = pairs.source_ns
     if len(pairs) < MIN_PAIRS or source_ns.min() == source_ns.max():
         return None
     origin_ns, reference_origin_ns = int(source_ns[0]), int(pairs.reference_ns[0])
-    x_s = (source_ns - origin_ns) / NS_PER_S
-    y_ns = ((pairs.reference_ns - reference_origin_ns) - (source_ns - origin_ns)).astype(np.float64)
-    keep = _inliers(x_s, y_ns, sigma_ns)
-    weight = sigma_ns[keep] ** -1.0
-    mean_s = float(np.average(x_s[keep], weights=weight**2))
-    design = np.column_stack([np.ones(keep.sum()), x_s[keep] - mean_s])
-    line, *_ = np.linalg.lstsq(design * weight[:, None], y_ns[keep] * weight, rcond=None)
-    residual = (y_ns[keep] - design @ line) * weight
-    scatter = max(float(residual @ residual) / (len(design) - 2), 1.0)
-    information = (design * weight[:, None]).T @ (design * weight[:, None])
+    y_ns = (pairs.reference_ns - reference_origin_ns) - (source_ns - origin_ns)
+    floor_ns = resolution_ns / np.sqrt(12)
+    fit = LineFit((source_ns - origin_ns) / NS_PER_S, y_ns.astype(np.float64), excess_ns, floor_ns)
+    keep = fit.inliers()
+    fit = fit.select(keep).centred()
+    line, residual = fit.solve()
     scale = np.diag([1.0, 1.0 / NS_PER_S])
-    elapsed_ns = round(mean_s * NS_PER_S)
+    elapsed_ns = round(fit.origin_s * NS_PER_S)
     return ClockModel(
         anchor_ns=origin_ns + elapsed_ns,
         reference_ns=reference_origin_ns + elapsed_ns + round(line[0]),
         drift=float(line[1]) / NS_PER_S,
-        cov=scatter * scale @ np.linalg.inv(information) @ scale,
+        cov=scale @ fit.covariance(are_delayed=bias_sigma_ns > 0) @ scale,
         bias_sigma_ns=float(bias_sigma_ns),
-        rms_ns=float(np.sqrt(residual @ residual / (weight @ weight))),
+        rms_ns=float(np.sqrt(residual @ residual / np.sum(fit.sigma_ns**-2.0))),
         first_ns=int(source_ns[keep].min()),
         last_ns=int(source_ns[keep].max()),
         n_used=int(keep.sum()),
         n_left_out=int((~keep).sum()),
-        origin=f"{len(pairs)} {what}",
+        origin=origin,
     )
-
-
-def _inliers(x_s: Array, y_ns: Array, sigma_ns: Array) -> NDArray[np.bool_]:
-    """Find the readings (N,) within 3.5 times the usual of the line through them, each by its own sigma."""
-    sharp = sigma_ns <= np.median(sigma_ns)
-    residual = y_ns - _median_slope(x_s[sharp], y_ns[sharp]) * x_s
-    residual = (residual - np.median(residual[sharp])) / sigma_ns
-    keep = np.ones(len(x_s), dtype=np.bool_)
-    for _ in range(_N_ROUNDS):
-        scale = max(1.4826 * float(np.median(np.abs(residual))), 1.0)
-        found = np.abs(residual) <= _OUTLIER_SIGMAS * scale
-        if found.sum() < MIN_PAIRS - 1 or np.ptp(x_s[found]) == 0 or np.array_equal(found, keep):
-            break
-        keep = found
-        line = np.polynomial.Polynomial.fit(x_s[keep], y_ns[keep], 1, w=1 / sigma_ns[keep])
-        residual = (y_ns - line(x_s)) / sigma_ns
-    return keep

@@ -39,8 +39,8 @@ class LineReport:
     Attributes:
         n_lines: lines fed.
         n_messages: messages made of them.
-        n_unnoticed: lines that had changed and made a message all the same: the damage was beside the sentence,
-            kept its sum, or hit a dialect without one.
+        n_unnoticed: lines that had changed and made a message all the same: the damage was beside the
+            sentence, kept its sum, or hit a dialect without one.
         n_wrong: messages that the line did not say, or that its sum denies.
         wrong: the first few of those, with what was fed.
         faults: lines refused, by reason.

@@ -60,7 +60,7 @@ def rms(values):
 
 def test_ten_seconds_of_requests_tell_the_drift_to_a_part_in_a_million():
     errors, sigmas = [], []
-    for seed in range(150):
+    for seed in range(100):
         rng = np.random.default_rng(seed)
         device = Device(drift=40e-6)
         model = fit_clock(exchanges(rng, device), "time requests")
@@ -73,7 +73,7 @@ def test_ten_seconds_of_requests_tell_the_drift_to_a_part_in_a_million():
 @pytest.mark.parametrize("where_s", [0.0, 5.0, 10.0, 40.0])
 def test_the_time_from_requests_is_off_by_no_more_than_its_sigma_says(where_s):
     sigmas = []
-    for seed in range(150):
+    for seed in range(100):
         rng = np.random.default_rng(seed)
         device = Device(drift=rng.normal(scale=40e-6))
         model = fit_clock(exchanges(rng, device), "time requests")
@@ -236,10 +236,10 @@ def test_steady_clocks_never_jump():
 
 def test_a_tracker_forgets_what_is_older_than_its_window():
     tracker = ClockTracker("edges", window_s=10)
-    for k in range(10_000):
+    for k in range(2_000):
         tracker.add(k * S // 10, START_NS + k * S // 10)
     assert tracker.model.n_used <= 101
-    assert tracker.model.first_ns >= 989 * S
+    assert tracker.model.first_ns >= 189 * S
 
 
 @given(st.integers(0, 3 * 10**18), st.integers(-HOUR_NS // 2 + 1, HOUR_NS // 2 - 1))

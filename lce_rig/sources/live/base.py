@@ -46,6 +46,7 @@ class SourceStatus:
         clock: whose time the stamps are, and how it is tied to others, in words.
         problems: what is wrong now, each a sentence with what to do.
         figures: further figures by name.
+        device: what answers: its model, serial number and firmware as far as it tells them.
     """
 
     sensor: str
@@ -56,6 +57,7 @@ class SourceStatus:
     clock: str = ""
     problems: tuple[str, ...] = ()
     figures: dict[str, float] = field(default_factory=dict)
+    device: str = ""
 
 
 class LiveSource(Protocol):

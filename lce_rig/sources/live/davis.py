@@ -1,0 +1,195 @@
+"""A DAVIS346 by dv-processing: events, frames and the edges at its trigger input.
+
+External pulses cannot trigger its frames; the camera stamps their edges with its own clock, so that this
+clock can be fitted to that of the sync board which sends them.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Any
+
+from lce_rig.core.errors import SourceError
+from lce_rig.rig import CameraSettings
+from lce_rig.sources.live.base import LiveSample, SourceStatus
+from lce_rig.sources.live.davis_device import OpenedCamera, open_davis
+from lce_rig.sources.live.davis_samples import DavisSamples
+from lce_rig.sources.live.reading import RateMeter, ReaderThread
+
+# A batch of events lasts 10 ms: ten seconds of a taker's absence at three streams.
+_N_SLOTS = 2048
+_PAUSE_S = 0.002
+_MAX_CLOCK_ERROR_NS = 500_000_000
+_SILENT_HINT = "Check the USB cable; unplug the camera for some seconds and start again."
+
+
+class DavisSource:
+    """A DAVIS346; see `LiveSource`. Yields `Events`, `Image` and `Pulse`.
+
+    Args:
+        sensor: the camera's name in the profile.
+        settings: its block of the profile.
+        open_camera: opens anything of dv-processing that has getNextEventBatch and its like; None opens the
+            attached camera.
+        silence_s: so long without anything is an error.
+    """
+
+    def __init__(
+        self,
+        sensor: str,
+        settings: CameraSettings,
+        open_camera: Callable[[str, CameraSettings], OpenedCamera] | None = None,
+        silence_s: float = 5.0,
+    ) -> None:
+        self.sensor = sensor
+        self._settings = settings
+        self._open_camera = open_camera or open_davis
+        self._samples = DavisSamples(sensor, settings)
+        self._reader = ReaderThread(f"camera {sensor!r}", self._read, _N_SLOTS, silence_s, _SILENT_HINT)
+        self._stack = ExitStack()
+        self._notes: tuple[str, ...] = ()
+        self._device = ""
+        self._n_imu = 0
+        self._rates = {"events": RateMeter(), "frames": RateMeter(), "pulses": RateMeter()}
+        self._delays_ns: deque[int] = deque(maxlen=100)
+
+    def __enter__(self) -> "DavisSource":
+        """Open and set up the camera.
+
+        Raises:
+            SourceError: it is absent, busy, another model, or cannot do what the profile wants.
+        """
+        opened = self._open_camera(self.sensor, self._settings)
+        with ExitStack() as stack:
+            self._input: Any = opened.input
+            stack.callback(self._let_go)
+            self._notes = opened.notes
+            self._device = opened.device
+            self._polls = self._find_streams()
+            self._reader.start()
+            stack.callback(self._reader.stop)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop and close the camera."""
+        self._stack.close()
+
+    def samples(self) -> Iterator[LiveSample]:
+        """Yield events, frames and pulses as they come.
+
+        Raises:
+            SourceError: the camera fell silent or is gone.
+        """
+        yield from self._reader.samples()
+
+    def status(self) -> SourceStatus:
+        """Say how the camera does."""
+        counted = self._samples
+        figures = {f"{name}_hz": rate.rate_hz for name, rate in self._rates.items()} | {
+            "n_events": float(counted.n_events),
+            "n_frames": float(counted.n_frames),
+            "n_pulses": float(counted.n_pulses),
+            "n_imu": float(self._n_imu),
+        }
+        delay_ns = self._delay_ns()
+        if delay_ns is not None:
+            figures["delay_ms"] = delay_ns * 1e-6
+        return SourceStatus(
+            self.sensor,
+            self._reader.n_samples,
+            self._reader.n_dropped,
+            counted.n_frames_lost,
+            self._reader.rate_hz,
+            "the camera's own, set to this computer's UTC on opening; drifts until fitted to trigger edges",
+            tuple(self._problems()),
+            figures,
+            self._device,
+        )
+
+    def _find_streams(self) -> list[Callable[[int], list[LiveSample]]]:
+        """List how to ask for each stream that the camera has.
+
+        Raises:
+            SourceError: it lacks one that the profile has.
+        """
+        has = {
+            "events": self._input.isEventStreamAvailable(),
+            "frames": self._input.isFrameStreamAvailable(),
+        }
+        for name, channel in self._settings.channels.items():
+            if not has[channel.kind]:
+                what = f"camera {self.sensor!r}: {self._device} has no {channel.kind} for channel {name!r}"
+                raise SourceError(what, "Is it another model? Check driver.device, or delete the channel.")
+        polls: list[Callable[[int], list[LiveSample]]] = [self._next_events] if has["events"] else []
+        polls += [self._next_frame] if has["frames"] else []
+        polls += [self._next_pulses] if self._input.isTriggerStreamAvailable() else []
+        polls += [self._next_imu] if self._input.isImuStreamAvailable() else []
+        return polls
+
+    def _read(self) -> list[LiveSample]:
+        """Ask every stream once: between them there is no order of time."""
+        host_ns = time.time_ns()
+        samples = [sample for poll in self._polls for sample in poll(host_ns)]
+        if not samples:
+            # A file has ended when its last stream has, a camera is gone when any is.
+            is_running = getattr(self._input, "isRunningAny", self._input.isRunning)
+            if not is_running():
+                hint = "Was it unplugged? Check cable and power; then start again."
+                raise SourceError(f"camera {self.sensor!r}: {self._device} is gone", hint)
+            time.sleep(_PAUSE_S)
+        return samples
+
+    def _next_events(self, host_ns: int) -> list[LiveSample]:
+        store = self._input.getNextEventBatch()
+        if store is None or len(store) == 0:
+            return []
+        events = self._samples.to_events(store, host_ns)
+        self._rates["events"].add(len(events))
+        self._delays_ns.append(host_ns - int(events.t_ns[-1]))
+        return [events]
+
+    def _next_frame(self, host_ns: int) -> list[LiveSample]:
+        frame = self._input.getNextFrame()
+        if frame is None:
+            return []
+        self._rates["frames"].add(1)
+        return [self._samples.to_image(frame, host_ns)]
+
+    def _next_pulses(self, host_ns: int) -> list[LiveSample]:
+        pulses: list[LiveSample] = list(
+            self._samples.to_pulses(self._input.getNextTriggerBatch() or (), host_ns)
+        )
+        if pulses:
+            self._rates["pulses"].add(len(pulses))
+        return pulses
+
+    def _next_imu(self, host_ns: int) -> list[LiveSample]:
+        """Take IMU data off their queue, lest it grow; nobody wants them yet."""
+        batch = self._input.getNextImuBatch()
+        self._n_imu += 0 if batch is None else len(batch)
+        return []
+
+    def _delay_ns(self) -> int | None:
+        """Give how old the freshest of the last events were on arrival; None before any came."""
+        return min(self._delays_ns.copy(), default=None)
+
+    def _problems(self) -> list[str]:
+        found = list(self._notes)
+        delay_ns = self._delay_ns()
+        if delay_ns is not None and abs(delay_ns) > _MAX_CLOCK_ERROR_NS:
+            found.append(
+                f"its clock and this computer's differ by {abs(delay_ns) * 1e-9:.3g} s: "
+                "was the computer's set meanwhile? Open the camera again"
+            )
+        if self._samples.n_resets:
+            found.append("its clock began anew while it ran: a sync cable sent a reset; open it again")
+        return found
+
+    def _let_go(self) -> None:
+        # dv-processing closes a device with its last reference.
+        del self._input

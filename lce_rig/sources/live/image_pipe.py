@@ -1,0 +1,233 @@
+"""Pictures from a command's standard output: GStreamer, ffmpeg or any program that writes them."""
+
+import os
+import selectors
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from fcntl import F_SETPIPE_SZ, fcntl
+from types import TracebackType
+from typing import IO
+
+from lce_rig.core.data import Image
+from lce_rig.core.errors import SourceError
+from lce_rig.rig import CameraSettings
+from lce_rig.sources.live.base import LiveSample, SourceStatus
+from lce_rig.sources.live.image_streams import JpegPictures, PictureStream, RawPictures, find_stream
+from lce_rig.sources.live.pixel_formats import FORMATS, find_format
+from lce_rig.sources.live.reading import ReaderThread
+
+_N_SLOTS = 16
+_WAIT_S = 0.25
+_PATIENCE_S = 2.0
+_PIPE_BYTES = 1 << 20
+_N_BEGIN = 10
+_TAIL_BYTES = 2000
+_EXAMPLE = (
+    "gst-launch-1.0 -q v4l2src device=/dev/video0 ! videoconvert ! video/x-raw,format=I420 ! y4menc ! fdsink"
+)
+
+
+class ImagePipeSource:
+    """A camera read by a command of the profile; see `LiveSource`.
+
+    The command writes Y4M, PGM, PPM or JPEG pictures, one behind the other, or raw ones of a pixel_format.
+    Such a stream carries no usable stamps: those given are the arrival of a picture's last byte, with nothing
+    taken off, and the status says so.
+
+    Args:
+        sensor: the camera's name in the profile.
+        settings: its block of the profile.
+        silence_s: so long without a picture is an error.
+    """
+
+    def __init__(self, sensor: str, settings: CameraSettings, silence_s: float = 10.0) -> None:
+        self.sensor = sensor
+        self._settings = settings
+        self._channel = next((n for n, c in settings.channels.items() if c.kind == "frames"), "frames")
+        self._who = f"camera {sensor!r}"
+        hint = f"Run its command in a shell: does it write pictures? {' '.join(settings.driver.command)}"
+        self._reader = ReaderThread(self._who, self._read, _N_SLOTS, silence_s, hint)
+        self._stack = ExitStack()
+        self._stream: PictureStream | None = None
+        self._begin = b""
+        self._complaints = b""
+        self._n_pictures = 0
+
+    def __enter__(self) -> "ImagePipeSource":
+        """Start the command.
+
+        Raises:
+            SourceError: there is none, or it cannot be started.
+        """
+        command = self._settings.driver.command
+        if not command:
+            hint = f"Set it to a list, program and arguments, such as: {_EXAMPLE}"
+            raise SourceError(f"{self._who}: driver.command is missing", hint)
+        self._stream, self._begin, self._complaints, self._n_pictures = self._raw_stream(), b"", b"", 0
+        with ExitStack() as stack:
+            try:
+                self._process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.PIPE,
+                    bufsize=0,
+                    start_new_session=True,  # Ctrl-C is ours; the command is stopped in its turn
+                )
+            except OSError as error:
+                hint = "Is the program installed? Give its full path."
+                what = f"{self._who}: {command[0]} cannot be started: {error.strerror}"
+                raise SourceError(what, hint) from None
+            stack.callback(self._end_process)
+            self._selector = stack.enter_context(selectors.DefaultSelector())
+            for pipe in self._pipes():
+                os.set_blocking(pipe.fileno(), False)
+                self._selector.register(pipe, selectors.EVENT_READ)
+            with suppress(OSError):  # fewer, larger reads where the system allows
+                fcntl(self._pipes()[0].fileno(), F_SETPIPE_SZ, _PIPE_BYTES)
+            self._reader.start()
+            stack.callback(self._reader.stop)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop the command."""
+        self._stack.close()
+
+    def samples(self) -> Iterator[LiveSample]:
+        """Yield pictures as they come.
+
+        Raises:
+            SourceError: the command ended, fell silent, or writes something else.
+        """
+        yield from self._reader.samples()
+
+    def status(self) -> SourceStatus:
+        """Say how the camera does."""
+        n_damaged = self._stream.n_damaged if self._stream else 0
+        problems = [f"{n_damaged} pictures came damaged: check the command"] if n_damaged else []
+        if isinstance(self._stream, RawPictures) and self._stream.row_bytes % 4:
+            n_row = self._stream.row_bytes
+            problems.append(
+                f"rows are taken to have {n_row} bytes, GStreamer pads them to {n_row + -n_row % 4}: "
+                "if the picture is slanted, let it write JPEG (jpegenc)"
+            )
+        return SourceStatus(
+            self.sensor,
+            self._reader.n_samples,
+            self._reader.n_dropped,
+            n_damaged,
+            self._reader.rate_hz,
+            "arrival at this computer, later than the exposure by what the command takes",
+            tuple(problems),
+            device=" ".join(self._settings.driver.command),
+        )
+
+    def _raw_stream(self) -> PictureStream | None:
+        """Prepare for raw pictures where the profile names their format."""
+        wanted = self._settings.driver.pixel_format
+        if wanted is None:
+            return None
+        code = find_format(wanted)
+        if code is None:
+            known = ", ".join(code.strip() for code in FORMATS)
+            what = f"{self._who}: driver.pixel_format {wanted!r} is not read here"
+            raise SourceError(what, f"It can be {known}, or missing for Y4M, PGM, PPM and JPEG.")
+        return (
+            JpegPictures()
+            if FORMATS[code].is_compressed
+            else RawPictures(code, *self._settings.resolution_px)
+        )
+
+    def _pipes(self) -> tuple[IO[bytes], IO[bytes]]:
+        assert self._process.stdout is not None and self._process.stderr is not None  # both are pipes
+        return self._process.stdout, self._process.stderr
+
+    def _read(self) -> list[LiveSample]:
+        pictures, complaints = self._pipes()
+        samples: list[LiveSample] = []
+        for key, _ in self._selector.select(_WAIT_S):
+            data = os.read(key.fd, _PIPE_BYTES)
+            if key.fileobj is complaints:
+                self._complaints = (self._complaints + data)[-_TAIL_BYTES:]
+                if not data:
+                    self._selector.unregister(complaints)
+            elif data:
+                samples += self._to_images(data)
+            else:
+                self._raise_end(pictures)
+        return samples
+
+    def _to_images(self, data: bytes) -> Iterator[Image]:
+        if self._stream is None:
+            self._begin = data = self._begin + data
+            if len(data) < _N_BEGIN:
+                return
+            self._stream = find_stream(data)
+            if self._stream is None:
+                what = f"{self._who}: its command writes no Y4M, PGM, PPM or JPEG; it begins {data[:16]!r}"
+                raise SourceError(what, f"For raw pictures set driver.pixel_format. An example: {_EXAMPLE}")
+        try:
+            for pixels in self._stream.feed(data):
+                host_ns = time.time_ns()
+                self._check_size(pixels.shape[1], pixels.shape[0])
+                count = self._n_pictures + self._stream.n_damaged
+                self._n_pictures += 1
+                yield Image(self.sensor, self._channel, host_ns, pixels, host_ns, count)
+        except ValueError as error:
+            raise SourceError(
+                f"{self._who}: what its command writes went wrong: {error}", self._said()
+            ) from None
+
+    def _check_size(self, width: int, height: int) -> None:
+        wanted = self._settings.resolution_px
+        if (width, height) != wanted:
+            raise SourceError(
+                f"{self._who}: its command writes {width}x{height} px, the intrinsics belong to "
+                f"{wanted[0]}x{wanted[1]} px",
+                "Set the size in the command, or measure intrinsics at this size.",
+            )
+
+    def _raise_end(self, pictures: IO[bytes]) -> None:
+        """Say how the command ended.
+
+        Raises:
+            SourceError: always.
+        """
+        self._selector.unregister(pictures)
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_PATIENCE_S)
+        with suppress(OSError):
+            self._complaints = (self._complaints + os.read(self._pipes()[1].fileno(), 1 << 16))[-_TAIL_BYTES:]
+        code = self._process.returncode
+        how = "closed its output" if code is None else f"ended with exit code {code}"
+        if code is not None and code < 0:
+            how = f"was ended by {signal.Signals(-code).name}"
+        n_left = self._stream.n_left if self._stream else len(self._begin)
+        torn = f"; {n_left} bytes of an unfinished picture were left out" if n_left else ""
+        what = f"{self._who}: its command {how} after {self._n_pictures} pictures{torn}"
+        raise SourceError(what, self._said())
+
+    def _said(self) -> str:
+        lines = self._complaints.decode("utf-8", "replace").strip().splitlines()[-3:]
+        if lines:
+            return f"It said: {' | '.join(line.strip() for line in lines)}"
+        return f"Run it in a shell: {' '.join(self._settings.driver.command)}"
+
+    def _end_process(self) -> None:
+        """Stop the command and all it has started, by force if need be."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGTERM)
+        try:
+            self._process.wait(_PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            with suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+        for pipe in self._pipes():
+            pipe.close()

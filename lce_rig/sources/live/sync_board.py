@@ -1,0 +1,298 @@
+"""A sync board on a serial port: its trigger pulses as they come, and its clock tied to the computer's."""
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from types import TracebackType
+
+from lce_rig.core.clock import NS_PER_S, ClockModel
+from lce_rig.core.errors import SourceError
+from lce_rig.rig.sync import SyncSettings
+from lce_rig.sources.live.base import Pulse, SourceStatus
+from lce_rig.sources.live.reading import ReaderThread
+from lce_rig.sources.live.sync_board_port import BoardPort
+from lce_rig.sources.live.sync_board_report import (
+    BoardView,
+    clock_words,
+    device_words,
+    figures,
+    problems,
+)
+from lce_rig.sources.live.sync_board_state import Arrival, BoardState
+from lce_rig.sources.live.sync_lines import DIALECTS, LineReader
+from lce_rig.sources.live.sync_lines.lce1 import VERSION
+from lce_rig.sources.live.sync_lines.messages import Hello
+
+# Opening the port may reset the board, and a VLP-16 takes 2.3 s to lock on its pulses again.
+HELLO_S = 6.0
+SILENCE_S = 30.0
+
+_N_SLOTS = 4096
+_GREET_AGAIN_NS = NS_PER_S
+_ANSWER_WITHIN_NS = NS_PER_S // 2
+# Often while little is known, then as often as a changing drift needs.
+_ASK_EVERY_NS = (NS_PER_S // 20, NS_PER_S // 5)
+_ASK_OFTEN_NS = 10 * NS_PER_S
+_SET_UTC_EVERY_NS = 10 * NS_PER_S
+_UTC_SIGMA_NS = 1_000_000
+_UTC_MIN_ANSWERS = 8
+_N_HEARD_BYTES = 2048
+
+
+class SyncBoard:
+    """An attached sync board; a `LiveSource` of pulses.
+
+    A reader thread always drains the port: some boards block, and hold their pulse high, when nobody does.
+    """
+
+    def __init__(
+        self,
+        settings: SyncSettings,
+        sensor: str = "sync",
+        hello_s: float = HELLO_S,
+        silence_s: float = SILENCE_S,
+    ) -> None:
+        """Prepare; nothing is opened yet.
+
+        Args:
+            settings: how the board is reached, and which camera each line triggers.
+            sensor: its name in messages.
+            hello_s: how long to wait for its first words.
+            silence_s: so long without a message is an error.
+        """
+        self.sensor = sensor
+        self._settings = settings
+        self._who = f"sync board '{sensor}'"
+        self._hello_s, self._silence_ns = hello_s, silence_s * NS_PER_S
+        self._reader = LineReader(DIALECTS[settings.type]())
+        lines = {trigger.channel: camera for camera, trigger in settings.triggers.items()}
+        self._state = BoardState(lines, self._reader.dialect.has_own_counts)
+        self._lock = threading.Lock()
+        self._is_heard = threading.Event()
+        self._failure: SourceError | None = None
+        self._heard = deque[int](maxlen=_N_HEARD_BYTES)
+        self._outbox: deque[bytes] = deque()
+        self._are_triggers_on = True
+        self._rate_hz: float | None = None
+        self._n_resets_seen = 0
+        self._cookie = 0
+        self._opened_ns = self._line_ns = self._asked_ns = self._told_utc_ns = self._greeted_ns = 0
+        self._busy_until_ns = 0
+        self._thread = ReaderThread(self._who, self._read, _N_SLOTS, math.inf, "")
+        self._port: BoardPort | None = None
+
+    def __enter__(self) -> "SyncBoard":
+        """Open the port, wait for the board's first words, set its lines and start them.
+
+        Raises:
+            SourceError: the port cannot be opened, or the board is silent or talks otherwise.
+        """
+        self._port = BoardPort(self._who, self._settings.device, self._settings.port_baud)
+        self._opened_ns = self._line_ns = self._busy_until_ns = time.monotonic_ns()
+        self._busy_until_ns += _ASK_OFTEN_NS
+        self._thread.start()
+        try:
+            self._is_heard.wait(self._hello_s)
+            if self._failure is not None:
+                raise self._failure
+            if not self._is_heard.is_set():
+                raise self._silent()
+            self._check_version()
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop reading and close the port; the board's pulses go on, so that the LiDAR stays locked."""
+        self._thread.stop()
+        if self._port is not None:
+            self._port.close()
+
+    def samples(self) -> Iterator[Pulse]:
+        """Yield pulses as they come: `sensor` is the camera, or "pps"; stamps are the board's own time.
+
+        Raises:
+            SourceError: the board was unplugged, or fell silent for good.
+        """
+        for sample in self._thread.samples():
+            if isinstance(sample, Pulse):
+                yield sample
+
+    def status(self) -> SourceStatus:
+        """Say how the board does."""
+        with self._lock:
+            view = self._view()
+            return SourceStatus(
+                self.sensor,
+                n_samples=self._thread.n_samples,
+                n_dropped=self._thread.n_dropped,
+                n_lost=sum(self._state.counts.n_lost.values()),
+                rate_hz=self._thread.rate_hz,
+                clock=clock_words(view),
+                problems=problems(view),
+                figures=figures(view),
+                device=device_words(view),
+            )
+
+    @property
+    def host_clock(self) -> ClockModel | None:
+        """The computer's time of day on the board's clock; None before it is known."""
+        with self._lock:
+            return self._state.host_clock
+
+    @property
+    def utc_clock(self) -> ClockModel | None:
+        """UTC on the board's clock, which is the LiDAR's; None where the board does not know UTC."""
+        with self._lock:
+            return self._state.utc_clock
+
+    def start_triggers(self, rate_hz: float | None = None) -> None:
+        """Let the pulses of the cameras begin; running numbers go on.
+
+        Args:
+            rate_hz: of all lines in place of the profile's: slow pulses tell which picture is of which.
+        """
+        with self._lock:
+            self._are_triggers_on, self._rate_hz = True, rate_hz
+            self._configure()
+
+    def stop_triggers(self) -> None:
+        """End the pulses of the cameras; those per second go on."""
+        with self._lock:
+            self._are_triggers_on = False
+            self._outbox.append(self._reader.dialect.stop())
+
+    def _read(self) -> list[Pulse]:
+        assert self._port is not None
+        try:
+            data = self._port.read()
+            arrival = Arrival(time.time_ns(), time.monotonic_ns())
+            with self._lock:
+                pulses = self._take(data, arrival)
+            self._talk(self._port, arrival.steady_ns)
+        except SourceError as error:
+            self._failure = error
+            self._is_heard.set()
+            raise
+        return pulses
+
+    def _take(self, data: bytes, arrival: Arrival) -> list[Pulse]:
+        self._heard.extend(data)
+        messages = self._reader.feed(data)
+        pulses: list[Pulse] = []
+        for message in messages:
+            pulses += self._state.take(message, arrival)
+        if messages:
+            self._line_ns = arrival.steady_ns
+        elif arrival.steady_ns - self._line_ns > self._silence_ns and self._is_heard.is_set():
+            raise SourceError(
+                f"{self._who} fell silent: nothing for {self._silence_ns / NS_PER_S:g} s",
+                "Check its cable and power, and press its reset.",
+            )
+        if not self._is_heard.is_set() and self._is_introduced(bool(messages)):
+            self._configure()
+            self._is_heard.set()
+        if self._state.counts.n_resets != self._n_resets_seen:
+            self._n_resets_seen = self._state.counts.n_resets
+            self._busy_until_ns = arrival.steady_ns + _ASK_OFTEN_NS
+            self._told_utc_ns = 0
+            self._configure()
+        return pulses
+
+    def _is_introduced(self, has_said_anything: bool) -> bool:
+        return self._state.hello is not None if self._settings.type == "lce1" else has_said_anything
+
+    def _configure(self) -> None:
+        """Queue the commands that set the lines, for a board that knows nothing yet."""
+        dialect = self._reader.dialect
+        for trigger in self._settings.triggers.values():
+            rate_hz = self._rate_hz or trigger.rate_hz
+            self._outbox.append(
+                dialect.set_trigger(trigger.channel, rate_hz, trigger.phase_us, trigger.pulse_us)
+            )
+        if self._settings.triggers and self._are_triggers_on:
+            self._outbox.append(dialect.start())
+
+    def _talk(self, port: BoardPort, now_ns: int) -> None:
+        """Send what is due: greetings, commands, UTC, a time request."""
+        if not self._is_heard.is_set():
+            if now_ns - self._greeted_ns > _GREET_AGAIN_NS:
+                self._greeted_ns = now_ns
+                self._send(port, self._reader.dialect.greeting())
+            return
+        while self._outbox:
+            self._send(port, self._outbox.popleft())
+        if now_ns - self._told_utc_ns > _SET_UTC_EVERY_NS:
+            self._tell_utc(port, now_ns)
+        is_busy = now_ns < self._busy_until_ns
+        is_free = self._state.has_answered or now_ns - self._asked_ns > _ANSWER_WITHIN_NS
+        if is_free and now_ns - self._asked_ns > _ASK_EVERY_NS[0 if is_busy else 1]:
+            self._asked_ns = now_ns
+            self._cookie += 1
+            request = self._reader.dialect.time_request(self._cookie)
+            if request:
+                # The answer is read by this same thread: it cannot overtake the note.
+                self._state.asked(self._cookie, port.write(request))
+
+    def _tell_utc(self, port: BoardPort, now_ns: int) -> None:
+        """Tell a board that has no receiver when a second begins, by the computer's time of day."""
+        with self._lock:
+            pps, model = self._state.pps, self._state.host_tracker.model
+        if pps is None or pps[0].origin == "G" or model is None or model.n_used < _UTC_MIN_ANSWERS:
+            return
+        utc_s = time.time_ns() // NS_PER_S + 2
+        board_clock = model.inverse()
+        if board_clock.sigma_ns(utc_s * NS_PER_S) < _UTC_SIGMA_NS:
+            self._told_utc_ns = now_ns
+            t_us = round(board_clock.convert(utc_s * NS_PER_S) / 1000)
+            self._send(port, self._reader.dialect.set_utc(t_us, utc_s))
+
+    def _send(self, port: BoardPort, data: bytes) -> None:
+        if data:
+            port.write(data)
+
+    def _view(self) -> BoardView:
+        return BoardView(
+            self._state,
+            self._reader,
+            time.monotonic_ns(),
+            self._opened_ns,
+            self._line_ns,
+            tuple(sorted(self._settings.triggers)) if self._are_triggers_on else (),
+            self._port.n_unwritten if self._port else 0,
+        )
+
+    def _check_version(self) -> None:
+        hello = self._state.hello
+        if self._settings.type == "lce1" and isinstance(hello, Hello) and hello.version != VERSION:
+            raise SourceError(
+                f"{self._who} speaks version {hello.version} of LCE1, and this program {VERSION}",
+                "Flash the firmware of this version of lce-rig.",
+            )
+
+    def _silent(self) -> SourceError:
+        """Say what is wrong with a board that has not introduced itself: silent, or of another kind."""
+        device, baud = self._settings.device, self._settings.port_baud
+        with self._lock:
+            heard = bytes(self._heard)
+        if not heard:
+            return SourceError(
+                f"{self._who} on {device} is silent: nothing for {self._hello_s:g} s",
+                "Check its power and firmware, and that sync.device is its port.",
+            )
+        for name, make in DIALECTS.items():
+            other = LineReader(make())
+            if name != self._settings.type and other.feed(heard + b"\n"):
+                return SourceError(
+                    f"{self._who} on {device} does not talk {self._settings.type}, but {name}",
+                    f"Set sync.type to {name}.",
+                )
+        return SourceError(
+            f"{self._who} on {device} talks, but not {self._settings.type}: {heard[:40]!r}",
+            f"Check sync.type and sync.baud (now {baud}), and that this is the board's port.",
+        )

@@ -1,0 +1,203 @@
+"""What a sync board's messages add up to: pulses, clocks, and what is wrong; no device, no thread."""
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lce_rig.core.clock import NS_PER_S, ClockModel
+from lce_rig.core.clock_fit import fit_arrivals
+from lce_rig.core.clock_tracker import ClockTracker
+from lce_rig.sources.live.base import Pulse
+from lce_rig.sources.live.sync_board_plausibility import ROOM_NS, BoardTime, RunningNumber, Verdict
+from lce_rig.sources.live.sync_lines.messages import (
+    BoardError,
+    BoardStatus,
+    Exposure,
+    Hello,
+    Message,
+    PpsEdge,
+    TimeReply,
+    TriggerEdge,
+    UtcTime,
+)
+
+PPS_LINE = "pps"
+"""Name of the line of the pulses per second, among those of the cameras."""
+
+_N_ARRIVALS = 2048
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """When a message came.
+
+    Attributes:
+        host_ns: the computer's time of day, which may be set at any moment.
+        steady_ns: a clock of the computer that nobody sets.
+    """
+
+    host_ns: int
+    steady_ns: int
+
+
+@dataclass
+class BoardCounts:
+    """How the board did so far.
+
+    Attributes:
+        n_pulses: pulses handed on, by line.
+        n_lost: pulses whose lines never came, by line; gaps in the running numbers tell.
+        n_resets: how often the board began anew.
+        n_implausible: messages left out because their times or numbers cannot be.
+        reset_steady_ns: when it last began anew.
+    """
+
+    n_pulses: dict[str, int] = field(default_factory=dict)
+    n_lost: dict[str, int] = field(default_factory=dict)
+    n_resets: int = 0
+    n_implausible: int = 0
+    reset_steady_ns: int | None = None
+
+
+class BoardState:
+    """Messages in, pulses out; clocks and counts in between.
+
+    Attributes:
+        counts: how the board did.
+        hello, status, utc: the last of each; None before the first.
+        pps: the last pulse per second, with its arrival.
+        error: the last complaint.
+        exposure_us: last measured exposure, by camera.
+        round_trip_ns: of the last time request.
+        host_tracker, utc_tracker: followers of the computer's time of day and of UTC on the board's clock.
+    """
+
+    def __init__(self, lines: Mapping[int, str], has_own_counts: bool = True) -> None:
+        """Begin with a board that has said nothing yet.
+
+        Args:
+            lines: name of the camera on each channel; pulses on others are left out.
+            has_own_counts: whether each channel counts its own pulses.
+        """
+        self.counts = BoardCounts()
+        self.hello: Hello | None = None
+        self.status: BoardStatus | None = None
+        self.utc: UtcTime | None = None
+        self.pps: tuple[PpsEdge, Arrival] | None = None
+        self.error: BoardError | None = None
+        self.exposure_us: dict[str, int] = {}
+        self.round_trip_ns: int | None = None
+        self.host_tracker = ClockTracker("time requests")
+        self.utc_tracker = ClockTracker("pulses per second")
+        self._lines = dict(lines)
+        self._has_own_counts = has_own_counts
+        self._time = BoardTime()
+        self._numbers: dict[str, RunningNumber] = {}
+        self._asked: tuple[int, int] | None = None
+        self._arrivals: deque[tuple[int, int]] = deque(maxlen=_N_ARRIVALS)
+
+    def asked(self, cookie: int, sent_ns: int) -> None:
+        """Note that a time request was sent at a time of day."""
+        self._asked = (cookie, sent_ns)
+
+    def take(self, message: Message, arrival: Arrival) -> list[Pulse]:
+        """Take a message, and give the pulses that it tells of."""
+        if isinstance(message, Hello):
+            self.hello = message
+            self._time.greeted()
+            return []
+        board_us = _board_time_us(message)
+        if board_us is not None:
+            verdict = self._time.judge(board_us * 1000, arrival.steady_ns)
+            if verdict is Verdict.ODD:
+                self.counts.n_implausible += 1
+                return []
+            if verdict is Verdict.ANEW:
+                self._begin_anew(arrival)
+        return self._sort(message, arrival)
+
+    @property
+    def has_answered(self) -> bool:
+        """Whether no time request is under way."""
+        return self._asked is None
+
+    @property
+    def host_clock(self) -> ClockModel | None:
+        """The computer's time of day on the board's clock; by time requests, or else by arrivals."""
+        model = self.host_tracker.model
+        if model is None and len(self._arrivals) > 0 and self.round_trip_ns is None:
+            stamps, arrivals = np.array(self._arrivals, dtype=np.int64).T
+            model = fit_arrivals(stamps, arrivals, "arrivals of pulses")
+        return model
+
+    @property
+    def utc_clock(self) -> ClockModel | None:
+        """UTC on the board's clock, by the pulses per second; None where it does not know UTC."""
+        return self.utc_tracker.model
+
+    def _sort(self, message: Message, arrival: Arrival) -> list[Pulse]:
+        match message:
+            case TriggerEdge(channel, count, t_us, True) if channel in self._lines:
+                return self._pulse(self._lines[channel], count, t_us, arrival)
+            case PpsEdge(seq, t_us, utc_s, _):
+                self.pps = (message, arrival)
+                pulses = self._pulse(PPS_LINE, seq, t_us, arrival)
+                if pulses and utc_s is not None:
+                    self.utc_tracker.add(t_us * 1000, utc_s * NS_PER_S)
+                return pulses
+            case TimeReply():
+                self._reply(message, arrival)
+            case Exposure(channel, _, _, duration_us) if channel in self._lines:
+                self.exposure_us[self._lines[channel]] = duration_us
+            case BoardStatus():
+                self.status = message
+            case BoardError():
+                self.error = message
+            case UtcTime():
+                self.utc = message
+        return []
+
+    def _pulse(self, line: str, count: int, t_us: int, arrival: Arrival) -> list[Pulse]:
+        # Where all lines share one running number, its gaps on a line say nothing.
+        number = self._numbers.setdefault(line if self._has_own_counts else "", RunningNumber())
+        if self._has_own_counts and number.judge(count, t_us) is Verdict.ODD:
+            self.counts.n_implausible += 1
+            return []
+        self.counts.n_lost[line] = number.n_lost
+        self.counts.n_pulses[line] = self.counts.n_pulses.get(line, 0) + 1
+        self._arrivals.append((t_us * 1000, arrival.host_ns))
+        return [Pulse(line, t_us * 1000, count, arrival.host_ns)]
+
+    def _reply(self, reply: TimeReply, arrival: Arrival) -> None:
+        if self._asked is None or self._asked[0] != reply.cookie:
+            return
+        sent_ns, turn_ns = self._asked[1], 1000 * (reply.tx_us - reply.rx_us)
+        self._asked = None
+        self.round_trip_ns = arrival.host_ns - sent_ns - turn_ns
+        # A clock that is set between question and answer makes nonsense of both.
+        if 0 <= self.round_trip_ns <= ROOM_NS:
+            middle_ns = sent_ns + (arrival.host_ns - sent_ns) // 2
+            board_ns = 500 * (reply.rx_us + reply.tx_us)
+            self.host_tracker.add(board_ns, middle_ns, self.round_trip_ns / 2)
+
+    def _begin_anew(self, arrival: Arrival) -> None:
+        self.counts.n_resets += 1
+        self.counts.reset_steady_ns = arrival.steady_ns
+        for number in self._numbers.values():
+            number.begin()
+        self._arrivals.clear()
+        self._asked = None
+        self.host_tracker.restart()
+        self.utc_tracker.restart()
+        self.pps = self.status = None
+
+
+def _board_time_us(message: Message) -> int | None:
+    match message:
+        case PpsEdge(_, t_us, _, _) | TriggerEdge(_, _, t_us, _) | Exposure(_, _, t_us, _):
+            return t_us
+        case TimeReply(_, _, tx_us):
+            return tx_us
+    return None

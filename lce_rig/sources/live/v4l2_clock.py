@@ -1,0 +1,163 @@
+"""Which of the computer's clocks stamps a camera's pictures, and what UTC time such a stamp is.
+
+Drivers say CLOCK_MONOTONIC. Jetson's do too, and stamp with a counter that is seconds away from it. So every
+clock is tried on the stamps themselves: a picture is younger than 0.2 s when it arrives, and never comes from
+the future.
+
+References:
+    https://docs.kernel.org/userspace-api/media/v4l/buffer.html (V4L2_BUF_FLAG_TIMESTAMP_*)
+    https://github.com/tier4/ros2_v4l2_camera (the offset of Jetson's counter)
+"""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+MAX_DELAY_NS = 200_000_000
+# A computer that stalls takes pictures late from the queue: no reason to doubt a clock once it is known.
+_MAX_STALL_NS = 2_000_000_000
+# Two clocks that agree as well as this may stand for each other.
+HARMLESS_NS = 2_000_000
+_N_BRACKETS = 3
+_CLOCK_IDS = {
+    "monotonic": time.CLOCK_MONOTONIC,
+    "monotonic_raw": time.CLOCK_MONOTONIC_RAW,
+    "boottime": time.CLOCK_BOOTTIME,
+    "realtime": time.CLOCK_REALTIME,
+}
+_TSC_OFFSET = Path("/sys/devices/system/clocksource/clocksource0/offset_ns")
+CLOCKS = ("monotonic", "monotonic_raw", "tsc", "tsc_minus", "boottime", "realtime")
+"""Candidates, in the order in which equally good ones are taken."""
+
+
+@dataclass(frozen=True)
+class ClockChoice:
+    """The clock that a stamp was made with.
+
+    Attributes:
+        clock: its name; None where no clock fits.
+        delays_ns: by clock, how old the stamp would be.
+        spread_ns: by how much the fitting clocks disagree; 0 where one fits.
+    """
+
+    clock: str | None
+    delays_ns: Mapping[str, int]
+    spread_ns: int
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether clocks fit that differ by more than is harmless."""
+        return self.spread_ns > HARMLESS_NS
+
+    def __str__(self) -> str:
+        ages = ", ".join(f"{name} {delay_ns / 1e6:.3g} ms" for name, delay_ns in self.delays_ns.items())
+        return f"age of a picture by {ages}"
+
+
+def read_clocks() -> dict[str, int]:
+    """Read every candidate clock now, ns; Jetson's counter only where the kernel gives its offset."""
+    readings = {name: time.clock_gettime_ns(number) for name, number in _CLOCK_IDS.items()}
+    try:
+        offset_ns = int(_TSC_OFFSET.read_text())
+    except (OSError, ValueError):
+        return readings
+    raw_ns = readings["monotonic_raw"]
+    return readings | {"tsc": raw_ns + offset_ns, "tsc_minus": raw_ns - offset_ns}
+
+
+def choose_clock(stamp_ns: int, now_ns: Mapping[str, int]) -> ClockChoice:
+    """Choose the clock with 0 <= now - stamp <= 0.2 s.
+
+    Args:
+        stamp_ns: of a picture.
+        now_ns: readings of the candidates when it arrived.
+    """
+    delays = {name: now_ns[name] - stamp_ns for name in CLOCKS if name in now_ns}
+    fitting = [name for name, delay_ns in delays.items() if 0 <= delay_ns <= MAX_DELAY_NS]
+    if not fitting:
+        return ClockChoice(None, delays, 0)
+    ages = [delays[name] for name in fitting]
+    return ClockChoice(fitting[0], delays, max(ages) - min(ages))
+
+
+class StampClock:
+    """Turns a driver's stamps into UTC, by the clock they fit.
+
+    The computer's UTC clock may be stepped while we run; its distance from the driver's clock is measured
+    anew for every picture.
+
+    Args:
+        clock: name of the driver's clock; "auto" tries the candidates on the stamps.
+    """
+
+    def __init__(self, clock: str = "auto") -> None:
+        self.clock: str | None = None if clock == "auto" else clock
+        self.choice: ClockChoice | None = None
+        self.n_changes = 0
+        self.delay_ns = 0
+        self._is_fixed = clock != "auto"
+        self._is_missing = False
+
+    def to_utc_ns(self, stamp_ns: int) -> int | None:
+        """Convert the stamp of a picture that has just arrived; None where no clock fits."""
+        now_ns, utc_ns = _read_with_utc()
+        delay_ns = now_ns[self.clock] - stamp_ns if self.clock in now_ns else -1
+        if not self._is_fixed and not 0 <= delay_ns <= _MAX_STALL_NS:
+            self.n_changes += self.clock is not None
+            self.choice = choose_clock(stamp_ns, now_ns)
+            self.clock = self.choice.clock
+        self._is_missing = self.clock is not None and self.clock not in now_ns
+        if self.clock is None or self._is_missing:
+            return None
+        self.delay_ns = now_ns[self.clock] - stamp_ns
+        return utc_ns - self.delay_ns
+
+    @property
+    def used(self) -> str | None:
+        """Name of the clock behind the last stamp; None where arrival had to be taken."""
+        return None if self._is_missing else self.clock
+
+    def problems(self) -> list[str]:
+        """Say what is doubtful about the stamps, each in a sentence."""
+        if self._is_missing:
+            return [
+                f"this computer has no clock {self.clock}: arrival is taken; set driver.frame_timing.clock"
+            ]
+        if self._is_fixed:
+            return self._problems_of_fixed()
+        found = []
+        if self.choice is not None and self.choice.clock is None:
+            found.append(
+                f"no clock fits the stamps ({self.choice}): arrival is taken, late by an unknown time"
+            )
+        elif self.choice is not None and self.choice.is_ambiguous:
+            found.append(
+                f"the clock of the stamps is uncertain by {self.choice.spread_ns * 1e-6:.3g} ms "
+                f"({self.choice}): set driver.frame_timing.clock if you know it"
+            )
+        if self.n_changes:
+            found.append(
+                f"the stamps left their clock {self.n_changes} times: check the camera's driver (dmesg)"
+            )
+        return found
+
+    def _problems_of_fixed(self) -> list[str]:
+        if 0 <= self.delay_ns <= _MAX_STALL_NS:
+            return []
+        age = f"{self.delay_ns * 1e-6:.3g} ms"
+        return [f"by clock {self.clock} pictures are {age} old: correct driver.frame_timing.clock"]
+
+
+def _read_with_utc() -> tuple[dict[str, int], int]:
+    """Read the candidates between two readings of UTC; the closest of a few tries, without interruption."""
+    best: tuple[int, dict[str, int], int] | None = None
+    for _ in range(_N_BRACKETS):
+        before_ns = time.time_ns()
+        readings = read_clocks()
+        width_ns = time.time_ns() - before_ns
+        if width_ns >= 0 and (best is None or width_ns < best[0]):
+            best = width_ns, readings, before_ns + width_ns // 2
+    if best is None:  # UTC was set back in every try
+        return read_clocks(), time.time_ns()
+    return best[1], best[2]

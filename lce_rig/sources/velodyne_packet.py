@@ -1,0 +1,167 @@
+"""Packets of a VLP-16, checked before they are believed: UDP carries whatever anybody sends to its port."""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core import velodyne
+
+# Neighbouring blocks of a real rotor at 600 rpm lie 0.38 to 0.42 deg apart.
+_MAX_UNEVEN_STEPS = 6
+_MAX_UNEVEN_SHARE = 0.15
+# 240 rpm to 1260 rpm; the sensor turns at 300 to 1200.
+_BLOCK_STEPS = (16, 84)
+_RMC = re.compile(
+    rb"\$G[PN]RMC,(\d\d)(\d\d)(\d\d)(?:\.\d*)?,([AV]),[^*\r\n]*\*([0-9A-Fa-f]{1,2})(?![0-9A-Fa-f])"
+)
+
+
+class BadPacketError(ValueError):
+    """A payload that is no packet of a VLP-16.
+
+    The message is one of a few: they are counted by kind, and kinds must not grow with what anybody sends.
+    """
+
+
+class OtherModelError(BadPacketError):
+    """A sound packet of another Velodyne."""
+
+    def __init__(self, model: str) -> None:
+        super().__init__(f"from a {model}")
+        self.model = model
+
+
+@dataclass(frozen=True, eq=False)
+class DataPacket:
+    """One data packet that passed the checks.
+
+    Attributes:
+        host_ns: arrival at the host; 0 where unknown.
+        us: time of the first firing past the hour, on the sensor's counter.
+        mode: of velodyne.RETURN_MODES.
+        azimuth: (12,) int64 of each block, 0.01 deg clockwise from the lidar frame's x axis.
+        fields: () of velodyne.DATA_PACKET.
+    """
+
+    host_ns: int
+    us: int
+    mode: int
+    azimuth: NDArray[np.int64]
+    fields: NDArray[np.void]
+
+    @property
+    def is_dual(self) -> bool:
+        """Whether each firing has two returns, in blocks of equal azimuth."""
+        return self.mode == velodyne.DUAL
+
+    @property
+    def steps_per_ns(self) -> float:
+        """Rotor speed over this packet, in 0.01 deg per ns."""
+        n_blocks_turned = velodyne.N_BLOCKS // 2 - 1 if self.is_dual else velodyne.N_BLOCKS - 1
+        turned = (self.azimuth[-1] - self.azimuth[0]) % velodyne.AZIMUTH_STEPS
+        return float(turned) / (n_blocks_turned * velodyne.BLOCK_NS)
+
+
+@dataclass(frozen=True)
+class PositionPacket:
+    """What the sensor says of its clock.
+
+    Attributes:
+        host_ns: arrival at the host; 0 where unknown.
+        us: time past the hour on the sensor's counter.
+        pps: index into velodyne.PPS_STATES.
+        nmea: the sentence it last received, without its line end; "" for none.
+        nmea_s: second past the hour of that sentence; None where it is no sound $GPRMC.
+        is_fix: whether that sentence claims to be valid (status A).
+    """
+
+    host_ns: int
+    us: int
+    pps: int
+    nmea: str
+    nmea_s: int | None
+    is_fix: bool
+
+
+def read_data_packet(payload: bytes | memoryview, host_ns: int) -> DataPacket:
+    """Check a payload in every way its layout allows.
+
+    Ranges and reflectivities can have any value; everything else is bound: flags, azimuths that rise evenly,
+    pairs of equal azimuth in dual mode and only there, the factory bytes and a time within the hour.
+
+    Raises:
+        OtherModelError: it is a sound packet of another model.
+        BadPacketError: it is damaged, or no data packet.
+    """
+    if len(payload) != velodyne.DATA_BYTES:
+        raise BadPacketError("of a wrong length")
+    fields = np.frombuffer(payload, velodyne.DATA_PACKET)[0]
+    blocks = fields["blocks"]
+    product, mode, us = int(fields["product"]), int(fields["mode"]), int(fields["us"])
+    if (blocks["flag"] != velodyne.BLOCK_FLAG).any():
+        raise BadPacketError("with a wrong block flag")
+    if us >= velodyne.HOUR_US:
+        raise BadPacketError("with a time beyond the hour")
+    azimuth = blocks["azimuth"].astype(np.int64)
+    if azimuth.max() >= velodyne.AZIMUTH_STEPS:
+        raise BadPacketError("with an azimuth beyond 360 deg")
+    if product != velodyne.VLP16 and product in velodyne.PRODUCTS and mode in velodyne.RETURN_MODES:
+        raise OtherModelError(velodyne.PRODUCTS[product])
+    if product != velodyne.VLP16 or mode not in velodyne.RETURN_MODES:
+        raise BadPacketError("with unknown factory bytes (firmware before 3.0.29 sends none)")
+    if not _is_even(azimuth, mode == velodyne.DUAL):
+        raise BadPacketError("with uneven azimuths")
+    return DataPacket(host_ns, us, mode, azimuth, fields)
+
+
+def _is_even(azimuth: NDArray[np.int64], is_dual: bool) -> bool:
+    """Tell whether blocks (12,) advance as those of a turning rotor."""
+    steps = np.diff(azimuth) % velodyne.AZIMUTH_STEPS
+    if is_dual:
+        if steps[0::2].any():
+            return False
+        steps = steps[1::2]
+    middle = float(np.sort(steps)[len(steps) // 2])
+    if not _BLOCK_STEPS[0] <= middle <= _BLOCK_STEPS[1]:
+        return False
+    return bool(np.abs(steps - middle).max() <= max_uneven_steps(middle))
+
+
+def max_uneven_steps(steps_per_block: float) -> float:
+    """Give by how much the way from block to block may differ from its mean, both in steps of 0.01 deg."""
+    return max(_MAX_UNEVEN_STEPS, _MAX_UNEVEN_SHARE * steps_per_block)
+
+
+def read_position_packet(payload: bytes | memoryview, host_ns: int) -> PositionPacket:
+    """Read what the sensor says of its clock.
+
+    Raises:
+        BadPacketError: it is no position packet.
+    """
+    if len(payload) != velodyne.POSITION_BYTES:
+        raise BadPacketError("of a wrong length")
+    fields = np.frombuffer(payload, velodyne.POSITION_PACKET)[0]
+    us, pps = int(fields["us"]), int(fields["pps"])
+    if us >= velodyne.HOUR_US:
+        raise BadPacketError("with a time beyond the hour")
+    if pps >= len(velodyne.PPS_STATES):
+        raise BadPacketError("with an unknown PPS state")
+    raw = bytes(fields["nmea"]).split(b"\0")[0]
+    nmea_s, is_fix = _read_rmc(raw)
+    nmea = raw.strip().decode("ascii", "replace")
+    return PositionPacket(host_ns, us, pps, nmea, nmea_s, is_fix)
+
+
+def _read_rmc(raw: bytes) -> tuple[int | None, bool]:
+    """Find second past the hour and status of a sentence whose checksum is right."""
+    match = _RMC.match(raw)
+    if match is None:
+        return None, False
+    body = raw[1 : raw.index(b"*")]
+    checksum = int(np.bitwise_xor.reduce(np.frombuffer(body, np.uint8)))
+    minute, second = int(match[2]), int(match[3])
+    if checksum != int(match[5], 16) or minute > 59 or second > 59:
+        return None, False
+    return 60 * minute + second, match[4] == b"A"

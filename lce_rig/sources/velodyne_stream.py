@@ -1,0 +1,228 @@
+"""From a stream of VLP-16 packets, live or recorded, to scans of one revolution each."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lce_rig.core import velodyne
+from lce_rig.core.data import Scan
+from lce_rig.rig import LidarSettings
+from lce_rig.sources.velodyne_clock import VelodyneClock
+from lce_rig.sources.velodyne_controls import read_controls
+from lce_rig.sources.velodyne_order import OrderCounts, PacketOrder, Place
+from lce_rig.sources.velodyne_packet import (
+    BadPacketError,
+    DataPacket,
+    read_data_packet,
+    read_position_packet,
+)
+from lce_rig.sources.velodyne_points import Vlp16Decoder, keep_brighter
+
+# A scan with more of its packets lost is not worth looking at.
+_MIN_COVERAGE = 0.5
+# Stamps by arrival and by the sensor may differ by a tenth of a second when one takes over from the other.
+_MAX_OVERLAP_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """Blocks of one packet that belong to one revolution.
+
+    Attributes:
+        packet: as it came.
+        elapsed_ns: of the counter at the packet's first firing.
+        blocks: which of its blocks.
+    """
+
+    packet: DataPacket
+    elapsed_ns: int
+    blocks: slice
+
+    @property
+    def start_ns(self) -> int:
+        """Counter at the first firing of the first block."""
+        n_before = int(self.blocks.start) // (2 if self.packet.is_dual else 1)
+        return self.elapsed_ns + velodyne.BLOCK_NS * n_before
+
+
+@dataclass
+class StreamCounts:
+    """What came, and what became of it.
+
+    Attributes:
+        n_data: data packets that passed the checks.
+        n_position: position packets that did.
+        n_scans: revolutions handed on.
+        n_partial: revolutions left out because they had begun before, or the sensor's clock was set.
+        n_thin: revolutions left out because more than half of their packets were lost.
+        n_empty: revolutions without a single return.
+        n_not_rising: scans left out because it turned out that those before were stamped late.
+        bad: packets left out, by what is wrong with them.
+        order: what the sensor's counter told.
+    """
+
+    n_data: int = 0
+    n_position: int = 0
+    n_scans: int = 0
+    n_partial: int = 0
+    n_thin: int = 0
+    n_empty: int = 0
+    n_not_rising: int = 0
+    bad: Counter[str] = field(default_factory=Counter)
+    order: OrderCounts = field(default_factory=OrderCounts)
+
+
+class Vlp16Stream:
+    """Puts packets of one sensor together.
+
+    Attributes:
+        counts: what came so far.
+        clock: what scans are stamped with.
+        mode: return mode of the packet that came last, of velodyne.RETURN_MODES; 0 before the first.
+        rotor_hz: speed of the rotor as it was last; 0 before the first packet.
+
+    Raises:
+        SourceError: velodyne-decoder is not installed, or `driver.controls` cannot be meant.
+    """
+
+    def __init__(self, sensor: str, settings: LidarSettings) -> None:
+        self.counts = StreamCounts()
+        self.clock = VelodyneClock(settings.timestamps.clock != "host")
+        self.mode = 0
+        self.rotor_hz = 0.0
+        self._sensor = sensor
+        self._order = PacketOrder()
+        self.counts.order = self._order.counts
+        self._decoder = Vlp16Decoder(settings.min_range_m, settings.max_range_m)
+        # The sensor counts clockwise.
+        cut_rad = -read_controls(sensor, settings).cut_azimuth_rad
+        self._cut = round(cut_rad / velodyne.AZIMUTH_STEP_RAD) % velodyne.AZIMUTH_STEPS
+        self._pieces: list[_Piece] = []
+        self._is_from_cut = False
+        self._last_stamp_ns: int | None = None
+
+    def push_position(self, payload: bytes | memoryview, host_ns: int) -> None:
+        """Take a position packet; a bad one is counted."""
+        try:
+            packet = read_position_packet(payload, host_ns)
+        except BadPacketError as error:
+            self.counts.bad[f"position packets {error}"] += 1
+            return
+        self.counts.n_position += 1
+        self.clock.see_position(packet)
+
+    def push_data(self, payload: bytes | memoryview, host_ns: int) -> Scan | None:
+        """Take a data packet; returns the scan that it completes. A bad one is counted.
+
+        Args:
+            payload: of the UDP packet.
+            host_ns: its arrival; 0 where unknown.
+        """
+        try:
+            packet = read_data_packet(payload, host_ns)
+        except BadPacketError as error:
+            self.counts.bad[f"data packets {error}"] += 1
+            return None
+        place = self._order.place(packet)
+        if place is Place.HELD:
+            return None
+        self.counts.n_data += 1
+        if place is Place.AFTER_STEP:
+            # What is left of the revolution is counted when the rotor passes the cut.
+            self._pieces, self._is_from_cut = [], False
+            self.clock.restart()
+        self.mode, self.rotor_hz = packet.mode, packet.steps_per_ns * 1e9 / velodyne.AZIMUTH_STEPS
+        self.clock.see_data(packet, self._order.elapsed_ns)
+        return self._add(packet, self._order.elapsed_ns)
+
+    def finish(self) -> Scan | None:
+        """End the stream; returns the last scan where it is whole but for the packet that would close it."""
+        if not self._pieces:
+            return None
+        last = self._pieces[-1]
+        to_go = velodyne.AZIMUTH_STEPS - self._past_cut(int(last.packet.azimuth[-1]))
+        if to_go <= 2 * last.packet.steps_per_ns * velodyne.BLOCK_NS:
+            return self._close()
+        self._pieces, self._is_from_cut = [], False
+        self.counts.n_partial += 1
+        return None
+
+    def _add(self, packet: DataPacket, elapsed_ns: int) -> Scan | None:
+        """Add a packet to its revolution, or to two where the rotor passes the cut within it."""
+        past_cut = (packet.azimuth - self._cut) % velodyne.AZIMUTH_STEPS
+        drops = np.flatnonzero(np.diff(past_cut) < 0)
+        scan = None
+        if self._pieces and self._passed_cut_before(packet, elapsed_ns, int(past_cut[0])):
+            scan = self._close()
+            self._is_from_cut = True
+        elif not self._pieces:
+            self._is_from_cut = bool(past_cut[0] <= packet.steps_per_ns * velodyne.BLOCK_NS)
+        if len(drops) == 0:
+            self._pieces.append(_Piece(packet, elapsed_ns, slice(0, velodyne.N_BLOCKS)))
+            return scan
+        first_after = int(drops[0]) + 1
+        self._pieces.append(_Piece(packet, elapsed_ns, slice(0, first_after)))
+        closed = self._close()
+        self._is_from_cut = True
+        self._pieces = [_Piece(packet, elapsed_ns, slice(first_after, velodyne.N_BLOCKS))]
+        return closed or scan
+
+    def _passed_cut_before(self, packet: DataPacket, elapsed_ns: int, past_cut: int) -> bool:
+        """Tell whether the rotor passed the cut between the last packet and this one."""
+        last = self._pieces[-1]
+        before = self._past_cut(int(last.packet.azimuth[-1]))
+        turned = packet.steps_per_ns * (elapsed_ns - last.elapsed_ns)
+        return past_cut < before or turned > velodyne.AZIMUTH_STEPS
+
+    def _past_cut(self, azimuth: int) -> int:
+        return (azimuth - self._cut) % velodyne.AZIMUTH_STEPS
+
+    def _close(self) -> Scan | None:
+        """Build the scan of the revolution that has ended."""
+        pieces, self._pieces = self._pieces, []
+        if not self._is_from_cut:
+            self.counts.n_partial += 1
+            return None
+        n_blocks = sum(piece.blocks.stop - piece.blocks.start for piece in pieces)
+        packet = pieces[-1].packet
+        n_wanted = velodyne.AZIMUTH_STEPS / (packet.steps_per_ns * velodyne.BLOCK_NS) * (1 + packet.is_dual)
+        if n_blocks < _MIN_COVERAGE * n_wanted:
+            self.counts.n_thin += 1
+            return None
+        return self._decode(pieces)
+
+    def _decode(self, pieces: list[_Piece]) -> Scan | None:
+        packets = np.array([piece.packet.fields for piece in pieces], velodyne.DATA_PACKET)
+        for piece, ranges in zip(pieces, packets["blocks"]["returns"]["range"], strict=True):
+            ranges[: piece.blocks.start] = 0
+            ranges[piece.blocks.stop :] = 0
+        if pieces[0].packet.is_dual:
+            keep_brighter(packets)
+        batch = self._decoder.decode(packets, [piece.elapsed_ns for piece in pieces])
+        if len(batch.points) == 0:
+            self.counts.n_empty += 1
+            return None
+        first_ns = pieces[0].start_ns
+        stamp_ns = self.clock.stamp_ns(first_ns)
+        if not self._rises(stamp_ns):
+            self.counts.n_not_rising += 1
+            return None
+        self.counts.n_scans += 1
+        return Scan(
+            self._sensor,
+            stamp_ns,
+            batch.points,
+            batch.intensity,
+            batch.ring,
+            batch.offset_ns - (first_ns - pieces[0].elapsed_ns),
+            pieces[-1].packet.host_ns or None,
+        )
+
+    def _rises(self, stamp_ns: int | None) -> bool:
+        """Tell whether a stamp follows the one before; where a clock is set back far, stamps start anew."""
+        last_ns = self._last_stamp_ns
+        if stamp_ns is None or (last_ns is not None and 0 <= last_ns - stamp_ns < _MAX_OVERLAP_NS):
+            return stamp_ns is None
+        self._last_stamp_ns = stamp_ns
+        return True

@@ -1,0 +1,20 @@
+"""Damaged packets of a VLP-16 between sound ones, fed to the receiver."""
+
+import pytest
+from fuzzing.vlp16_packets import fuzz_packets
+
+
+def test_damaged_packets_make_no_point_that_was_not_sent():
+    report = fuzz_packets(1_500, seed=0)
+    assert report.n_wrong == 0
+    assert report.n_scans > 30 and report.n_points > 80_000
+    for reason in ("block flag", "wrong length", "uneven azimuths", "factory bytes", "HDL-32E", "PPS state"):
+        assert any(reason in key for key in report.refused)
+    assert report.refused["n_astray"] > 50
+
+
+@pytest.mark.slow
+def test_a_million_damaged_packets_leave_memory_as_it_was():
+    report = fuzz_packets(1_000_000, seed=1)
+    assert report.n_wrong == 0
+    assert report.grown_bytes < 4_000_000
