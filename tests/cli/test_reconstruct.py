@@ -55,3 +55,59 @@ def test_a_folder_without_events_is_refused_with_the_kinds_that_are_read(lce_rig
     outcome = lce_rig("reconstruct", tmp_path, "-o", tmp_path / "out")
     assert outcome.code == 5
     assert ".aedat4" in outcome.err
+
+
+def test_a_part_of_a_recording_gives_pictures_like_those_of_the_whole_there(lce_rig, tmp_path):
+    path = recording(tmp_path / "sweep.npz", 2.6)
+    assert lce_rig("reconstruct", path, "-o", tmp_path / "whole").code == 0
+    words = ["reconstruct", path, "-o", tmp_path / "part", "--start", 1.6, "--duration", 0.3]
+    outcome = lce_rig(*words)
+    assert outcome.code == 0, outcome.err
+    assert "left out" not in outcome.err
+    part = stamps(tmp_path / "part")
+    first_ns = int(part[0])
+    assert len(part) == 6 and np.all(np.diff(part) == 50_000_000)
+    whole = stamps(tmp_path / "whole")
+    assert set(part) <= set(whole)
+    twin = tmp_path / "whole" / f"{whole.index(first_ns):06d}.png"
+    a, b = (cv2.imread(str(file)).astype(int) for file in (twin, tmp_path / "part" / "000000.png"))
+    # Warmed up on other events, cut into other windows: alike, not the same.
+    assert np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.7
+
+
+def stamps(folder):
+    return [int(line.split(",")[1]) for line in (folder / "stamps.csv").read_text().splitlines()[1:]]
+
+
+def test_a_start_after_the_end_is_refused_with_the_recordings_length(lce_rig, tmp_path):
+    outcome = lce_rig("reconstruct", recording(tmp_path / "a.npz"), "-o", tmp_path / "out", "--start", 60)
+    assert outcome.code == 2
+    assert "ends 1.200 s after its first event" in outcome.err
+
+
+def test_an_animation_is_written_beside_the_pictures(lce_rig, tmp_path):
+    words = [
+        "reconstruct",
+        recording(tmp_path / "sweep.npz"),
+        "-o",
+        tmp_path / "out",
+        "--gif",
+        tmp_path / "a.gif",
+    ]
+    outcome = lce_rig(*words)
+    assert outcome.code == 0, outcome.err
+    assert (tmp_path / "a.gif").read_bytes()[:6] == b"GIF89a"
+
+
+def test_a_video_of_an_unknown_kind_is_refused_with_those_that_are_known(lce_rig, tmp_path):
+    words = [
+        "reconstruct",
+        recording(tmp_path / "sweep.npz"),
+        "-o",
+        tmp_path / "out",
+        "--video",
+        tmp_path / "a.mov",
+    ]
+    outcome = lce_rig(*words)
+    assert outcome.code == 5
+    assert ".mp4, .avi, .mkv" in outcome.err

@@ -1,0 +1,198 @@
+"""Raw events of a capture are seen through pictures for the LiDAR's time on the board, made once."""
+
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig import pipeline
+from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.errors import ProfileError
+from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.pipeline.event_detection import picture_stamp_ns
+from lce_rig.rig import Rig, load_rig, parse_rig
+from lce_rig.session import Session
+from tests.calibrate.boards import simulate
+from tests.detect.moving_board import CENTRE_PX, HEIGHT_PX, WIDTH_PX, Motion, board_events
+
+MS = 1_000_000
+T0_NS = 1_700_000_000_000_000_000
+SCAN_NS = T0_NS + 1_150 * MS
+PROFILE = f"""
+format_version: 1
+name: small
+board: {{inner_corners: [6, 4], square_m: 0.07, width_m: 0.546, height_m: 0.406}}
+lidars:
+  lidar: {{frame: velodyne, timestamps: {{reference: first_firing, expected_offset_s: 0.0}}}}
+cameras:
+  dvs:
+    resolution_px: [{WIDTH_PX}, {HEIGHT_PX}]
+    intrinsics: {{fx_px: 200, fy_px: 200, cx_px: {CENTRE_PX[0]}, cy_px: {CENTRE_PX[1]}}}
+    channels:
+      events: {{kind: events, timestamps: {{reference: mid_exposure, expected_offset_s: 0.0}}}}
+"""
+
+
+@pytest.fixture(scope="module")
+def stream() -> Events:
+    events = board_events(Motion(), 1.4, threshold=0.6)
+    return replace(events, sensor="dvs", t_ns=events.t_ns + T0_NS)
+
+
+def bare_scan(stamp_ns: int | None = SCAN_NS) -> Scan:
+    points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32) + [5, 0, 0]
+    return Scan(
+        "lidar", stamp_ns, points.astype(np.float32), np.zeros(50, np.float32), np.zeros(50, np.int16)
+    )
+
+
+def session_of(folder: Path, events: Events, profile: str = PROFILE, **more) -> Session:
+    with Session.create(folder / "session", parse_rig(profile)) as session:
+        scan = bare_scan(more.pop("stamp_ns", SCAN_NS))
+        session.add_capture(more.pop("images", []), [scan], {}, [events])
+    return session
+
+
+def found_in(session: Session, **more) -> ImageBoard | Refusal:
+    return pipeline.detect(session, **more).images["dvs", "events"]["000000"]
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory, stream) -> Session:
+    session = session_of(tmp_path_factory.mktemp("seen"), stream)
+    assert isinstance(found_in(session), ImageBoard)
+    return session
+
+
+def test_the_board_is_found_and_followed_at_the_middle_of_the_sweep(seen):
+    board = found_in(seen)
+    assert board.stamp_ns == SCAN_NS + 50 * MS
+    assert len(board.track_ns) == 4
+    assert board.quality["events_px_s"] > 5
+
+
+def test_what_was_found_and_its_picture_are_remembered(seen):
+    files = sorted((seen.path / "detections").rglob("*.npz"))
+    kinds = sorted(file.name.split(".", 1)[1] for file in files)
+    assert kinds == ["dvs.events.npz", "dvs.events.picture.npz", "lidar.npz"]
+    changed = [file.stat().st_mtime_ns for file in files]
+    picture = pipeline.event_picture(seen, seen.captures[0], "dvs", "events")
+    assert isinstance(picture, Image)
+    assert (picture.sensor, picture.channel, picture.stamp_ns) == ("dvs", "events", SCAN_NS + 50 * MS)
+    found_in(seen)
+    assert sorted((seen.path / "detections").rglob("*.npz")) == files
+    assert [file.stat().st_mtime_ns for file in files] == changed
+
+
+def test_a_picture_that_is_not_remembered_is_made_again_the_same(seen):
+    capture = seen.captures[0]
+    first = pipeline.event_picture(seen, capture, "dvs", "events")
+    for file in (seen.path / "detections").rglob("*.picture.npz"):
+        file.unlink()
+    np.testing.assert_array_equal(pipeline.event_picture(seen, capture, "dvs", "events").pixels, first.pixels)
+
+
+def test_the_event_map_can_be_asked_for_and_does_not_pass_for_the_networks_picture(seen):
+    assert isinstance(found_in(seen, event_image="map"), Refusal)
+    assert isinstance(found_in(seen), ImageBoard)
+    capture = seen.captures[0]
+    pictures = [
+        pipeline.event_picture(seen, capture, "dvs", "events", which).pixels for which in (None, "map")
+    ]
+    assert np.abs(pictures[0].astype(int) - pictures[1]).mean() > 20
+
+
+def test_stamps_of_either_clock_are_brought_to_the_rigs_time(tmp_path, stream):
+    profile = PROFILE.replace("first_firing, expected_offset_s: 0.0", "first_firing, expected_offset_s: 0.02")
+    profile = profile.replace("mid_exposure, expected_offset_s: 0.0", "mid_exposure, expected_offset_s: 3.5")
+    early = replace(stream, t_ns=stream.t_ns - 3_480 * MS)
+    board = found_in(session_of(tmp_path, early, profile))
+    assert isinstance(board, ImageBoard)
+    assert board.stamp_ns == SCAN_NS + 50 * MS + 20 * MS - 3_500 * MS
+
+
+def test_the_stamp_is_the_median_firing_time_of_the_first_lidars_board(seen):
+    rig = load_rig("rles")
+    lidar = replace(simulate(1, 0)[0].lidar[0], stamp_ns=SCAN_NS)
+    offset_ns = 31 * MS + np.arange(len(lidar.points))
+    timed = replace(lidar, offset_ns=offset_ns)
+    capture = seen.captures[0]
+
+    def stamp(lidars):
+        return picture_stamp_ns(rig, capture, "davis", "events", lidars)
+
+    assert stamp({"lidar": [timed, lidar]}) == SCAN_NS + round(np.median(offset_ns))
+    assert stamp({"lidar": [lidar]}) == SCAN_NS + 50 * MS
+    assert stamp({"lidar": Refusal("lidar", "no plate", "show it")}) == SCAN_NS + 50 * MS
+    assert stamp({}) is None
+
+
+def test_scans_without_stamps_leave_the_end_of_the_stream(tmp_path, stream):
+    board = found_in(session_of(tmp_path, stream, stamp_ns=None))
+    assert board.stamp_ns == int(stream.t_ns[-1])
+
+
+def test_another_scan_under_the_same_name_gives_another_picture(tmp_path, stream):
+    first = found_in(session_of(tmp_path / "a", stream))
+    other = session_of(tmp_path / "b", stream, stamp_ns=SCAN_NS - 40 * MS)
+    # The cache travels along: the samples are the same, only the stamp is not.
+    (tmp_path / "a" / "session" / "detections").rename(other.path / "detections")
+    assert first.stamp_ns - found_in(other).stamp_ns == 40 * MS
+
+
+def test_a_stored_picture_is_taken_unless_one_is_asked_for(tmp_path, stream):
+    blank = Image("dvs", "events", SCAN_NS, np.full((HEIGHT_PX, WIDTH_PX), 128, np.uint8))
+    session = session_of(tmp_path, stream, images=[blank])
+    assert "contrast too low" in found_in(session).cause
+    assert isinstance(found_in(session, event_image="network"), ImageBoard)
+
+
+def test_damaged_events_are_a_refusal_that_says_so(tmp_path, stream):
+    session = session_of(tmp_path, stream)
+    path = session.captures[0].path / "dvs.events.npz"
+    path.write_bytes(path.read_bytes()[:-100])
+    board = found_in(session)
+    assert board.stage == "read" and "damaged" in board.cause
+
+
+def with_network(path: str) -> str:
+    return PROFILE.replace("{kind: events,", f"{{kind: events, reconstruction: {{model: {path}}},")
+
+
+def shipped_network() -> bytes:
+    return (resources.files("lce_rig") / "models" / "reconstruction.onnx").read_bytes()
+
+
+def test_another_network_is_found_beside_the_profile_and_makes_its_own_pictures(tmp_path, stream):
+    (tmp_path / "mine.onnx").write_bytes(shipped_network())
+    (tmp_path / "mine.yaml").write_text(with_network("mine.onnx"), encoding="utf-8")
+    rig: Rig = load_rig(tmp_path / "mine.yaml")
+    with Session.create(tmp_path / "session", rig) as session:
+        session.add_capture([], [bare_scan()], {}, [stream])
+    # Opened anew: the profile frozen in the session leads to the file.
+    assert isinstance(found_in(Session.open(tmp_path / "session")), ImageBoard)
+    n_before = len(list((tmp_path / "session" / "detections").rglob("*.picture.npz")))
+    # Another file under the same name is another network: here one whose first weights differ.
+    changed = bytearray(shipped_network())
+    middle = len(changed) // 2
+    changed[middle : middle + 4000] = bytes(4000)
+    (tmp_path / "mine.onnx").write_bytes(bytes(changed))
+    pipeline.detect(Session.open(tmp_path / "session"))
+    assert len(list((tmp_path / "session" / "detections").rglob("*.picture.npz"))) == n_before + 1
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(None, "no such file"), (b"hxight_2", "its input .* has the shape"), (b"", "no ONNX file")],
+)
+def test_a_network_that_cannot_be_used_is_named_with_file_and_key(tmp_path, stream, content, said):
+    path = tmp_path / "mine.onnx"
+    if content is not None:
+        path.write_bytes(shipped_network().replace(b"height_2", content) if content else b"")
+    session = session_of(tmp_path, stream, with_network(str(path)))
+    with pytest.raises(ProfileError, match=said) as raised:
+        found_in(session)
+    for part in ("rig.yaml", "cameras.dvs.channels.events.reconstruction.model", "mine.onnx"):
+        assert part in raised.value.what
