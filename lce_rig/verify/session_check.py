@@ -26,6 +26,8 @@ from lce_rig.verify.overlay import camera_part, draw_overlay
 from lce_rig.verify.writing import write_overlays
 
 Progress = Callable[[int, int], None]
+# Boards that a wrong extrinsic puts a little off are measured; what lies farther away is another thing.
+_ELSEWHERE_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -124,10 +126,11 @@ def check_session(
 
     files = write_overlays(folder, overlays())
     metrics = summarise(list(residuals.values())) if residuals else None
+    n_seen = sum(_sees_board(detections, pair, name) for name in detections.captures(pair))
     return SessionCheck(
         pair,
         calibration.verdict,
-        contradictions(metrics, session.rig),
+        contradictions(metrics, session.rig, n_seen - len(residuals), n_seen),
         tuple(residuals.values()),
         metrics,
         calibration.captures_used,
@@ -136,11 +139,30 @@ def check_session(
     )
 
 
-def contradictions(metrics: Metrics | None, rig: Rig) -> tuple[str, ...]:
-    """Say where captures contradict an extrinsic: residuals beyond the limits, or no board at all."""
-    if metrics is None:
-        return ("no capture shows the board to both sensors",)
-    return tuple(residuals_beyond(metrics, rig.quality))
+def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: int) -> tuple[str, ...]:
+    """Say where captures contradict an extrinsic: large residuals, or no board where it should be.
+
+    Args:
+        metrics: of the captures in which both sensors see the board in one place; None without any.
+        rig: its limits.
+        n_elsewhere: captures in which no place in the scan is near the one the camera sees; a board that the
+            LiDAR missed among other things of its size is no contradiction, many are.
+        n_seen: captures in which both sensors saw something.
+    """
+    doubts = [] if metrics is None else residuals_beyond(metrics, rig.quality)
+    if 4 * n_elsewhere > n_seen:
+        text = (
+            f"in {n_elsewhere} of {n_seen} captures nothing in the scan is where the extrinsic puts the board"
+        )
+        doubts.append(text)
+    if n_seen == 0:
+        doubts.append("no capture shows the board to both sensors")
+    return tuple(doubts)
+
+
+def _sees_board(detections: Detections, pair: Pair, name: str) -> bool:
+    image, lidar = detections.of(pair, name)
+    return isinstance(image, ImageBoard) and isinstance(lidar, list)
 
 
 def _meetings(
@@ -160,11 +182,15 @@ def _meetings(
 def _observe(
     rig: Rig, detections: Detections, pair: Pair, name: str, calibration: Calibration
 ) -> Observation | None:
+    """Pair what both sensors saw; None where nothing in the scan is near the board that the camera sees."""
     image, lidar = detections.of(pair, name)
     if not isinstance(image, ImageBoard) or not isinstance(lidar, list):
         return None
     candidates = CaptureCandidates(name, image, lidar)
-    return match_candidates(candidates, rig.board.to_board(), calibration.T_cam_lidar)
+    matched = match_candidates(candidates, rig.board.to_board(), calibration.T_cam_lidar)
+    middle = calibration.T_cam_lidar @ matched.lidar.T_lidar_board[:, 3]
+    apart_m = float(np.linalg.norm(middle[:3] - matched.image.T_cam_board[:3, 3]))
+    return matched if apart_m < _ELSEWHERE_M else None
 
 
 def _draw(
