@@ -79,8 +79,22 @@ def simulate_captures(
 
 def _still_capture(stage: Stage, index: int) -> SimulatedCapture:
     rng = stage.rng(index, PLACEMENT)
-    T_world_board = stage.place(index, rng)
-    carrier = build_carrier(stage.options.carrier, stage.board, T_world_board, rng)
+    return capture_at(stage, index, stage.place(index, rng), rng)
+
+
+def capture_at(
+    stage: Stage, index: int, T_world_board: Array, rng: np.random.Generator | None = None
+) -> SimulatedCapture:
+    """Take one capture of a board that is held still at a given place.
+
+    Args:
+        stage: the session, see `set_stage`.
+        index: of the capture; its noise and its stamp follow from it.
+        T_world_board: (4, 4).
+        rng: source of what its carrier looks like; follows from the index by default.
+    """
+    carrier_rng = stage.rng(index, CARRIER) if rng is None else rng
+    carrier = build_carrier(stage.options.carrier, stage.board, T_world_board, carrier_rng)
     scene = Scene(stage.room.raycaster, carrier, stage.board, T_world_board, stage.options.print_reflectivity)
     stamp_ns = _FIRST_STAMP_NS + index * _CAPTURE_EVERY_NS
     exposed_ns = stamp_ns + _half_turn_ns(stage, index)

@@ -123,6 +123,11 @@ def _is_in_picture(view: View, board: Board, T_world_board: Array) -> bool:
     return bool(np.all(is_seen & (np.linalg.norm(offset, axis=-1) < 0.97 * lens_reach(lens))))
 
 
+def can_be_held(view: View, board: Board, room: Room, T_world_board: Array) -> bool:
+    """Tell whether somebody can hold the board there, and the camera and the LiDAR see all of it."""
+    return _is_in_picture(view, board, T_world_board) and _stands_free(view, board, room, T_world_board)
+
+
 def _stands_free(view: View, board: Board, room: Room, T_world_board: Array) -> bool:
     centre, normal = T_world_board[:3, 3], T_world_board[:3, 2]
     if abs(normal[2]) > 0.7:

@@ -88,7 +88,7 @@ def _row(name: str, sessions: Sequence[SessionRun]) -> tuple[object, ...]:
     return (
         name,
         len(runs),
-        f"{len(corners)} of {n}" if corners else "-",
+        "-" if "+" in name else f"{len(corners)} of {n}",
         f"{rms(np.array(corners)):.3f}" if corners else "-",
         *errors,
         f"{1000 * rms(np.array(clocks)):.1f}" if clocks else "-",

@@ -1,0 +1,140 @@
+"""Places at which a person can hold the board so that both sensors see it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.collect.guidance.sensors import SensorModel
+from lce_rig.core.geometry import Array, exp_so3, invert, pose
+
+NEAREST_M = 1.2
+TILTS_DEG = (0.0, 22.0, 42.0)
+N_TILT_DIRECTIONS = 8
+#: As a diamond each ring crosses two slanted edges.
+DIAMOND_DEG = 45.0
+ROLLS_DEG = (-12.0, 0.0, 12.0)
+#: Share of the plate's height that must lie within the LiDAR's vertical field.
+SEEN_SHARE = 0.8
+#: How far below and above the LiDAR arms hold the board's centre.
+REACH_M = (-0.9, 0.8)
+#: Least side of a square, foreshortened by the tilt, from which corners are found without fail.
+LEAST_SQUARE_PX = 5.0
+# Free border of the picture, as a share of its width: people do not hold the board to the pixel.
+_MARGIN = 0.03
+_GRAZING_COSINE = 0.45
+# Powers of 1/g with g^4 = g + 1 fill three dimensions evenly (M. Roberts, 2018).
+_SPREAD = (1 / 1.2207440846057596) ** np.arange(1, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Where the camera, the LiDAR and the ground are.
+
+    Attributes:
+        model: the sensors.
+        T_cam_lidar: (4, 4) rough extrinsic.
+        up: (3,) unit vector upwards, frame camera.
+    """
+
+    model: SensorModel
+    T_cam_lidar: Array
+    up: Array
+
+    @classmethod
+    def upright(cls, model: SensorModel, T_cam_lidar: Array) -> "View":
+        """Take the LiDAR's z axis for the vertical, as spinning LiDARs stand upright."""
+        return cls(model, T_cam_lidar, np.asarray(T_cam_lidar[:3, 2]))
+
+
+def spread_candidates(view: View, n_places: int = 60, n_tilts: int = 8) -> Array:
+    """Lay out poses T_cam_board (N, 4, 4) that both sensors see, evenly over everything that is reachable.
+
+    Args:
+        view: the sensors.
+        n_places: places of the board's centre, over the picture and the distances, that are tried.
+        n_tilts: tilts, of `TILTS_DEG` in eight directions, that are tried at each; the next ones at the next.
+    """
+    lens = view.model.lens
+    even = np.mod(0.5 + np.arange(1, n_places + 1)[:, None] * _SPREAD, 1.0)
+    pixels = (0.1 + 0.8 * even[:, :2]) * [lens.width_px - 1, lens.height_px - 1]
+    rays = lens.unproject(pixels)
+    far_m = view.model.limits.max_distance_m
+    # Equal steps in 1/distance: near boards differ more from one another.
+    distance_m = 1 / (1 / NEAREST_M + (1 / far_m - 1 / NEAREST_M) * even[:, 2])
+    tilts = _tilts()
+    which = np.arange(n_places * n_tilts)
+    tilt = tilts[(which * 5) % len(tilts)]
+    roll = np.radians(DIAMOND_DEG + np.array(ROLLS_DEG)[(which // len(tilts)) % len(ROLLS_DEG)])
+    place = which // n_tilts
+    is_known = np.isfinite(rays[place]).all(axis=1)
+    place, tilt, roll = place[is_known], tilt[is_known], roll[is_known]
+    poses = face_camera(view, rays[place], distance_m[place], tilt, roll)
+    return poses[is_reachable(view, poses)]
+
+
+def face_camera(view: View, rays: Array, distance_m: Array, tilt_rad: Array, roll_rad: Array) -> Array:
+    """Build T_cam_board (N, 4, 4) of boards that look at the camera, tilted and rolled.
+
+    Args:
+        view: the sensors.
+        rays: (N, 3) unit vectors from the camera to the board's centre.
+        distance_m: (N,).
+        tilt_rad: (N, 2) about the board's horizontal axis (to the right as the camera sees it) and about the
+            axis square to it, upwards.
+        roll_rad: (N,) about its normal, 0 where its width is level.
+    """
+    facing = facing_axes(view, rays)
+    turns = np.concatenate([tilt_rad, np.zeros((len(tilt_rad), 1))], axis=1)
+    rolls = np.concatenate([np.zeros((len(roll_rad), 2)), roll_rad[:, None]], axis=1)
+    return pose(facing @ exp_so3(turns) @ exp_so3(rolls), distance_m[:, None] * rays)
+
+
+def facing_axes(view: View, rays: Array) -> Array:
+    """Build the axes (N, 3, 3) of boards that face the camera: level to the right, upwards, towards it."""
+    right = np.cross(view.up, -rays)
+    right /= np.maximum(np.linalg.norm(right, axis=1, keepdims=True), 1e-9)
+    return np.stack([right, np.cross(-rays, right), -rays], axis=-1)
+
+
+def is_reachable(view: View, T_cam_board: Array) -> NDArray[np.bool_]:
+    """Tell which poses (N, 4, 4) a person can hold and both sensors see, (N,)."""
+    model, limits = view.model, view.model.limits
+    centre, normal = T_cam_board[:, :3, 3], T_cam_board[:, :3, 2]
+    distance_m = np.linalg.norm(centre, axis=1)
+    ok = (distance_m >= max(NEAREST_M, limits.min_distance_m) - 1e-6) & (distance_m <= limits.max_distance_m)
+
+    cosine = np.sum(-normal * centre, axis=1) / distance_m
+    focal_px = min(model.lens.fx_px, model.lens.fy_px)
+    square_px = focal_px * model.board.square_m / distance_m * cosine
+    ok &= cosine > np.cos(np.radians(limits.max_tilt_deg))
+    ok &= square_px > max(LEAST_SQUARE_PX, limits.min_square_px)
+
+    outline = np.einsum("nij,kj->nki", T_cam_board[:, :3, :3], model.board.outline()) + centre[:, None]
+    pixels, is_valid = model.lens.project(outline)
+    ok &= np.all(is_valid & model.lens.is_inside(pixels, _MARGIN * model.lens.width_px), axis=1)
+
+    T_lidar_cam = invert(view.T_cam_lidar)
+    seen = outline @ T_lidar_cam[:3, :3].T + T_lidar_cam[:3, 3]
+    elevation = np.arctan2(seen[..., 2], np.hypot(seen[..., 0], seen[..., 1]))
+    lasers = model.elevations_rad
+    half_gap = np.ptp(lasers) / (len(lasers) - 1) / 2
+    top, bottom = elevation.max(axis=1), elevation.min(axis=1)
+    covered = np.minimum(top, lasers.max() + half_gap) - np.maximum(bottom, lasers.min() - half_gap)
+    ok &= covered >= SEEN_SHARE * (top - bottom)
+
+    to_lidar = view.T_cam_lidar[:3, 3] - centre
+    range_m = np.linalg.norm(to_lidar, axis=1)
+    ok &= np.sum(normal * to_lidar, axis=1) > _GRAZING_COSINE * range_m
+    height_m = -to_lidar @ view.up
+    ok &= (height_m > REACH_M[0]) & (height_m < REACH_M[1])
+    # Nobody holds a board flat.
+    return np.asarray(ok & (np.abs(normal @ view.up) < 0.7))
+
+
+def _tilts() -> Array:
+    """List all tilts (T, 2) about the level axis and the upward one, rad."""
+    straight, *tilted = np.radians(TILTS_DEG)
+    direction = 2 * np.pi * np.arange(N_TILT_DIRECTIONS) / N_TILT_DIRECTIONS
+    circle = np.stack([np.cos(direction), np.sin(direction)], axis=1)
+    return np.concatenate([[[straight, straight]], *(each * circle for each in tilted)])

@@ -1,0 +1,207 @@
+"""What a board placement tells about the extrinsic, before it is captured; sums over placements just add.
+
+The estimate minimises sum_k f_k (calibrate/problem.py). With half Hessians H_k, half gradients whose noise
+has covariance B_k, and half gradients that move by D_k b when the L lasers measure b too long, the estimate
+errs by -H^-1 sum_k (noise + D_k b), H = sum_k H_k + prior, hence
+
+    cov = H^-1 (sum_k B_k) H^-1 + systematic(S),    S = -H^-1 sum_k D_k                                  (1)
+
+with the systematic part of lce_rig.solvers.covariance. All are first built in the board's frame, in which a
+plane's residual depends on three freedoms b(u, v) = (1, u, v) only, and then moved to the camera's.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.collect.guidance.rings import Rings, cross_board
+from lce_rig.collect.guidance.sensors import SensorModel
+from lce_rig.core.geometry import Array, invert, skew
+from lce_rig.solvers.covariance import symmetric_inverse
+
+#: Extrinsic tangent (translation m, rotation rad, axes of the camera) and the edge shift.
+N_UNKNOWNS = 7
+_PLANE_FREEDOMS = 3
+# Ring ends of a usual capture: what weighs edges against planes.
+_USUAL_ENDS = 14
+_EDGE_NORMALS = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+# A ring is represented by its ends and its middle, with Simpson's weights: exact for second moments.
+_NODES = np.array([0.0, 0.5, 1.0])
+_SHARES = np.array([1.0, 4.0, 1.0]) / 6
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What each of N placements adds to (1).
+
+    Attributes:
+        hessian: (N, 7, 7) H_k.
+        noise: (N, 7, 7) B_k.
+        drift: (N, 7, L) D_k.
+        n_rings: (N,) rings on the board.
+        n_points: (N,) points on the board.
+    """
+
+    hessian: Array
+    noise: Array
+    drift: Array
+    n_rings: NDArray[np.intp]
+    n_points: Array
+
+    def of(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> "Evidence":
+        """Take some of the placements."""
+        return Evidence(
+            self.hessian[chosen],
+            self.noise[chosen],
+            self.drift[chosen],
+            self.n_rings[chosen],
+            self.n_points[chosen],
+        )
+
+
+def weigh_placements(model: SensorModel, T_cam_board: Array, T_cam_lidar: Array) -> Evidence:
+    """Work out what boards at given places would tell.
+
+    Args:
+        model: the sensors.
+        T_cam_board: (N, 4, 4).
+        T_cam_lidar: (4, 4) rough extrinsic: the profile's nominal, or an estimate.
+    """
+    rings = cross_board(model, invert(T_cam_lidar) @ T_cam_board)
+    hessian, by_plane, edge_noise = _in_board_frame(model, rings, T_cam_board, T_cam_lidar)
+    fit, by_laser = _plane_fit(model, rings, T_cam_board, T_cam_lidar)
+    pose_cov = _pose_covariance(model, T_cam_board)
+    of_pose = hessian[:, :, :6]
+    noise = edge_noise + of_pose @ pose_cov @ np.swapaxes(of_pose, 1, 2)
+    noise += by_plane @ fit @ np.swapaxes(by_plane, 1, 2)
+    A = _to_board_tangent(T_cam_board, T_cam_lidar)
+    A_T = np.swapaxes(A, 1, 2)
+    return Evidence(
+        hessian=A_T @ hessian @ A,
+        noise=A_T @ noise @ A,
+        drift=A_T @ by_plane @ by_laser,
+        n_rings=rings.n_rings,
+        n_points=rings.n_points.sum(axis=1),
+    )
+
+
+def _in_board_frame(
+    model: SensorModel, rings: Rings, T_cam_board: Array, T_cam_lidar: Array
+) -> tuple[Array, Array, Array]:
+    """Build half Hessians, half gradients by errors of the LiDAR's plane, and the noise of ring ends.
+
+    Returns:
+        (N, 7, 7), (N, 7, 3) by b of an error along the board's normal, (N, 7, 7).
+    """
+    errors = model.errors
+    n, n_lasers = rings.n_points.shape
+    n_ends = 2 * n_lasers
+    moments = _plane_moments(rings)
+    total = np.maximum(rings.n_points.sum(axis=1), 1.0)[:, None, None]
+    # Rows of planes are -(0, 0, 1, v, -u, 0, 0).
+    rows = np.zeros((N_UNKNOWNS, _PLANE_FREEDOMS))
+    rows[2, 0], rows[3, 2], rows[4, 1] = -1.0, -1.0, 1.0
+    w_plane = _PLANE_FREEDOMS / errors.plane_m**2
+    hessian = w_plane * rows @ (moments / total) @ rows.T
+    by_plane = -w_plane * rows @ (moments / total)
+
+    is_seen = (rings.n_points > 0)[..., None]
+    ends, normal = rings.ends, _EDGE_NORMALS[rings.edge]
+    lever = ends[..., 0] * normal[..., 1] - ends[..., 1] * normal[..., 0]
+    edge_rows = np.zeros((*rings.edge.shape, N_UNKNOWNS))
+    edge_rows[..., :2], edge_rows[..., 5], edge_rows[..., 6] = -normal, -lever, 1.0
+    edge_rows = (edge_rows * is_seen[..., None]).reshape(n, n_ends, N_UNKNOWNS)
+    n_seen = np.maximum(2 * rings.n_rings, 1)[:, None, None]
+    w_edge = _USUAL_ENDS / errors.edge_m**2 / n_seen
+    edge_T = np.swapaxes(edge_rows, 1, 2)
+    hessian += w_edge * (edge_T @ edge_rows)
+
+    eye = _lidar_in_board(T_cam_board, T_cam_lidar)[:, None, None, :]
+    # A plane too far along the normal moves its ring ends sideways, along their rays.
+    sideways = np.sum(normal * (ends - eye[..., :2]), axis=-1) / -eye[..., 2]
+    basis = np.concatenate([np.ones((*ends.shape[:-1], 1)), ends], axis=-1)
+    by_plane -= w_edge * edge_T @ (sideways[..., None] * basis).reshape(n, n_ends, _PLANE_FREEDOMS)
+
+    chord = ends[:, :, 1] - ends[:, :, 0]
+    direction = chord / np.maximum(np.linalg.norm(chord, axis=-1, keepdims=True), 1e-9)
+    across = np.abs(np.sum(direction[:, :, None] * normal, axis=-1))
+    # Edges lie anywhere between a ring's last point and the next one.
+    variance = (across * rings.spacing_m[..., None]) ** 2 / 12 + errors.ring_end_m**2
+    edge_noise = w_edge**2 * ((edge_T * variance.reshape(n, 1, n_ends)) @ edge_rows)
+    by_side = w_edge * edge_T @ np.eye(len(_EDGE_NORMALS))[rings.edge.reshape(n, n_ends)]
+    edge_noise += errors.side_m**2 * by_side @ np.swapaxes(by_side, 1, 2)
+    return hessian, by_plane, edge_noise
+
+
+def _plane_moments(rings: Rings) -> Array:
+    """Sum b b^T over the points of each board, (N, 3, 3)."""
+    basis = _node_basis(rings)
+    weights = rings.n_points[..., None] * _SHARES
+    return np.asarray(np.einsum("nlk,nlki,nlkj->nij", weights, basis, basis, optimize=True))
+
+
+def _node_basis(rings: Rings) -> Array:
+    """Evaluate b = (1, u, v) at the ends and the middle of each ring, (N, L, 3, 3)."""
+    nodes = rings.ends[:, :, :1] + _NODES[:, None] * (rings.ends[:, :, 1:] - rings.ends[:, :, :1])
+    return np.concatenate([np.ones((*nodes.shape[:-1], 1)), nodes], axis=-1)
+
+
+def _plane_fit(
+    model: SensorModel, rings: Rings, T_cam_board: Array, T_cam_lidar: Array
+) -> tuple[Array, Array]:
+    """Propagate range errors to the LiDAR's plane, which is fitted by least squares along its normal.
+
+    Returns:
+        The covariance (N, 3, 3) that range noise leaves, and the plane's move (N, 3, L) by m of each laser.
+    """
+    basis, weights, moments = _node_basis(rings), rings.n_points[..., None] * _SHARES, _plane_moments(rings)
+    eye = _lidar_in_board(T_cam_board, T_cam_lidar)[:, None, None, :]
+    range_m = np.sqrt(np.sum((basis[..., 1:] - eye[..., :2]) ** 2, axis=-1) + eye[..., 2] ** 2)
+    incidence = -eye[..., 2] / range_m
+    inverse = symmetric_inverse(moments + 1e-9 * np.eye(3))
+    mean_square = np.sum(weights * incidence**2, axis=(1, 2)) / np.maximum(weights.sum(axis=(1, 2)), 1e-9)
+    fit = (model.errors.range_m**2 * mean_square)[:, None, None] * inverse
+    pull = np.einsum("nlk,nlki->nil", weights * incidence, basis)
+    return fit, inverse @ pull
+
+
+def _pose_covariance(model: SensorModel, T_cam_board: Array) -> Array:
+    """Predict the covariance (N, 6, 6) of the camera's pose of boards, axes of the board, about its centre.
+
+    Corners give (J^T J)^-1 sigma^2 with the pinhole's J; what is common to a capture is added.
+    """
+    corners, errors = model.board.corners(), model.errors
+    R, lens = T_cam_board[:, :3, :3], model.lens
+    points = np.einsum("nij,kj->nki", R, corners) + T_cam_board[:, None, :3, 3]
+    x, y, z = np.moveaxis(points, -1, 0)
+    depth = np.maximum(z, 0.1)
+    by_point = np.zeros((*depth.shape, 2, 3))
+    by_point[..., 0, 0], by_point[..., 0, 2] = lens.fx_px / depth, -lens.fx_px * x / depth**2
+    by_point[..., 1, 1], by_point[..., 1, 2] = lens.fy_px / depth, -lens.fy_px * y / depth**2
+    by_shift = by_point @ R[:, None]
+    by_turn = -by_shift @ skew(corners)
+    J = np.concatenate([by_shift, by_turn], axis=-1).reshape(len(R), 2 * len(corners), 6)
+    cov = errors.corner_px**2 * symmetric_inverse(np.swapaxes(J, 1, 2) @ J)
+    common = np.array([0.0, 0.0, errors.depth_m, errors.tilt_rad, errors.tilt_rad, errors.tilt_rad])
+    return np.asarray(cov + np.diag(common**2))
+
+
+def _to_board_tangent(T_cam_board: Array, T_cam_lidar: Array) -> Array:
+    """Build A (N, 7, 7), from the extrinsic's tangent to motions of the LiDAR's points on the board.
+
+    A point x moves by tau + phi x (x - t): by R^T (tau + phi x (c - t)) at the board's centre c, seen from
+    the board, and turns about it by R^T phi.
+    """
+    R_T = np.swapaxes(T_cam_board[:, :3, :3], 1, 2)
+    A = np.zeros((len(R_T), N_UNKNOWNS, N_UNKNOWNS))
+    A[:, :3, :3] = A[:, 3:6, 3:6] = R_T
+    A[:, :3, 3:6] = -R_T @ skew(T_cam_board[:, :3, 3] - T_cam_lidar[:3, 3])
+    A[:, 6, 6] = 1.0
+    return A
+
+
+def _lidar_in_board(T_cam_board: Array, T_cam_lidar: Array) -> Array:
+    """Find the LiDAR's origin (N, 3) in the frame of each board."""
+    to_lidar = T_cam_lidar[:3, 3] - T_cam_board[:, :3, 3]
+    return np.asarray(np.einsum("nji,nj->ni", T_cam_board[:, :3, :3], to_lidar))

@@ -1,0 +1,177 @@
+"""The next placement: the reachable one that shrinks the predicted covariance most."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.collect.guidance.candidates import View, spread_candidates
+from lce_rig.collect.guidance.evidence import Evidence, weigh_placements
+from lce_rig.collect.guidance.precision import Precision, combine, combine_with_each, shortfall, sigmas
+from lce_rig.collect.guidance.words import instruct, say
+from lce_rig.core.geometry import Array, rotation_angle
+from lce_rig.core.results import Refusal
+
+#: Fewer captures hardly tell their own scatter (below 7 unknowns + 4 its correction has no meaning).
+FEWEST_FOR_ENOUGH = 11
+#: The target counts as met when the calibration is predicted to state this share of it.
+ENOUGH_SHARE = 0.9
+#: A placement that brings less than this share of what the best one would adds nothing.
+LEAST_SHARE = 0.1
+#: Around a place that cannot be reached.
+AVOIDED_M = 0.4
+# A metre of way, or a turn by a radian, costs as much as an answer that is so much worse.
+_EFFORT = 0.01
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Novelty:
+    """Which placements count as the same: moved and turned by less than this."""
+
+    min_move_m: float = 0.15
+    min_turn_deg: float = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Guidance:
+    """What is known after some captures, and where the board should go next.
+
+    Attributes:
+        n_captures: placements held.
+        sigma_rotation_deg, sigma_translation_m: predicted error now.
+        next_rotation_deg, next_translation_m: the same after the wanted placement.
+        is_enough: whether the calibration is predicted to meet the profile's target, with a margin.
+        T_cam_board: (4, 4) wanted; None where no reachable placement is new.
+    """
+
+    n_captures: int
+    sigma_rotation_deg: float
+    sigma_translation_m: float
+    next_rotation_deg: float
+    next_translation_m: float
+    is_enough: bool
+    T_cam_board: Array | None
+
+
+class Planner:
+    """Chooses placements of the board before one camera and one LiDAR.
+
+    Args:
+        view: the sensors, and the extrinsic as far as it is known.
+        novelty: which placements count as the same.
+        n_places: how many places of the board's centre are considered, with eight tilts each.
+    """
+
+    def __init__(self, view: View, novelty: Novelty | None = None, n_places: int = 400) -> None:
+        self.view = view
+        self.novelty = novelty or Novelty()
+        poses = spread_candidates(view, n_places)
+        evidence = weigh_placements(view.model, poses, view.T_cam_lidar)
+        # One ring more than needed, as people do not hold the board to the centimetre.
+        is_seen = (evidence.n_rings > view.model.limits.min_rings) & (
+            evidence.n_points >= view.model.limits.min_points
+        )
+        self.candidates, self._evidence = poses[is_seen], evidence.of(is_seen)
+
+    def guide(self, held: Array, present: Array | None = None, avoid: Array | None = None) -> Guidance:
+        """Say how well the extrinsic is known, and where the board should go.
+
+        Args:
+            held: (N, 4, 4) T_cam_board of the captures so far; N may be 0.
+            present: (4, 4) where the board is now; of placements that are nearly as good the nearest wins.
+            avoid: (M, 4, 4) placements that cannot be reached, or where a sensor does not find the board:
+                something is in the way, so that others near them are not asked for either.
+        """
+        model = self.view.model
+        evidence = self._weigh(held)
+        now = combine(evidence, model.errors)
+        after = combine_with_each(evidence, self._evidence, model.errors)
+        cost = shortfall(model, after.improvable)
+        if present is not None:
+            cost = cost * (1 + _EFFORT * _effort(present, self.candidates))
+        is_taken = self._is_like(held, self.candidates).any(axis=0)
+        if avoid is not None:
+            is_taken |= _way_m(avoid, self.candidates).min(axis=0, initial=np.inf) < AVOIDED_M
+        cost[is_taken] = np.inf
+        best = int(np.argmin(cost)) if len(cost) else 0
+        wanted = self.candidates[best] if len(cost) and np.isfinite(cost[best]) else None
+        rotation, translation = sigmas(now.cov)
+        then = now.cov if wanted is None else after.cov[best]
+        next_rotation, next_translation = sigmas(then)
+        return Guidance(
+            n_captures=len(held),
+            sigma_rotation_deg=float(np.degrees(rotation)),
+            sigma_translation_m=float(translation),
+            next_rotation_deg=float(np.degrees(next_rotation)),
+            next_translation_m=float(next_translation),
+            is_enough=self._is_enough(now, len(held)),
+            T_cam_board=wanted,
+        )
+
+    def adds_nothing(self, held: Array, present: Array, names: Sequence[str] | None = None) -> Refusal | None:
+        """Refuse a placement that would hardly shrink the predicted covariance.
+
+        Args:
+            held: (N, 4, 4) T_cam_board of the captures so far.
+            present: (4, 4) where the board is.
+            names: of the captures held; numbers from 1 by default.
+
+        Returns:
+            Why not to capture it and where to go instead; None where it adds something.
+        """
+        guidance = self.guide(held, present)
+        wanted = guidance.T_cam_board
+        action = "you may stop" if wanted is None else say(instruct(self.view, present, wanted))
+        alike = np.flatnonzero(self._is_like(held, present[None])[:, 0])
+        if len(alike):
+            name = str(alike[0] + 1) if names is None else names[alike[0]]
+            return Refusal("calibrate", f"the board stands where capture {name} shows it", action)
+        if wanted is None:
+            return None
+        own, best = self._gains(held, np.stack([present, wanted]))
+        if own >= LEAST_SHARE * best:
+            return None
+        cause = (
+            f"this placement makes the result {max(100 * own, 0.0):.1f} % better, another {100 * best:.0f} %"
+        )
+        return Refusal("calibrate", cause, action)
+
+    def _gains(self, held: Array, placements: Array) -> Array:
+        """Compute by which share each of some placements (N, 4, 4) shrinks what can be shrunk, (N,)."""
+        model, evidence = self.view.model, self._weigh(held)
+        now = shortfall(model, combine(evidence, model.errors).improvable)
+        after = combine_with_each(evidence, self._weigh(placements), model.errors)
+        return np.asarray(1 - shortfall(model, after.improvable) / now)
+
+    def _weigh(self, poses: Array) -> Evidence:
+        return weigh_placements(self.view.model, poses, self.view.T_cam_lidar)
+
+    def _is_enough(self, now: Precision, n_captures: int) -> bool:
+        if n_captures < max(FEWEST_FOR_ENOUGH, self.view.model.limits.min_captures):
+            return False
+        rotation, translation = sigmas(now.claimed(n_captures))
+        model = self.view.model
+        worse = max(rotation / model.target_sigma_rad, translation / model.target_sigma_m)
+        return bool(worse <= ENOUGH_SHARE)
+
+    def _is_like(self, held: Array, others: Array) -> NDArray[np.bool_]:
+        """Tell which of others (M, 4, 4) stand where one of those held (N, 4, 4) does, (N, M)."""
+        # The print may be read from either end.
+        R, R_others = held[:, None, :3, :3], others[None, :, :3, :3]
+        turn = np.minimum(rotation_angle(R, R_others), rotation_angle(R @ _HALF_TURN, R_others))
+        is_turned = turn >= np.radians(self.novelty.min_turn_deg)
+        return np.asarray((_way_m(held, others) < self.novelty.min_move_m) & ~is_turned)
+
+
+def _way_m(held: Array, others: Array) -> Array:
+    """Measure the distances (N, M) between boards (N, 4, 4) and others (M, 4, 4)."""
+    return np.asarray(np.linalg.norm(held[:, None, :3, 3] - others[None, :, :3, 3], axis=-1))
+
+
+def _effort(present: Array, candidates: Array) -> Array:
+    """Measure the way and the turn from one pose (4, 4) to others (N, 4, 4), m and rad together."""
+    way_m = np.linalg.norm(candidates[:, :3, 3] - present[:3, 3], axis=1)
+    turn = np.arccos(np.clip(candidates[:, :3, 2] @ present[:3, 2], -1.0, 1.0))
+    return np.asarray(way_m + turn)

@@ -1,0 +1,134 @@
+"""What a camera and a LiDAR measure of a board, and how well, as far as guidance must know beforehand."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.errors import ProfileError
+from lce_rig.core.geometry import Array
+from lce_rig.rig import QualitySettings, Rig
+from lce_rig.simulate.lidar import VLP16
+
+#: How many captures' residuals the assumed errors are worth.
+PRIOR_CAPTURES = 5
+#: Rms distance of a board's points from its middle line: what a tilt moves them by.
+BOARD_LEVER_M = 0.2
+_BEAMS = {"vlp16": VLP16}
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """Standard deviations of what is measured.
+
+    The errors of a capture are those of its corners, ranges and ring ends, which average out over many
+    points, and those common to all its points, which do not: an imperfect lens model, a bowed board, a hand
+    that is never quite still, an arm behind one edge. Those of the pose are given as if they were the
+    camera's.
+
+    Attributes:
+        corner_px: of a corner, per coordinate.
+        range_m: of a range, from shot to shot.
+        ring_end_m: of a ring's end across the board's edge, beyond the spacing of its points.
+        side_m: of all ring ends on one edge of the plate in one capture: what stands behind it draws them.
+        tilt_rad: of the board's pose about its three axes, common to a capture.
+        depth_m: of the board's place along its normal, common to a capture.
+        laser_bias_m: of the lasers' constant range errors about their mean.
+        range_offset_m: of that mean.
+        plane_m, edge_m: typical residuals of a capture, by which the solver weighs planes against edges.
+        edge_shift_m: of the distance by which ring ends lie beyond the plate, a priori.
+    """
+
+    corner_px: float = 0.05
+    range_m: float = 0.010
+    ring_end_m: float = 0.004
+    side_m: float = 0.003
+    tilt_rad: float = 0.001
+    depth_m: float = 0.001
+    laser_bias_m: float = 0.008
+    range_offset_m: float = 0.005
+    plane_m: float = 0.0035
+    edge_m: float = 0.005
+    edge_shift_m: float = 0.015
+
+    def learned(self, plane_rms_m: float, edge_rms_m: float, n_captures: int) -> "ErrorModel":
+        """Adapt to the residuals that captures of this rig left.
+
+        Where planes fit worse than expected, the poses of boards err more; where ring ends do, all their
+        errors grow alike. What is assumed here counts like `PRIOR_CAPTURES`.
+
+        Args:
+            plane_rms_m, edge_rms_m: of the calibration so far ("fit_plane_rms_m", "fit_edge_rms_m").
+            n_captures: behind it.
+        """
+        share = n_captures / (n_captures + PRIOR_CAPTURES)
+        plane_m = float(np.sqrt((1 - share) * self.plane_m**2 + share * plane_rms_m**2))
+        edge_m = float(np.sqrt((1 - share) * self.edge_m**2 + share * edge_rms_m**2))
+        excess = max(plane_m**2 - self.plane_m**2, 0.0) / 2
+        growth = edge_m / self.edge_m
+        return replace(
+            self,
+            ring_end_m=growth * self.ring_end_m,
+            side_m=growth * self.side_m,
+            tilt_rad=float(np.sqrt(self.tilt_rad**2 + excess / BOARD_LEVER_M**2)),
+            depth_m=float(np.sqrt(self.depth_m**2 + excess)),
+            plane_m=plane_m,
+            edge_m=edge_m,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SensorModel:
+    """A camera and a LiDAR that look at one board.
+
+    Attributes:
+        board: the board.
+        lens: the camera.
+        elevations_rad: (L,) of the LiDAR's rings, from the lowest.
+        azimuth_step_rad: angle between neighbouring firings of one ring.
+        limits: the profile's, on what a capture must show.
+        target_sigma_rad, target_sigma_m: how well the extrinsic is to be known.
+        errors: how both measure.
+    """
+
+    board: Board
+    lens: Intrinsics
+    elevations_rad: Array
+    azimuth_step_rad: float
+    limits: QualitySettings
+    target_sigma_rad: float
+    target_sigma_m: float
+    errors: ErrorModel = field(default_factory=ErrorModel)
+
+    def with_errors(self, errors: ErrorModel) -> "SensorModel":
+        """Exchange how both sensors measure."""
+        return replace(self, errors=errors)
+
+
+def model_sensors(rig: Rig, camera: str, lidar: str) -> SensorModel:
+    """Build the model of a pair of sensors from a profile.
+
+    Raises:
+        ProfileError: the beams of the LiDAR's model are not known.
+    """
+    settings = rig.lidars[lidar]
+    beams = _BEAMS.get("".join(c for c in settings.model.lower() if c.isalnum()))
+    if beams is None:
+        known = ", ".join(each.name for each in _BEAMS.values())
+        raise ProfileError(
+            f"lidars.{lidar}.model: no guidance for {settings.model}, its beams are not known",
+            f"collect without guidance, or use one of {known}",
+        )
+    return SensorModel(
+        board=rig.board.to_board(),
+        lens=rig.cameras[camera].to_intrinsics(),
+        elevations_rad=np.sort(beams.elevations_rad),
+        azimuth_step_rad=2 * np.pi * beams.sequence_ns * 1e-9 * settings.rate_hz,
+        limits=rig.quality,
+        target_sigma_rad=float(np.radians(rig.calibration.target_sigma_deg)),
+        target_sigma_m=rig.calibration.target_sigma_m,
+        errors=ErrorModel(
+            laser_bias_m=settings.laser_bias_sigma_m, range_offset_m=settings.range_offset_sigma_m
+        ),
+    )

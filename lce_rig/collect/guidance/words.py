@@ -1,0 +1,180 @@
+"""From where the board is to where it should be, in words for the person who stands behind it.
+
+That person faces the rig: what the camera sees on its right is on the person's left.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from lce_rig.collect.guidance.candidates import View, face_camera, facing_axes
+from lce_rig.core.geometry import Array, exp_so3
+
+Kind = Literal["sideways", "nearer", "height", "tilt", "turn", "roll"]
+
+STEP_M = 0.6
+MOST_AT_ONCE = 3
+#: What people cannot follow, or need not: smaller differences are not mentioned.
+DEAD_BANDS = {"sideways": 0.12, "nearer": 0.15, "height": 0.10, "tilt": 8.0, "turn": 8.0, "roll": 15.0}
+#: Within so many dead bands of every wanted figure the board is there.
+THERE = 1.5
+
+
+@dataclass(frozen=True)
+class Instruction:
+    """One thing to do.
+
+    Attributes:
+        kind: what changes.
+        amount: by how much, in m or deg; positive to the camera's right, nearer, up, top towards the rig,
+            the person's left side towards the rig, clockwise as the person sees it.
+        text: the same in words.
+    """
+
+    kind: Kind
+    amount: float
+    text: str
+
+    @property
+    def size(self) -> float:
+        """The amount in dead bands, which makes ways and angles comparable."""
+        return abs(self.amount) / DEAD_BANDS[self.kind]
+
+
+@dataclass(frozen=True)
+class HeldPose:
+    """How a board is held, as the person thinks of it.
+
+    Attributes:
+        right_m: of its centre to the right of the camera's sight line, level.
+        ahead_m: level distance from the camera along that line.
+        up_m: above the camera.
+        tilt_deg: how far the top leans towards the rig.
+        turn_deg: how far the person's left side is turned towards the rig.
+        roll_deg: turn in its plane, counter-clockwise as the camera sees it, 0 where its width is level.
+    """
+
+    right_m: float
+    ahead_m: float
+    up_m: float
+    tilt_deg: float
+    turn_deg: float
+    roll_deg: float
+
+
+def describe_pose(view: View, T_cam_board: Array) -> HeldPose:
+    """Take a pose T_cam_board (4, 4) apart."""
+    centre = T_cam_board[:3, 3]
+    right, ahead = _level_axes(view)
+    ray = centre / np.linalg.norm(centre)
+    R = facing_axes(view, ray[None])[0].T @ T_cam_board[:3, :3]
+    normal = R[:, 2]
+    # Turned upright about the shortest way, what is left is the roll.
+    axis = np.cross(normal, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(axis))
+    angle = np.arctan2(sine, normal[2])
+    upright = exp_so3(axis / max(sine, 1e-12) * angle) @ R
+    return HeldPose(
+        right_m=float(right @ centre),
+        ahead_m=float(ahead @ centre),
+        up_m=float(view.up @ centre),
+        tilt_deg=float(np.degrees(-np.arcsin(np.clip(normal[1], -1.0, 1.0)))),
+        turn_deg=float(np.degrees(-np.arctan2(normal[0], normal[2]))),
+        roll_deg=float(np.degrees(np.arctan2(upright[1, 0], upright[0, 0]))),
+    )
+
+
+def build_pose(view: View, held: HeldPose) -> Array:
+    """Put T_cam_board (4, 4) together, the inverse of `describe_pose`."""
+    right, ahead = _level_axes(view)
+    centre = held.right_m * right + held.ahead_m * ahead + held.up_m * view.up
+    distance_m = float(np.linalg.norm(centre))
+    tilt, turn = np.radians([held.tilt_deg, held.turn_deg])
+    level = np.cos(tilt)
+    normal = np.array([-np.sin(turn) * level, -np.sin(tilt), np.cos(turn) * level])
+    axis = np.cross([0.0, 0.0, 1.0], normal)
+    sine = float(np.linalg.norm(axis))
+    vector = axis / max(sine, 1e-12) * np.arctan2(sine, normal[2])
+    ray = (centre / distance_m)[None]
+    roll = np.radians(np.array([held.roll_deg]))
+    poses = face_camera(view, ray, np.array([distance_m]), vector[None, :2], roll)
+    return np.asarray(poses[0])
+
+
+def instruct(view: View, present: Array, wanted: Array) -> list[Instruction]:
+    """Say what to do, largest first, at most `MOST_AT_ONCE`; empty where the board is there.
+
+    Args:
+        view: the sensors.
+        present: (4, 4) T_cam_board now.
+        wanted: (4, 4) T_cam_board to reach.
+    """
+    every = [_instruction(kind, amount) for kind, amount in _changes(view, present, wanted).items()]
+    needed = sorted((each for each in every if each.size > 1), key=lambda each: -each.size)
+    return needed[:MOST_AT_ONCE]
+
+
+def say(instructions: Sequence[Instruction]) -> str:
+    """Join instructions to one sentence; "hold still" where there are none."""
+    return ", ".join(each.text for each in instructions) or "hold still"
+
+
+def is_there(view: View, present: Array, wanted: Array) -> bool:
+    """Tell whether a board (4, 4) is as near to where it should be as people can hold it."""
+    changes = _changes(view, present, wanted)
+    return all(abs(amount) <= THERE * DEAD_BANDS[kind] for kind, amount in changes.items())
+
+
+def _changes(view: View, present: Array, wanted: Array) -> dict[Kind, float]:
+    """Compute the signed changes by kind, m and deg, as `Instruction.amount`."""
+    now, then = describe_pose(view, present), describe_pose(view, wanted)
+    # A print looks the same from either end.
+    roll_deg = (then.roll_deg - now.roll_deg + 90) % 180 - 90
+    # Forwards is towards the rig from where the person stands.
+    sight = np.array([now.right_m, now.ahead_m]) / max(np.hypot(now.right_m, now.ahead_m), 1e-9)
+    way = np.array([then.right_m - now.right_m, then.ahead_m - now.ahead_m])
+    return {
+        "sideways": float(way @ [sight[1], -sight[0]]),
+        "nearer": float(-way @ sight),
+        "height": then.up_m - now.up_m,
+        "tilt": then.tilt_deg - now.tilt_deg,
+        "turn": then.turn_deg - now.turn_deg,
+        "roll": roll_deg,
+    }
+
+
+def _instruction(kind: Kind, amount: float) -> Instruction:
+    size = abs(amount)
+    if kind == "sideways":
+        text = f"{_way(size)} {'left' if amount > 0 else 'right'}"
+    elif kind == "nearer":
+        text = f"{size:.1f} m {'closer' if amount > 0 else 'back'}"
+    elif kind == "height":
+        text = f"{'raise' if amount > 0 else 'lower'} it {100 * size:.0f} cm"
+    elif kind == "tilt":
+        text = f"tilt the {'top' if amount > 0 else 'bottom'} {_angle(size)}towards the rig"
+    elif kind == "turn":
+        text = f"turn the {'left' if amount > 0 else 'right'} side {_angle(size)}towards the rig"
+    else:
+        text = f"rotate it {_angle(size)}{'clockwise' if amount > 0 else 'anticlockwise'}"
+    return Instruction(kind, amount, text)
+
+
+def _way(size_m: float) -> str:
+    if size_m < 0.75 * STEP_M:
+        return f"{10 * round(10 * size_m)} cm"
+    steps = round(size_m / STEP_M)
+    return "one step" if steps == 1 else f"{steps} steps"
+
+
+def _angle(size_deg: float) -> str:
+    return "a little " if size_deg < 15 else "far " if size_deg > 45 else ""
+
+
+def _level_axes(view: View) -> tuple[Array, Array]:
+    """Build the level directions to the camera's right and ahead of it, frame camera."""
+    right = np.cross(np.array([0.0, 0.0, 1.0]), view.up)
+    right /= max(float(np.linalg.norm(right)), 1e-9)
+    return right, np.asarray(np.cross(view.up, right))

@@ -1,0 +1,254 @@
+"""Does guidance help? A simulated person who follows it, against the same number of random placements."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from benchmarks.tables import print_head, print_row, rms
+from lce_rig import pipeline
+from lce_rig.calibrate import CalibrateOptions
+from lce_rig.collect.guidance import (
+    HeldPose,
+    Planner,
+    View,
+    build_pose,
+    combine,
+    describe_pose,
+    instruct,
+    model_sensors,
+    sigmas,
+    weigh_placements,
+)
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.geometry import Array, difference, exp_so3, fit_plane, pose
+from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.rig import Rig, load_rig
+from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures, truth_extrinsics
+from lce_rig.simulate.captures import capture_at
+from lce_rig.simulate.placements import can_be_held, count_rings
+from lce_rig.simulate.stage import Stage, set_stage
+
+RIGS = ("rlfs", "rles")
+# After so many tries a person gives a placement up: a wall is in the way, or the board is never seen whole.
+_TRIES = 8
+_PERSON, _OFFSET = 101, 102
+
+
+@dataclass(frozen=True)
+class Person:
+    """How somebody follows instructions.
+
+    Attributes:
+        place_sigma_m: error along each axis.
+        turn_sigma_deg: error about each axis.
+        ignored_share: how often one of the instructions is not followed.
+    """
+
+    place_sigma_m: float = 0.10
+    turn_sigma_deg: float = 8.0
+    ignored_share: float = 0.2
+
+    def follow(self, view: View, present: Array, wanted: Array, rng: np.random.Generator) -> Array:
+        """Move a board T_cam_board (4, 4) to where it is wanted, more or less."""
+        aim = describe_pose(view, wanted)
+        instructions = instruct(view, present, wanted)
+        if instructions and rng.random() < self.ignored_share:
+            aim = _without(
+                aim, describe_pose(view, present), rng.choice([each.kind for each in instructions])
+            )
+        aimed = build_pose(view, aim)
+        turn = exp_so3(np.radians(self.turn_sigma_deg) * rng.standard_normal(3))
+        place = aimed[:3, 3] + self.place_sigma_m * rng.standard_normal(3)
+        return pose(turn @ aimed[:3, :3], place)
+
+
+@dataclass(frozen=True, eq=False)
+class Visit:
+    """One capture of a session: what both sensors found, and where the board truly was."""
+
+    image: pipeline.ImageDetection
+    scan: pipeline.LidarDetection
+    T_cam_board: Array
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Errors of one session (6,), as calibrated and as predicted before."""
+
+    error: Array
+    predicted: tuple[float, float]
+    claimed: tuple[float, float]
+
+
+def bench_guidance(n_seeds: int, n_captures: int = 15) -> None:
+    """Tabulate the errors of guided and of random sessions."""
+    head = "rig, placements, seeds, captures, offset, rms deg, rms mm, predicted deg / mm, claimed deg / mm"
+    print_head(*head.split(", "))
+    for name in RIGS:
+        sessions = {
+            "random": [random_session(name, seed, n_captures) for seed in range(n_seeds)],
+            "guided": [guided_session(name, seed, n_captures) for seed in range(n_seeds)],
+        }
+        for offset in ("none", "drawn"):
+            for kind, visits in sessions.items():
+                print_outcomes(name, kind, n_captures, offset, visits)
+
+
+def print_outcomes(name: str, kind: str, n_captures: int, offset: str, sessions: list[list[Visit]]) -> None:
+    """Calibrate sessions and print a row."""
+    outcomes = [
+        outcome
+        for seed, visits in enumerate(sessions)
+        for outcome in judge_session(name, seed, visits, is_offset=offset == "drawn")
+    ]
+    errors = np.array([each.error for each in outcomes])
+    predicted, claimed = (
+        np.array([getattr(each, key) for each in outcomes]) for key in ("predicted", "claimed")
+    )
+    pairs = [
+        f"{rms(np.degrees(both[:, 0])):.4f} / {rms(1000 * both[:, 1]):.2f}" for both in (predicted, claimed)
+    ]
+    print_row(
+        name,
+        kind,
+        len(outcomes),
+        n_captures,
+        offset,
+        f"{rms(np.degrees(np.linalg.norm(errors[:, 3:], axis=1))):.4f}",
+        f"{rms(1000 * np.linalg.norm(errors[:, :3], axis=1)):.2f}",
+        *pairs,
+    )
+
+
+def random_session(name: str, seed: int, n_captures: int) -> list[Visit]:
+    """Capture boards wherever the simulator's own placements put them."""
+    rig = load_rig(name)
+    options = SimulationOptions.for_rig(name)
+    captures = simulate_captures(rig, n_captures=n_captures, seed=seed, options=options)
+    return [_visit(rig, capture) for capture in captures]
+
+
+def guided_session(name: str, seed: int, n_captures: int, person: Person | None = None) -> list[Visit]:
+    """Capture boards where a person puts them who is told where to go."""
+    person = person or Person()
+    rig = load_rig(name)
+    camera, lidar = next(iter(rig.cameras)), next(iter(rig.lidars))
+    nominal = rig.nominal(camera, lidar)
+    assert nominal is not None
+    view = View.upright(model_sensors(rig, camera, lidar), nominal.to_matrix())
+    planner = Planner(view)
+    stage = set_stage(rig, seed, SimulationOptions.for_rig(name))
+    rng = stage.rng(_PERSON)
+    present = build_pose(view, HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0))
+    held, avoid = np.zeros((0, 4, 4)), np.zeros((0, 4, 4))
+    visits: list[Visit] = []
+    while len(visits) < n_captures:
+        present, avoid = _go(planner, stage, person, held, present, avoid, rng)
+        visit = _visit(rig, capture_at(stage, len(visits), stage.views[0].T_world_cam @ present))
+        # As on a rig: nothing is captured while either sensor does not find the board.
+        if isinstance(visit.image, ImageBoard) and isinstance(visit.scan, list):
+            visits.append(visit)
+            held = np.concatenate([held, visit.image.T_cam_board[None]])
+        else:
+            avoid = np.concatenate([avoid, present[None]])
+    return visits
+
+
+def _go(
+    planner: Planner,
+    stage: Stage,
+    person: Person,
+    held: Array,
+    present: Array,
+    avoid: Array,
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Follow the guidance until both sensors see the board; give up what cannot be reached."""
+    view = stage.views[0]
+    while True:
+        wanted = planner.guide(held, present, avoid).T_cam_board
+        assert wanted is not None
+        for _ in range(_TRIES):
+            reached = person.follow(planner.view, present, wanted, rng)
+            T_world_board = view.T_world_cam @ reached
+            is_free = can_be_held(view, stage.board, stage.room, T_world_board)
+            if is_free and count_rings(view, stage.board, T_world_board) >= stage.rig.quality.min_rings:
+                return reached, avoid
+        avoid = np.concatenate([avoid, wanted[None]])
+
+
+def _visit(rig: Rig, capture: SimulatedCapture) -> Visit:
+    image, scan = capture.images[0], capture.scans[0]
+    truth = capture.T_cam_board[image.sensor]
+    return Visit(pipeline.detect_image(rig, image), pipeline.detect_scan(rig, scan), truth)
+
+
+def judge_session(name: str, seed: int, visits: list[Visit], *, is_offset: bool) -> Iterator[Outcome]:
+    """Calibrate a session and hold it against the truth; nothing where there are too few captures.
+
+    Args:
+        name: of the rig.
+        seed: of the session.
+        visits: its captures.
+        is_offset: whether all ranges are off by one error of the size that the profile states, which the
+            simulator does not have by itself; the prediction allows for it only then.
+    """
+    rig = load_rig(name)
+    camera, lidar = next(iter(rig.cameras)), next(iter(rig.lidars))
+    sigma_m = rig.lidars[lidar].range_offset_sigma_m
+    offset_m = sigma_m * np.random.default_rng([seed, _OFFSET]).standard_normal() if is_offset else 0.0
+    names = [f"{k:06d}" for k in range(len(visits))]
+    images = {name: visit.image for name, visit in zip(names, visits, strict=True)}
+    scans = {name: lengthen(visit.scan, offset_m) for name, visit in zip(names, visits, strict=True)}
+    detections = pipeline.Detections({(camera, "frames"): images}, {lidar: scans})
+    try:
+        result, estimate = pipeline.calibrate(rig, detections, CalibrateOptions(seed=seed))[0][0]
+    except NotEnoughDataError:
+        return
+    used = np.array([v.T_cam_board for n, v in zip(names, visits, strict=True) if n in estimate.used])
+    model = model_sensors(rig, camera, lidar)
+    figures = estimate.diagnostics
+    errors = model.errors.learned(figures["fit_plane_rms_m"], figures["fit_edge_rms_m"], len(used))
+    errors = errors if is_offset else replace(errors, range_offset_m=0.0)
+    nominal = rig.nominal(camera, lidar)
+    assert nominal is not None
+    evidence = weigh_placements(model.with_errors(errors), used, nominal.to_matrix())
+    rotation, translation = sigmas(combine(evidence, errors).cov)
+    truth = truth_extrinsics(rig, seed, SimulationOptions.for_rig(name))[camera, lidar]
+    yield Outcome(
+        difference(estimate.T_cam_lidar, truth),
+        (float(rotation), float(translation)),
+        (float(np.radians(result.sigma_rotation_deg)), result.sigma_translation_m),
+    )
+
+
+def lengthen(scan: pipeline.LidarDetection, offset_m: float) -> pipeline.LidarDetection:
+    """Add an offset to all ranges of the boards found in a scan."""
+    if not isinstance(scan, list) or offset_m == 0:
+        return scan
+    return [_lengthen(board, offset_m) for board in scan]
+
+
+def _lengthen(board: LidarBoard, offset_m: float) -> LidarBoard:
+    points, ends = (
+        p * (1 + offset_m / np.linalg.norm(p, axis=1, keepdims=True))
+        for p in (board.points, board.edge_points)
+    )
+    centre = board.T_lidar_board[:3, 3]
+    moved = board.T_lidar_board.copy()
+    moved[:3, 3] += offset_m * centre / np.linalg.norm(centre)
+    return replace(board, points=points, edge_points=ends, plane=fit_plane(points)[0], T_lidar_board=moved)
+
+
+def _without(aim: HeldPose, present: HeldPose, kind: str) -> HeldPose:
+    """Leave one instruction out."""
+    keys = {
+        "sideways": "right_m",
+        "nearer": "ahead_m",
+        "height": "up_m",
+        "tilt": "tilt_deg",
+        "turn": "turn_deg",
+        "roll": "roll_deg",
+    }
+    return replace(aim, **{keys[kind]: getattr(present, keys[kind])})

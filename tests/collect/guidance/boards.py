@@ -1,0 +1,52 @@
+"""Sensors and placements that the tests of guidance share."""
+
+import numpy as np
+
+from lce_rig.collect.guidance import SensorModel, View
+from lce_rig.collect.guidance.sensors import ErrorModel
+from lce_rig.core.geometry import Array, invert
+from lce_rig.rig import QualitySettings
+from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, random_pose, scan_board
+
+# What the simulator of boards has: white noise, no side of a board that is drawn by what stands behind it.
+SURROGATE = ErrorModel(
+    corner_px=0.1,
+    range_m=0.01,
+    ring_end_m=0.0,
+    side_m=0.0,
+    tilt_rad=0.0,
+    depth_m=0.0,
+    laser_bias_m=0.0,
+    range_offset_m=0.0,
+)
+
+
+def model(errors: ErrorModel | None = None) -> SensorModel:
+    """Describe a VLP-16 and a camera before the board of the calibration's tests."""
+    return SensorModel(
+        board=BOARD,
+        lens=CAMERA,
+        elevations_rad=np.radians(np.arange(-15.0, 16.0, 2.0)),
+        azimuth_step_rad=float(np.radians(0.2)),
+        limits=QualitySettings(),
+        target_sigma_rad=float(np.radians(0.2)),
+        target_sigma_m=0.01,
+        errors=errors or ErrorModel(),
+    )
+
+
+def view(errors: ErrorModel | None = None) -> View:
+    """Look along the LiDAR's x axis."""
+    return View.upright(model(errors), T_FORWARD)
+
+
+def placements(n: int, seed: int) -> Array:
+    """Draw T_cam_board (n, 4, 4) that the LiDAR sees well."""
+    rng = np.random.default_rng(seed)
+    exact = Scenario(range_sigma_m=0.0)
+    found: list[Array] = []
+    while len(found) < n:
+        T_cam_board = random_pose(rng, exact, BOARD)
+        if scan_board(invert(T_FORWARD) @ T_cam_board, rng, exact, BOARD) is not None:
+            found.append(T_cam_board)
+    return np.array(found)

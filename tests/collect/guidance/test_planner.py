@@ -1,0 +1,155 @@
+"""Where the board is sent, when it is enough, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.collect.guidance import (
+    Novelty,
+    Planner,
+    View,
+    is_reachable,
+    model_sensors,
+    outline_px,
+    predict_covariance,
+    sigmas,
+)
+from lce_rig.core.errors import ProfileError
+from lce_rig.core.geometry import perturb
+from lce_rig.rig import load_rig
+from tests.calibrate.boards import T_FORWARD
+from tests.collect.guidance.boards import model, placements, view
+
+NONE = np.zeros((0, 4, 4))
+
+
+@pytest.fixture(scope="module")
+def planner():
+    return Planner(view(), n_places=100)
+
+
+@pytest.fixture(scope="module")
+def guided(planner):
+    held = NONE
+    while len(held) < 12:
+        held = np.concatenate([held, planner.guide(held).T_cam_board[None]])
+    return held
+
+
+def test_every_candidate_is_seen_by_both_sensors(planner):
+    limits = planner.view.model.limits
+    assert len(planner.candidates) > 100
+    distance_m = np.linalg.norm(planner.candidates[:, :3, 3], axis=1)
+    assert distance_m.min() >= 1.2 - 1e-6
+    assert distance_m.max() <= limits.max_distance_m
+    for T_cam_board in planner.candidates:
+        outline = outline_px(planner.view.model, T_cam_board)
+        assert planner.view.model.lens.is_inside(outline).all()
+
+
+def test_candidates_lean_to_every_side_and_hang_as_diamonds(planner):
+    normals = planner.candidates[:, :3, 2]
+    sight = planner.candidates[:, :3, 3] / np.linalg.norm(planner.candidates[:, :3, 3], axis=1)[:, None]
+    tilt_deg = np.degrees(np.arccos(np.clip(-np.sum(normals * sight, axis=1), -1, 1)))
+    assert tilt_deg.max() < 46
+    sideways = normals + sight
+    for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        assert np.sum(sign * sideways[:, axis] > 0.25) > 5
+    assert np.abs(planner.candidates[:, 1, 0]).min() > 0.2
+
+
+def test_guided_placements_tell_more_than_random_ones(guided):
+    random = [sigmas(predict_covariance(model(), placements(12, seed), T_FORWARD)) for seed in range(5)]
+    rotation, translation = sigmas(predict_covariance(model(), guided, T_FORWARD))
+    assert rotation < 0.8 * np.median([each[0] for each in random])
+    assert translation < 0.9 * np.median([each[1] for each in random])
+
+
+def test_the_wanted_placement_keeps_what_it_promises(planner, guided):
+    guidance = planner.guide(guided[:5])
+    after = np.concatenate([guided[:5], guidance.T_cam_board[None]])
+    rotation, translation = sigmas(predict_covariance(planner.view.model, after, T_FORWARD))
+    assert guidance.next_rotation_deg == pytest.approx(np.degrees(rotation))
+    assert guidance.next_translation_m == pytest.approx(translation)
+    assert guidance.next_rotation_deg < guidance.sigma_rotation_deg
+
+
+def test_no_placement_is_asked_for_twice(guided):
+    for k, T_cam_board in enumerate(guided):
+        way_m = np.linalg.norm(guided[:k, :3, 3] - T_cam_board[:3, 3], axis=1)
+        turn = guided[:k, :3, 2] @ T_cam_board[:3, 2]
+        roll = np.abs(guided[:k, :3, 0] @ T_cam_board[:3, 0])
+        assert not np.any((way_m < 0.01) & (turn > 0.9999) & (roll > 0.9999))
+
+
+def test_what_cannot_be_reached_is_not_asked_for_again(planner):
+    first = planner.guide(NONE).T_cam_board
+    second = planner.guide(NONE, avoid=first[None]).T_cam_board
+    assert np.linalg.norm(second[:3, 3] - first[:3, 3]) >= 0.4
+    assert planner.guide(NONE, avoid=planner.candidates).T_cam_board is None
+
+
+def test_of_placements_nearly_as_good_the_nearest_is_taken(planner, guided):
+    held = guided[:8]
+    free = planner.guide(held).T_cam_board
+    nearby = planner.guide(held, present=planner.candidates[3]).T_cam_board
+    reach_m = [np.linalg.norm(T[:3, 3] - planner.candidates[3, :3, 3]) for T in (nearby, free)]
+    assert reach_m[0] <= reach_m[1]
+
+
+def test_it_is_enough_when_the_target_is_predicted_and_not_before(guided):
+    modest = replace(model(), target_sigma_rad=np.radians(0.5), target_sigma_m=0.03)
+    strict = replace(model(), target_sigma_rad=np.radians(0.02), target_sigma_m=0.001)
+    few = Planner(View.upright(modest, T_FORWARD), n_places=20)
+    assert few.guide(guided).is_enough
+    assert not few.guide(guided[:10]).is_enough
+    assert not Planner(View.upright(strict, T_FORWARD), n_places=20).guide(guided).is_enough
+
+
+def test_a_capture_of_what_is_held_is_refused_and_says_where_to_go(planner, guided):
+    again = perturb(guided[2], np.array([0.02, 0.0, 0.02, 0.03, 0.0, 0.0]))
+    refusal = planner.adds_nothing(guided[:6], again)
+    assert refusal.cause == "the board stands where capture 3 shows it"
+    assert refusal.action
+    assert planner.adds_nothing(guided[:6], again, names=list("abcdef")).cause.endswith("capture c shows it")
+
+
+def test_a_new_placement_is_welcome(planner, guided):
+    assert planner.adds_nothing(guided[:6], guided[7]) is None
+    assert planner.adds_nothing(NONE, guided[0]) is None
+
+
+def test_a_placement_that_tells_little_is_refused_with_its_figure():
+    bold = Planner(view(), Novelty(0.001, 0.05), n_places=100)
+    near = bold.guide(NONE).T_cam_board
+    crowd = np.array([perturb(near, np.r_[0.02 * k, 0, 0, 0, 0, 0.01 * k]) for k in range(-4, 5)])
+    refusal = bold.adds_nothing(crowd, perturb(near, np.array([0.012, 0.0, 0.0, 0.0, 0.0, 0.015])))
+    assert "% better, another" in refusal.cause
+
+
+def test_reach_ends_at_the_arms_the_border_and_the_lidar_s_field():
+    poses = placements(40, seed=9)
+    is_fine = is_reachable(view(), poses)
+    assert is_fine.any()
+    raised, aside, far = poses.copy(), poses.copy(), poses.copy()
+    raised[:, :3, 3] += 2.0 * T_FORWARD[:3, 2]
+    aside[:, 0, 3] += 4.0
+    far[:, :3, 3] *= 7.0 / np.linalg.norm(poses[:, :3, 3], axis=1)[:, None]
+    for moved in (raised, aside, far):
+        assert not is_reachable(view(), moved).any()
+
+
+def test_the_shipped_rigs_can_be_guided():
+    for name, camera in (("rlfs", "cam"), ("rles", "davis")):
+        rig = load_rig(name)
+        sensors = model_sensors(rig, camera, "lidar")
+        nominal = rig.nominal(camera, "lidar").to_matrix()
+        assert Planner(View.upright(sensors, nominal), n_places=60).guide(NONE).T_cam_board is not None
+
+
+def test_a_lidar_whose_beams_are_not_known_is_named():
+    rig = load_rig("rlfs")
+    lidar = rig.lidars["lidar"].model_copy(update={"model": "Unknown-9"})
+    with pytest.raises(ProfileError, match="Unknown-9"):
+        model_sensors(rig.model_copy(update={"lidars": {"lidar": lidar}}), "cam", "lidar")

@@ -1,0 +1,139 @@
+"""The predicted covariance against the calibration's own matrices and against its errors over many seeds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.calibrate import CalibrateOptions
+from lce_rig.calibrate.calibrate import calibrate_observations
+from lce_rig.calibrate.features import extract_features
+from lce_rig.calibrate.observability import linearise
+from lce_rig.calibrate.problem import Problem, Weights
+from lce_rig.calibrate.systematic import ring_sensitivities
+from lce_rig.collect.guidance import combine, predict_covariance, sigmas, weigh_placements
+from lce_rig.collect.guidance.precision import combine_with_each
+from lce_rig.collect.guidance.sensors import ErrorModel
+from lce_rig.core.geometry import difference, invert
+from lce_rig.core.results import Observation
+from lce_rig.solvers.covariance import symmetric_inverse
+from lce_rig.solvers.registration import vec_rotation
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, scan_board
+from tests.collect.guidance.boards import SURROGATE, model, placements
+
+
+def observe(poses, seed, scenario):
+    rng = np.random.default_rng(seed)
+    captures = []
+    for k, T_cam_board in enumerate(poses):
+        lidar = scan_board(invert(T_FORWARD) @ T_cam_board, rng, scenario, BOARD)
+        captures.append(Observation(f"{k:06d}", photograph(T_cam_board, rng, scenario, BOARD), lidar))
+    return captures
+
+
+@pytest.fixture(scope="module")
+def poses():
+    rng = np.random.default_rng(0)
+    every = placements(40, seed=5)
+    seen = [photograph(T, rng, Scenario(), BOARD) is not None for T in every]
+    return every[seen][:14]
+
+
+@pytest.fixture(scope="module")
+def linearised(poses):
+    """The calibration's own matrices at the truth, with weights as the prediction's."""
+    errors = replace(SURROGATE, plane_m=0.004, edge_m=0.005)
+    observations = observe(poses, 6, Scenario(range_sigma_m=0.0, corner_sigma_px=1e-6))
+    options = CalibrateOptions()
+    features = [extract_features(each, BOARD, options) for each in observations]
+    weights = Weights(3 / errors.plane_m**2, 14 / errors.edge_m**2, 1 / errors.edge_shift_m**2)
+    problem = Problem(features, BOARD, weights)
+    x = np.concatenate([vec_rotation(T_FORWARD[:3, :3]), T_FORWARD[:3, 3], [0.0, 1.0]])
+    edge_ids = problem.associate(x[None])[0]
+    return errors, observations, options, problem, x, edge_ids
+
+
+def test_information_is_that_of_the_calibration(poses, linearised):
+    errors, _, _, problem, x, edge_ids = linearised
+    _, hessians = linearise(problem, x, edge_ids)
+    predicted = weigh_placements(model(errors), poses, T_FORWARD).hessian
+    scale = np.sqrt(np.einsum("nii->ni", hessians))
+    difference_of = (predicted - hessians) / (scale[:, :, None] * scale[:, None, :])
+    assert np.abs(difference_of).max() < 0.12
+    together = np.linalg.eigvals(np.linalg.solve(hessians.sum(axis=0), predicted.sum(axis=0)))
+    assert np.all(np.abs(together.real - 1) < 0.1)
+
+
+def test_lasers_pull_as_in_the_calibration(poses, linearised):
+    errors, observations, options, problem, x, edge_ids = linearised
+    _, hessians = linearise(problem, x, edge_ids)
+    information = hessians.sum(axis=0)
+    information[6, 6] += 1 / errors.edge_shift_m**2
+    sensitivities = ring_sensitivities(observations, BOARD, options, problem, x, edge_ids, information)
+    rings = np.unique(np.concatenate([each.lidar.ring for each in observations]))
+    predicted = -symmetric_inverse(information) @ weigh_placements(model(errors), poses, T_FORWARD).drift.sum(
+        axis=0
+    )
+    scale = np.linalg.norm(sensitivities, axis=1, keepdims=True)
+    assert np.abs((predicted[:, rings] - sensitivities) / scale)[:6].max() < 0.15
+
+
+def test_predicted_scatter_is_that_of_many_sessions(poses):
+    scenario = Scenario(range_sigma_m=0.01, corner_sigma_px=0.1)
+    options = CalibrateOptions(n_draws=0)
+    runs = [
+        calibrate_observations(observe(poses, seed, scenario), BOARD, options) for seed in range(100, 125)
+    ]
+    errors = np.array([difference(run.T_cam_lidar, T_FORWARD) for run in runs])
+    figures = [run.diagnostics for run in runs]
+    learned = SURROGATE
+    for key, name in (("plane_m", "fit_plane_rms_m"), ("edge_m", "fit_edge_rms_m")):
+        learned = replace(learned, **{key: float(np.mean([each[name] for each in figures]))})
+    predicted = combine(weigh_placements(model(learned), poses, T_FORWARD), learned)
+    for actual, expected in zip(sigmas(np.cov(errors.T)), sigmas(predicted.cov), strict=True):
+        assert 0.75 < expected / actual < 1.33
+
+
+def test_a_placement_more_makes_it_better_and_a_second_of_the_same_kind_less_so(poses):
+    before = np.array(sigmas(predict_covariance(model(), poses[:6], T_FORWARD)))
+    after = np.array(sigmas(predict_covariance(model(), poses[:7], T_FORWARD)))
+    again = np.array(sigmas(predict_covariance(model(), poses[[*range(7), 6]], T_FORWARD)))
+    assert np.all(after < before)
+    assert np.all(before - after > after - again)
+
+
+def test_without_captures_nothing_is_known():
+    rotation, translation = sigmas(predict_covariance(model(), np.zeros((0, 4, 4)), T_FORWARD))
+    assert rotation > 0.5
+    assert translation > 1.0
+
+
+def test_one_more_of_many_is_as_if_it_were_held(poses):
+    evidence = weigh_placements(model(), poses, T_FORWARD)
+    held = evidence.of(np.arange(5))
+    each = combine_with_each(held, evidence.of(np.array([9, 11])), ErrorModel())
+    one = combine(evidence.of(np.array([0, 1, 2, 3, 4, 11])), ErrorModel())
+    np.testing.assert_allclose(each.cov[1], one.cov, rtol=1e-9)
+
+
+def test_a_range_offset_adds_its_own_size_along_the_sight(poses):
+    errors = replace(ErrorModel(), range_offset_m=0.005)
+    precision = combine(weigh_placements(model(errors), poses, T_FORWARD), errors)
+    assert np.sqrt(precision.offset[2, 2]) == pytest.approx(0.005, rel=0.25)
+
+
+def test_few_captures_claim_more_than_they_err(poses):
+    precision = combine(weigh_placements(model(), poses, T_FORWARD), ErrorModel())
+    assert np.all(np.diag(precision.claimed(14)) > np.diag(precision.cov))
+    np.testing.assert_allclose(precision.claimed(10_000), precision.cov, rtol=2e-3)
+
+
+def test_worse_residuals_than_expected_are_learned():
+    prior = ErrorModel()
+    learned = prior.learned(plane_rms_m=0.03, edge_rms_m=0.01, n_captures=15)
+    assert 0.02 < learned.plane_m < 0.03
+    assert learned.tilt_rad > 5 * prior.tilt_rad
+    assert learned.side_m > 1.5 * prior.side_m
+    same = prior.learned(prior.plane_m, prior.edge_m, 15)
+    assert same.side_m == pytest.approx(prior.side_m)
+    assert same.tilt_rad == pytest.approx(prior.tilt_rad)
