@@ -20,7 +20,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "reconstruct": ("lce_rig.cli.reconstruct", "Turn the events of a recording into pictures."),
     "check": ("lce_rig.cli.check", "Show what was detected in each capture, and why not."),
     "calibrate": ("lce_rig.cli.calibrate", "Estimate the extrinsics of a session."),
+    "intrinsics": ("lce_rig.cli.intrinsics", "Measure the cameras' lenses from a session."),
     "verify": ("lce_rig.cli.verify", "Draw the LiDAR into the pictures and print residuals."),
+    "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of independent sessions."),
 }
 EXIT_BUG = 70
 EXIT_INTERRUPTED = 130

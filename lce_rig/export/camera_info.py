@@ -26,7 +26,7 @@ def export_camera_info(calibrations: Sequence[Calibration], rig: Rig, folder: Pa
     for name, calibration in chosen.items():
         path = folder / f"camera_info_{name}.yaml"
         intrinsics = rig.cameras[name].to_intrinsics()
-        write_atomically(path, _text(name, intrinsics, header("camera_info", rig, [calibration])))
+        write_atomically(path, camera_info_text(name, intrinsics, header("camera_info", rig, [calibration])))
         read = read_camera_info(path)
         check_projection(path, "the camera model", calibration.T_cam_lidar, read, calibration, rig)
         paths.append(path)
@@ -43,7 +43,8 @@ def ros_distortion(intrinsics: Intrinsics) -> tuple[str, tuple[float, ...]]:
     return model, (*given, *(0.0,) * (count - len(given)))
 
 
-def _text(name: str, intrinsics: Intrinsics, head: list[str]) -> str:
+def camera_info_text(name: str, intrinsics: Intrinsics, head: Sequence[str]) -> str:
+    """Write the content of a camera_info file, after `head` as comments."""
     model, coefficients = ros_distortion(intrinsics)
     projection = np.hstack([intrinsics.matrix, np.zeros((3, 1))])
     lines = [f"# {line}" for line in head]

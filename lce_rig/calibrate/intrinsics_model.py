@@ -1,0 +1,184 @@
+"""Lens models as vectors of parameters, with the derivatives that fitting them wants."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array
+
+# Tells a lens from another: rays of a grid of this many points across the picture.
+_GRID = 24
+_STEPS = 20
+
+
+@dataclass(frozen=True)
+class LensModel:
+    """A lens model: [fx, fy, cx, cy, distortion ...] in pixels and the order of `Intrinsics.distortion`.
+
+    Attributes:
+        name: what the command line calls it.
+        family: the model of `Intrinsics`.
+        coefficients: names of the distortion coefficients.
+        prior_sigma: standard deviation a priori of each coefficient about zero; inf where there is none. The
+            rational model's upper and lower polynomials can stand in for each other, which this decides.
+    """
+
+    name: str
+    family: Literal["radtan", "equidistant"]
+    coefficients: tuple[str, ...]
+    prior_sigma: tuple[float, ...]
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters with their unit, in order."""
+        return ("fx_px", "fy_px", "cx_px", "cy_px", *self.coefficients)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return 4 + len(self.coefficients)
+
+    def vector(self, intrinsics: Intrinsics) -> Array:
+        """List the parameters (P,) of intrinsics of this family; coefficients they lack are zero.
+
+        Raises:
+            ValueError: the intrinsics have more coefficients, or are of the other family.
+        """
+        given = intrinsics.distortion
+        if intrinsics.model != self.family or len(given) > len(self.coefficients):
+            raise ValueError(f"{intrinsics.model} with {len(given)} coefficients is no {self.name}")
+        padded = (*given, *(0.0,) * (len(self.coefficients) - len(given)))
+        return np.array([intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px, *padded])
+
+    def intrinsics(self, vector: Array, width_px: int, height_px: int) -> Intrinsics:
+        """Build intrinsics from parameters (P,)."""
+        fx, fy, cx, cy, *distortion = (float(value) for value in vector)
+        return Intrinsics(fx, fy, cx, cy, width_px, height_px, self.family, tuple(distortion))
+
+    def project(self, vector: Array, points_camera: Array) -> tuple[Array, Array, Array]:
+        """Project points and differentiate the pixels.
+
+        Args:
+            vector: (P,) parameters.
+            points_camera: (..., 3) m in front of the camera; validity is not checked.
+
+        Returns:
+            Pixels (..., 2), their derivative by the point (..., 2, 3) and by the parameters (..., 2, P).
+        """
+        distort = _distort_equidistant if self.family == "equidistant" else _distort_radtan
+        xy, by_point, by_coefficient = distort(vector[4:], points_camera)
+        focal = vector[:2]
+        by_parameter = np.zeros((*xy.shape, self.size))
+        by_parameter[..., 0, 0], by_parameter[..., 1, 1] = xy[..., 0], xy[..., 1]
+        by_parameter[..., 0, 2] = by_parameter[..., 1, 3] = 1.0
+        by_parameter[..., 4:] = focal[:, None] * by_coefficient
+        return xy * focal + vector[2:4], focal[:, None] * by_point, by_parameter
+
+
+_NO_PRIOR = float("inf")
+MODELS = {
+    model.name: model
+    for model in (
+        LensModel("radtan4", "radtan", ("k1", "k2", "p1", "p2"), (_NO_PRIOR,) * 4),
+        LensModel("radtan5", "radtan", ("k1", "k2", "p1", "p2", "k3"), (_NO_PRIOR,) * 5),
+        LensModel(
+            "rational",
+            "radtan",
+            ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+            (_NO_PRIOR,) * 4 + (0.3,) * 4,
+        ),
+        LensModel("equidistant", "equidistant", ("k1", "k2", "k3", "k4"), (_NO_PRIOR,) * 4),
+    )
+}
+
+
+def model_of(intrinsics: Intrinsics) -> LensModel:
+    """Choose the smallest model that holds these intrinsics; a lens without distortion gets radtan4."""
+    if intrinsics.model == "equidistant":
+        return MODELS["equidistant"]
+    n = len(intrinsics.distortion)
+    return MODELS["radtan4" if n <= 4 else "radtan5" if n == 5 else "rational"]
+
+
+def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
+    """Find the parameters (P,) of another model that draw about the same picture.
+
+    Exact where the new model contains the old one; else least squares over a grid of pixels, within the field
+    of view where the old model is valid.
+    """
+    if intrinsics.model == model.family and len(intrinsics.distortion) <= len(model.coefficients):
+        return model.vector(intrinsics)
+    u, v = np.meshgrid(
+        np.linspace(0, intrinsics.width_px - 1, _GRID), np.linspace(0, intrinsics.height_px - 1, _GRID)
+    )
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+    rays = intrinsics.unproject(pixels)
+    # A pinhole polynomial cannot draw what lies beside or behind the camera.
+    is_seen = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.2)
+    vector = np.concatenate(
+        [
+            [intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px],
+            np.zeros(model.size - 4),
+        ]
+    )
+    ridge = np.concatenate([np.zeros(4), np.ones(model.size - 4)])
+    for _ in range(_STEPS):
+        predicted, _, J = model.project(vector, rays[is_seen])
+        J = J.reshape(-1, model.size)
+        H = J.T @ J + np.diag(ridge)
+        vector = vector - np.linalg.solve(H, J.T @ (predicted - pixels[is_seen]).ravel() + ridge * vector)
+    return vector
+
+
+def _distort_radtan(coefficients: Array, points: Array) -> tuple[Array, Array, Array]:
+    """Distort x/z, y/z; derivatives by the point (..., 2, 3) and by the coefficients (..., 2, n)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(coefficients, (0, 8 - len(coefficients)))
+    x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
+    s = x * x + y * y
+    upper, lower = 1 + s * (k1 + s * (k2 + s * k3)), 1 + s * (k4 + s * (k5 + s * k6))
+    scale = upper / lower
+    # Derivative of the radial scale by s = r^2.
+    slope = (k1 + s * (2 * k2 + 3 * s * k3) - scale * (k4 + s * (2 * k5 + 3 * s * k6))) / lower
+    xy = np.stack(
+        [
+            x * scale + 2 * p1 * x * y + p2 * (s + 2 * x * x),
+            y * scale + p1 * (s + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+    across = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    xx = scale + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    yy = scale + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    by_xy = np.stack([np.stack([xx, across], axis=-1), np.stack([across, yy], axis=-1)], axis=-2)
+    by_z = -(by_xy @ np.stack([x, y], axis=-1)[..., None])
+    by_point = np.concatenate([by_xy, by_z], axis=-1) / points[..., 2, None, None]
+
+    powers = np.stack([s, s * s, s * s * s], axis=-1) / lower[..., None]
+    radial = np.stack([x, y], axis=-1)[..., None] * powers[..., None, :]
+    tangential = np.stack(
+        [np.stack([2 * x * y, s + 2 * x * x], axis=-1), np.stack([s + 2 * y * y, 2 * x * y], axis=-1)],
+        axis=-2,
+    )
+    all_eight = [radial[..., :2], tangential, radial[..., 2:], -scale[..., None, None] * radial]
+    return xy, by_point, np.concatenate(all_eight, axis=-1)[..., : len(coefficients)]
+
+
+def _distort_equidistant(coefficients: Array, points: Array) -> tuple[Array, Array, Array]:
+    """Distort by the angle from the axis; derivatives as `_distort_radtan`."""
+    lateral, z = points[..., :2], points[..., 2]
+    rho = np.maximum(np.linalg.norm(lateral, axis=-1), 1e-12)
+    angle = np.arctan2(rho, z)
+    squares = angle[..., None] ** (2 * np.arange(1, 5))
+    radius = angle * (1 + squares @ coefficients)
+    slope = 1 + squares @ (coefficients * [3, 5, 7, 9])
+    direction = lateral / rho[..., None]
+    by_rho, by_z = slope * z / (rho**2 + z**2), -slope * rho / (rho**2 + z**2)
+    # The radius grows along the direction by `by_rho`; across it the picture turns about the centre.
+    outer = direction[..., :, None] * direction[..., None, :]
+    turn = (radius / rho)[..., None, None]
+    by_lateral = by_rho[..., None, None] * outer + turn * (np.eye(2) - outer)
+    by_point = np.concatenate([by_lateral, (by_z[..., None] * direction)[..., None]], axis=-1)
+    by_coefficient = direction[..., None] * (angle[..., None] * squares)[..., None, :]
+    return direction * radius[..., None], by_point, by_coefficient

@@ -1,0 +1,159 @@
+"""`lce-rig intrinsics`: a camera's lens from the pictures of a session, held against the profile's."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lce_rig.cli import show
+
+if TYPE_CHECKING:
+    from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
+
+_COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
+_MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")
+
+
+@click.command()
+@click.argument("session", type=click.Path(path_type=Path), default="session")
+@click.option("--camera", "cameras", multiple=True, metavar="NAME", help="Only this camera; may be repeated.")
+@click.option(
+    "--channels",
+    metavar="NAME[,NAME]",
+    help="Channels to use together, as they share the lens [default: those of frames].",
+)
+@click.option(
+    "--model",
+    type=click.Choice(_MODELS),
+    help="Lens model; auto compares all by their errors on captures left out [default: the profile's].",
+)
+@click.option(
+    "--save-profile",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write a new profile: the session's with the measured intrinsics.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print intrinsics.json on stdout.")
+def intrinsics(
+    session: Path,
+    cameras: tuple[str, ...],
+    channels: str | None,
+    model: str | None,
+    save_profile: Path | None,
+    as_json: bool,
+) -> None:
+    """Measure the lens of each camera from the boards in SESSION's pictures (default: session/).
+
+    Says how sure every parameter is, what the captures leave open, and whether the profile's intrinsics still
+    fit. Writes SESSION/intrinsics/: a block for the profile, camera_info and a page of pictures for each
+    camera. The profile itself is not touched. Exits with 6 where the captures do not do.
+    """
+    from lce_rig.core.errors import NotEnoughDataError, UsageError
+    from lce_rig.pipeline.intrinsics import measure_intrinsics
+    from lce_rig.pipeline.intrinsics_files import document, write_intrinsics
+    from lce_rig.pipeline.intrinsics_files import save_profile as write_profile
+    from lce_rig.session import Session
+
+    opened = Session.open(session)
+    unknown = sorted(set(cameras) - set(opened.rig.cameras))
+    if unknown:
+        raise UsageError(f"there is no camera {unknown[0]!r}; there is {', '.join(opened.rig.cameras)}")
+    if save_profile is not None and save_profile.exists():
+        raise UsageError(f"{save_profile} exists already", "Name another file: nothing is written over.")
+    wanted = [] if channels is None else [name.strip() for name in channels.split(",")]
+    measured, troubles = [], []
+    for camera in cameras or tuple(opened.rig.cameras):
+        try:
+            with show.progress_bar(f"looking through {camera}") as progress:
+                measured.append(
+                    measure_intrinsics(opened, camera, channels=wanted, model=model, progress=progress)
+                )
+        except NotEnoughDataError as error:
+            troubles.append(error)
+    if not measured:
+        raise troubles[0]
+    for trouble in troubles:
+        show.warn(str(trouble))
+    files = write_intrinsics(opened, measured)
+    if as_json:
+        show.print_json(document(opened.rig, measured))
+    else:
+        for one in measured:
+            show.print_lines(_head(one))
+            show.print_table(_table(one))
+            show.print_lines(_findings(one))
+    show.note("written: " + ", ".join(path.name for path in files) + f" in {files[0].parent}")
+    if save_profile is not None:
+        write_profile(opened, measured, save_profile)
+        show.note(f"written: {save_profile}")
+
+
+def _head(measured: "MeasuredIntrinsics") -> list[str]:
+    estimate = measured.estimate
+    n = len({view.capture for view in estimate.views})
+    lines = [
+        f"[bold]{measured.camera}[/] ({', '.join(measured.channels)}): {estimate.model.name} from "
+        f"{len(estimate.views)} pictures of {n} captures",
+        f"  corners   {estimate.rms_px:.3f} px rms, {estimate.held_out_rms_px:.3f} px on captures left out",
+        f"  seen      {100 * measured.certainty.is_covered.mean():.0f} % of the picture",
+        f"  board     {_board(measured)}",
+    ]
+    if measured.choice is not None:
+        lines.append(f"  model     {show.escape(measured.choice.reason)}")
+    return lines
+
+
+def _board(measured: "MeasuredIntrinsics") -> str:
+    """Say how the board differs from its drawing, which is taken into account."""
+    estimate = measured.estimate
+    (along_width, along_height, aspect), sigma = estimate.shape, estimate.shape_sigma
+    return (
+        f"bowed by {1000 * along_width:+.1f} and {1000 * along_height:+.1f} mm (width, height), printed "
+        f"{100 * aspect:+.2f} +- {100 * sigma[2]:.2f} % too wide, "
+        f"corners off by {1000 * estimate.print_rms_m:.2f} mm"
+    )
+
+
+def _table(measured: "MeasuredIntrinsics") -> Any:
+    """List the parameters, beside the profile's where these are of the same model and resolution."""
+    from lce_rig.pipeline.intrinsics_files import final
+
+    estimate, given = measured.estimate, measured.given
+    values = estimate.model.vector(final(measured))
+    try:
+        old = None if measured.check is None else estimate.model.vector(given)
+    except ValueError:
+        old = None
+    table = show.plain_table("")
+    for title in ("", "measured", "sigma", "profile", "difference"):
+        table.add_column(title, justify="left" if not title else "right")
+    for index, name in enumerate(estimate.model.parameters):
+        digits = 2 if name.endswith("_px") else 5
+        sigma = float(estimate.sigma[index])
+        cells = [f"{values[index]:.{digits}f}", f"{sigma:.{digits}f}", "-", "-"]
+        if old is not None:
+            cells[2] = f"{old[index]:.{digits}f}"
+            cells[3] = f"{(values[index] - old[index]) / sigma:+.1f} sigma"
+        table.add_row("  " + name.removesuffix("_px"), *cells)
+    return table
+
+
+def _findings(measured: "MeasuredIntrinsics") -> list[str]:
+    from lce_rig.calibrate.intrinsics_check import describe, explain
+
+    lines = []
+    if measured.check is None:
+        given = measured.given
+        size = f"{given.width_px}x{given.height_px}"
+        lines.append(
+            f"  [red]the profile's intrinsics belong to {size} px, the pictures have another size[/]"
+        )
+    else:
+        verdict = measured.check.verdict()
+        lines.append(f"  {describe(measured.check)}")
+        if verdict != "pass":
+            lines.append(f"  [{_COLOURS[verdict]}]{show.escape(explain(measured.check))}[/]")
+    lines += [f"  [yellow]{show.escape(text)}[/]" for text in measured.weaknesses]
+    for name, why in measured.refused.items():
+        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.cause}: {why.action}')}[/]")
+    return lines

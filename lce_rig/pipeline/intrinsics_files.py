@@ -1,0 +1,204 @@
+"""Measured intrinsics as files: a block for the profile, a new profile, camera_info, a page of pictures."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.errors import LceRigError, UsageError
+from lce_rig.core.results import Refusal
+from lce_rig.export.camera_info import camera_info_text, read_camera_info, ros_distortion
+from lce_rig.export.writing import MADE_BY, number, numbers, write_atomically
+from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
+from lce_rig.rig import Rig, dump_rig, find_profile, load_rig, parse_rig, set_value, shipped_profiles
+from lce_rig.session import Session
+
+INTRINSICS = "intrinsics"
+FORMAT_VERSION = 1
+_PIXEL_DIGITS, _COEFFICIENT_DIGITS = 4, 8
+
+
+def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
+    """Write the session's intrinsics/ anew.
+
+    For each camera a block to paste into the profile, a camera_info file and a page of pictures; and
+    intrinsics.json for machines.
+
+    Returns:
+        The files.
+
+    Raises:
+        LceRigError: a file cannot be written, or does not read back as it was.
+    """
+    from lce_rig.verify.intrinsics_plot import draw_intrinsics
+    from lce_rig.verify.writing import write_picture
+
+    folder = session.path / INTRINSICS
+    for old in sorted(folder.glob("*")) if folder.is_dir() else []:
+        old.unlink()
+    files = [folder / "intrinsics.json"]
+    write_atomically(files[0], json.dumps(document(session.rig, measured), indent=2) + "\n")
+    for one in measured:
+        block = folder / f"{one.camera}.yaml"
+        write_atomically(block, profile_block(session.rig, one))
+        info = folder / f"camera_info_{one.camera}.yaml"
+        write_atomically(info, camera_info_text(one.camera, final(one), _head(session.rig, one)))
+        _check(info, final(one))
+        page = draw_intrinsics(
+            one.estimate,
+            one.certainty,
+            one.difference,
+            title=f"Intrinsics of camera {one.camera}, rig {session.rig.name}",
+            weaknesses=one.weaknesses,
+        )
+        files += [block, info, write_picture(folder / f"{one.camera}.png", page)]
+    return files
+
+
+def final(measured: MeasuredIntrinsics) -> Intrinsics:
+    """Give the intrinsics with as many digits as every file holds."""
+    lens = measured.estimate.intrinsics
+    fx, fy, cx, cy = (
+        round(value, _PIXEL_DIGITS) for value in (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
+    )
+    distortion = tuple(round(value, _COEFFICIENT_DIGITS) for value in lens.distortion)
+    return replace(lens, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, distortion=distortion)
+
+
+def profile_block(rig: Rig, measured: MeasuredIntrinsics) -> str:
+    """Write the block `intrinsics:` of the camera as a profile holds it, indented to be pasted."""
+    lens, sigma = final(measured), measured.estimate.sigma
+    lines = [f"# {line}" for line in _head(rig, measured)]
+    lines += [
+        f"# In the profile this block belongs to cameras.{measured.camera}, whose pictures have",
+        f"#   resolution_px: [{lens.width_px}, {lens.height_px}]",
+        "    intrinsics:",
+        f"      model: {lens.model}",
+    ]
+    for index, key in enumerate(("fx_px", "fy_px", "cx_px", "cy_px")):
+        lines.append(f"      {key}: {number(getattr(lens, key))}   # +- {sigma[index]:.2g}")
+    names = " ".join(measured.estimate.model.coefficients)
+    deviations = " ".join(f"{value:.1g}" for value in sigma[4:])
+    lines.append(f"      distortion: {numbers(lens.distortion)}   # {names}, +- {deviations}")
+    return "\n".join(lines) + "\n"
+
+
+def save_profile(session: Session, measured: Sequence[MeasuredIntrinsics], path: Path) -> None:
+    """Write the session's profile with the measured intrinsics in place of its own, comments kept.
+
+    Raises:
+        UsageError: the file exists already.
+        ProfileError: the intrinsics make no valid profile.
+    """
+    if path.exists():
+        raise UsageError(f"{path} exists already", "Name another file: a profile is never written over.")
+    text = _profile_text(session.rig)
+    for one in measured:
+        lens, block = final(one), f"cameras.{one.camera}"
+        if (lens.width_px, lens.height_px) != session.rig.cameras[one.camera].resolution_px:
+            text = set_value(text, f"{block}.resolution_px", f"[{lens.width_px}, {lens.height_px}]")
+        for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
+            text = set_value(text, f"{block}.intrinsics.{key}", number(getattr(lens, key)))
+        text = set_value(text, f"{block}.intrinsics.model", lens.model)
+        text = set_value(text, f"{block}.intrinsics.distortion", numbers(lens.distortion))
+    head = "".join(f"# {line}\n" for one in measured for line in _head(session.rig, one))
+    parse_rig(head + text, str(path))
+    write_atomically(path, head + text)
+
+
+def _profile_text(rig: Rig) -> str:
+    """Find the text of a profile with its comments: a session keeps none, a shipped profile does."""
+    if rig.name in shipped_profiles() and load_rig(rig.name) == rig:
+        return find_profile(rig.name).read_text(encoding="utf-8")
+    return dump_rig(rig)
+
+
+def _head(rig: Rig, measured: MeasuredIntrinsics) -> list[str]:
+    estimate = measured.estimate
+    n = len({view.capture for view in estimate.views})
+    return [
+        f"intrinsics of camera {measured.camera} of rig {rig.name}, measured by {MADE_BY} from {n} captures",
+        f"corners off by {estimate.rms_px:.3f} px rms, {estimate.held_out_rms_px:.3f} px on captures left "
+        "out",
+        *(f"weak: {text}" for text in measured.weaknesses),
+    ]
+
+
+def _check(path: Path, wanted: Intrinsics) -> None:
+    """Read a camera_info file back: it must be the same camera."""
+    given, read = ros_distortion(wanted)[1], read_camera_info(path)
+    if read != replace(wanted, distortion=given):
+        raise LceRigError(f"{path}: reads back as another camera")
+
+
+def document(rig: Rig, measured: Sequence[MeasuredIntrinsics]) -> dict[str, Any]:
+    """Build the content of intrinsics.json from plain types; figures that could not be computed are null."""
+    return {
+        "format_version": FORMAT_VERSION,
+        "rig": rig.name,
+        "made_by": MADE_BY,
+        "cameras": [_camera(one) for one in measured],
+    }
+
+
+def _camera(measured: MeasuredIntrinsics) -> dict[str, Any]:
+    estimate, lens = measured.estimate, final(measured)
+    choice = measured.choice
+    return {
+        "camera": measured.camera,
+        "channels": list(measured.channels),
+        "model": estimate.model.name,
+        "resolution_px": [lens.width_px, lens.height_px],
+        "intrinsics": _settings(lens),
+        "parameters": list(estimate.model.parameters),
+        "sigma": estimate.sigma.tolist(),
+        "cov": estimate.cov.tolist(),
+        "inflation": estimate.inflation,
+        "rms_px": estimate.rms_px,
+        "held_out_px": estimate.held_out_rms_px,
+        "board": {
+            "bow_m": estimate.shape[:2].tolist(),
+            "aspect": float(estimate.shape[2]),
+            "sigma": estimate.shape_sigma.tolist(),
+            "print_rms_m": estimate.print_rms_m,
+        },
+        "covered": float(measured.certainty.is_covered.mean()),
+        "models": None if choice is None else [asdict(score) for score in choice.scores],
+        "reason": None if choice is None else choice.reason,
+        "weaknesses": list(measured.weaknesses),
+        "views_used": [view.name for view in estimate.views],
+        "views_refused": _refusals(measured.refused),
+        "profile": _comparison(measured),
+    }
+
+
+def _settings(lens: Intrinsics) -> dict[str, Any]:
+    pixels = {key: getattr(lens, key) for key in ("fx_px", "fy_px", "cx_px", "cy_px")}
+    return {"model": lens.model, **pixels, "distortion": list(lens.distortion)}
+
+
+def _figure(value: float | None) -> float | None:
+    """Give null for what could not be computed, as where the profile's lens draws nothing."""
+    return value if value is not None and np.isfinite(value) else None
+
+
+def _refusals(refused: Mapping[str, Refusal]) -> dict[str, Any]:
+    return {name: asdict(why) for name, why in refused.items()}
+
+
+def _comparison(measured: MeasuredIntrinsics) -> dict[str, Any] | None:
+    """How the profile's intrinsics compare; null where they belong to another resolution."""
+    check, difference = measured.check, measured.difference
+    if check is None or difference is None:
+        return None
+    return {
+        "intrinsics": _settings(measured.given),
+        **{name: _figure(value) for name, value in asdict(check).items()},
+        "displacement_max_px": _figure(difference.max_px),
+        "turn_rad": np.asarray(difference.turn_rad).tolist(),
+        "verdict": check.verdict(),
+    }

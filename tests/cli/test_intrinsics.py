@@ -1,0 +1,83 @@
+"""lce-rig intrinsics, as a user types it, on the simulated session of the verbs."""
+
+import json
+
+import pytest
+
+from lce_rig.rig import load_rig
+
+
+@pytest.fixture(scope="module")
+def few(simulated, tmp_path_factory):
+    """The first eight captures of the simulated session."""
+    import shutil
+
+    copy = tmp_path_factory.mktemp("few") / "session"
+    shutil.copytree(simulated, copy)
+    for k in range(8, 16):
+        shutil.rmtree(copy / "captures" / f"{k:06d}")
+    return copy
+
+
+def test_the_lens_is_printed_beside_the_profiles_and_written(lce_rig, few, tmp_path):
+    outcome = lce_rig("intrinsics", few, "--save-profile", tmp_path / "new.yaml")
+    assert outcome.code == 0, outcome.err
+    assert "davis (frames): radtan5 from 8 pictures of 8 captures" in outcome.out
+    fx = next(line for line in outcome.out.splitlines() if line.lstrip().startswith("fx"))
+    assert "349.57" in fx
+    assert "sigma" in fx
+    assert "profile   corners off by" in outcome.out
+    assert "do not fit" not in outcome.out
+    assert "davis.png" in outcome.err
+    document = json.loads((few / "intrinsics" / "intrinsics.json").read_text())
+    measured = document["cameras"][0]["intrinsics"]["fx_px"]
+    assert measured == pytest.approx(349.57, abs=6)
+    assert load_rig(tmp_path / "new.yaml").cameras["davis"].intrinsics.fx_px == measured
+    assert load_rig(few / "rig.yaml").cameras["davis"].intrinsics.fx_px == 349.57
+
+
+def test_stale_intrinsics_are_called_so_and_json_says_it_too(lce_rig, few):
+    profile = few / "rig.yaml"
+    right = profile.read_text()
+    profile.write_text(
+        right.replace("fx_px: 349.57", "fx_px: 367.0").replace("fy_px: 349.18", "fy_px: 366.6")
+    )
+    try:
+        outcome = lce_rig("intrinsics", few, "--json")
+    finally:
+        profile.write_text(right)
+    assert outcome.code == 0, outcome.err
+    profile_record = json.loads(outcome.out)["cameras"][0]["profile"]
+    assert profile_record["verdict"] == "fail"
+    assert profile_record["focal_ratio"] == pytest.approx(349.57 / 367.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--camera", "thermal"], "there is no camera 'thermal'; there is davis"),
+        (["--channels", "frames,colour"], "has no channel 'colour'"),
+        (["--model", "brown"], "'brown' is not one of"),
+    ],
+)
+def test_what_does_not_exist_is_a_usage_error(lce_rig, few, words, says):
+    outcome = lce_rig("intrinsics", few, *words)
+    assert outcome.code == 2
+    assert says in outcome.err
+
+
+def test_nothing_is_written_over(lce_rig, few, tmp_path):
+    (tmp_path / "mine.yaml").write_text("precious")
+    outcome = lce_rig("intrinsics", few, "--save-profile", tmp_path / "mine.yaml")
+    assert outcome.code == 2
+    assert (tmp_path / "mine.yaml").read_text() == "precious"
+
+
+def test_too_few_captures_exit_with_6(lce_rig, session):
+    import shutil
+
+    for k in range(3, 16):
+        shutil.rmtree(session / "captures" / f"{k:06d}")
+    outcome = lce_rig("intrinsics", session)
+    assert outcome.code == 6
+    assert "the board is in 3 of 3 captures" in outcome.err

@@ -1,0 +1,151 @@
+"""lce-rig repeat, as a user types it."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Image
+from lce_rig.core.geometry import perturb
+from lce_rig.core.results import Calibration, Certificate, Metrics
+from lce_rig.export.result import write_result
+from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
+from lce_rig.session import Session
+
+RLES = find_profile("rles").read_text(encoding="utf-8")
+COV = np.diag([4e-6] * 3 + [1e-6] * 3)
+
+
+@pytest.fixture
+def made(tmp_path):
+    """Make a session with one capture and a result whose tangent from the nominal is given."""
+
+    def make(name, tangent, text=RLES, seed=None, verdict="pass", lidar="lidar"):
+        rig = parse_rig(text)
+        seed = sum(name.encode()) if seed is None else seed
+        noise = np.random.default_rng(seed).integers(0, 255, (260, 346), dtype=np.uint8)
+        with Session.create(tmp_path / name, rig) as session:
+            session.add_capture([Image("davis", "frames", None, noise)], [], {})
+        T = load_rig("rles").nominal_extrinsics[0].to_matrix()
+        calibration = Calibration(
+            camera="davis",
+            channel="frames",
+            lidar=lidar,
+            T_cam_lidar=perturb(T, np.array(tangent, dtype=float)),
+            cov=COV,
+            certificate=Certificate(True, 1e-9),
+            metrics=Metrics(0.008, 0.006, 0.1),
+            n_captures=20,
+            n_detected=20,
+            captures_used=("000000",),
+            captures_refused={},
+            verdict=verdict,
+            reasons=() if verdict == "pass" else ("the board was bent",),
+        )
+        write_result(tmp_path / name / "calibration" / "result.json", rig.name, [calibration])
+        return tmp_path / name
+
+    return make
+
+
+def test_sessions_that_agree_are_said_to_in_one_sentence(lce_rig, made):
+    a = made("monday", [0.001, 0, 0, 0, 0.001, 0])
+    b = made("tuesday", [0, 0.002, 0, 0.001, 0, 0])
+    c = made("wednesday", [0, 0, -0.002, 0, 0, 0.001])
+    outcome = lce_rig("repeat", a, b, c)
+    assert outcome.code == 0, outcome.err
+    assert outcome.out.splitlines()[-1].startswith("The three calibrations of davis and lidar agree")
+    assert "12 degrees of freedom" in outcome.out
+    assert sum(line.startswith(("monday", "tuesday", "wednesday")) for line in outcome.out.splitlines()) == 6
+
+
+def test_sessions_that_disagree_exit_with_7_and_the_odd_one_is_named(lce_rig, made):
+    sessions = [
+        made("monday", [0] * 6),
+        made("tuesday", [0.001] * 6),
+        made("moved", [0.02, 0, 0, 0, 0.01, 0]),
+    ]
+    outcome = lce_rig("repeat", *sessions, "--json")
+    assert outcome.code == 7
+    document = json.loads(outcome.out)["pairs"][0]
+    assert not document["agrees"]
+    assert document["odd_one"] == "moved"
+    assert "Without moved the others agree" in document["sentence"]
+    assert len(document["differences"]) == 3
+    assert "disagree" in outcome.err
+
+
+def test_a_session_alone_or_twice_is_a_usage_error(lce_rig, made):
+    a = made("monday", [0] * 6)
+    assert lce_rig("repeat", a).code == 2
+    assert lce_rig("repeat").code == 2
+    outcome = lce_rig("repeat", a, a.parent / "." / "monday")
+    assert outcome.code == 2
+    assert "is given twice" in outcome.err
+
+
+def test_a_copy_is_no_second_session(lce_rig, made, tmp_path):
+    a = made("monday", [0] * 6)
+    shutil.copytree(a, tmp_path / "copy")
+    outcome = lce_rig("repeat", a, tmp_path / "copy")
+    assert outcome.code == 4
+    assert "monday and copy share 1 captures: they are not independent" in outcome.err
+
+
+def test_other_rigs_and_other_lenses_are_refused_and_another_board_is_remarked(lce_rig, made):
+    a = made("monday", [0] * 6)
+    other = made("other", [0] * 6, set_value(RLES, "name", "rles02"))
+    outcome = lce_rig("repeat", a, other)
+    assert outcome.code == 4
+    assert "monday is of rig 'rles', other of rig 'rles02'" in outcome.err
+    refocused = made("refocused", [0] * 6, set_value(RLES, "cameras.davis.intrinsics.fx_px", "355.0"))
+    outcome = lce_rig("repeat", a, refocused)
+    assert outcome.code == 4
+    assert "cameras.davis.intrinsics.fx_px" in outcome.err
+    board = made("board", [0.001] * 6, set_value(RLES, "board.width_m", "0.81"))
+    outcome = lce_rig("repeat", a, board)
+    assert outcome.code == 0
+    assert "monday and board were taken with different boards" in outcome.err
+
+
+def test_a_calibration_that_failed_by_itself_is_not_vouched_for(lce_rig, made):
+    outcome = lce_rig("repeat", made("monday", [0] * 6), made("bad", [0] * 6, verdict="fail"))
+    assert outcome.code == 7
+    assert "the calibration of bad (davis and lidar) failed by itself" in outcome.err
+
+
+def test_sensors_of_one_session_only_leave_nothing_to_compare(lce_rig, made):
+    outcome = lce_rig("repeat", made("monday", [0] * 6), made("rear", [0] * 6, lidar="rear"))
+    assert outcome.code == 4
+    assert "no camera and LiDAR are calibrated in two of the sessions" in outcome.err
+
+
+def test_a_damaged_result_names_its_file(lce_rig, made):
+    a, b = made("monday", [0] * 6), made("tuesday", [0] * 6)
+    path = b / "calibration" / "result.json"
+    document = json.loads(path.read_text())
+    document["pairs"][0]["cov"] = np.zeros((6, 6)).tolist()
+    document["pairs"][0] |= {"sigma_rotation_deg": 0.0, "sigma_translation_m": 0.0}
+    path.write_text(json.dumps(document))
+    outcome = lce_rig("repeat", a, b)
+    assert outcome.code == 4
+    assert "the covariance of davis and lidar has no inverse" in outcome.err
+    path.write_text("{")
+    assert lce_rig("repeat", a, b).code == 4
+
+
+def test_sessions_without_a_result_are_calibrated_and_left_as_they_are(lce_rig, simulated, tmp_path):
+    halves = []
+    for half in range(2):
+        copy = tmp_path / f"half{half}"
+        shutil.copytree(simulated, copy)
+        shutil.rmtree(copy / "calibration", ignore_errors=True)
+        for k in range(half, 16, 2):
+            shutil.rmtree(copy / "captures" / f"{k:06d}")
+        halves.append(copy)
+    outcome = lce_rig("repeat", *halves)
+    assert outcome.code == 0, outcome.err
+    assert "half1 held no result: calibrated for this comparison, not written" in outcome.err
+    assert "The two calibrations of davis and lidar agree" in outcome.out
+    assert not (halves[0] / "calibration").exists()

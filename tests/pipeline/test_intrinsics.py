@@ -1,0 +1,165 @@
+"""Intrinsics of a session whose profile may be wrong: found, held against the profile, and written."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from lce_rig.core.data import Image
+from lce_rig.core.errors import NotEnoughDataError, UsageError
+from lce_rig.export.camera_info import read_camera_info
+from lce_rig.pipeline.intrinsics import measure_intrinsics
+from lce_rig.pipeline.intrinsics_files import final, profile_block, save_profile, write_intrinsics
+from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
+from lce_rig.session import Session
+from tests.detect.test_image_board import draw, looking
+
+RLES = find_profile("rles").read_text(encoding="utf-8")
+RIG = load_rig("rles")
+LENS = RIG.cameras["davis"].to_intrinsics()
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    """The board eight times all over the picture, as the profile's lens draws it."""
+    board, rng = RIG.board.to_board(), np.random.default_rng(1)
+    drawn = []
+    while len(drawn) < 8:
+        ray = LENS.unproject(rng.uniform(0.15, 0.85, 2) * [LENS.width_px, LENS.height_px])
+        tilt, about, roll = rng.uniform(15, 45), rng.uniform(0, 360), rng.uniform(20, 70)
+        T = looking(tilt, about, roll, tuple(ray * rng.uniform(1.3, 2.2)))
+        corners, _ = LENS.project(board.corners() @ T[:3, :3].T + T[:3, 3])
+        if LENS.is_inside(corners, 8.0).all():
+            drawn.append(draw(board, LENS, T, seed=len(drawn)))
+    return drawn
+
+
+def session_of(path, pictures, channel="frames", **camera) -> Session:
+    """Make a session of pictures with keys of the camera set to other values."""
+    text = RLES
+    for key, value in camera.items():
+        text = set_value(text, f"cameras.davis.{key.replace('__', '.')}", value)
+    with Session.create(path, parse_rig(text)) as session:
+        for pixels in pictures:
+            session.add_capture([Image("davis", channel, None, pixels)], [], {})
+    return session
+
+
+@pytest.fixture(scope="module")
+def session(pictures, tmp_path_factory) -> Session:
+    return session_of(tmp_path_factory.mktemp("right") / "session", pictures)
+
+
+@pytest.fixture(scope="module")
+def measured(session):
+    return measure_intrinsics(session, "davis")
+
+
+def sigmas_off(measured):
+    estimate = measured.estimate
+    return (estimate.model.vector(estimate.intrinsics) - estimate.model.vector(LENS)) / estimate.sigma
+
+
+def test_right_intrinsics_are_confirmed(measured):
+    assert measured.channels == ("frames",)
+    assert measured.refused == {}
+    assert np.abs(sigmas_off(measured)).max() < 4.5
+    assert measured.estimate.rms_px < 0.05
+    assert measured.check.verdict() == "pass"
+
+
+def test_wrong_intrinsics_lead_to_the_same_lens_and_fail(pictures, tmp_path):
+    wrong = {"intrinsics__fx_px": "230.0", "intrinsics__fy_px": "230.0", "intrinsics__distortion": "[]"}
+    measured = measure_intrinsics(session_of(tmp_path / "s", pictures, **wrong), "davis", model="radtan5")
+    assert np.abs(sigmas_off(measured)).max() < 4.5
+    assert len(measured.estimate.views) == 8
+    assert measured.estimate.rms_px < 0.05
+    assert measured.check.verdict() == "fail"
+
+
+def test_a_profile_of_another_resolution_is_no_obstacle(pictures, tmp_path):
+    text = set_value(RLES, "cameras.davis.resolution_px", "[692, 520]")
+    double = {"fx_px": "699.1", "fy_px": "698.4", "cx_px": "345.5", "cy_px": "253.0"}
+    for key, value in double.items():
+        text = set_value(text, f"cameras.davis.intrinsics.{key}", value)
+    with Session.create(tmp_path / "session", parse_rig(text)) as session:
+        for pixels in pictures[:6]:
+            session.add_capture([Image("davis", "frames", None, pixels)], [], {})
+    measured = measure_intrinsics(session, "davis")
+    assert np.abs(sigmas_off(measured)).max() < 4.5
+    assert measured.check is None
+    assert measured.difference is None
+    save_profile(session, [measured], tmp_path / "new.yaml")
+    camera = load_rig(tmp_path / "new.yaml").cameras["davis"]
+    assert camera.resolution_px == (346, 260)
+    assert camera.to_intrinsics() == final(measured)
+
+
+def test_channels_share_the_lens_and_bad_pictures_are_named(pictures, tmp_path):
+    session = session_of(tmp_path / "session", pictures[:4])
+    with Session.open(session.path, writable=True) as writer:
+        for pixels in [*pictures[4:], np.full((260, 346), 90, dtype=np.uint8)]:
+            writer.add_capture([Image("davis", "events", None, pixels)], [], {})
+    (session.path / "captures" / "000003" / "davis.frames.png").write_bytes(b"torn")
+    both = measure_intrinsics(session, "davis", channels=["frames", "events"])
+    assert [view.channel for view in both.estimate.views] == ["frames"] * 3 + ["events"] * 4
+    assert set(both.refused) == {"000003.frames", "000008.events"}
+    assert both.refused["000003.frames"].stage == "read"
+    assert both.refused["000008.events"].stage == "image"
+    assert np.abs(sigmas_off(both)).max() < 4.5
+    with pytest.raises(NotEnoughDataError, match="the board is in 3 of 4 captures") as caught:
+        measure_intrinsics(session, "davis", channels=["frames"])
+    assert "1 x capture 000003 is damaged" in caught.value.hint
+
+
+def test_unknown_channels_and_models_are_usage_errors(session):
+    with pytest.raises(UsageError, match="camera davis has no channel 'colour'; it has frames, events"):
+        measure_intrinsics(session, "davis", channels=["colour"])
+    with pytest.raises(UsageError, match="there is radtan4, radtan5, rational, equidistant and auto"):
+        measure_intrinsics(session, "davis", model="brown")
+
+
+def test_every_file_holds_the_same_lens(session, measured, tmp_path):
+    stale = session.path / "intrinsics" / "old.yaml"
+    stale.parent.mkdir(exist_ok=True)
+    stale.write_text("of an earlier run")
+    files = write_intrinsics(session, [measured])
+    assert {path.name for path in (session.path / "intrinsics").iterdir()} == {path.name for path in files}
+    lens = final(measured)
+    block = yaml.safe_load((session.path / "intrinsics" / "davis.yaml").read_text())["intrinsics"]
+    assert block["fx_px"] == lens.fx_px
+    assert tuple(block["distortion"]) == lens.distortion
+    info = read_camera_info(session.path / "intrinsics" / "camera_info_davis.yaml")
+    assert (info.matrix == lens.matrix).all()
+    document = json.loads(files[0].read_text())["cameras"][0]
+    assert document["intrinsics"]["cy_px"] == lens.cy_px
+    assert document["profile"]["verdict"] == "pass"
+    assert document["views_used"] == [f"{k:06d}.frames" for k in range(8)]
+    assert files[-1].read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_new_profile_keeps_the_comments_of_the_old_and_never_replaces_a_file(session, measured, tmp_path):
+    save_profile(session, [measured], tmp_path / "new.yaml")
+    rig = load_rig(tmp_path / "new.yaml")
+    assert rig.cameras["davis"].to_intrinsics() == final(measured)
+    assert rig.board == RIG.board
+    assert "# measure it; do not trust the drawing" in (tmp_path / "new.yaml").read_text()
+    with pytest.raises(UsageError, match="exists already"):
+        save_profile(session, [measured], tmp_path / "new.yaml")
+
+
+def test_the_block_can_be_pasted_into_the_profile(measured):
+    lines = RLES.splitlines()
+    first = next(k for k, line in enumerate(lines) if line.startswith("    intrinsics:"))
+    end = next(k for k in range(first, len(lines)) if lines[k].startswith("    channels:"))
+    pasted = [*lines[:first], *profile_block(RIG, measured).splitlines(), *lines[end:]]
+    assert parse_rig("\n".join(pasted)).cameras["davis"].to_intrinsics() == final(measured)
+
+
+def test_a_lens_of_another_family_goes_into_the_profile_too(session, measured, tmp_path):
+    fisheye = replace(LENS, model="equidistant", distortion=(-0.05, 0.01, -0.002, 1e-5))
+    other = replace(measured, estimate=replace(measured.estimate, intrinsics=fisheye))
+    save_profile(session, [other], tmp_path / "new.yaml")
+    assert load_rig(tmp_path / "new.yaml").cameras["davis"].to_intrinsics() == fisheye
