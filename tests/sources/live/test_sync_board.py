@@ -27,7 +27,7 @@ def take(board, n, line="cam"):
     return pulses
 
 
-def wait_until(condition, patience_s=5.0):
+def wait_until(condition, patience_s=20.0):
     end_s = time.monotonic() + patience_s
     while not condition() and time.monotonic() < end_s:
         time.sleep(0.01)
@@ -47,12 +47,13 @@ def test_pulses_come_one_by_one_with_the_boards_own_stamps():
 
 def test_its_clock_is_tied_to_the_computers_by_asking():
     with FakeBoard(drift=2000e-6) as fake, SyncBoard(settings(fake.path)) as board:
-        wait_until(lambda: board.host_clock is not None and board.host_clock.n_used >= 8)
+        wait_until(lambda: (clock := board.host_clock) is not None and clock.n_used >= 8)
         model = board.host_clock
         error_ns = model.convert(model.last_ns) - fake.host_ns(model.last_ns)
         assert abs(error_ns) < 5 * model.sigma_ns(model.last_ns) + 1000
         assert model.sigma_ns(model.last_ns) < 2_000_000
-        assert model.drift == pytest.approx(-2000e-6, abs=200e-6)
+        # On a busy machine any answer may come some milliseconds late.
+        assert model.drift == pytest.approx(-2000e-6, abs=200e-6 + 4e6 / (model.last_ns - model.first_ns))
         assert "time requests: drift" in board.status().clock
 
 

@@ -265,7 +265,7 @@ def running(host_board):
 def test_our_live_source_and_the_firmware_understand_each_other(running):
     given = {"device": running.path, "triggers": {"cam": {"channel": 1, "rate_hz": 50.0, "phase_us": 3000}}}
     with SyncBoard(SyncSettings.model_validate(given)) as board:
-        pulses, told, end_s = [], [], time.monotonic() + 10
+        pulses, told, end_s = [], [], time.monotonic() + 30
         for pulse in board.samples():
             pulses += [pulse] if pulse.sensor == "cam" else []
             told += [pulse] if pulse.sensor == "pps" else []
@@ -273,7 +273,8 @@ def test_our_live_source_and_the_firmware_understand_each_other(running):
                 break
         assert [pulse.count for pulse in pulses] == list(range(1, len(pulses) + 1))
         model, status = board.host_clock, board.status()
-        assert model.drift == pytest.approx(-300e-6, abs=60e-6)
+        # On a busy machine any answer may come some milliseconds late.
+        assert model.drift == pytest.approx(-300e-6, abs=60e-6 + 4e6 / (model.last_ns - model.first_ns))
         # The last pulse per second began a second of this computer's clock.
         off_ns = (model.convert(told[-1].stamp_ns) + 500_000_000) % 1_000_000_000 - 500_000_000
         assert abs(off_ns) < 30_000_000
