@@ -142,13 +142,14 @@ def motion_figures(found: ImageBoard, sweep_s: float | None) -> dict[str, float]
 
 
 def _slope(time_s: Array, values: Array, cov: Array) -> tuple[Array, Array]:
-    """Fit values (K, 3) = a + b t by weighted least squares; return b (3,) and its covariance (3, 3)."""
-    weights = np.linalg.inv(cov)
-    powers = np.stack([np.ones_like(time_s), time_s], axis=1)
-    H = np.einsum("ka,kb,kij->aibj", powers, powers, weights).reshape(6, 6)
-    g = np.einsum("ka,kij,kj->ai", powers, weights, values).ravel()
-    inverse = np.linalg.inv(H)
-    return (inverse @ g)[3:], inverse[3:, 3:]
+    """Fit values (K, 3) = a + b t; return b (3,) and its covariance (3, 3).
+
+    All count alike: weighed by their covariances, in which depth and place go together, what a hand's way
+    deviates from the line sideways would pass for speed along the line of sight.
+    """
+    since_s = time_s - time_s.mean()
+    share = since_s / np.sum(since_s**2)
+    return share @ values, np.einsum("k,kij->ij", share**2, cov)
 
 
 def _sigma_along(vector: Array, cov: Array) -> float:

@@ -72,7 +72,7 @@ def find_image_board(
     outer_contrast, goes_on = extent(grey, crossings.grid_px)
     if outer_contrast < _MIN_OUTER_CONTRAST or goes_on:
         seen = seen_grid(grey)
-        return explain_other_grid(grey, board, crossings.grid_px if seen is None else seen)
+        return explain_other_grid(grey, board, crossings.grid_px if seen is None else seen, is_from_events)
     problem = quality_problem(quality, min_contrast, min_sharpness, is_from_events)
     if problem is not None:
         return problem

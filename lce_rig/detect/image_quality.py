@@ -101,7 +101,7 @@ def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool 
         return Refusal("image", cause, "expose shorter or turn the board away from the light")
     seen = seen_grid(grey)
     if seen is not None:
-        return explain_other_grid(grey, board, seen)
+        return explain_other_grid(grey, board, seen, is_from_events)
     if bright - low < 50:
         cause = f"contrast too low: grey values {low:.0f} to {bright:.0f}, no {wanted} inner corners seen"
         too_few = "move the board while events are recorded: only moving edges make them"
@@ -121,7 +121,9 @@ def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool 
     )
 
 
-def explain_other_grid(grey: NDArray[np.uint8], board: Board, seen_px: Array) -> Refusal:
+def explain_other_grid(
+    grey: NDArray[np.uint8], board: Board, seen_px: Array, is_from_events: bool = False
+) -> Refusal:
     """Say that another grid of corners is in the picture than the profile's.
 
     Args:
@@ -133,7 +135,9 @@ def explain_other_grid(grey: NDArray[np.uint8], board: Board, seen_px: Array) ->
         return Refusal(
             "image",
             f"the {wanted[0]}x{wanted[1]} inner corners are there but too unclear to measure",
-            "hold the board still, closer and better lit",
+            f"{MOVE_SLOWLY}; come closer"
+            if is_from_events
+            else "hold the board still, closer and better lit",
         )
     is_part = seen[0] <= wanted[0] and seen[1] <= wanted[1]
     side = _side_beyond(grey, seen_px)
@@ -147,7 +151,7 @@ def explain_other_grid(grey: NDArray[np.uint8], board: Board, seen_px: Array) ->
         action = (
             "uncover the whole print; if it has these corners, correct board.inner_corners in the profile"
         )
-        return Refusal("image", text, action)
+        return Refusal("image", text, f"{MOVE_SLOWLY}; {action}" if is_from_events else action)
     return Refusal(
         "image", text, "correct board.inner_corners in the profile: one less than squares along each side"
     )
