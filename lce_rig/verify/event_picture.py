@@ -70,7 +70,7 @@ def draw_event_key(
     """Explain the colours in one line of text."""
     span_ms = 1e-6 * float(events.t_ns[-1] - events.t_ns[0]) if len(events) else 0.0
     texts = (
-        (f"events of the last {span_ms:.0f} ms:", INK),
+        (f"events of the last {span_ms:.{0 if span_ms >= 10 else 1}f} ms:", INK),
         ("brighter", BRIGHTER),
         ("darker", DARKER),
     )

@@ -90,6 +90,8 @@ def test_an_error_of_the_user_of_a_recorder_is_not_hidden_by_a_full_disk(tmp_pat
         raise KeyError
 
 
+# An interrupt may land while a generator is set up, which Python then reports and drops.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("name", KINDS)
 def test_an_interrupt_at_any_moment_leaves_a_bag_that_is_read_up_to_there(
     tmp_path: Path, rles: Rig, name: str

@@ -14,6 +14,7 @@ PERIOD_NS = STREAMED_VLP16.period_ns
 #: 14 November 2023, 22:13:20 UTC.
 T0_NS = 1_700_000_000_000_000_000
 NETWORK_NS = 120_000
+HOUR_NS = 3600 * 10**9
 
 
 def settings(**changes: object) -> LidarSettings:
@@ -70,6 +71,18 @@ def push(
             scans.append(scan)
     last = stream.finish()
     return scans if last is None else [*scans, last]
+
+
+def stream_of(**changes: object) -> Vlp16Stream:
+    return Vlp16Stream("lidar", settings(**changes))
+
+
+def only_data(packets: Iterable[SensorPacket]) -> list[SensorPacket]:
+    return [packet for packet in packets if packet.port == velodyne.DATA_PORT]
+
+
+def stamps(scans: Iterable[Scan]) -> list[int | None]:
+    return [scan.stamp_ns for scan in scans]
 
 
 def largest_errors(truth: Scan, decoded: Scan) -> tuple[float, float]:

@@ -24,7 +24,7 @@ from lce_rig.sources.velodyne_stream import Vlp16Stream
 SILENCE_S = 2.0
 _WAIT_S = 0.1
 # Half a second of scans: whoever is slower wants the newest.
-_N_SLOTS = 5
+N_SLOTS = 5
 _N_RATED = 30
 # A scan that is later than this lowers the rate.
 _RATED_LATE_S = 0.5
@@ -48,6 +48,7 @@ class Vlp16Source:
         settings: LidarSettings,
         *,
         silence_s: float = SILENCE_S,
+        n_slots: int = N_SLOTS,
         record_to: Path | None = None,
         web_port: int = 80,
     ) -> None:
@@ -57,12 +58,14 @@ class Vlp16Source:
             sensor: its name in the profile.
             settings: its block of the profile.
             silence_s: without packets for so long, it is taken to be gone.
+            n_slots: scans that wait for a slow taker; the oldest are dropped.
             record_to: a pcap file for the raw packets; it must not exist.
             web_port: of the sensor's web server, which is asked when no packets come.
         """
         self.sensor = sensor
         self._settings = settings
         self._silence_s = silence_s
+        self._n_slots = n_slots
         self._record_to = record_to
         self._web_port = web_port
         self._lock = threading.Lock()
@@ -71,7 +74,7 @@ class Vlp16Source:
         self._reset()
 
     def _reset(self) -> None:
-        self._mailbox: Mailbox[Scan] = Mailbox(_N_SLOTS)
+        self._mailbox: Mailbox[Scan] = Mailbox(self._n_slots)
         self._reception = Reception()
         self._stream: Vlp16Stream | None = None
         self._recorder: PcapRecorder | None = None
