@@ -1,7 +1,7 @@
 """A recording of the network as a stream of scans of a VLP-16, through the decoding that is used live."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -68,7 +68,7 @@ class PcapRecording:
         survey = self._survey()
         self._address = self._choose(survey)
         self.key = fingerprint([path])
-        self.streams: dict[Stream, Span | None] = {
+        self.streams: Mapping[Stream, Span | None] = {
             Stream(self._lidar, "", "scans"): self._span_ns() if options.is_part else None
         }
         n_packets = survey.senders[self._address] * path.stat().st_size / max(survey.n_bytes, 1)
