@@ -1,0 +1,1 @@
+"""Guided collection from attached sensors."""

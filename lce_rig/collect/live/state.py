@@ -1,0 +1,115 @@
+"""What a live collection knows at one moment: all that its views show."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.collect.guidance import Coverage
+from lce_rig.core.geometry import Array
+
+Phase = Literal["starting", "searching", "moving", "holding", "saving", "refused", "enough", "lost", "ended"]
+"""starting: no sensor has sent yet; searching: not every sensor sees the board; moving: the board has to go
+elsewhere, or moves; holding: it stands still and is about to be captured; saving: it is being written; refused:
+it stands still where it adds nothing; enough: you may stop; lost: a sensor is gone; ended."""
+
+Sound = Literal["tick", "captured", "refused", "enough", "lost"]
+
+
+@dataclass(frozen=True)
+class StreamState:
+    """How one stream does, and whether the board is seen in it.
+
+    Attributes:
+        name: "cam.frames", "lidar".
+        rate_hz: samples a second.
+        n_lost: what never arrived or nobody took.
+        sees_board: None where it was not looked for.
+        reason: why not, or what is wrong with the sensor, and what to do; "" while all is well.
+        figures: in few words: "2 rings, 3.1 m", "0.05 px".
+    """
+
+    name: str
+    rate_hz: float = 0.0
+    n_lost: int = 0
+    sees_board: bool | None = None
+    reason: str = ""
+    figures: str = ""
+
+
+@dataclass(frozen=True)
+class Cue:
+    """A moment that is worth a sound.
+
+    Attributes:
+        number: rises with every cue, so that a view plays each once.
+        sound: which.
+    """
+
+    number: int
+    sound: Sound
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """The camera's last picture, and where the board is and should be in it.
+
+    Attributes:
+        camera: the stream it comes from.
+        pixels: (H, W) or (H, W, 3) BGR uint8.
+        present_px: (K, 2) closed outline of the board; None where it is not seen.
+        wanted_px: (K, 2) closed outline of the placement wanted next; None where there is none. Points out of
+            the lens's sight are NaN.
+        is_there: whether the board is where it should be.
+    """
+
+    camera: str
+    pixels: NDArray[np.uint8]
+    present_px: Array | None = None
+    wanted_px: Array | None = None
+    is_there: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class LiveState:
+    """One moment of a live collection.
+
+    Attributes:
+        rig, session: the profile's name and the session's folder.
+        elapsed_s: since the collection began.
+        phase: what goes on.
+        headline: the one thing to do, large: "one step left, 0.5 m closer".
+        detail: why, or what goes on, smaller; "" where there is nothing to add.
+        hold_s: how long the board has still to be held; None unless it is being held.
+        n_captures: in the session.
+        n_wanted: how many are wanted; None where the target decides.
+        streams: every stream.
+        drawing: the guiding camera's picture; None before one has come.
+        coverage: how much of what is reachable has been shown; None without guidance.
+        sigma_deg, sigma_mm: predicted 1-sigma of rotation and translation now; NaN where captures are too few.
+        target_deg, target_mm: the profile's.
+        cues: the latest few, oldest first.
+        log: the latest messages, oldest first.
+        notes: what holds all the time: "boards must stand still: ...".
+    """
+
+    rig: str
+    session: str
+    elapsed_s: float
+    phase: Phase
+    headline: str
+    detail: str
+    hold_s: float | None
+    n_captures: int
+    n_wanted: int | None
+    streams: tuple[StreamState, ...]
+    drawing: Drawing | None
+    coverage: Coverage | None
+    sigma_deg: float
+    sigma_mm: float
+    target_deg: float
+    target_mm: float
+    cues: tuple[Cue, ...] = ()
+    log: tuple[str, ...] = ()
+    notes: tuple[str, ...] = field(default=())
