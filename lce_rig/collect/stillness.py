@@ -32,37 +32,71 @@ class StillnessOptions:
 def find_still_moments(
     sightings: Iterable[Sighting], board: Board, options: StillnessOptions
 ) -> Iterator[Moment]:
-    """Yield the stillest moment of every stretch in which the board stands still.
+    """Yield the stillest moment of every stretch in which the board stands still."""
+    gate = StillnessGate(board, options)
+    for sighting in sightings:
+        moment = gate.take(sighting)
+        if moment is not None:
+            yield moment
+    moment = gate.finish()
+    if moment is not None:
+        yield moment
+
+
+class StillnessGate:
+    """Takes sightings in order of time, and gives the stillest moment of every stretch of stillness.
 
     It is the middle of a window in which nothing moved more than its figure `motion_m`. A stretch ends when
     the board moves, is lost, or has stood for `dwell_s`; it is then reported once.
+
+    Attributes:
+        motion_m: how far the board moved in the last window; infinite where there is no whole one.
+        held_s: for how long the present stretch has lasted, since its first whole window; None out of one.
     """
-    window: deque[Sighting] = deque()
-    best: Moment | None = None
-    best_m = np.inf
-    since_ns = 0
-    for sighting in sightings:
-        if not sighting.images or not sighting.lidars or _is_gap(window, sighting, options):
+
+    def __init__(self, board: Board, options: StillnessOptions) -> None:
+        self.motion_m = np.inf
+        self.held_s: float | None = None
+        self._board = board
+        self._options = options
+        self._window: deque[Sighting] = deque()
+        self._best: Moment | None = None
+        self._best_m = np.inf
+        self._since_ns = 0
+
+    def take(self, sighting: Sighting) -> Moment | None:
+        """Take the next sighting, and give the moment of a stretch that has ended with it."""
+        options, now_ns = self._options, sighting.frame.time_ns
+        self.motion_m = self._measure(sighting)
+        is_still = self.motion_m <= options.max_motion_m
+        if is_still:
+            self._since_ns = now_ns if self._best is None else self._since_ns
+            if self._best is None or self.motion_m < self._best_m:
+                middle = self._window[len(self._window) // 2]
+                self._best = Moment(middle, {"motion_m": round(self.motion_m, 6)})
+                self._best_m = self.motion_m
+        self.held_s = (now_ns - self._since_ns) * 1e-9 if is_still else None
+        if self._best is not None and (not is_still or now_ns - self._since_ns > options.dwell_s * 1e9):
+            return self.finish()
+        return None
+
+    def finish(self) -> Moment | None:
+        """Give the moment of the stretch that lasts, where there is one, and end it."""
+        best, self._best, self.held_s = self._best, None, None
+        return best
+
+    def _measure(self, sighting: Sighting) -> float:
+        """Put a sighting into the window and measure how far the board moved in it."""
+        window, options = self._window, self._options
+        is_seen = bool(sighting.images and sighting.lidars)
+        if not is_seen or _is_gap(window, sighting, options):
             window.clear()
-        if sighting.images and sighting.lidars:
+        if is_seen:
             window.append(sighting)
         while len(window) > 2 and _span_s(window) - _step_s(window) >= options.window_s:
             window.popleft()
         is_full = len(window) > 2 and _span_s(window) >= options.window_s * 0.999
-        motion_m = _motion_m(window, board, options.max_motion_m) if is_full else np.inf
-        now_ns = sighting.frame.time_ns
-        if motion_m <= options.max_motion_m:
-            since_ns = since_ns if best is not None else now_ns
-            if best is None or motion_m < best_m:
-                best = Moment(window[len(window) // 2], {"motion_m": round(motion_m, 6)})
-                best_m = motion_m
-        if best is not None and (
-            motion_m > options.max_motion_m or now_ns - since_ns > options.dwell_s * 1e9
-        ):
-            yield best
-            best = None
-    if best is not None:
-        yield best
+        return _motion_m(window, self._board, options.max_motion_m) if is_full else np.inf
 
 
 def _is_gap(window: deque[Sighting], sighting: Sighting, options: StillnessOptions) -> bool:
