@@ -35,13 +35,46 @@ def find_moving_moments(
         taken: no placements yet; it says how far apart they must be.
         tally: receives why other sightings are no moments.
     """
-    chooser = _Chooser(options, taken)
-    for sighting, around in _with_neighbours(sightings, options.window_s):
-        judged = judge_sighting(sighting, around, rig, options)
-        if isinstance(judged, Refusal):
-            tally.add(judged)
-        yield from chooser.take(sighting.frame.time_ns, judged if isinstance(judged, Moment) else None)
-    yield from chooser.finish()
+    gate = MotionGate(rig, options, taken, tally)
+    for sighting in sightings:
+        yield from gate.take(sighting)
+    yield from gate.finish()
+
+
+class MotionGate:
+    """Takes sightings in order of time, and gives the best moment of every place that the board passes.
+
+    Attributes:
+        judged: the last sighting that could be judged: a moment that will do, or why it does not; None where
+            no camera of events saw the board.
+    """
+
+    def __init__(self, rig: Rig, options: MotionOptions, taken: Placements, tally: Tally) -> None:
+        """Begin without sightings; for the arguments see `find_moving_moments`."""
+        self.judged: Moment | Refusal | None = None
+        self._rig = rig
+        self._options = options
+        self._tally = tally
+        self._neighbours = _Neighbours(options.window_s)
+        self._chooser = _Chooser(options, taken)
+
+    def take(self, sighting: Sighting) -> list[Moment]:
+        """Take the next sighting, and give the moments that nothing better can follow."""
+        return self._judge(self._neighbours.take(sighting))
+
+    def finish(self) -> list[Moment]:
+        """Give what is left when nothing more comes."""
+        return [*self._judge(self._neighbours.finish()), *self._chooser.finish()]
+
+    def _judge(self, sightings: Iterable[tuple[Sighting, list[Sighting]]]) -> list[Moment]:
+        moments: list[Moment] = []
+        for sighting, around in sightings:
+            self.judged = judge_sighting(sighting, around, self._rig, self._options)
+            if isinstance(self.judged, Refusal):
+                self._tally.add(self.judged)
+            moment = self.judged if isinstance(self.judged, Moment) else None
+            moments.extend(self._chooser.take(sighting.frame.time_ns, moment))
+        return moments
 
 
 class _Chooser:
@@ -89,37 +122,36 @@ class _Chooser:
         return is_short, abs(float(np.log(speed_ratio))) + moment.figures["unsteady_m"] / _UNSTEADY_M
 
 
-def _with_neighbours(
-    sightings: Iterable[Sighting], window_s: float
-) -> Iterator[tuple[Sighting, list[Sighting]]]:
-    """Yield each sighting with all within half a window of it, itself among them."""
-    half_ns = round(window_s * 0.5e9)
-    near: deque[Sighting] = deque()
-    n_waiting = 0
-    for sighting in sightings:
-        now_ns = sighting.frame.time_ns
+class _Neighbours:
+    """Gives each sighting with all within half a window of it, itself among them, once they have come."""
+
+    def __init__(self, window_s: float) -> None:
+        self._half_ns = round(window_s * 0.5e9)
+        self._near: deque[Sighting] = deque()
+        self._n_waiting = 0
+
+    def take(self, sighting: Sighting) -> Iterator[tuple[Sighting, list[Sighting]]]:
+        """Take the next sighting, and give those whose neighbours are complete."""
+        near, now_ns = self._near, sighting.frame.time_ns
         if near and now_ns <= near[-1].frame.time_ns:
             # The clocks were set back.
-            yield from _last_of(near, n_waiting, half_ns)
-            near.clear()
-            n_waiting = 0
+            yield from self.finish()
         near.append(sighting)
-        n_waiting += 1
-        while now_ns - near[-n_waiting].frame.time_ns >= half_ns:
-            yield near[-n_waiting], _around(near[-n_waiting], near, half_ns)
-            n_waiting -= 1
-        while near[-max(n_waiting, 1)].frame.time_ns - near[0].frame.time_ns > half_ns:
+        self._n_waiting += 1
+        while now_ns - near[-self._n_waiting].frame.time_ns >= self._half_ns:
+            oldest = near[-self._n_waiting]
+            yield oldest, self._around(oldest)
+            self._n_waiting -= 1
+        while near[-max(self._n_waiting, 1)].frame.time_ns - near[0].frame.time_ns > self._half_ns:
             near.popleft()
-    yield from _last_of(near, n_waiting, half_ns)
 
+    def finish(self) -> Iterator[tuple[Sighting, list[Sighting]]]:
+        """Give those that still wait, and forget all."""
+        for place in range(len(self._near) - self._n_waiting, len(self._near)):
+            yield self._near[place], self._around(self._near[place])
+        self._near.clear()
+        self._n_waiting = 0
 
-def _last_of(
-    near: deque[Sighting], n_waiting: int, half_ns: int
-) -> Iterator[tuple[Sighting, list[Sighting]]]:
-    for place in range(len(near) - n_waiting, len(near)):
-        yield near[place], _around(near[place], near, half_ns)
-
-
-def _around(sighting: Sighting, near: Iterable[Sighting], half_ns: int) -> list[Sighting]:
-    time_ns = sighting.frame.time_ns
-    return [other for other in near if abs(other.frame.time_ns - time_ns) <= half_ns]
+    def _around(self, sighting: Sighting) -> list[Sighting]:
+        time_ns = sighting.frame.time_ns
+        return [other for other in self._near if abs(other.frame.time_ns - time_ns) <= self._half_ns]
