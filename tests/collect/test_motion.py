@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.collect.event_moment import MotionOptions
-from lce_rig.collect.motion import _with_neighbours, find_moving_moments
+from lce_rig.collect.motion import _Neighbours, find_moving_moments
 from lce_rig.collect.novelty import Placements
 from lce_rig.collect.pairing import Frame
 from lce_rig.collect.tally import Tally
@@ -163,7 +163,9 @@ def test_every_sighting_is_judged_once_with_all_that_lie_within_half_a_window(
     times_ms = np.cumsum(steps)
     times_ms[set_back:] -= 100_000
     sightings = [Sighting(Frame(int(t) * 10**6, (), ()), {}, {}) for t in times_ms]
-    found = list(_with_neighbours(iter(sightings), 0.5))
+    neighbours = _Neighbours(0.5)
+    found = [each for sighting in sightings for each in neighbours.take(sighting)]
+    found.extend(neighbours.finish())
     assert [sighting for sighting, _ in found] == sightings
     for k, (sighting, around) in enumerate(found):
         same_clock = sightings[:set_back] if k < set_back else sightings[set_back:]

@@ -11,8 +11,8 @@ from lce_rig.core.geometry import Array
 
 Phase = Literal["starting", "searching", "moving", "holding", "saving", "refused", "enough", "lost", "ended"]
 """starting: no sensor has sent yet; searching: not every sensor sees the board; moving: the board has to go
-elsewhere, or moves; holding: it stands still and is about to be captured; saving: it is being written; refused:
-it stands still where it adds nothing; enough: you may stop; lost: a sensor is gone; ended."""
+elsewhere, or moves; holding: it stands still and is about to be captured; saving: it is being written;
+refused: it stands still where it adds nothing; enough: you may stop; lost: a sensor is gone; ended."""
 
 Sound = Literal["tick", "captured", "refused", "enough", "lost"]
 
@@ -87,7 +87,7 @@ class LiveState:
         streams: every stream.
         drawing: the guiding camera's picture; None before one has come.
         coverage: how much of what is reachable has been shown; None without guidance.
-        sigma_deg, sigma_mm: predicted 1-sigma of rotation and translation now; NaN where captures are too few.
+        sigma_deg, sigma_mm: predicted 1-sigma of rotation and translation now; NaN where captures are few.
         target_deg, target_mm: the profile's.
         cues: the latest few, oldest first.
         log: the latest messages, oldest first.
