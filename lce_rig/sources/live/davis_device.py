@@ -20,7 +20,7 @@ _CHECK = (
     "Check the USB 3 cable, `lsusb | grep 152a`, iniVation's udev rules (else only root may open it), and "
     "that no other program (DV, a ROS driver) holds it."
 )
-_INSTALL = "pip install 'dv-processing>=2,<3' (Linux, Python 3.9 to 3.13)"
+_INSTALL = "Run: pip install 'lce-rig[davis]' (dv-processing 2: Linux, Python 3.10 to 3.13)"
 _US = timedelta(microseconds=1)
 # Modules and parameters of libcaer's davis.h.
 _APS, _EXTERNAL_INPUT = 2, 4

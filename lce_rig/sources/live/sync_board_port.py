@@ -35,9 +35,7 @@ class BoardPort:
         try:
             import serial
         except ImportError:
-            raise SourceError(
-                f"{who} needs the package pyserial", "Run: pip install 'lce-rig[live]'"
-            ) from None
+            raise SourceError(f"{who} needs the package pyserial", "Run: pip install pyserial") from None
         self._failures: tuple[type[Exception], ...] = (serial.SerialException, OSError)
         self._timeouts: type[Exception] = serial.SerialTimeoutException
         self._port: Any = serial.Serial()

@@ -38,7 +38,7 @@ def test_the_shipped_rigs_get_their_drivers(rig: str, sources: list[tuple[str, s
 
 
 def test_a_camera_with_a_command_is_read_through_it() -> None:
-    rig = with_driver(load_rig("rlfs"), "cam", command=("true",), device=None)
+    rig = with_driver(load_rig("rlfs"), "cam", type=None, command=("true",), device=None)
     assert type(open_live(rig)[1]).__name__ == "ImagePipeSource"
 
 
