@@ -1,44 +1,31 @@
-"""Algorithm 1 in order: consensus -> features -> planes -> outliers and weights -> draws -> final solution.
+"""One camera and one LiDAR: pairs that agree on one extrinsic, then the method that the options name."""
 
-References:
-    Jiao et al., "LCE-Calib: Automatic LiDAR-Frame/Event Camera Extrinsic Calibration With a Globally Optimal
-    Solution", IEEE/ASME Transactions on Mechatronics, 2023. Unlike there, candidates are judged on captures
-    they were not fitted to, draws are seeded, and each solution carries a certificate.
-"""
-
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
+from lce_rig.calibrate.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.calibrate.consensus import Consensus, find_consensus
-from lce_rig.calibrate.draws import Draws, draw_subsets
-from lce_rig.calibrate.estimate import CalibrationEstimate, CaptureResidual
-from lce_rig.calibrate.features import CaptureFeatures, extract_features
-from lce_rig.calibrate.initial import drop_uncertain, solve_planes
-from lce_rig.calibrate.metrics import capture_residual, error_to_reference, summarise
-from lce_rig.calibrate.observability import describe_weakest, linearise, require_observable
-from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates
-from lce_rig.calibrate.outliers import reject_outliers
-from lce_rig.calibrate.placements import group_placements
-from lce_rig.calibrate.problem import Problem, Solutions, Weights
-from lce_rig.calibrate.systematic import ring_sensitivities
+from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates, Method
 from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.geometry import Array
-from lce_rig.core.results import Certificate, Observation, Refusal
-from lce_rig.solvers.covariance import jackknife_covariance, systematic_covariance
+from lce_rig.core.results import Observation
 
-# Weights given by the user count in captures with residuals of this size, which sets the scale of the prior.
-NOMINAL_SIGMA_M = 0.01
-_PLANE_FREEDOMS = 3
+Progress = Callable[[int, int], None]
+
+METHODS: Mapping[
+    Method, Callable[[Sequence[Observation], Board, CalibrateOptions, Progress | None], CalibrationEstimate]
+] = {
+    "paper": calibrate_by_algorithm_1,
+}
+"""Name -> what estimates T_cam_lidar from boards whose pairing is settled."""
 
 
 def calibrate(
     candidates: Sequence[CaptureCandidates],
     board: Board,
     options: CalibrateOptions | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> CalibrationEstimate:
     """Estimate T_cam_lidar from what both sensors saw of the board.
 
@@ -62,9 +49,9 @@ def calibrate_observations(
     observations: Sequence[Observation],
     board: Board,
     options: CalibrateOptions,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> CalibrationEstimate:
-    """Estimate T_cam_lidar from boards whose pairing is settled.
+    """Estimate T_cam_lidar by the method of the options from boards whose pairing is settled.
 
     Args:
         observations: one a capture.
@@ -75,24 +62,8 @@ def calibrate_observations(
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
-    features = [extract_features(observation, board, options) for observation in observations]
-    problem = Problem(features, board, _weights(options, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
-    T_planes = solve_planes(features, problem)
-    require_observable(features, problem, T_planes)
-
-    outliers, sigmas = reject_outliers(features, problem, T_planes, options)
-    features = [f for f in features if f.capture not in outliers]
-    observations = [o for o in observations if o.capture not in outliers]
-    keep = drop_uncertain(features, T_planes) if options.use_uncertainty else None
-    problem = Problem(features, board, _weights(options, features, *sigmas), keep)
-    T_planes = solve_planes(features, problem)
-    require_observable(features, problem, T_planes)
-
-    draws = draw_subsets(problem, T_planes, options.n_draws, options.n_rounds, options.seed, progress)
-    T_start = T_planes if draws is None else draws.T_mean[draws.best]
-    solution = problem.solve(np.ones((1, problem.n_captures)), T_start, options.n_rounds)
-    covariances = _covariances(observations, board, options, problem, solution)
-    return _report(observations, features, board, problem, solution, covariances, draws, outliers)
+    estimate = METHODS[options.method](observations, board, options, progress)
+    return replace(estimate, method=options.method)
 
 
 def with_consensus(estimate: CalibrationEstimate, consensus: Consensus) -> CalibrationEstimate:
@@ -124,130 +95,3 @@ def agree(candidates: Sequence[CaptureCandidates], board: Board, options: Calibr
             "check the board's size, the intrinsics and the pairing of pictures with scans; add captures",
         )
     return consensus
-
-
-def _weights(
-    options: CalibrateOptions, features: Sequence[CaptureFeatures], plane_sigma_m: float, edge_sigma_m: float
-) -> Weights:
-    """Weigh by the options where they give both weights, else by likelihood.
-
-    The camera's and the LiDAR's plane differ in three ways, by an offset and two tilts, however many points
-    the LiDAR's has; its ring ends err independently, by where their rays happen to fall. A capture's mean
-    squares therefore count 3 / sigma_plane^2 and M / sigma_edge^2, with M ring ends.
-    """
-    unit = 1 / NOMINAL_SIGMA_M**2
-    n_ends = float(np.mean([len(f.edge_points) for f in features]))
-    if options.plane_weight is None or options.edge_weight is None:
-        plane, edge = _PLANE_FREEDOMS / plane_sigma_m**2, n_ends / edge_sigma_m**2
-    else:
-        plane, edge = options.plane_weight * unit, options.edge_weight * unit
-    has_shift = options.edge_shift == "free" and options.use_ptl
-    return Weights(
-        plane=plane if options.use_ptpl else 0.0,
-        edge=edge if options.use_ptl else 0.0,
-        shift_prior=1 / options.edge_shift_sigma_m**2 if has_shift else None,
-    )
-
-
-def _report(
-    observations: Sequence[Observation],
-    features: Sequence[CaptureFeatures],
-    board: Board,
-    problem: Problem,
-    solution: Solutions,
-    covariances: tuple[Array, Array],
-    draws: Draws | None,
-    refused: dict[str, Refusal],
-) -> CalibrationEstimate:
-    T = solution.T[0]
-    cov = covariances[0] + covariances[1]
-    held_out = np.full(len(features), np.nan) if draws is None else draws.capture_held_out_m
-    residuals: list[CaptureResidual] = [
-        capture_residual(T, observation, board, float(error))
-        for observation, error in zip(observations, held_out, strict=True)
-    ]
-    certificates, metrics = solution.certificates, summarise(residuals)
-    return CalibrationEstimate(
-        T_cam_lidar=T,
-        cov=cov[:6, :6],
-        certificate=Certificate(bool(certificates.is_optimal[0]), float(certificates.relative_gap[0])),
-        metrics=metrics,
-        used=tuple(f.capture for f in features),
-        refused=dict(sorted(refused.items())),
-        observations={observation.capture: observation for observation in observations},
-        residuals=tuple(residuals),
-        held_out_m=float(np.mean(held_out)),
-        weak_direction=describe_weakest(cov[:6, :6], features),
-        # The paper's code counts every ring end twice, which halves its mean.
-        diagnostics=_diagnostics(problem, solution, covariances, draws)
-        | {
-            "paper_mee_m": metrics.mee_m / 2,
-            "held_out_m": float(np.mean(held_out)),
-            "n_placements": float(group_placements(observations).max() + 1),
-        },
-    )
-
-
-def _covariances(
-    observations: Sequence[Observation],
-    board: Board,
-    options: CalibrateOptions,
-    problem: Problem,
-    solution: Solutions,
-) -> tuple[Array, Array]:
-    """Estimate the covariances (6 + k, 6 + k) of the solution, edge shift last.
-
-    Returns:
-        What the scatter between captures shows, and what the LiDAR's errors common to them add.
-    """
-    x, edge_ids = solution.x[0], solution.edge_ids[0]
-    gradients, hessians = linearise(problem, x, edge_ids)
-    prior = np.zeros_like(hessians[0])
-    if problem.weights.shift_prior is not None:
-        prior[6, 6] = problem.weights.shift_prior
-    # Captures of one placement share its errors: they are left out together.
-    placement = group_placements(observations)
-    n_placements = int(placement.max()) + 1
-    together_g, together_H = (np.zeros((n_placements, *a.shape[1:])) for a in (gradients, hessians))
-    np.add.at(together_g, placement, gradients)
-    np.add.at(together_H, placement, hessians)
-    scatter = jackknife_covariance(together_g, together_H, prior)
-    laser_m, offset_m = options.laser_bias_sigma_m, options.range_offset_sigma_m
-    if laser_m == 0 and offset_m == 0:
-        return scatter, np.zeros_like(scatter)
-    information = hessians.sum(axis=0) + prior
-    sensitivities = ring_sensitivities(observations, board, options, problem, x, edge_ids, information)
-    return scatter, systematic_covariance(sensitivities, laser_m, offset_m)
-
-
-def _diagnostics(
-    problem: Problem,
-    solution: Solutions,
-    covariances: tuple[Array, Array],
-    draws: Draws | None,
-) -> dict[str, float]:
-    plane, edge = problem.errors(solution.x)
-    figures = {
-        "plane_weight": problem.weights.plane * NOMINAL_SIGMA_M**2,
-        "edge_weight": problem.weights.edge * NOMINAL_SIGMA_M**2,
-        "fit_plane_rms_m": float(np.sqrt(np.mean(plane**2))),
-        "fit_edge_rms_m": float(np.sqrt(np.mean(edge**2))),
-    }
-    for name, cov in zip(("scatter", "systematic"), covariances, strict=True):
-        figures[f"sigma_{name}_rotation_deg"] = float(np.degrees(np.sqrt(np.trace(cov[3:6, 3:6]))))
-        figures[f"sigma_{name}_translation_m"] = float(np.sqrt(np.trace(cov[:3, :3])))
-    if problem.n_shift:
-        figures["edge_shift_m"] = float(solution.linear[0, 3])
-        figures["edge_shift_sigma_m"] = float(np.sqrt(covariances[0][6, 6] + covariances[1][6, 6]))
-    if draws is not None:
-        offset = error_to_reference(draws.T_mean[draws.best], solution.T[0])
-        figures |= {
-            "best_subset_size": float(draws.sizes[draws.best]),
-            "n_solved": float(draws.n_solved),
-            "certified_share": draws.certified_share,
-            "draw_mean_offset_deg": offset[0],
-            "draw_mean_offset_m": offset[1],
-            "draw_spread_rotation_deg": float(np.degrees(draws.spread_rotation_rad[draws.best])),
-            "draw_spread_translation_m": float(draws.spread_translation_m[draws.best]),
-        }
-    return figures

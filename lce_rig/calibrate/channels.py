@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate.calibrate import NOMINAL_SIGMA_M, agree, calibrate_observations, with_consensus
+from lce_rig.calibrate.algorithm_1 import NOMINAL_SIGMA_M
+from lce_rig.calibrate.calibrate import agree, calibrate_observations, with_consensus
 from lce_rig.calibrate.consensus import Consensus
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.motion import PoseSamples, fit_motions
@@ -152,8 +153,8 @@ def _agree(
 
 
 def _alone(consensus: Consensus, board: Board, options: CalibrateOptions) -> CalibrationEstimate:
-    """Calibrate one channel as if boards stood still, without draws."""
-    return calibrate_observations(consensus.observations, board, replace(options, n_draws=0))
+    """Calibrate one channel by Algorithm 1 as if boards stood still, without draws."""
+    return calibrate_observations(consensus.observations, board, replace(options, method="paper", n_draws=0))
 
 
 def _alone_moved(

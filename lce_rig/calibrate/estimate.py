@@ -37,7 +37,7 @@ class CalibrationEstimate:
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera: what the scatter between
             captures shows, and what range errors of the LiDAR add that are the same in all captures. Errors
             of the intrinsics and of the board's size are not in it.
-        certificate: of the final cost over all captures used.
+        certificate: of the final cost over all captures used; its gap is infinite where there is none.
         metrics: errors over all captures used.
         used: names of the captures behind the estimate, sorted.
         refused: why each other capture is not.
@@ -46,6 +46,7 @@ class CalibrationEstimate:
         held_out_m: mean over captures of `CaptureResidual.held_out_m`.
         weak_direction: the least certain motion in words, with its standard deviation.
         diagnostics: further figures by name.
+        method: that found it, as `CalibrateOptions.method`.
     """
 
     T_cam_lidar: Array
@@ -59,3 +60,4 @@ class CalibrationEstimate:
     held_out_m: float
     weak_direction: str
     diagnostics: Mapping[str, float]
+    method: str = "paper"

@@ -6,6 +6,8 @@ from typing import Literal
 
 from lce_rig.core.results import ImageBoard, LidarBoard
 
+Method = Literal["paper"]
+
 
 @dataclass(frozen=True, eq=False)
 class CaptureCandidates:
@@ -27,6 +29,7 @@ class CalibrateOptions:
     """Switches of the algorithm; the defaults are the recommended set.
 
     Attributes:
+        method: how the extrinsic is found: "paper" (Algorithm 1 of LCE-Calib).
         n_draws: I, subsets drawn for each subset size.
         n_rounds: rounds of re-association in each draw.
         seed: of the draws.
@@ -46,6 +49,7 @@ class CalibrateOptions:
         min_captures: fewer captures are refused.
     """
 
+    method: Method = "paper"
     n_draws: int = 100
     n_rounds: int = 3
     seed: int = 0

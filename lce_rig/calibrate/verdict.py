@@ -80,6 +80,9 @@ def judge(
 def _certificate(estimate: CalibrationEstimate) -> list[Doubt]:
     if estimate.certificate.is_optimal:
         return []
+    if np.isinf(estimate.certificate.gap):
+        text = f"not certified: method {estimate.method} has no certificate, --method paper has"
+        return [Doubt("marginal", text)]
     text = f"not certified as the global minimum (gap {estimate.certificate.gap:.1e}): collect more captures"
     return [Doubt("fail", text)]
 

@@ -32,6 +32,13 @@ _COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
     type=click.Choice(["network", "map"]),
     help="How events become pictures: by network, or sums of polarities [default: the profile's, network].",
 )
+@click.option(
+    "--method",
+    type=click.Choice(["paper"]),
+    default="paper",
+    show_default=True,
+    help="How the extrinsic is found.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export a failed result too, marked as failed.")
 @click.option(
@@ -168,8 +175,7 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
         f"board found by both sensors in {c.n_detected}",
         f"  residuals    planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm, "
         f"{_left_out(held_out_m)}corners {metrics.reprojection_px:.2f} px",
-        f"  certificate  {'global minimum' if c.certificate.is_optimal else '[red]not proven[/]'}, "
-        f"gap {c.certificate.gap:.0e}",
+        f"  certificate  {_certificate(c)}",
     ]
     lines += _channel_lines(c)
     if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
@@ -180,6 +186,13 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.cause}: {why.action}')}[/]")
     lines += [f"  [{colour}]{show.escape(reason)}[/]" for reason in c.reasons]
     return lines
+
+
+def _certificate(calibration: Calibration) -> str:
+    is_optimal, gap = calibration.certificate.is_optimal, calibration.certificate.gap
+    if not math.isfinite(gap):
+        return f"none, method {calibration.method} gives no proof"
+    return f"{'global minimum' if is_optimal else '[red]not proven[/]'}, gap {gap:.0e}"
 
 
 def _channel_lines(calibration: Calibration) -> list[str]:

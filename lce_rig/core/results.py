@@ -111,7 +111,7 @@ class Certificate:
 
     Attributes:
         is_optimal: whether the gap is below the tolerance.
-        gap: bound on (cost - global minimum) / cost.
+        gap: bound on (cost - global minimum) / cost; infinite where the method has none.
     """
 
     is_optimal: bool
@@ -191,6 +191,7 @@ class Calibration:
         captures_used: names of the captures behind the estimate.
         captures_refused: why each other capture is not.
         diagnostics: further figures by name.
+        method: that found the extrinsic, as `CalibrateOptions.method`.
     """
 
     camera: str
@@ -210,6 +211,7 @@ class Calibration:
     egt_translation_m: float | None = None
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     channel_results: tuple[ChannelResult, ...] = ()
+    method: str = "paper"
 
     @property
     def channels(self) -> tuple[str, ...]:

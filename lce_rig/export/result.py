@@ -68,6 +68,7 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
         "reasons": list(calibration.reasons),
         "diagnostics": {name: _figure(value) for name, value in sorted(calibration.diagnostics.items())},
         "channels": [_channel(result, calibration) for result in calibration.channel_results],
+        "method": calibration.method,
     }
 
 
@@ -192,6 +193,7 @@ def _calibration(pair: PairRecord) -> Calibration:
         egt_translation_m=pair.egt_translation_m,
         diagnostics={name: figure(value) for name, value in pair.diagnostics.items()},
         channel_results=tuple(_channel_result(record) for record in pair.channels),
+        method=pair.method,
     )
 
 

@@ -69,6 +69,7 @@ class PairRecord(_Record):
     reasons: list[str]
     diagnostics: dict[str, float | None] = Field(default_factory=dict)
     channels: list[ChannelRecord] = Field(default_factory=list)
+    method: str = "paper"
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "PairRecord":

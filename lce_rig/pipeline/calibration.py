@@ -222,6 +222,7 @@ def _judged(
         reasons=reasons,
         diagnostics=diagnostics,
         channel_results=result.channels,
+        method=estimate.method,
     )
 
 

@@ -166,3 +166,7 @@ def test_progress_reaches_the_end():
     calibrate(simulate(6, 0), BOARD, FAST, lambda done, total: seen.append((done, total)))
     assert seen[-1] == (9, 9)
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+
+
+def test_the_estimate_names_its_method():
+    assert calibrate(simulate(6, 0), BOARD, replace(FAST, method="paper")).method == "paper"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import CalibrateOptions, ChannelsEstimate, calibrate
+from lce_rig.calibrate.report import NO_CERTIFICATE
 from lce_rig.calibrate.scale import compare_scales
 from lce_rig.calibrate.verdict import judge
 from lce_rig.core.geometry import perturb
@@ -33,6 +34,12 @@ def test_a_result_without_certificate_fails(estimate):
     verdict, reasons = verdict_of(replace(estimate, certificate=Certificate(False, 0.3)))
     assert verdict == "fail"
     assert "gap 3.0e-01" in reasons[0]
+
+
+def test_a_method_without_certificates_is_marginal_and_named(estimate):
+    verdict, reasons = verdict_of(replace(estimate, certificate=NO_CERTIFICATE, method="other"))
+    assert verdict == "marginal"
+    assert "method other has no certificate" in reasons[0]
 
 
 @pytest.mark.parametrize(("factor", "expected"), [(0.5, "pass"), (2.0, "marginal"), (9.0, "fail")])

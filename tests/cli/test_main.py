@@ -59,3 +59,11 @@ def test_the_module_runs_like_the_command():
     words = [sys.executable, "-m", "lce_rig", "--version"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     assert done.stdout == f"lce-rig {__version__}\n"
+
+
+def test_every_method_of_calibration_can_be_chosen():
+    from lce_rig.calibrate.calibrate import METHODS
+    from lce_rig.cli.calibrate import calibrate
+
+    (option,) = [parameter for parameter in calibrate.params if parameter.name == "method"]
+    assert list(option.type.choices) == list(METHODS)

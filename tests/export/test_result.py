@@ -47,6 +47,13 @@ def test_the_published_fields_are_there_in_order(make: Make) -> None:
     assert refused["000003"] == {"stage": "calibrate", "cause": "12 cm off", "action": "repeat it"}
 
 
+def test_the_method_is_told_and_read_back(make: Make, tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    write_result(path, "rles", [make(method="other")])
+    assert json.loads(path.read_text())["pairs"][0]["method"] == "other"
+    assert read_result(path).calibrations[0].method == "other"
+
+
 def test_figures_that_do_not_exist_are_null(make: Make) -> None:
     pair = to_json_dict(
         "rles", [make(metrics=Metrics(np.nan, 0.1, 0.2), certificate=Certificate(False, np.inf))]

@@ -1,0 +1,69 @@
+"""From a solution to an estimate with residuals and figures, the same whatever method found it."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.features import CaptureFeatures
+from lce_rig.calibrate.metrics import capture_residual, summarise
+from lce_rig.calibrate.observability import describe_weakest
+from lce_rig.calibrate.placements import group_placements
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Certificate, Observation, Refusal
+
+# Of methods that prove nothing about their minimum.
+NO_CERTIFICATE = Certificate(is_optimal=False, gap=float("inf"))
+
+
+def report_estimate(
+    T_cam_lidar: Array,
+    cov: Array,
+    observations: Sequence[Observation],
+    features: Sequence[CaptureFeatures],
+    board: Board,
+    *,
+    certificate: Certificate = NO_CERTIFICATE,
+    held_out_m: Array | None = None,
+    refused: Mapping[str, Refusal],
+    diagnostics: Mapping[str, float],
+) -> CalibrationEstimate:
+    """Measure the residuals of an extrinsic and put everything known about it together.
+
+    Args:
+        T_cam_lidar: (4, 4).
+        cov: (6, 6) of it, tangent (translation m, rotation rad).
+        observations: the F captures used.
+        features: of each.
+        board: the board.
+        certificate: of the minimum, where the method gives one.
+        held_out_m: (F,) rms residual of each capture where it was not fitted, where the method knows it.
+        refused: captures that the method left out.
+        diagnostics: the method's own figures.
+    """
+    held_out = np.full(len(observations), np.nan) if held_out_m is None else held_out_m
+    residuals = tuple(
+        capture_residual(T_cam_lidar, observation, board, float(error))
+        for observation, error in zip(observations, held_out, strict=True)
+    )
+    metrics = summarise(residuals)
+    figures = {
+        # The paper's code counts every ring end twice, which halves its mean.
+        "paper_mee_m": metrics.mee_m / 2,
+        "held_out_m": float(np.mean(held_out)),
+        "n_placements": float(group_placements(observations).max() + 1),
+    }
+    return CalibrationEstimate(
+        T_cam_lidar=T_cam_lidar,
+        cov=cov,
+        certificate=certificate,
+        metrics=metrics,
+        used=tuple(f.capture for f in features),
+        refused=dict(sorted(refused.items())),
+        observations={observation.capture: observation for observation in observations},
+        residuals=residuals,
+        held_out_m=float(np.mean(held_out)),
+        weak_direction=describe_weakest(cov, features),
+        diagnostics={**diagnostics, **figures},
+    )
