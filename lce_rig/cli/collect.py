@@ -1,4 +1,4 @@
-"""`lce-rig collect`: a session from recordings, unattended."""
+"""`lce-rig collect`: a session from attached sensors, guided, or from recordings, unattended."""
 
 from pathlib import Path
 from typing import Any
@@ -25,12 +25,12 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 @click.option(
     "--from",
     "paths",
-    required=True,
     multiple=True,
     type=click.Path(path_type=Path),
     metavar="PATH",
-    help="A folder with img/ and pcd/, a ROS 1 or ROS 2 bag, an mcap or pcap file, or an event camera's file "
-    "(AEDAT4, Prophesee RAW, HDF5); may be repeated, also for several recorders of one moment.",
+    help="Read a recording: a folder with img/ and pcd/, a ROS 1 or ROS 2 bag, an mcap or pcap file, or an "
+    "event camera's file (AEDAT4, Prophesee RAW, HDF5); may be repeated, also for several recorders of one "
+    "moment.",
 )
 @click.option(
     "--pair",
@@ -53,6 +53,30 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     metavar="N",
     help="Stop reading once the session has N captures; say so where it stays short.",
 )
+@click.option(
+    "--frames", type=click.IntRange(1), metavar="N", help="Live: stop at N captures, not when enough."
+)
+@click.option("--timeout", type=FiniteRange(0, min_open=True), metavar="S", help="Live: stop after so long.")
+@click.option("--keep-going", is_flag=True, help="Live: go on when the target is met, until told to stop.")
+@click.option(
+    "--hold", type=FiniteRange(0, 30), metavar="S", help="Live: how long a board stands still.  [1.5]"
+)
+@click.option("--plain", is_flag=True, help="Live: lines on stderr in place of a screen.")
+@click.option(
+    "--preview",
+    is_flag=False,
+    flag_value="127.0.0.1:8765",
+    metavar="[HOST:PORT]",
+    help="Live: serve a page for a phone; by default on 127.0.0.1:8765. Elsewhere it asks for a token.",
+)
+@click.option(
+    "--record",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Live: keep the raw streams too, in a new folder that --from reads.",
+)
+@click.option("--simulated", is_flag=True, help="Live: of a simulated rig, with a simulated person.")
+@click.option("--seed", type=click.IntRange(0), help="Of --simulated.  [0]")
 def collect(
     rig_name: str,
     session: Path,
@@ -65,14 +89,27 @@ def collect(
     lidar: str | None,
     max_captures: int | None,
     target: int | None,
+    **live: Any,
 ) -> None:
-    """Build or continue SESSION (default: session/) from recordings.
+    """Build or continue SESSION (default: session/), live or from recordings.
 
-    Every pair of a folder becomes a capture. Bags are cut where the board stands still in both sensors and is
-    somewhere new; where they hold raw events, where it moves slowly, and the events are kept. Recordings of
-    one moment, such as --from lidar.bag --from events.aedat4, are read as one: each adds a sensor to those
-    before it. Run it again to continue: what is captured already is not captured twice.
+    Without --from the rig's attached sensors are read. One person holds the board and is told where to go;
+    captures are taken when it stands still there, or moves slowly before an event camera. No key has to be
+    pressed. Collection ends when the calibration is predicted to meet the profile's target, and can be
+    continued any time. `lce-rig doctor` checks the rig first.
+
+    With --from, every pair of a folder becomes a capture. Bags are cut where the board stands still in both
+    sensors and is somewhere new; where they hold raw events, where it moves slowly, and the events are kept.
+    Recordings of one moment, such as --from lidar.bag --from events.aedat4, are read as one: each adds a
+    sensor to those before it. Run it again to continue: what is captured already is not captured twice.
     """
+    if not paths:
+        _refuse_options(_OF_RECORDINGS, "belongs to recordings", "name one with --from")
+        from lce_rig.cli.collect_live import LiveArguments, run_live
+
+        run_live(rig_name, session, LiveArguments(**live))
+        return
+    _refuse_options(tuple(live), "belongs to live collection", "leave --from out, or this option")
     from lce_rig.collect import CollectOptions
     from lce_rig.collect import collect as fill
     from lce_rig.core.errors import NotEnoughDataError
@@ -100,6 +137,33 @@ def collect(
             f"{session}: no capture could be made of {', '.join(map(str, paths))}",
             _remedy(report),
         )
+
+
+_OF_RECORDINGS = (
+    "pair",
+    "pair_tolerance",
+    "topics",
+    "camera",
+    "channel",
+    "lidar",
+    "max_captures",
+    "target",
+)
+
+
+def _refuse_options(names: tuple[str, ...], what: str, hint: str) -> None:
+    """Refuse options that mean nothing here, rather than leave them unheard.
+
+    Raises:
+        UsageError: one was given; it is named.
+    """
+    from lce_rig.core.errors import UsageError
+
+    context = click.get_current_context()
+    for param in context.command.params:
+        source = context.get_parameter_source(param.name or "")
+        if param.name in names and source is click.core.ParameterSource.COMMANDLINE:
+            raise UsageError(f"{param.opts[-1]} {what}", hint)
 
 
 def _remedy(report: Any) -> str:

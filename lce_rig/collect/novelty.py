@@ -65,7 +65,7 @@ def known_placements(session: Session, min_move_m: float, min_turn_deg: float) -
     known = Placements(min_move_m, min_turn_deg)
     for capture in session.captures:
         try:
-            known.add_poses(capture.name, _poses_of(capture, session))
+            known.add_poses(capture.name, capture_poses(capture, session))
         except LceRigError:
             continue  # A damaged capture is named when it is used.
     return known
@@ -77,7 +77,12 @@ def board_figures(boards: Mapping[ImageKey, ImageBoard]) -> dict[str, Any]:
     return {"T_cam_board": poses}
 
 
-def _poses_of(capture: Capture, session: Session) -> dict[ImageKey, Array]:
+def capture_poses(capture: Capture, session: Session) -> dict[ImageKey, Array]:
+    """Find where each camera saw the board, T_cam_board (4, 4), by (camera, channel).
+
+    Raises:
+        SessionError: the capture is damaged.
+    """
     stored = capture.meta.get("T_cam_board")
     if isinstance(stored, dict):
         poses = {tuple(key.split(".", 1)): np.array(pose, dtype=np.float64) for key, pose in stored.items()}

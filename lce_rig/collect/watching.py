@@ -24,12 +24,14 @@ class Sighting:
         images: by (camera, channel), where it was found.
         lidars: candidates by LiDAR; things of the board's size may be among them.
         unseen: why it was not found, by (camera, channel), where it was looked for.
+        unscanned: why it was not found, by LiDAR, where it was looked for.
     """
 
     frame: Frame
     images: dict[ImageKey, ImageBoard]
     lidars: dict[str, list[LidarBoard]]
     unseen: dict[ImageKey, Refusal] = field(default_factory=dict)
+    unscanned: dict[str, Refusal] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,17 +77,20 @@ class BoardWatcher:
                 unseen[key] = found
             elif found is not None:
                 images[key] = found
-        lidars = {}
+        lidars: dict[str, list[LidarBoard]] = {}
+        unscanned: dict[str, Refusal] = {}
         # Nothing is gained from scans while no camera sees the board.
         for scan in frame.scans if images else ():
             candidates = self._find_in_scan(scan, frame.time_ns)
-            if candidates:
+            if isinstance(candidates, Refusal):
+                unscanned[scan.sensor] = candidates
+            else:
                 lidars[scan.sensor] = candidates
         if not images:
             self.counts["no board in any picture"] += 1
         elif not lidars:
             self.counts["no board in the scan"] += 1
-        return Sighting(frame, images, lidars, unseen)
+        return Sighting(frame, images, lidars, unseen, unscanned)
 
     def _find_in_image(self, image: Image, key: ImageKey, time_ns: int) -> ImageBoard | Refusal | None:
         last = self._seen.pop(key, None)
@@ -102,18 +107,17 @@ class BoardWatcher:
             self._seen[key] = found
         return found
 
-    def _find_in_scan(self, scan: Scan, time_ns: int) -> list[LidarBoard]:
+    def _find_in_scan(self, scan: Scan, time_ns: int) -> list[LidarBoard] | Refusal:
         tracked = (track_lidar_board(scan, self._board, old) for old in self._candidates.get(scan.sensor, []))
         found = [board for board in tracked if isinstance(board, LidarBoard)]
-        if self._is_search_due(scan.sensor, time_ns) or not found:
-            settings = self.rig.lidars[scan.sensor]
-            reach_m = min(settings.max_range_m, self.rig.quality.max_distance_m)
-            search = find_lidar_boards(
-                scan, self._board, min_range_m=settings.min_range_m, max_range_m=reach_m
-            )
-            found = [] if isinstance(search, Refusal) else search
-        self._candidates[scan.sensor] = found
-        return found
+        if not self._is_search_due(scan.sensor, time_ns) and found:
+            self._candidates[scan.sensor] = found
+            return found
+        settings = self.rig.lidars[scan.sensor]
+        reach_m = min(settings.max_range_m, self.rig.quality.max_distance_m)
+        search = find_lidar_boards(scan, self._board, min_range_m=settings.min_range_m, max_range_m=reach_m)
+        self._candidates[scan.sensor] = [] if isinstance(search, Refusal) else search
+        return search
 
     def _is_search_due(self, key: ImageKey | str, time_ns: int) -> bool:
         last_ns = self._searched_ns.get(key)

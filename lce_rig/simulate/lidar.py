@@ -96,6 +96,49 @@ def simulate_scan(
         min_range_m: nearer returns are not reported.
         max_range_m: farther returns are not reported.
     """
+    sweep = sweep_scene(scene, T_world_lidar, model, noise, rng, stamp_ns, board_at)
+    return measure_sweep(
+        sweep,
+        model,
+        noise,
+        rng,
+        laser_bias_m=laser_bias_m,
+        sensor=sensor,
+        stamp_ns=stamp_ns,
+        min_range_m=min_range_m,
+        max_range_m=max_range_m,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """What the beams of one revolution met, before any error of measurement.
+
+    Attributes:
+        laser: (N,) of each firing, in firing order.
+        offset_ns: (N,) after the first firing.
+        azimuth_rad: (N,).
+        returns: of each firing.
+        is_rim: (N,) whether the beam met the board's border.
+    """
+
+    laser: NDArray[np.intp]
+    offset_ns: NDArray[np.int64]
+    azimuth_rad: Array
+    returns: Returns
+    is_rim: NDArray[np.bool_]
+
+
+def sweep_scene(
+    scene: Scene,
+    T_world_lidar: Array,
+    model: LidarModel,
+    noise: LidarNoise,
+    rng: np.random.Generator,
+    stamp_ns: int = 0,
+    board_at: Callable[[NDArray[np.int64]], Array] | None = None,
+) -> Sweep:
+    """Send the beams of one revolution; for the arguments see `simulate_scan`."""
     laser, offset_ns, azimuth_rad = _firings(model, rng)
     origins = np.zeros((len(laser), 3))
     origins[:, 2] = model.vertical_offsets_m[laser]
@@ -107,17 +150,35 @@ def simulate_scan(
     else:
         instants = _instants(scene, board_at, stamp_ns + offset_ns)
         returns, is_rim = _receive_moving(instants, origins_world, directions_world, noise)
+    return Sweep(laser, offset_ns, azimuth_rad, returns, is_rim)
 
+
+def measure_sweep(
+    sweep: Sweep,
+    model: LidarModel,
+    noise: LidarNoise,
+    rng: np.random.Generator,
+    *,
+    laser_bias_m: Array | None = None,
+    sensor: str = "lidar",
+    stamp_ns: int = 0,
+    min_range_m: float = 0.4,
+    max_range_m: float = 100.0,
+) -> Scan:
+    """Measure what the beams met; for the arguments see `simulate_scan`."""
+    laser, returns = sweep.laser, sweep.returns
     bias_m = np.zeros(len(model.elevations_rad)) if laser_bias_m is None else laser_bias_m
     range_m, intensity = _measure(returns, bias_m[laser], noise, rng)
     spread_rad = noise.rim_spread_rad * rng.uniform(-1.0, 1.0, len(range_m))
-    azimuth_rad = azimuth_rad + np.where(is_rim, spread_rad, 0.0)
+    azimuth_rad = sweep.azimuth_rad + np.where(sweep.is_rim, spread_rad, 0.0)
     if noise.is_quantised:
         azimuth_rad = np.rint(azimuth_rad / _AZIMUTH_STEP_RAD) * _AZIMUTH_STEP_RAD
     is_lost = rng.random(len(range_m)) < noise.dropout
     threshold = _THRESHOLD * np.maximum(returns.range_m / _FULL_RANGE_M, 1.0) ** 2
     keep = np.isfinite(range_m) & (returns.energy > threshold) & ~is_lost
     keep &= (range_m >= min_range_m) & (range_m <= max_range_m)
+    origins = np.zeros((len(laser), 3))
+    origins[:, 2] = model.vertical_offsets_m[laser]
     rays = _directions(model.elevations_rad[laser[keep]], azimuth_rad[keep])
     return Scan(
         sensor=sensor,
@@ -125,7 +186,7 @@ def simulate_scan(
         points=(origins[keep] + range_m[keep, None] * rays).astype(np.float32),
         intensity=intensity[keep].astype(np.float32),
         ring=model.rings[laser[keep]],
-        offset_ns=offset_ns[keep],
+        offset_ns=sweep.offset_ns[keep],
         host_ns=stamp_ns + model.period_ns,
     )
 

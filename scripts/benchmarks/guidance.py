@@ -10,18 +10,17 @@ from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.collect.guidance import (
     HeldPose,
+    Person,
     Planner,
     View,
     build_pose,
     combine,
-    describe_pose,
-    instruct,
     model_sensors,
     sigmas,
     weigh_placements,
 )
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.geometry import Array, difference, exp_so3, fit_plane, pose
+from lce_rig.core.geometry import Array, difference, fit_plane
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures, truth_extrinsics
@@ -33,34 +32,6 @@ RIGS = ("rlfs", "rles")
 # After so many tries a person gives a placement up: a wall is in the way, or the board is never seen whole.
 _TRIES = 8
 _PERSON, _OFFSET = 101, 102
-
-
-@dataclass(frozen=True)
-class Person:
-    """How somebody follows instructions.
-
-    Attributes:
-        place_sigma_m: error along each axis.
-        turn_sigma_deg: error about each axis.
-        ignored_share: how often one of the instructions is not followed.
-    """
-
-    place_sigma_m: float = 0.10
-    turn_sigma_deg: float = 8.0
-    ignored_share: float = 0.2
-
-    def follow(self, view: View, present: Array, wanted: Array, rng: np.random.Generator) -> Array:
-        """Move a board T_cam_board (4, 4) to where it is wanted, more or less."""
-        aim = describe_pose(view, wanted)
-        instructions = instruct(view, present, wanted)
-        if instructions and rng.random() < self.ignored_share:
-            aim = _without(
-                aim, describe_pose(view, present), rng.choice([each.kind for each in instructions])
-            )
-        aimed = build_pose(view, aim)
-        turn = exp_so3(np.radians(self.turn_sigma_deg) * rng.standard_normal(3))
-        place = aimed[:3, 3] + self.place_sigma_m * rng.standard_normal(3)
-        return pose(turn @ aimed[:3, :3], place)
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,16 +210,3 @@ def _lengthen(board: LidarBoard, offset_m: float) -> LidarBoard:
     moved = board.T_lidar_board.copy()
     moved[:3, 3] += offset_m * centre / np.linalg.norm(centre)
     return replace(board, points=points, edge_points=ends, plane=fit_plane(points)[0], T_lidar_board=moved)
-
-
-def _without(aim: HeldPose, present: HeldPose, kind: str) -> HeldPose:
-    """Leave one instruction out."""
-    keys = {
-        "sideways": "right_m",
-        "nearer": "ahead_m",
-        "height": "up_m",
-        "tilt": "tilt_deg",
-        "turn": "turn_deg",
-        "roll": "roll_deg",
-    }
-    return replace(aim, **{keys[kind]: getattr(present, keys[kind])})

@@ -4,6 +4,7 @@ from lce_rig.collect.guidance.candidates import View, is_reachable, spread_candi
 from lce_rig.collect.guidance.coverage import Coverage, measure_coverage
 from lce_rig.collect.guidance.evidence import Evidence, weigh_placements
 from lce_rig.collect.guidance.outline import outline_px
+from lce_rig.collect.guidance.person import Person
 from lce_rig.collect.guidance.planner import Guidance, Novelty, Planner
 from lce_rig.collect.guidance.precision import Precision, combine, predict_covariance, sigmas
 from lce_rig.collect.guidance.sensors import ErrorModel, SensorModel, model_sensors
@@ -25,6 +26,7 @@ __all__ = [
     "HeldPose",
     "Instruction",
     "Novelty",
+    "Person",
     "Planner",
     "Precision",
     "SensorModel",

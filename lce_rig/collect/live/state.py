@@ -62,6 +62,7 @@ class Drawing:
         wanted_px: (K, 2) closed outline of the placement wanted next; None where there is none. Points out of
             the lens's sight are NaN.
         is_there: whether the board is where it should be.
+        present, wanted: (4, 4) T_cam_board of both; None like their outlines.
     """
 
     camera: str
@@ -69,6 +70,8 @@ class Drawing:
     present_px: Array | None = None
     wanted_px: Array | None = None
     is_there: bool = False
+    present: Array | None = None
+    wanted: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,10 +70,13 @@ def to_status(
         "receive_buffer_bytes": float(reception.granted_bytes),
         "rotor_hz": stream.rotor_hz,
         "is_dual": float(stream.mode == velodyne.DUAL),
+        "is_device_time": float(state.is_device),
     }
     if position is not None:
         figures["pps_state"] = float(position.pps)
         figures["nmea_fix"] = float(position.is_fix)
+        if position.nmea_s is not None:
+            figures["nmea_past_hour_s"] = float(position.nmea_s)
     if ahead_ns is not None:
         figures["device_ahead_s"] = ahead_ns * 1e-9
     if recorder is not None:

@@ -1,0 +1,152 @@
+"""`lce-rig collect` without --from: attached sensors, or the simulated rig."""
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from lce_rig.cli import show
+from lce_rig.cli.keys import Controls, controls
+
+if TYPE_CHECKING:
+    from lce_rig.collect.live.collection import LiveReport
+    from lce_rig.collect.live.recorder import SampleRecorder
+    from lce_rig.collect.live.state import LiveState
+    from lce_rig.rig import Rig
+    from lce_rig.sources.live.base import LiveSource
+
+_ENDINGS = {
+    "enough": "the target is predicted to be met",
+    "frames": "as many captures as wanted",
+    "timeout": "the time is over",
+    "stopped": "stopped",
+    "lost": "a sensor was lost",
+}
+
+
+@dataclass(frozen=True)
+class LiveArguments:
+    """The options of live collection, as they were given.
+
+    Attributes:
+        frames, timeout, keep_going, hold, plain, preview, record, simulated, seed: see --help.
+    """
+
+    frames: int | None
+    timeout: float | None
+    keep_going: bool
+    hold: float | None
+    plain: bool
+    preview: str | None
+    record: Path | None
+    simulated: bool
+    seed: int | None
+
+
+def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
+    """Collect live into a session, and say how it went."""
+    from lce_rig.cli.live_view import open_view
+    from lce_rig.collect.live.collection import HOLD_S, LiveOptions, collect_live
+    from lce_rig.core.errors import UsageError
+    from lce_rig.rig import load_rig
+    from lce_rig.session import Session
+
+    if given.seed is not None and not given.simulated:
+        raise UsageError("--seed belongs to --simulated", "leave it out")
+    rig = load_rig(rig_name)
+    hold_s = HOLD_S if given.hold is None else given.hold
+    options = LiveOptions(given.frames, given.timeout, hold_s, goes_on=given.keep_going)
+    with ExitStack() as stack:
+        session = stack.enter_context(Session.resume(path, rig))
+        n_before = len(session.captures)
+        recorder = stack.enter_context(_recorder(given, rig))
+        sources, listeners = _open_rig(stack, rig, given)
+        listeners += _open_preview(stack, given)
+        asked = stack.enter_context(controls())
+        with open_view(is_plain=given.plain, has_keys=asked.is_interactive) as view:
+            listeners.append(view.show)
+
+            def tell(state: "LiveState") -> None:
+                for listener in listeners:
+                    listener(state)
+
+            try:
+                report = collect_live(session, sources, options, tell, asked, recorder)
+            finally:
+                n_captures = len(session.captures)
+                saved = f"{path}: {n_captures} captures ({n_captures - n_before} new)"
+                stack.callback(show.note, saved)
+    _tell(report, n_captures, asked)
+
+
+def _open_rig(
+    stack: ExitStack, rig: "Rig", given: LiveArguments
+) -> "tuple[list[LiveSource], list[Callable[[LiveState], None]]]":
+    """Build the sources: attached ones, or simulated ones with whoever follows the guidance."""
+    if not given.simulated:
+        from lce_rig.sources.live.opening import open_live
+
+        return open_live(rig, given.record), []
+    from lce_rig.collect.live.simulated import SimulatedRig
+
+    show.note("starting the simulated rig ...")
+    simulated = stack.enter_context(SimulatedRig(rig, given.seed or 0))
+    return simulated.sources, [simulated.watch]
+
+
+def _open_preview(stack: ExitStack, given: LiveArguments) -> "list[Callable[[LiveState], None]]":
+    """Serve the page where it is wanted, and say where."""
+    if given.preview is None:
+        return []
+    from lce_rig.collect.preview import Preview, parse_address
+
+    host, port = parse_address(given.preview)
+    preview = stack.enter_context(Preview(host, port))
+    show.note(f"preview: {preview.url}")
+    return [preview.publish]
+
+
+@contextmanager
+def _recorder(given: LiveArguments, rig: "Rig") -> "Iterator[SampleRecorder | None]":
+    """Record the raw streams where it is wanted; a VLP-16 records its own packets."""
+    if given.record is None:
+        yield None
+        return
+    from lce_rig.collect.live.recorder import SampleRecorder
+
+    packets = frozenset() if given.simulated else frozenset(rig.lidars)
+    with SampleRecorder(given.record, rig, packets) as recorder:
+        yield recorder
+    for problem in recorder.problems():
+        show.warn(problem)
+    show.note(f"{given.record}: {recorder.n_written} samples recorded")
+
+
+def _tell(report: "LiveReport", n_captures: int, asked: Controls) -> None:
+    """Say how it went.
+
+    Raises:
+        SourceError: a sensor was lost for good; what was captured is safe.
+        NotEnoughDataError: there is not one capture.
+    """
+    from lce_rig.core.errors import NotEnoughDataError
+
+    for text in report.notes:
+        show.note(text)
+    lost = {name: n for name, n in report.n_lost.items() if n}
+    if lost:
+        show.note("lost on the way: " + ", ".join(f"{name} {n}" for name, n in sorted(lost.items())))
+    show.note(f"ended: {_ENDINGS[report.ending]}")
+    if report.error is not None:
+        raise report.error
+    if asked.signal == signal.SIGINT:
+        raise click.exceptions.Exit(130)
+    if n_captures == 0:
+        raise NotEnoughDataError(
+            "nothing was captured",
+            "The board must be seen by every sensor at once; `lce-rig doctor` says what is in the way.",
+        )

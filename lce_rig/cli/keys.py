@@ -1,0 +1,64 @@
+"""Keys and signals of a live collection: nobody has to press any, and none is waited for."""
+
+import select
+import signal
+import sys
+import termios
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Any
+
+from lce_rig.collect.live.collection import Key
+
+_KEYS: dict[str, Key] = {"q": "stop", "\x03": "stop", " ": "capture", "n": "next"}
+HELP = "q stop   space capture now   n another place"
+
+
+@dataclass
+class Controls:
+    """What the user has asked for.
+
+    Attributes:
+        is_interactive: whether keys can be pressed at all.
+        signal: that was received, by its number; None for none.
+    """
+
+    is_interactive: bool
+    signal: int | None = None
+
+    def __call__(self) -> Key | None:
+        """Give the next thing that is asked for; None where nothing is."""
+        if self.signal is not None:
+            return "stop"
+        if self.is_interactive and select.select([sys.stdin], [], [], 0)[0]:
+            return _KEYS.get(sys.stdin.read(1).lower())
+        return None
+
+
+@contextmanager
+def controls() -> Iterator[Controls]:
+    """Read single keys where there is a terminal, and take signals as requests to stop."""
+    is_interactive = sys.stdin.isatty()
+    asked = Controls(is_interactive)
+
+    def take(number: int, _frame: Any) -> None:
+        if asked.signal is not None and number == signal.SIGINT:
+            raise KeyboardInterrupt  # Who asks twice is in a hurry.
+        asked.signal = number
+
+    before = {
+        number: signal.signal(number, take) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    }
+    settings = termios.tcgetattr(sys.stdin) if is_interactive else None
+    try:
+        if is_interactive:
+            tty.setcbreak(sys.stdin)
+        yield asked
+    finally:
+        if settings is not None:
+            with suppress(termios.error):  # The terminal may be gone.
+                termios.tcsetattr(sys.stdin, termios.TCSADRAIN, settings)
+        for number, handler in before.items():
+            signal.signal(number, handler)

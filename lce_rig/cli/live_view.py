@@ -1,0 +1,207 @@
+"""A live collection in a terminal: one screen of 80x24, or plain lines for scripts and logs."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+import numpy as np
+
+from lce_rig.cli.braille import draw_outlines
+from lce_rig.cli.keys import HELP
+from lce_rig.collect.live.state import LiveState, Phase, StreamState
+
+_STYLES: dict[Phase, str] = {
+    "starting": "white on grey30",
+    "searching": "white on dark_red",
+    "moving": "black on yellow",
+    "holding": "black on green",
+    "saving": "black on green",
+    "refused": "black on dark_orange",
+    "enough": "black on green",
+    "lost": "white on red",
+    "ended": "white on grey30",
+}
+_BELLS = {"captured": 1, "refused": 2, "enough": 3, "lost": 3, "tick": 0}
+_LOG_LINES, _NOTE_LINES, _DRAWING_SIZE = 3, 2, (34, 6)
+_PLAIN_EVERY_S = 3.0
+_BARS = ("left_right", "up_down", "near_far", "tilt", "roll")
+
+
+class View(Protocol):
+    """Shows states."""
+
+    def show(self, state: LiveState) -> None:
+        """Show a state."""
+        ...
+
+
+@contextmanager
+def open_view(*, is_plain: bool, has_keys: bool) -> Iterator[View]:
+    """Open a screen where stderr is a terminal, else, or where wanted, plain lines."""
+    if is_plain or not sys.stderr.isatty():
+        yield PlainView()
+        return
+    from rich.console import Console
+    from rich.live import Live
+
+    console = Console(stderr=True, highlight=False)
+    with Live(console=console, screen=True, auto_refresh=False) as live:
+        yield ScreenView(live, console, has_keys=has_keys)
+
+
+class PlainView:
+    """A line on stderr whenever something changes; instructions, which change all the time, now and then."""
+
+    def __init__(self) -> None:
+        self._said: tuple[str, str] | None = None
+        self._said_s = -_PLAIN_EVERY_S
+        self._n_logged = 0
+        self._notes: set[str] = set()
+
+    def show(self, state: LiveState) -> None:
+        """Print what is new."""
+        for note in state.notes:
+            if note not in self._notes:
+                self._notes.add(note)
+                _print(f"note: {note}")
+        for text in _new(state, self._n_logged):
+            _print(text)
+        self._n_logged = state.cues[-1].number if state.cues else 0
+        said = (state.phase, state.headline)
+        is_due = (
+            self._said is None or said[0] != self._said[0] or state.elapsed_s - self._said_s > _PLAIN_EVERY_S
+        )
+        if said != self._said and is_due and state.phase != "ended":
+            self._said, self._said_s = said, state.elapsed_s
+            detail = f" ({state.detail})" if state.detail else ""
+            _print(f"{_clock(state)} {state.phase}: {state.headline}{detail}")
+
+
+class ScreenView:
+    """One screen, drawn anew with every state."""
+
+    def __init__(self, live: Any, console: Any, *, has_keys: bool) -> None:
+        self._live = live
+        self._console = console
+        self._has_keys = has_keys
+        self._n_cued = 0
+
+    def show(self, state: LiveState) -> None:
+        """Draw a state, and ring the bell for what is new in it."""
+        for cue in state.cues:
+            if cue.number > self._n_cued:
+                for _ in range(_BELLS[cue.sound]):
+                    self._console.bell()
+        self._n_cued = state.cues[-1].number if state.cues else 0
+        self._live.update(render(state, has_keys=self._has_keys), refresh=True)
+
+
+def render(state: LiveState, *, has_keys: bool = True) -> Any:
+    """Lay a state out for a terminal of 80x24."""
+    from rich.columns import Columns
+    from rich.console import Group
+    from rich.padding import Padding
+    from rich.text import Text
+
+    wanted = f" of {state.n_wanted}" if state.n_wanted is not None else ""
+    title = Text.assemble(
+        (f"lce-rig {state.rig}", "bold"),
+        f"  {_clock(state)}  ",
+        (f"{state.n_captures}{wanted} captures", "bold"),
+        f"  {state.session}",
+        no_wrap=True,
+        overflow="ellipsis",
+    )
+    headline = state.headline.upper()
+    if state.hold_s is not None:
+        headline += f"   {state.hold_s:.1f} s"
+    banner = Padding(Text(headline, style="bold", justify="center"), (1, 2), style=_STYLES[state.phase])
+    detail = Text(state.detail or " ", overflow="ellipsis", no_wrap=True, style="italic")
+    parts = [title, banner, detail, _stream_table(state.streams)]
+    drawing = _drawing(state)
+    side = _progress(state)
+    parts.append(Columns([side, drawing], padding=(0, 2)) if drawing is not None else side)
+    parts += [
+        Text(f"! {note}", style="yellow", no_wrap=True, overflow="ellipsis")
+        for note in state.notes[:_NOTE_LINES]
+    ]
+    parts += [Text(line, style="dim", no_wrap=True, overflow="ellipsis") for line in state.log[-_LOG_LINES:]]
+    if has_keys:
+        parts.append(Text(HELP, style="bold dim"))
+    return Group(*parts)
+
+
+def _stream_table(streams: tuple[StreamState, ...]) -> Any:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, show_header=False, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column(width=14, no_wrap=True)
+    table.add_column(width=7, justify="right", no_wrap=True)
+    table.add_column(width=9, no_wrap=True)
+    table.add_column(no_wrap=True, overflow="ellipsis")
+    for stream in streams:
+        is_bad = stream.sees_board is False or bool(stream.reason)
+        mark, style = (
+            ("x", "bold red") if is_bad else ("o", "bold green") if stream.sees_board else ("-", "dim")
+        )
+        lost = f"{stream.n_lost} lost" if stream.n_lost else ""
+        table.add_row(
+            Text(f"{mark} {stream.name}", style=style),
+            f"{stream.rate_hz:.1f}/s" if stream.rate_hz < 1000 else f"{stream.rate_hz / 1e6:.2f}M/s",
+            Text(lost, style="red"),
+            Text(stream.reason or stream.figures, style="red" if is_bad else ""),
+        )
+    return table
+
+
+def _progress(state: LiveState) -> Any:
+    """Show coverage as bars, and the predicted sigmas against their targets."""
+    from rich.text import Text
+
+    lines = Text()
+    for name in _BARS:
+        share = 0.0 if state.coverage is None else float(getattr(state.coverage, name))
+        filled = round(14 * share)
+        style = "green" if share >= 0.99 else "yellow"
+        lines.append(f"{name.replace('_', '-'):<11}")
+        lines.append("█" * filled, style=style)
+        lines.append("░" * (14 - filled) + f" {100 * share:3.0f} %\n", style="dim")
+    lines.append("predicted  ")
+    for sigma, target, unit in (
+        (state.sigma_deg, state.target_deg, "deg"),
+        (state.sigma_mm, state.target_mm, "mm"),
+    ):
+        shown = "-" if not np.isfinite(sigma) else f"{sigma:.2g}"
+        style = "green" if np.isfinite(sigma) and sigma <= target else "yellow"
+        lines.append(f"{shown}", style=style)
+        lines.append(f" of {target:g} {unit}  ")
+    return lines
+
+
+def _drawing(state: LiveState) -> Any:
+    """Draw where the board is (dotted) and where it should be, as small as it gets."""
+    from rich.text import Text
+
+    drawing = state.drawing
+    if drawing is None:
+        return None
+    height, width = drawing.pixels.shape[:2]
+    rows = draw_outlines((width, height), drawing.wanted_px, drawing.present_px, _DRAWING_SIZE)
+    return Text("\n".join(rows), style="green" if drawing.is_there else "", no_wrap=True)
+
+
+def _new(state: LiveState, n_known: int) -> list[str]:
+    """List the messages that belong to cues not known yet."""
+    n_new = sum(1 for cue in state.cues if cue.number > n_known and cue.sound != "tick")
+    return list(state.log[-n_new:]) if n_new else []
+
+
+def _clock(state: LiveState) -> str:
+    elapsed_s = int(state.elapsed_s)
+    return f"{elapsed_s // 60:02d}:{elapsed_s % 60:02d}"
+
+
+def _print(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)  # noqa: T201

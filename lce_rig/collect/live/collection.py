@@ -1,0 +1,320 @@
+"""The live loop: see the board in the newest frame, say where it goes, capture it when it is there.
+
+Threads: one reads each sensor (its source), one forwards what it read (`Pumps`), one pairs (`FrameFeed`), one
+writes captures (`Keeper`); this loop alone looks for the board, decides and tells the views.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from lce_rig.collect.live.frame_feed import FrameFeed
+from lce_rig.collect.live.gates import LiveGate, SlowBoards, StillBoards
+from lce_rig.collect.live.guide import Guide
+from lce_rig.collect.live.keeper import Keeper, Task
+from lce_rig.collect.live.monitor import Monitor
+from lce_rig.collect.live.narration import Narration, narrate_unseen
+from lce_rig.collect.live.pumps import Pumps
+from lce_rig.collect.live.recorder import SampleRecorder
+from lce_rig.collect.live.rig_clock import RigClock, SyncTimes
+from lce_rig.collect.live.state import LiveState
+from lce_rig.collect.novelty import Placements, capture_poses
+from lce_rig.collect.sync import pair_times
+from lce_rig.collect.watching import BoardWatcher, ImageKey, Moment, Sighting
+from lce_rig.core.errors import LceRigError, SourceError
+from lce_rig.rig import Rig
+from lce_rig.session import Capture, Session
+from lce_rig.sources.live.base import LiveSource
+
+Ending = Literal["enough", "frames", "timeout", "stopped", "lost"]
+Key = Literal["stop", "capture", "next"]
+"""stop: end; capture: take what is seen now; next: propose another placement."""
+
+#: How long a board stands still before it is captured, beyond the first half second.
+HOLD_S = 1.5
+_WAIT_S = 0.1
+_NOVEL_M, _NOVEL_DEG = 0.15, 10.0
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """How a live collection goes.
+
+    Attributes:
+        n_wanted: captures that the session is to hold; None until the target is predicted to be met.
+        timeout_s: ends after so long; None never.
+        hold_s: how long a board stands still before it is captured, beyond the first half second.
+        lost_s: how long a lost sensor is waited for.
+        goes_on: whether to go on when the target is met, until told to stop.
+        search_interval_s: how often a whole picture is searched while no board is in sight.
+    """
+
+    n_wanted: int | None = None
+    timeout_s: float | None = None
+    hold_s: float = HOLD_S
+    lost_s: float = 60.0
+    goes_on: bool = False
+    search_interval_s: float = 0.3
+
+
+@dataclass
+class LiveReport:
+    """How a live collection went.
+
+    Attributes:
+        ending: why it ended.
+        captured: names of the new captures, in order.
+        latencies_s: from each decision until its capture was safe on the disk.
+        n_frames: frames looked at.
+        n_skipped: frames that came while one before was looked at.
+        n_lost: what sensors lost or nobody took, by sensor.
+        error: the sensor that is lost for good; None where none is.
+        notes: what else was odd.
+    """
+
+    ending: Ending = "stopped"
+    captured: list[str] = field(default_factory=list)
+    latencies_s: list[float] = field(default_factory=list)
+    n_frames: int = 0
+    n_skipped: int = 0
+    n_lost: dict[str, int] = field(default_factory=dict)
+    error: SourceError | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+def collect_live(
+    session: Session,
+    sources: Sequence[LiveSource],
+    options: LiveOptions | None = None,
+    show: Callable[[LiveState], None] = lambda _state: None,
+    keys: Callable[[], Key | None] = lambda: None,
+    recorder: SampleRecorder | None = None,
+) -> LiveReport:
+    """Collect from attached sensors until there is enough.
+
+    Args:
+        session: open for writing; what it holds counts.
+        sources: of every sensor, and the sync board's where there is one; not open yet.
+        options: how it goes.
+        show: told the state after every frame, and twice a second without one; must not block.
+        keys: asked what the user wants.
+        recorder: takes every sample too; open.
+
+    Raises:
+        SourceError: a sensor cannot be opened.
+        SessionError: a capture cannot be written; those before are safe.
+        ProfileError: the profile cannot be used, such as a network of its.
+    """
+    options = options or LiveOptions()
+    rig = session.rig
+    board = next((source for source in sources if isinstance(source, SyncTimes)), None)
+    guides = make_guides(rig)
+    for capture in session.captures:
+        _count_in(capture, session, guides)
+    # Leaving closes in turn: nothing new comes, what was decided is written, the devices are let go.
+    with Pumps(sources) as pumps:
+        clock = RigClock(rig, board)
+        with (
+            Keeper(session, guides, rig.quality.min_captures) as keeper,
+            FrameFeed(rig, pumps, clock, None if recorder is None else recorder.put) as feed,
+        ):
+            loop = _Loop(session, options, pumps, clock, feed, keeper, guides, show, recorder)
+            report = loop.run(keys)
+        loop.take_kept()
+        loop.close_books()
+    return report
+
+
+def make_guides(rig: Rig) -> list[Guide]:
+    """Make a guide for every camera with every LiDAR: by its frames where it has any."""
+    keys: list[ImageKey] = []
+    for name, camera in rig.cameras.items():
+        framed = [channel for channel, given in camera.channels.items() if given.kind == "frames"]
+        keys.append((name, (framed or list(camera.channels))[0]))
+    return [Guide(rig, key, lidar) for key in keys for lidar in rig.lidars]
+
+
+def _count_in(capture: Capture, session: Session, guides: Sequence[Guide]) -> None:
+    """Let guides know a capture of an earlier run."""
+    try:
+        poses, lidars = capture_poses(capture, session), capture.lidars
+    except LceRigError:
+        return  # A damaged capture is named when it is used.
+    for guide in guides:
+        if guide.key in poses and guide.lidar in lidars:
+            guide.add(capture.name, poses[guide.key])
+
+
+class _Loop:
+    def __init__(
+        self,
+        session: Session,
+        options: LiveOptions,
+        pumps: Pumps,
+        clock: RigClock,
+        feed: FrameFeed,
+        keeper: Keeper,
+        guides: Sequence[Guide],
+        show: Callable[[LiveState], None],
+        recorder: SampleRecorder | None,
+    ) -> None:
+        self.report = LiveReport()
+        self._session, self._rig, self._options = session, session.rig, options
+        self._pumps, self._clock, self._feed, self._keeper = pumps, clock, feed, keeper
+        self._guides = guides
+        self._show = show
+        self._recorder = recorder
+        self._began_s = time.monotonic()
+        self._watcher = BoardWatcher(self._rig, options.search_interval_s)
+        self._gate: LiveGate | None = None
+        self._n_captures = len(session.captures)
+        names = [capture.name for capture in session.captures]
+        self._next_number = int(names[-1]) + 1 if names else 0
+        self._monitor = Monitor(session, options.n_wanted, pumps, clock)
+        self._last: Sighting | None = None
+
+    def run(self, keys: Callable[[], Key | None]) -> LiveReport:
+        """Go on until something ends it."""
+        while True:
+            frame = self._feed.take(_WAIT_S)
+            self.take_kept()
+            if frame is not None:
+                self.report.n_frames += 1
+                self._see(self._watcher.sight(frame))
+            key = keys()
+            self._obey(key)
+            ending = self._find_ending(key)
+            self._tell(has_frame=frame is not None, ending=ending)
+            if ending is not None:
+                self.report.ending = ending
+                return self.report
+
+    def take_kept(self) -> None:
+        """Count the captures that have become safe."""
+        for kept in self._keeper.take():
+            self._n_captures += 1
+            self.report.captured.append(kept.name)
+            self.report.latencies_s.append(kept.latency_s)
+            self._monitor.cue("captured", f"captured {kept.name} ({kept.latency_s:.2f} s)")
+
+    def close_books(self) -> None:
+        """Gather what was lost on the way, and write it into the session's journal."""
+        report = self.report
+        report.n_skipped = self._feed.n_skipped
+        for name, status in self._pumps.statuses().items():
+            report.n_lost[name] = status.n_lost + status.n_dropped
+        report.notes += self._keeper.notes() + self._clock.problems()
+        if self._recorder is not None:
+            report.notes += self._recorder.problems()
+        self._session.journal(
+            "collected live",
+            ending=report.ending,
+            captured=len(report.captured),
+            frames=report.n_frames,
+            lost=report.n_lost,
+            error="" if report.error is None else report.error.what,
+        )
+
+    def _see(self, sighting: Sighting) -> None:
+        """Look for a moment in a sighting, and put into words what goes on."""
+        self._last = sighting
+        self._monitor.see(sighting)
+        gate = self._find_gate()
+        moments = gate.take(sighting)
+        guide = self._active_guide(sighting)
+        now_s = time.monotonic()
+        if guide.key not in sighting.images or guide.lidar not in sighting.lidars:
+            present = sighting.images[guide.key].T_cam_board if guide.key in sighting.images else None
+            guide.plan(present, now_s)
+            narration = narrate_unseen(sighting, guide, self._monitor.reasons)
+        else:
+            present = sighting.images[guide.key].T_cam_board
+            guide.plan(present, now_s)
+            narration = gate.narrate(guide, present)
+        for moment in moments:
+            narration = self._decide(moment, guide, narration)
+        self._monitor.narrate(narration, guide, present)
+
+    def _decide(self, moment: Moment, guide: Guide, narration: Narration) -> Narration:
+        """Capture a moment, unless it adds nothing."""
+        sighting = moment.sighting
+        if guide.key not in sighting.images or guide.lidar not in sighting.lidars:
+            return narration
+        refusal = guide.adds_nothing(sighting.images[guide.key].T_cam_board)
+        if refusal is None:
+            self._capture(moment)
+            return Narration("saving", "captured")
+        self._monitor.cue("refused", f"not captured: {refusal.cause}")
+        return Narration("refused", refusal.action, f"not here: {refusal.cause}")
+
+    def _capture(self, moment: Moment) -> None:
+        sighting, gate = moment.sighting, self._find_gate()
+        frame = sighting.frame
+        pairs = [pair.to_meta() for pair in pair_times(frame, self._rig, self._clock.common)]
+        verdict = self._clock.verdict()
+        meta: dict[str, object] = {
+            "source": {"key": f"live:{frame.time_ns}", "label": f"live, at {frame.time_ns} ns"},
+            "pairs": pairs,
+            "still_boards_only": verdict.requires_still_boards,
+        }
+        self._keeper.keep(Task(moment, frame.images, gate.events_of(moment), meta, time.monotonic()))
+        name = f"{self._next_number:06d}"
+        self._next_number += 1
+        for guide in self._guides:
+            if guide.key in sighting.images and guide.lidar in sighting.lidars:
+                guide.add(name, sighting.images[guide.key].T_cam_board)
+
+    def _obey(self, key: Key | None) -> None:
+        guide = None if self._last is None else self._active_guide(self._last)
+        if key == "next" and guide is not None:
+            guide.give_up()
+            self._monitor.log("another placement was asked for")
+        if key == "capture" and guide is not None and self._last is not None:
+            if guide.key in self._last.images and guide.lidar in self._last.lidars:
+                self._capture(Moment(self._last, {"by_hand": 1.0}))
+            else:
+                self._monitor.cue("refused", "not captured: not every sensor sees the board")
+
+    def _find_ending(self, key: Key | None) -> Ending | None:
+        options, elapsed_s = self._options, time.monotonic() - self._began_s
+        lost = self._pumps.lost()
+        vital = {name: why for name, why in lost.items() if name in {*self._rig.lidars, *self._rig.cameras}}
+        for error, since_s in vital.values():
+            if time.monotonic() - since_s > options.lost_s:
+                self.report.error = error
+                return "lost"
+        if key == "stop":
+            return "stopped"
+        if options.n_wanted is not None and self._n_captures >= options.n_wanted:
+            return "frames"
+        if options.timeout_s is not None and elapsed_s > options.timeout_s:
+            return "timeout"
+        is_open = options.n_wanted is not None or options.goes_on or self._keeper.is_busy
+        return "enough" if self._is_enough() and not is_open else None
+
+    def _is_enough(self) -> bool:
+        guided = [guide for guide in self._guides if guide.guidance is not None]
+        return len(guided) == len(self._guides) and all(g.guidance and g.guidance.is_enough for g in guided)
+
+    def _tell(self, *, has_frame: bool, ending: Ending | None) -> None:
+        if has_frame or ending is not None or self._monitor.is_due():
+            is_enough, has_ended = self._is_enough(), ending is not None
+            self._show(self._monitor.state(self._n_captures, is_enough=is_enough, has_ended=has_ended))
+
+    def _active_guide(self, sighting: Sighting) -> Guide:
+        """Choose the guide that has the fewest captures, among those whose camera sees the board."""
+        seeing = [g for g in self._guides if g.key in sighting.images]
+        return min(seeing or self._guides, key=lambda guide: guide.n_held)
+
+    def _find_gate(self) -> LiveGate:
+        """Choose how boards are captured: moving where events come and clocks are tied, else still."""
+        has_events = self._last is not None and bool(self._last.frame.events)
+        may_move = has_events and not self._clock.verdict().requires_still_boards
+        if self._gate is None or may_move != isinstance(self._gate, SlowBoards):
+            self._gate = (
+                SlowBoards(self._rig, Placements(_NOVEL_M, _NOVEL_DEG))
+                if may_move
+                else StillBoards(self._rig, self._options.hold_s)
+            )
+        return self._gate

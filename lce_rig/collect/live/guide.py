@@ -1,0 +1,168 @@
+"""What the captures have shown of one camera and one LiDAR, and where the board goes next."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lce_rig.collect.guidance import (
+    Coverage,
+    Guidance,
+    Instruction,
+    Planner,
+    SensorModel,
+    View,
+    instruct,
+    is_there,
+    measure_coverage,
+    model_sensors,
+    outline_px,
+)
+from lce_rig.collect.watching import ImageKey
+from lce_rig.core.errors import ProfileError
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Refusal
+from lce_rig.rig import Rig
+
+#: Another placement is proposed after a board was wanted at one for so long.
+GIVE_UP_S = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """What a first calibration of the captures says.
+
+    Attributes:
+        T_cam_lidar: (4, 4).
+        plane_rms_m, edge_rms_m: residuals.
+        n_captures: behind it.
+    """
+
+    T_cam_lidar: Array
+    plane_rms_m: float
+    edge_rms_m: float
+    n_captures: int
+
+
+class Guide:
+    """Guides the board before one camera and one LiDAR.
+
+    Without a nominal extrinsic in the profile it begins when a first calibration is there; for a LiDAR whose
+    beams are not known there is no guidance at all.
+
+    Attributes:
+        key: camera and channel in which the board is followed.
+        lidar: name of the LiDAR.
+        problem: why there is no guidance yet, and what to do; "" while there is.
+        guidance: the latest; None before the first.
+    """
+
+    def __init__(self, rig: Rig, key: ImageKey, lidar: str) -> None:
+        """Begin without captures."""
+        self.key = key
+        self.lidar = lidar
+        self.problem = ""
+        self.guidance: Guidance | None = None
+        self._names: list[str] = []
+        self._held: list[Array] = []
+        self._avoid: list[Array] = []
+        self._wanted_since_s = 0.0
+        self._coverage: Coverage | None = None
+        self._planner: Planner | None = None
+        self._model: SensorModel | None = None
+        try:
+            self._model = model_sensors(rig, key[0], lidar)
+        except ProfileError as error:
+            self.problem = f"no guidance: {error.what}"
+            return
+        nominal = rig.nominal(key[0], lidar)
+        if nominal is None:
+            self.problem = (
+                f"guidance begins after {rig.quality.min_captures} captures: "
+                f"the profile has no nominal extrinsic of {key[0]} and {lidar}"
+            )
+        else:
+            self._planner = Planner(View.upright(self._model, nominal.to_matrix()))
+
+    @property
+    def n_held(self) -> int:
+        """Captures so far."""
+        return len(self._held)
+
+    @property
+    def wanted(self) -> Array | None:
+        """Where the board should go, T_cam_board (4, 4); None where nothing new can be reached."""
+        return None if self.guidance is None else self.guidance.T_cam_board
+
+    def add(self, name: str, T_cam_board: Array) -> None:
+        """Take a capture into account; the next placement is chosen by `plan`."""
+        self._names.append(name)
+        self._held.append(T_cam_board)
+        self.guidance = self._coverage = None
+
+    def prepare(self, learned: Learned) -> Planner | None:
+        """Build a planner that knows what the captures have shown; takes a second and changes nothing."""
+        if self._model is None:
+            return None
+        errors = self._model.errors.learned(learned.plane_rms_m, learned.edge_rms_m, learned.n_captures)
+        return Planner(View.upright(self._model.with_errors(errors), learned.T_cam_lidar))
+
+    def adopt(self, planner: Planner) -> None:
+        """Take a planner from `prepare`."""
+        self._planner = planner
+        self.problem = ""
+        self.guidance = self._coverage = None
+
+    def plan(self, present: Array | None, now_s: float) -> None:
+        """Choose the next placement where none is chosen, or the last was not reached for long.
+
+        Args:
+            present: (4, 4) where the board is; None where it is not seen.
+            now_s: by any steady clock.
+        """
+        if self._planner is None:
+            return
+        if self.guidance is not None and now_s - self._wanted_since_s < GIVE_UP_S:
+            return
+        if self.guidance is not None:
+            self.give_up()
+        avoid = np.stack(self._avoid) if self._avoid else None
+        self.guidance = self._planner.guide(self._held_poses(), present, avoid)
+        self._wanted_since_s = now_s
+
+    def give_up(self) -> None:
+        """Ask for another placement: something is in the way of this one."""
+        if self.wanted is not None:
+            self._avoid.append(self.wanted)
+        self.guidance = None
+
+    def adds_nothing(self, present: Array) -> Refusal | None:
+        """Say why a board (4, 4) need not be captured where it is; None where it adds something."""
+        if self._planner is None:
+            return None
+        return self._planner.adds_nothing(self._held_poses(), present, self._names)
+
+    def instruct(self, present: Array) -> list[Instruction]:
+        """Say what to do with a board (4, 4)."""
+        if self._planner is None or self.wanted is None:
+            return []
+        return instruct(self._planner.view, present, self.wanted)
+
+    def is_there(self, present: Array) -> bool:
+        """Tell whether a board (4, 4) is where it should be."""
+        if self._planner is None or self.wanted is None:
+            return False
+        return is_there(self._planner.view, present, self.wanted)
+
+    def outline_px(self, T_cam_board: Array) -> Array | None:
+        """Project a board (4, 4) into the picture as a closed polygon."""
+        return None if self._model is None else outline_px(self._model, T_cam_board)
+
+    def coverage(self) -> Coverage | None:
+        """Measure what the captures have shown."""
+        if self._coverage is None and self._planner is not None:
+            held, reachable = self._held_poses(), self._planner.candidates
+            self._coverage = measure_coverage(self._planner.view, held, reachable)
+        return self._coverage
+
+    def _held_poses(self) -> Array:
+        return np.stack(self._held) if self._held else np.zeros((0, 4, 4))

@@ -1,0 +1,218 @@
+"""Gathers what the loop knows into the states that views show."""
+
+import time
+from collections import deque
+
+import numpy as np
+
+from lce_rig.collect.live.guide import Guide
+from lce_rig.collect.live.narration import Narration, image_figures, scan_figures, stream_name
+from lce_rig.collect.live.pumps import Pumps
+from lce_rig.collect.live.rig_clock import RigClock
+from lce_rig.collect.live.state import Cue, Drawing, LiveState, Phase, Sound, StreamState
+from lce_rig.collect.watching import Sighting
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Refusal
+from lce_rig.session import Session
+from lce_rig.sources.live.base import SourceStatus
+
+_EVERY_S = 0.5
+_N_CUES, _N_LOG = 8, 40
+_TICK_S = 0.5
+_ENOUGH = "enough: you may stop"
+
+
+class Monitor:
+    """Remembers the latest of everything.
+
+    Attributes:
+        reasons: why the board is not seen, by the stream's name.
+    """
+
+    def __init__(self, session: Session, n_wanted: int | None, pumps: Pumps, clock: RigClock) -> None:
+        """Begin with nothing seen."""
+        self.reasons: dict[str, Refusal] = {}
+        self._session = session
+        self._n_wanted = n_wanted
+        self._pumps = pumps
+        self._clock = clock
+        self._began_s = self._told_s = self._asked_s = time.monotonic()
+        self._statuses: dict[str, SourceStatus] = {}
+        self._cues: deque[Cue] = deque(maxlen=_N_CUES)
+        self._n_cues = 0
+        self._log: deque[str] = deque(maxlen=_N_LOG)
+        self._narration = Narration("starting", "waiting for the sensors")
+        self._guide: Guide | None = None
+        self._drawing: Drawing | None = None
+        self._sighting: Sighting | None = None
+        self._ticks_left: int | None = None
+        self._lost: frozenset[str] = frozenset()
+        self._was_enough = False
+
+    def see(self, sighting: Sighting) -> None:
+        """Take a sighting, and remember why streams do not show the board."""
+        self._sighting = sighting
+        for key, why in sighting.unseen.items():
+            self.reasons[stream_name(key)] = why
+        self.reasons.update(sighting.unscanned)
+        for key in sighting.images:
+            self.reasons.pop(stream_name(key), None)
+        for lidar in sighting.lidars:
+            self.reasons.pop(lidar, None)
+
+    def narrate(self, narration: Narration, guide: Guide, present: Array | None) -> None:
+        """Take what is said of the last sighting."""
+        self._narration, self._guide = narration, guide
+        self._tick(narration)
+        assert self._sighting is not None
+        picture = next(
+            (each for each in self._sighting.frame.images if (each.sensor, each.channel) == guide.key), None
+        )
+        if picture is not None:
+            self._drawing = Drawing(
+                stream_name(guide.key),
+                picture.pixels,
+                None if present is None else guide.outline_px(present),
+                None if guide.wanted is None else guide.outline_px(guide.wanted),
+                present is not None and guide.is_there(present),
+                present,
+                guide.wanted,
+            )
+
+    def cue(self, sound: Sound, text: str = "") -> None:
+        """Ask for a sound, and log a message."""
+        self._n_cues += 1
+        self._cues.append(Cue(self._n_cues, sound))
+        if text:
+            self.log(text)
+
+    def log(self, text: str) -> None:
+        """Log a message, with the time since the beginning."""
+        elapsed_s = int(time.monotonic() - self._began_s)
+        self._log.append(f"{elapsed_s // 60:02d}:{elapsed_s % 60:02d} {text}")
+
+    def is_due(self) -> bool:
+        """Tell whether views have not been told anything for long."""
+        return time.monotonic() - self._told_s > _EVERY_S
+
+    def state(self, n_captures: int, *, is_enough: bool, has_ended: bool) -> LiveState:
+        """Give everything as it is now."""
+        self._told_s = now_s = time.monotonic()
+        self._watch_sensors()
+        if is_enough and not self._was_enough:
+            self.cue("enough", "the target is predicted to be met: you may stop")
+        self._was_enough = is_enough
+        phase, headline, detail = self._phase(is_enough=is_enough, has_ended=has_ended)
+        rig, guidance = self._session.rig, self._guide.guidance if self._guide else None
+        return LiveState(
+            rig=rig.name,
+            session=str(self._session.path),
+            elapsed_s=now_s - self._began_s,
+            phase=phase,
+            headline=headline,
+            detail=detail,
+            hold_s=self._narration.hold_s if phase == "holding" else None,
+            n_captures=n_captures,
+            n_wanted=self._n_wanted,
+            streams=self._streams(),
+            drawing=self._drawing,
+            coverage=self._guide.coverage() if self._guide else None,
+            sigma_deg=np.nan if guidance is None else guidance.sigma_rotation_deg,
+            sigma_mm=np.nan if guidance is None else 1000 * guidance.sigma_translation_m,
+            target_deg=rig.calibration.target_sigma_deg,
+            target_mm=1000 * rig.calibration.target_sigma_m,
+            cues=tuple(self._cues),
+            log=tuple(self._log),
+            notes=self._notes(),
+        )
+
+    def _phase(self, *, is_enough: bool, has_ended: bool) -> tuple[Phase, str, str]:
+        said = self._narration
+        if has_ended:
+            return "ended", "collection has ended", said.headline if is_enough else ""
+        if self._lost:
+            name = sorted(self._lost)[0]
+            error = self._pumps.lost().get(name)
+            return "lost", f"{name} is lost", "" if error is None else f"{error[0].what} {error[0].hint}"
+        if is_enough:
+            return "enough", _ENOUGH, said.headline
+        return said.phase, said.headline, said.detail
+
+    def _tick(self, narration: Narration) -> None:
+        """Tick every half second while a board is held."""
+        if narration.hold_s is None:
+            self._ticks_left = None
+            return
+        ticks_left = int(narration.hold_s / _TICK_S)
+        if ticks_left != self._ticks_left:
+            self.cue("tick")
+        self._ticks_left = ticks_left
+
+    def _watch_sensors(self) -> None:
+        """Ask how sensors do, and log those that go and come back."""
+        if not self._statuses or time.monotonic() - self._asked_s > _EVERY_S:
+            self._asked_s = time.monotonic()
+            self._statuses = self._pumps.statuses()
+        lost = self._pumps.lost()
+        for name in sorted(lost.keys() - self._lost):
+            self.cue("lost", f"{name} is lost: {lost[name][0].what}")
+        for name in sorted(self._lost - lost.keys()):
+            self.log(f"{name} is back")
+        self._lost = frozenset(lost)
+
+    def _streams(self) -> tuple[StreamState, ...]:
+        """List every stream: channels of cameras, LiDARs, then what else there is."""
+        rig, streams = self._session.rig, []
+        for name, camera in rig.cameras.items():
+            status = self._statuses.get(name, SourceStatus(name))
+            for channel, given in camera.channels.items():
+                kind_hz = status.figures.get(f"{given.kind}_hz", status.rate_hz)
+                streams.append(self._camera_stream(name, channel, given.kind == "frames", kind_hz, status))
+        for name in rig.lidars:
+            streams.append(self._lidar_stream(name, self._statuses.get(name, SourceStatus(name))))
+        known = {*rig.cameras, *rig.lidars}
+        for name, status in self._statuses.items():
+            if name not in known:
+                streams.append(StreamState(name, status.rate_hz, status.n_lost, None, self._trouble(name)))
+        return tuple(streams)
+
+    def _camera_stream(
+        self, camera: str, channel: str, is_framed: bool, rate_hz: float, status: SourceStatus
+    ) -> StreamState:
+        name, sighting = f"{camera}.{channel}", self._sighting
+        n_lost = status.n_lost + status.n_dropped
+        pictures = {(i.sensor, i.channel) for i in sighting.frame.images} if sighting else set()
+        if sighting is None or (camera, channel) not in pictures:
+            return StreamState(name, rate_hz, n_lost, None, self._trouble(camera) if is_framed else "")
+        board = sighting.images.get((camera, channel))
+        if board is None:
+            why = self.reasons.get(name)
+            reason = self._trouble(camera) or (f"{why.cause}: {why.action}" if why else "no board")
+            return StreamState(name, rate_hz, n_lost, False, reason)
+        return StreamState(name, rate_hz, n_lost, True, self._trouble(camera), image_figures(board))
+
+    def _lidar_stream(self, lidar: str, status: SourceStatus) -> StreamState:
+        sighting, n_lost = self._sighting, status.n_lost + status.n_dropped
+        if sighting is None or not sighting.images:
+            return StreamState(lidar, status.rate_hz, n_lost, None, self._trouble(lidar))
+        boards = sighting.lidars.get(lidar)
+        if not boards:
+            why = self.reasons.get(lidar)
+            reason = self._trouble(lidar) or (f"{why.cause}: {why.action}" if why else "no board")
+            return StreamState(lidar, status.rate_hz, n_lost, False, reason)
+        return StreamState(lidar, status.rate_hz, n_lost, True, self._trouble(lidar), scan_figures(boards[0]))
+
+    def _trouble(self, sensor: str) -> str:
+        """Say what is wrong with a sensor now; "" where nothing is."""
+        lost = self._pumps.lost().get(sensor)
+        return "" if lost is None else f"lost: {lost[0].what}"
+
+    def _notes(self) -> tuple[str, ...]:
+        verdict = self._clock.verdict()
+        notes = [str(verdict)] if verdict.requires_still_boards else []
+        notes += self._clock.problems()
+        for name, status in self._statuses.items():
+            notes += [f"{name}: {problem}" for problem in status.problems]
+        if self._guide is not None and self._guide.problem:
+            notes.append(self._guide.problem)
+        return tuple(notes)

@@ -1,0 +1,101 @@
+"""What goes on, and the one thing to do about it, in words for the person who holds the board."""
+
+from dataclasses import dataclass
+
+from lce_rig.collect.event_moment import MotionOptions
+from lce_rig.collect.guidance import say
+from lce_rig.collect.live.guide import Guide
+from lce_rig.collect.live.state import Phase
+from lce_rig.collect.watching import ImageKey, Moment, Sighting
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+
+_HOLD = "hold still"
+_SHOW = "show the board to the camera"
+
+
+@dataclass(frozen=True)
+class Narration:
+    """One moment in words.
+
+    Attributes:
+        phase, headline, detail, hold_s: as `LiveState`.
+    """
+
+    phase: Phase
+    headline: str
+    detail: str = ""
+    hold_s: float | None = None
+
+
+def narrate_unseen(sighting: Sighting, guide: Guide, reasons: dict[str, Refusal]) -> Narration:
+    """Say what keeps a board out of sight.
+
+    Args:
+        sighting: in which the guide's camera or LiDAR does not see the board.
+        guide: whose sensors they are.
+        reasons: the last refusal of each stream, by its name.
+    """
+    if guide.key not in sighting.images:
+        why = reasons.get(stream_name(guide.key))
+        # A picture without a board hardly tells why; one with half a board does.
+        return Narration("searching", _SHOW, f"{why.cause}: {why.action}" if why else "")
+    why = reasons.get(guide.lidar)
+    headline = why.action if why else "the LiDAR does not see the board"
+    return Narration("searching", headline, f"{guide.lidar}: {why.cause}" if why else "")
+
+
+def narrate_still(
+    guide: Guide, present: Array, held_s: float | None, hold_s: float, refusal: Refusal | None
+) -> Narration:
+    """Say where a board goes that has to stand still to be captured.
+
+    Args:
+        guide: of the sensors that see it.
+        present: (4, 4) where it is.
+        held_s: for how long it has stood still; None while it moves.
+        hold_s: for how long it has to.
+        refusal: why it need not be captured here; None where it adds something.
+    """
+    if held_s is not None and refusal is not None:
+        return Narration("refused", _next(guide, present, refusal.action), f"not here: {refusal.cause}")
+    if held_s is not None:
+        return Narration("holding", _HOLD, "", max(hold_s - held_s, 0.0))
+    return Narration("moving", _next(guide, present, _HOLD), guide.problem)
+
+
+def narrate_moving(
+    guide: Guide, present: Array, judged: Moment | Refusal | None, options: MotionOptions
+) -> Narration:
+    """Say where a board goes that has to move slowly to be captured."""
+    headline = _next(guide, present, f"move it slowly, about {100 * options.best_speed_mps:.0f} cm/s")
+    if isinstance(judged, Refusal):
+        return Narration("moving", headline, f"{judged.cause}: {judged.action}")
+    if isinstance(judged, Moment) and guide.is_there(present):
+        return Narration("holding", "good: go on slowly", f"{judged.figures['speed_mps']:.2f} m/s")
+    return Narration("moving", headline, guide.problem)
+
+
+def stream_name(key: ImageKey) -> str:
+    """Name a camera's channel as views do."""
+    return f"{key[0]}.{key[1]}"
+
+
+def image_figures(board: ImageBoard) -> str:
+    """Sum a board in a picture up in few words."""
+    distance_m = board.quality.get("distance_m", float(board.T_cam_board[2, 3]))
+    return f"{distance_m:.1f} m, {board.reprojection_px:.2f} px"
+
+
+def scan_figures(board: LidarBoard) -> str:
+    """Sum a board in a scan up in few words."""
+    n_rings = int(board.quality.get("n_rings", len(set(board.ring.tolist()))))
+    return f"{n_rings} rings, {len(board.points)} points"
+
+
+def _next(guide: Guide, present: Array, otherwise: str) -> str:
+    """Say how to go on to the wanted placement; something else where the board is there, or none is known."""
+    if guide.wanted is None:
+        return "hold it somewhere else, tilted otherwise" if guide.guidance is None else otherwise
+    instructions = guide.instruct(present)
+    return say(instructions) if instructions else otherwise

@@ -1,0 +1,255 @@
+"""The simulated rig in real time: its sensors as live sources, and a person who follows the guidance.
+
+The simulation runs in a process of its own, as sensors do. While the board is held, its scene is rendered
+once and measured anew for each picture and scan; on its way it is rendered every time, and samples come as
+fast as that goes.
+"""
+
+import multiprocessing
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from multiprocessing.connection import Connection
+from types import TracebackType
+
+import numpy as np
+
+from lce_rig.collect.guidance import HeldPose, Person, View, build_pose, model_sensors
+from lce_rig.collect.live.state import LiveState
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.errors import LceRigError, ProfileError, SourceError
+from lce_rig.core.geometry import Array
+from lce_rig.rig import Rig
+from lce_rig.simulate import SimulationOptions
+from lce_rig.simulate.live_scene import LiveScene
+from lce_rig.sources.live.base import LiveSource, Mailbox, SourceStatus
+from lce_rig.sources.live.reading import RateMeter
+
+START_S = 120.0
+# How people behave: they react, walk, and try again where nothing happens.
+REACTION_S = 0.7
+WALK_MPS = 0.6
+AGAIN_S = 7.0
+_TRIES = 8
+_START = HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0)
+_PERSON_STREAM = 101
+_WAIT_S = 0.2
+
+
+class SimulatedSource:
+    """One simulated sensor; see `LiveSource`."""
+
+    def __init__(self, sensor: str) -> None:
+        self.sensor = sensor
+        self._mailbox: Mailbox[Image | Scan] = Mailbox(32)
+        self._rate = RateMeter()
+
+    def __enter__(self) -> "SimulatedSource":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._mailbox.close()
+
+    def samples(self) -> Iterator[Image | Scan]:
+        """Yield samples as they come, until the source is closed."""
+        while not self._mailbox.is_ended:
+            sample = self._mailbox.take(_WAIT_S)
+            if sample is not None:
+                yield sample
+        self._mailbox.take(0)
+
+    def status(self) -> SourceStatus:
+        """Say how the sensor does."""
+        box = self._mailbox
+        return SourceStatus(
+            self.sensor, box.n_put, box.n_dropped, 0, self._rate.rate_hz, "simulated", device="simulated"
+        )
+
+    def put(self, sample: Image | Scan) -> None:
+        """Take a sample of the simulation."""
+        self._mailbox.put(sample)
+        self._rate.add(1)
+
+    def fail(self, error: SourceError) -> None:
+        """End for good."""
+        self._mailbox.close(error)
+
+
+class SimulatedRig:
+    """A simulated rig and whoever holds the board before it; open while its `with` block lasts.
+
+    Attributes:
+        sources: of its sensors: frames and scans. Events cannot be simulated in real time.
+    """
+
+    def __init__(self, rig: Rig, seed: int, person: Person | None = None) -> None:
+        """Prepare.
+
+        Args:
+            rig: the profile.
+            seed: of truth, room, noise and the person.
+            person: how instructions are followed.
+
+        Raises:
+            ProfileError: the rig has no camera with frames, or its LiDAR is not known.
+        """
+        self._rig = rig
+        self._seed = seed
+        self._person = person or Person()
+        framed = [
+            name
+            for name, each in rig.cameras.items()
+            if any(c.kind == "frames" for c in each.channels.values())
+        ]
+        if not framed:
+            raise ProfileError(
+                f"rig {rig.name!r} has no camera with frames; events are not simulated in real time",
+                "Simulate a recording instead: lce-rig simulate --recording FOLDER.",
+            )
+        self._by_sensor = {name: SimulatedSource(name) for name in [*framed, *rig.lidars]}
+        self._views = {name: _view(rig, name) for name in framed}
+        self._sent_s = -1e9
+        self._last: tuple[int, bytes] | None = None
+        self._changed_s = 0.0
+
+    @property
+    def sources(self) -> list[LiveSource]:
+        """The sensors."""
+        return list(self._by_sensor.values())
+
+    def __enter__(self) -> "SimulatedRig":
+        """Start the simulation and wait until it runs.
+
+        Raises:
+            SourceError: it does not.
+        """
+        # A forked process would share locks of this one's threads.
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        arguments = theirs, self._rig, self._seed, self._person, dict(self._views)
+        self._process = context.Process(target=_simulate, args=arguments, name="simulated rig", daemon=True)
+        self._process.start()
+        theirs.close()
+        try:
+            if not self._connection.poll(START_S):
+                raise SourceError("the simulated rig does not start", "Is the computer very busy?")
+            answer = self._connection.recv()
+        except (EOFError, OSError):
+            answer = SourceError("the simulated rig ended at once")
+        if isinstance(answer, LceRigError):
+            self._process.join()
+            raise answer
+        self._reader = threading.Thread(target=self._read, name="read simulated rig", daemon=True)
+        self._reader.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop the simulation."""
+        self._process.terminate()
+        self._process.join()
+        self._reader.join()
+        self._connection.close()
+
+    def watch(self, state: LiveState) -> None:
+        """Let the person see a state of the collection: where the board is wanted, and what was captured."""
+        drawing = state.drawing
+        if drawing is None or drawing.wanted is None or state.phase in ("holding", "saving", "enough"):
+            return
+        wanted, now_s = (state.n_captures, drawing.wanted.tobytes()), time.monotonic()
+        if wanted != self._last:
+            self._last, self._changed_s = wanted, now_s
+            self._sent_s = -1e9
+        is_noticed = now_s - self._changed_s > REACTION_S
+        if is_noticed and now_s - self._sent_s > AGAIN_S:
+            self._sent_s = now_s
+            try:
+                self._connection.send((drawing.camera.partition(".")[0], drawing.wanted))
+            except OSError:
+                return  # The reader tells.
+
+    def _read(self) -> None:
+        while True:
+            try:
+                sample: Image | Scan = self._connection.recv()
+            except (EOFError, OSError):
+                for source in self._by_sensor.values():
+                    source.fail(SourceError("the simulated rig has ended", "Start again."))
+                return
+            self._by_sensor[sample.sensor].put(sample)
+
+
+def _view(rig: Rig, camera: str) -> View:
+    """Look through a camera as the drawing has it: people do not know the true extrinsic."""
+    lidar = next(iter(rig.lidars))
+    nominal = rig.nominal(camera, lidar)
+    if nominal is None:
+        raise ProfileError(
+            f"rig {rig.name!r} has no nominal extrinsic of {camera} and {lidar}, which its simulation needs",
+            "Add it under nominal_extrinsics.",
+        )
+    return View.upright(model_sensors(rig, camera, lidar), nominal.to_matrix())
+
+
+def _simulate(connection: Connection, rig: Rig, seed: int, person: Person, views: Mapping[str, View]) -> None:
+    """Run the simulation until the other end is gone."""
+    try:
+        scene = LiveScene(rig, seed, SimulationOptions.for_rig(rig.name))
+        camera = next(iter(views))
+        scene.hold(scene.stage.T_world_sensor[camera] @ build_pose(views[camera], _START))
+    except LceRigError as error:
+        connection.send(error)
+        return
+    connection.send("running")
+    walker = _Walker(scene, person, views)
+    period_ns = max(model.period_ns for model in scene.stage.models.values())
+    due_ns = time.time_ns()
+    try:
+        while True:
+            while connection.poll():
+                walker.hear(*connection.recv())
+            walker.walk(time.monotonic())
+            due_ns = max(due_ns + period_ns, time.time_ns() - period_ns)
+            for sample in scene.take(due_ns - period_ns):
+                connection.send(sample)
+            time.sleep(max(0.0, (due_ns - time.time_ns()) * 1e-9))
+    except (EOFError, OSError, KeyboardInterrupt):
+        return
+
+
+class _Walker:
+    """Carries the board to where it is wanted, as far as the room lets it."""
+
+    def __init__(self, scene: LiveScene, person: Person, views: Mapping[str, View]) -> None:
+        self._scene = scene
+        self._person = person
+        self._views = views
+        self._rng = scene.stage.rng(_PERSON_STREAM)
+        self._way: tuple[Array, Array, float, float] | None = None
+
+    def hear(self, camera: str, wanted: Array) -> None:
+        """Set out for a placement T_cam_board (4, 4)."""
+        view, T_world_cam = self._views[camera], self._scene.stage.T_world_sensor[camera]
+        present = np.linalg.inv(T_world_cam) @ self._scene.T_world_board
+        for _ in range(_TRIES):
+            reached = T_world_cam @ self._person.follow(view, present, wanted, self._rng)
+            if self._scene.can_be_held(camera, reached):
+                way_m = float(np.linalg.norm(reached[:3, 3] - self._scene.T_world_board[:3, 3]))
+                now_s = time.monotonic()
+                self._way = self._scene.T_world_board, reached, now_s, now_s + max(way_m / WALK_MPS, 0.5)
+                return
+
+    def walk(self, now_s: float) -> None:
+        """Go on."""
+        if self._way is None:
+            return
+        start, end, from_s, until_s = self._way
+        share = min((now_s - from_s) / (until_s - from_s), 1.0)
+        if share >= 1:
+            self._scene.hold(end)
+            self._way = None
+        else:
+            self._scene.pass_by(start, end, share)
