@@ -23,7 +23,7 @@ _STYLES: dict[Phase, str] = {
     "ended": "white on grey30",
 }
 _BELLS = {"captured": 1, "refused": 2, "enough": 3, "lost": 3, "tick": 0}
-_LOG_LINES, _NOTE_LINES, _DRAWING_SIZE = 3, 2, (34, 6)
+_LOG_LINES, _NOTE_LINES, _DRAWING_SIZE = 3, 2, (40, 9)
 _PLAIN_EVERY_S = 3.0
 _BARS = ("left_right", "up_down", "near_far", "tilt", "roll")
 
@@ -157,7 +157,7 @@ def _stream_table(streams: tuple[StreamState, ...]) -> Any:
 
 
 def _progress(state: LiveState) -> Any:
-    """Show coverage as bars, and the predicted sigmas against their targets."""
+    """Show coverage as bars, and the predicted standard deviations against their targets."""
     from rich.text import Text
 
     lines = Text()
@@ -168,15 +168,19 @@ def _progress(state: LiveState) -> Any:
         lines.append(f"{name.replace('_', '-'):<11}")
         lines.append("█" * filled, style=style)
         lines.append("░" * (14 - filled) + f" {100 * share:3.0f} %\n", style="dim")
-    lines.append("predicted  ")
-    for sigma, target, unit in (
-        (state.sigma_deg, state.target_deg, "deg"),
-        (state.sigma_mm, state.target_mm, "mm"),
+    for name, sigma, target, unit in (
+        ("rotation", state.sigma_deg, state.target_deg, "deg"),
+        ("position", state.sigma_mm, state.target_mm, "mm"),
     ):
-        shown = "-" if not np.isfinite(sigma) else f"{sigma:.2g}"
-        style = "green" if np.isfinite(sigma) and sigma <= target else "yellow"
-        lines.append(f"{shown}", style=style)
-        lines.append(f" of {target:g} {unit}  ")
+        is_known = np.isfinite(sigma)
+        shown = f"{sigma:.2g}" if sigma < 10 else f"{sigma:.0f}"
+        lines.append(f"{name:<11}")
+        lines.append(
+            f"+-{shown} {unit}" if is_known else "-",
+            style="green" if is_known and sigma <= target else "yellow",
+        )
+        lines.append(f" (target {target:g})\n")
+    lines.rstrip()
     return lines
 
 

@@ -129,6 +129,8 @@ class RigClock:
 
     def verdict(self) -> SyncVerdict:
         """Judge whether boards must stand still while they are captured."""
+        if self._board is None:
+            return SyncVerdict(True, ("no sync board ties the cameras' clocks to the LiDAR's",))
         return judge_sync(self._rig, self.common)
 
     def _take_pulse(self, source: str, pulse: Pulse) -> list[Sample]:
