@@ -4,6 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from lce_rig.calibrate.algorithm_1 import calibrate_by_algorithm_1
+from lce_rig.calibrate.baselines.corners import calibrate_by_corners
+from lce_rig.calibrate.baselines.zhou2018 import calibrate_by_lines_and_planes
 from lce_rig.calibrate.consensus import Consensus, find_consensus
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates, Method
@@ -17,6 +19,8 @@ METHODS: Mapping[
     Method, Callable[[Sequence[Observation], Board, CalibrateOptions, Progress | None], CalibrationEstimate]
 ] = {
     "paper": calibrate_by_algorithm_1,
+    "zhou": calibrate_by_lines_and_planes,
+    "corners": calibrate_by_corners,
 }
 """Name -> what estimates T_cam_lidar from boards whose pairing is settled."""
 

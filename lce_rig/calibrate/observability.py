@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.calibrate.problem import Problem, Weights
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.geometry import Array, skew
-from lce_rig.solvers.registration import vec_rotation, with_one
+from lce_rig.core.geometry import Array
+from lce_rig.solvers.registration import tangent_basis, vec_rotation, with_one
 
 # One capture's board plane, camera against LiDAR, is good to about this much.
 PLANE_SIGMA_M = 0.005
@@ -36,14 +36,7 @@ def linearise(
     w = Weights(w.plane, w.edge, None if w.shift_prior is None else 0.0)
     n = problem.n_captures
     M = problem.moments(np.eye(n), np.repeat(edge_ids[None], n, axis=0), w)
-    k = problem.n_shift
-    J = np.zeros((problem.size, 6 + k))
-    R = x[:9].reshape(3, 3).T
-    # R = exp(phi^) R0: vec R moves by vec(e_k^ R0).
-    J[:9, 3:6] = vec_rotation(skew(np.eye(3)) @ R).T
-    J[9:12, :3] = np.eye(3)
-    if k:
-        J[12, 6] = 1
+    J = tangent_basis(x[:9].reshape(3, 3).T, problem.n_shift)
     return (M @ x) @ J, J.T @ M @ J
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from lce_rig.core.results import ImageBoard, LidarBoard
 
-Method = Literal["paper"]
+Method = Literal["paper", "zhou", "corners"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,8 @@ class CalibrateOptions:
     """Switches of the algorithm; the defaults are the recommended set.
 
     Attributes:
-        method: how the extrinsic is found: "paper" (Algorithm 1 of LCE-Calib).
+        method: how the extrinsic is found: "paper" (Algorithm 1 of LCE-Calib), "zhou" (lines and planes of
+            Zhou, Li, Kaess, 2018) or "corners" (corner to corner); what follows matters to the first alone.
         n_draws: I, subsets drawn for each subset size.
         n_rounds: rounds of re-association in each draw.
         seed: of the draws.

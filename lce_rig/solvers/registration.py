@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.geometry import Array, exp_so3, project_to_so3
+from lce_rig.core.geometry import Array, exp_so3, project_to_so3, skew
 
 N_ROTATION = 9
 
@@ -65,6 +65,24 @@ def vec_rotation(R: Array) -> Array:
 def with_one(vectors: Array) -> Array:
     """Append the constant 1 to vectors (..., m)."""
     return np.concatenate([vectors, np.ones((*vectors.shape[:-1], 1))], axis=-1)
+
+
+def tangent_basis(R: Array, n_linear: int) -> Array:
+    """Differentiate x = [vec R; t; s; 1] by the tangent (translation, rotation, s), R = exp(phi^) R0.
+
+    Args:
+        R: (3, 3).
+        n_linear: length of s.
+
+    Returns:
+        (13 + k, 6 + k).
+    """
+    J = np.zeros((13 + n_linear, 6 + n_linear))
+    # vec R moves by vec(e_k^ R0).
+    J[:N_ROTATION, 3:6] = vec_rotation(skew(np.eye(3)) @ R).T
+    J[N_ROTATION:12, :3] = np.eye(3)
+    J[12 : 12 + n_linear, 6:] = np.eye(n_linear)
+    return J
 
 
 def eliminate_linear(M: Array, relative_floor: float = 1e-12) -> tuple[Array, Array]:
