@@ -1,0 +1,90 @@
+// The line to the rig: updates in the order they were sent, each answered once it is on the screen.
+
+const RETRY_MS = [300, 600, 1000, 2000];
+const DEAD_MS = 3500; // the rig sends something every second
+
+/**
+ * Keep a connection open for good.
+ *
+ * @param {(state: object, picture: Blob|null) => Promise<void>} onState shows an update
+ * @param {(isOpen: boolean, isRefused: boolean) => void} onLine is told when the line opens and when it is lost
+ * @param {(ageS: number|null) => void} onBeat is told that nothing is new, and for how long
+ */
+export function connect(onState, onLine, onBeat) {
+  let tries = 0;
+  let socket = null;
+  let lastHeard = 0;
+  let lastShown = 0;
+
+  function answer() {
+    if (socket !== null && socket.readyState === WebSocket.OPEN) {
+      socket.send(JSON.stringify({ shown: lastShown, visible: !document.hidden }));
+    }
+  }
+
+  function open() {
+    const line = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live`);
+    line.binaryType = "blob";
+    socket = line;
+    lastHeard = performance.now();
+    lastShown = 0;
+    let waiting = null;
+    let shown = Promise.resolve();
+
+    function show(state, picture) {
+      shown = shown.then(() => onState(state, picture)).catch((error) => console.error(error)).then(() => {
+        if (socket !== line) return;
+        lastShown = state.update;
+        answer();
+      });
+    }
+    line.onopen = () => {
+      tries = 0;
+      if (document.hidden) answer();
+      onLine(true, false);
+    };
+    line.onmessage = ({ data }) => {
+      lastHeard = performance.now();
+      if (typeof data !== "string") {
+        show(waiting, data);
+        return;
+      }
+      const message = JSON.parse(data);
+      if (message.beat) onBeat(message.age_s);
+      else if (message.drawing !== null && message.drawing.has_picture) waiting = message;
+      else show(message, null);
+    };
+    line.onclose = () => socket === line && lost();
+  }
+
+  async function lost() {
+    socket = null;
+    onLine(false, false);
+    const wait = RETRY_MS[Math.min(tries, RETRY_MS.length - 1)];
+    tries += 1;
+    await new Promise((done) => setTimeout(done, wait));
+    if (tries > 2 && (await isRefused())) onLine(false, true);
+    open();
+  }
+
+  // A line that was cut without a goodbye stays silent; closing it would wait for the other end.
+  setInterval(() => {
+    if (socket !== null && performance.now() - lastHeard > DEAD_MS) {
+      const line = socket;
+      line.onclose = line.onmessage = line.onopen = null;
+      line.close();
+      lost();
+    }
+  }, 500);
+  document.addEventListener("visibilitychange", answer);
+  open();
+}
+
+// A new collection has a new token: this page's link is then no good any more.
+async function isRefused() {
+  try {
+    return (await fetch("icon.svg", { cache: "no-store" })).status === 403;
+  } catch {
+    return false;
+  }
+}

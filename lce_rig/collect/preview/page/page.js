@@ -1,0 +1,105 @@
+// Ties the line to the rig to what is on the screen.
+
+import { connect } from "./connection.js";
+import { fitHeadline, showPanels } from "./panels.js";
+import { play, playCues, setSound, setSpeech, speak } from "./sounds.js";
+import { setMirrored, showDrawing, showHold } from "./stage.js";
+
+const STALE_S = 3;
+const byId = (id) => document.getElementById(id);
+
+let phase = "starting";
+let isAfterGap = false;
+let wasOpen = false;
+
+connect(
+  async (state, picture) => {
+    phase = state.phase;
+    setBanner("");
+    await showDrawing(state.drawing, picture);
+    showPanels(state);
+    showHold(state.hold_s);
+    playCues(state.cues, isAfterGap);
+    speak(state.headline, state.phase);
+    isAfterGap = false;
+    document.title = `${state.n_captures} · ${state.headline}`;
+  },
+  (isOpen, isRefused) => {
+    document.body.dataset.connection = isOpen ? "open" : "lost";
+    if (isOpen) {
+      wasOpen = true;
+      setBanner("");
+      return;
+    }
+    isAfterGap = true;
+    showHold(null);
+    if (isRefused) setBanner("This link is no longer valid. Open the one that the rig shows now.");
+    else if (phase === "ended") setBanner("The collection has ended.");
+    else setBanner("Connection to the rig lost. Trying again …");
+    if (wasOpen && phase !== "ended") play("lost");
+    wasOpen = false;
+  },
+  (ageS) => {
+    if (ageS !== null && ageS > STALE_S && phase !== "ended") {
+      setBanner(`No news from the rig for ${Math.round(ageS)} s`);
+    }
+  },
+);
+
+function setBanner(text) {
+  byId("banner").hidden = text === "";
+  if (byId("banner").textContent !== text) byId("banner").textContent = text;
+}
+
+// What is chosen once stays chosen; sounds need a tap each time.
+function toggle(id, isOn, choose) {
+  const button = byId(id);
+  const set = (on) => {
+    button.setAttribute("aria-pressed", String(on));
+    choose(on);
+  };
+  button.setAttribute("aria-pressed", String(isOn));
+  button.addEventListener("click", () => set(button.getAttribute("aria-pressed") !== "true"));
+  return set;
+}
+
+toggle("sound", false, setSound);
+
+if ("speechSynthesis" in window) {
+  toggle("speech", false, setSpeech);
+  const offer = () => (byId("speech").hidden = speechSynthesis.getVoices().length === 0);
+  speechSynthesis.addEventListener("voiceschanged", offer);
+  offer();
+}
+
+toggle("mirror", localStorage.getItem("mirror") !== "no", (on) => {
+  localStorage.setItem("mirror", on ? "yes" : "no");
+  setMirrored(on);
+});
+setMirrored(localStorage.getItem("mirror") !== "no");
+
+if (document.fullscreenEnabled) {
+  const button = byId("fullscreen");
+  button.hidden = false;
+  button.addEventListener("click", () => {
+    if (document.fullscreenElement === null) document.documentElement.requestFullscreen();
+    else document.exitFullscreen();
+  });
+  document.addEventListener("fullscreenchange", () =>
+    button.setAttribute("aria-pressed", String(document.fullscreenElement !== null)),
+  );
+}
+
+// Browsers let only pages from this computer, or encrypted ones, keep the screen on.
+async function keepScreenOn() {
+  if (document.hidden || !("wakeLock" in navigator)) return;
+  try {
+    await navigator.wakeLock.request("screen");
+  } catch {
+    // The battery is low, or the system says no: the screen follows the phone's own setting.
+  }
+}
+document.addEventListener("visibilitychange", keepScreenOn);
+keepScreenOn();
+
+new ResizeObserver(fitHeadline).observe(byId("headline"));

@@ -1,0 +1,96 @@
+"""A viewer without a browser: HTTP and a WebSocket by hand, one call at a time."""
+
+import asyncio
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import aiohttp
+
+
+class Watcher:
+    """One client with its own cookies; closed at the end of its `with` block."""
+
+    def __init__(self, url: str) -> None:
+        self.url, _, query = url.partition("?")
+        self.token = query.removeprefix("token=")
+        self._loop = asyncio.new_event_loop()
+        self._http = self._run(_client())
+        self.socket: Any = None
+
+    def get(
+        self, path: str = "", headers: Mapping[str, str] | None = None
+    ) -> tuple[int, Mapping[str, str], bytes]:
+        """Give status, headers and content."""
+
+        async def ask() -> tuple[int, Mapping[str, str], bytes]:
+            async with self._http.get(self.url + path, headers=headers) as answer:
+                return answer.status, answer.headers, await answer.read()
+
+        return self._run(ask())
+
+    def watch(self, query: str = "", headers: Mapping[str, str] | None = None) -> None:
+        """Open the connection that feeds the page.
+
+        Raises:
+            aiohttp.WSServerHandshakeError: it is refused.
+        """
+        self.socket = self._run(
+            self._http.ws_connect(f"{self.url}live{query}", headers=headers, max_msg_size=0)
+        )
+
+    def receive(self, timeout_s: float = 5.0) -> Any:
+        """Give the next message: a document, bytes, or the number with which the connection was closed."""
+        message = self._run(self.socket.receive(timeout_s))
+        if message.type is aiohttp.WSMsgType.TEXT:
+            return json.loads(message.data)
+        if message.type is aiohttp.WSMsgType.BINARY:
+            return message.data
+        return message.data if message.type is aiohttp.WSMsgType.CLOSE else self.socket.close_code
+
+    def receive_all(self, quiet_s: float) -> list[Any]:
+        """Give what comes until nothing has come for so long, without beats."""
+        found: list[Any] = []
+        while True:
+            try:
+                message = self.receive(quiet_s)
+            except asyncio.TimeoutError:
+                return found
+            if isinstance(message, int):
+                return found
+            if not (isinstance(message, dict) and message.get("beat")):
+                found.append(message)
+
+    def next_state(self, visible: bool = True) -> tuple[dict[str, Any], bytes | None]:
+        """Give the next state and its picture, and answer that it is on the screen."""
+        while (state := self.receive()).get("beat"):
+            pass
+        has_picture = state["drawing"] is not None and state["drawing"]["has_picture"]
+        jpeg = self.receive() if has_picture else None
+        self.answer(state["update"], visible)
+        return state, jpeg
+
+    def answer(self, shown: int, visible: bool = True) -> None:
+        self.send(json.dumps({"shown": shown, "visible": visible}))
+
+    def send(self, text: str) -> None:
+        self._run(self.socket.send_str(text))
+
+    def __enter__(self) -> "Watcher":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.socket is not None:
+            self._run(self.socket.close())
+        self._run(self._http.close())
+        self._loop.close()
+
+    def _run(self, work: Any) -> Any:
+        async def within() -> Any:
+            return await asyncio.wait_for(work, 10)
+
+        return self._loop.run_until_complete(within())
+
+
+async def _client() -> aiohttp.ClientSession:
+    return aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True))
