@@ -109,6 +109,8 @@ def collect(
 
         run_live(rig_name, session, LiveArguments(**live))
         return
+    from lce_rig.cli.simulate import require_kind
+
     _refuse_options(tuple(live), "belongs to live collection", "leave --from out, or this option")
     from lce_rig.collect import CollectOptions
     from lce_rig.collect import collect as fill
@@ -119,6 +121,7 @@ def collect(
     from lce_rig.sources.base import PairedRecording, SourceOptions
 
     rig = load_rig(rig_name)
+    require_kind(session, None)
     options = SourceOptions(camera, channel, lidar, pair, pair_tolerance, topics, is_part=len(paths) > 1)
     recordings = [open_recording(path, rig, options) for path in paths]
     with Session.resume(session, rig) as writer, show.progress_bar("collecting") as progress:

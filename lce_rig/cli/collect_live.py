@@ -11,6 +11,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.keys import Controls, controls
+from lce_rig.cli.simulate import TRUTH, require_kind, write_truth
 
 if TYPE_CHECKING:
     from lce_rig.collect.live.collection import LiveReport
@@ -58,13 +59,14 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
     if given.seed is not None and not given.simulated:
         raise UsageError("--seed belongs to --simulated", "leave it out")
     rig = load_rig(rig_name)
+    require_kind(path, (given.seed or 0) if given.simulated else None)
     hold_s = HOLD_S if given.hold is None else given.hold
     options = LiveOptions(given.frames, given.timeout, hold_s, goes_on=given.keep_going)
     with ExitStack() as stack:
         session = stack.enter_context(Session.resume(path, rig))
         n_before = len(session.captures)
         recorder = stack.enter_context(_recorder(given, rig))
-        sources, listeners = _open_rig(stack, rig, given)
+        sources, listeners = _open_rig(stack, rig, path, given)
         listeners += _open_preview(stack, given)
         asked = stack.enter_context(controls())
         with open_view(is_plain=given.plain, has_keys=asked.is_interactive) as view:
@@ -84,17 +86,20 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
 
 
 def _open_rig(
-    stack: ExitStack, rig: "Rig", given: LiveArguments
+    stack: ExitStack, rig: "Rig", path: Path, given: LiveArguments
 ) -> "tuple[list[LiveSource], list[Callable[[LiveState], None]]]":
-    """Build the sources: attached ones, or simulated ones with whoever follows the guidance."""
+    """Build the sources: attached ones, or simulated ones, whose truth goes into the session's folder."""
     if not given.simulated:
         from lce_rig.sources.live.opening import open_live
 
         return open_live(rig, given.record), []
     from lce_rig.collect.live.simulated import SimulatedRig
+    from lce_rig.simulate import SimulationOptions, rig_truth
 
+    seed = given.seed or 0
     show.note("starting the simulated rig ...")
-    simulated = stack.enter_context(SimulatedRig(rig, given.seed or 0))
+    simulated = stack.enter_context(SimulatedRig(rig, seed))
+    write_truth(path / TRUTH, rig_truth(rig, seed, SimulationOptions.for_rig(rig.name)))
     return simulated.sources, [simulated.watch]
 
 
@@ -106,7 +111,8 @@ def _open_preview(stack: ExitStack, given: LiveArguments) -> "list[Callable[[Liv
 
     host, port = parse_address(given.preview)
     preview = stack.enter_context(Preview(host, port))
-    show.note(f"preview: {preview.url}")
+    for url in preview.urls:
+        show.note(f"preview: {url}")
     return [preview.publish]
 
 

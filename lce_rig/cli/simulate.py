@@ -187,9 +187,9 @@ def _simulate_session(
                 progress(done, n_captures)
         except BaseException:
             with suppress(OSError):
-                _write_truth(path / TRUTH, truth)
+                write_truth(path / TRUTH, truth)
             raise
-        _write_truth(path / TRUTH, truth)
+        write_truth(path / TRUTH, truth)
     show.note(f"{path}: {n_captures} simulated captures of rig {rig.name}; truth in {path / TRUTH}")
 
 
@@ -202,7 +202,7 @@ def _simulate_recording(
 
     recording = simulate_recording(rig, duration_s=duration_s, seed=seed, options=options)
     with FolderRecorder(folder, rig, ros) as recorder, show.progress_bar("simulating, s") as progress:
-        _write_truth(folder / TRUTH, rig_truth(rig, seed, options) | recording_truth(recording))
+        write_truth(folder / TRUTH, rig_truth(rig, seed, options) | recording_truth(recording))
         for sample in recording:
             recorder.write(sample)
             progress(max(0, stamp_of(sample) - recording.start_ns) // 10**9, round(duration_s))
@@ -211,7 +211,35 @@ def _simulate_recording(
     show.note(f"next: lce-rig collect --rig {rig.name} --from {recorder.bag}")
 
 
-def _write_truth(path: Path, document: dict[str, Any]) -> None:
+def require_kind(session: Path, seed: int | None) -> None:
+    """Refuse to mix simulated captures with real ones, or with those of another simulation.
+
+    Args:
+        session: where captures are to be added; may not be there yet.
+        seed: of the simulation that they come from; None for real ones.
+
+    Raises:
+        SessionError: the session holds captures of another kind.
+    """
+    from lce_rig.core.errors import SessionError
+
+    truth = session / TRUTH
+    hint = "Collect into another folder."
+    if not truth.exists():
+        if seed is not None and any((session / "captures").glob("[0-9]*")):
+            raise SessionError(f"{session} holds captures of real sensors", hint)
+        return
+    if seed is None:
+        raise SessionError(f"{session} is a simulated session ({TRUTH} is in it)", hint)
+    try:
+        held = json.loads(truth.read_text(encoding="utf-8")).get("seed")
+    except (ValueError, AttributeError) as error:
+        raise SessionError(f"{truth} is damaged", hint) from error
+    if held != seed:
+        raise SessionError(f"{session} was simulated with seed {held}, not {seed}", f"Add --seed {held}.")
+
+
+def write_truth(path: Path, document: dict[str, Any]) -> None:
     """Write indented JSON with each innermost list, such as a row of a matrix, on a line of its own."""
     text = json.dumps(document, indent=1)
     text = re.sub(r"\[([^\[\]{}\"]+)\]", lambda found: f"[{' '.join(found[1].split())}]", text)

@@ -148,7 +148,10 @@ class Keeper:
                 self._failure = failure
                 is_free = not self._tasks and not self._is_closing
             if failure is None and is_free:
-                self._teach()
+                try:
+                    self._teach()
+                except Exception as error:  # Captures must be written, whatever a calibration trips over.
+                    self._session.journal("calibration failed", error=repr(error))
 
     def _store(self, task: Task) -> LceRigError | None:
         sighting = task.moment.sighting

@@ -33,7 +33,7 @@ AGAIN_S = 7.0
 _TRIES = 8
 _START = HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0)
 _PERSON_STREAM = 101
-_WAIT_S = 0.2
+_WAIT_S, _N_SLOTS = 0.2, 32
 
 
 class SimulatedSource:
@@ -41,10 +41,19 @@ class SimulatedSource:
 
     def __init__(self, sensor: str) -> None:
         self.sensor = sensor
-        self._mailbox: Mailbox[Image | Scan] = Mailbox(32)
+        self._mailbox: Mailbox[Image | Scan] = Mailbox(_N_SLOTS)
+        self._failure: SourceError | None = None
         self._rate = RateMeter()
 
     def __enter__(self) -> "SimulatedSource":
+        """Begin to take samples.
+
+        Raises:
+            SourceError: the simulation has ended.
+        """
+        if self._failure is not None:
+            raise self._failure
+        self._mailbox = Mailbox(_N_SLOTS)
         return self
 
     def __exit__(
@@ -54,11 +63,12 @@ class SimulatedSource:
 
     def samples(self) -> Iterator[Image | Scan]:
         """Yield samples as they come, until the source is closed."""
-        while not self._mailbox.is_ended:
-            sample = self._mailbox.take(_WAIT_S)
+        mailbox = self._mailbox
+        while not mailbox.is_ended:
+            sample = mailbox.take(_WAIT_S)
             if sample is not None:
                 yield sample
-        self._mailbox.take(0)
+        mailbox.take(0)
 
     def status(self) -> SourceStatus:
         """Say how the sensor does."""
@@ -74,6 +84,7 @@ class SimulatedSource:
 
     def fail(self, error: SourceError) -> None:
         """End for good."""
+        self._failure = error
         self._mailbox.close(error)
 
 

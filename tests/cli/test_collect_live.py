@@ -1,0 +1,109 @@
+"""`lce-rig collect` without --from: its options, its errors, and a simulated rig from end to end."""
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig.rig import load_rig
+from lce_rig.session import Session
+from lce_rig.simulate import truth_extrinsics
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--max-captures", "3"], "--max-captures"),
+        (["--pair", "order"], "--pair"),
+        (["--topic", "cam=/x"], "--topic"),
+        (["--from", "somewhere", "--frames", "3"], "--frames"),
+        (["--from", "somewhere", "--simulated"], "--simulated"),
+        (["--from", "somewhere", "--preview"], "--preview"),
+        (["--seed", "3"], "--seed"),
+    ],
+)
+def test_options_of_the_other_kind_are_refused_by_name(
+    lce_rig, tmp_path: Path, arguments: list[str], named: str
+) -> None:
+    result = lce_rig("collect", "--rig", "rles", tmp_path / "session", *arguments)
+    assert result.code == 2 and named in result.err
+    assert not (tmp_path / "session").exists()
+
+
+def test_a_rig_without_its_devices_says_what_to_check(lce_rig, tmp_path: Path) -> None:
+    result = lce_rig("collect", "--rig", "rlfs", tmp_path / "session", "--plain", "--timeout", "5")
+    assert result.code == 5
+    assert "lidar" in result.err and "doctor" in result.err
+
+
+def test_simulated_and_real_captures_are_not_mixed(lce_rig, tmp_path: Path) -> None:
+    path = tmp_path / "session"
+    path.mkdir()
+    (path / "truth.json").write_text(json.dumps({"seed": 3}))
+    result = lce_rig("collect", "--rig", "rles", path, "--plain", "--timeout", "5")
+    assert result.code == 4 and "simulated" in result.err
+    result = lce_rig(
+        "collect", "--rig", "rles", path, "--simulated", "--seed", "4", "--plain", "--timeout", "5"
+    )
+    assert result.code == 4 and "--seed 3" in result.err
+    (path / "truth.json").unlink()
+    (path / "captures/000000").mkdir(parents=True)
+    result = lce_rig("collect", "--rig", "rles", path, "--simulated", "--plain", "--timeout", "5")
+    assert result.code == 4 and "real" in result.err
+
+
+def start(path: Path, *arguments: str, **options: object) -> "subprocess.Popen[str]":
+    command = [
+        sys.executable,
+        "-m",
+        "lce_rig",
+        "collect",
+        "--rig",
+        "rles",
+        str(path),
+        "--simulated",
+        *arguments,
+    ]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)  # type: ignore[call-overload, no-any-return]
+
+
+def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(tmp_path: Path) -> None:
+    path = tmp_path / "session"
+    process = start(path, "--plain", "--frames", "2", "--timeout", "90", "--hold", "0.3")
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 0, said
+    session = Session.open(path)
+    assert len(session.captures) == 2
+    for capture in session.captures:
+        capture.check()
+    truth = json.loads((path / "truth.json").read_text())
+    expected = truth_extrinsics(load_rig("rles"), 0)["davis", "lidar"]
+    assert np.allclose(truth["T_cam_lidar"], expected)
+    assert "2 captures (2 new)" in said and "holding: hold still" in said
+
+
+def test_a_signal_ends_the_screen_and_leaves_the_terminal_as_it_was(tmp_path: Path) -> None:
+    ours, theirs = pty.openpty()
+    process = start(tmp_path / "session", stdin=theirs)
+    os.close(theirs)
+    assert process.stderr is not None
+    try:
+        deadline_s = time.monotonic() + 60
+        while not (tmp_path / "session/truth.json").exists():
+            assert time.monotonic() < deadline_s and process.poll() is None
+            time.sleep(0.1)
+        time.sleep(2.0)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=30)
+    finally:
+        process.kill()
+        os.close(ours)
+    assert process.returncode == 130, said
+    assert "captures (" in said and "Traceback" not in said

@@ -1,0 +1,141 @@
+"""A live collection in a terminal of 80x24, and in plain lines."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from lce_rig.cli.braille import draw_outlines
+from lce_rig.cli.live_view import PlainView, ScreenView, render
+from lce_rig.collect.guidance import Coverage
+from lce_rig.collect.live.state import Cue, Drawing, LiveState, StreamState
+
+SQUARE = np.array([[300.0, 200.0], [700, 240], [660, 500], [280, 470], [300, 200]])
+STREAMS = (
+    StreamState("davis.frames", 24.9, 0, True, "", "2.1 m, 0.12 px"),
+    StreamState("davis.events", 1.2e6),
+    StreamState("lidar", 10.0, 3, False, "2 rings on the board: come 0.8 m closer"),
+    StreamState("sync", 12.0),
+)
+STATE = LiveState(
+    rig="rles",
+    session="/home/somebody/with/a/long/path/to/a/session-of-today",
+    elapsed_s=75.2,
+    phase="holding",
+    headline="hold still",
+    detail="",
+    hold_s=1.24,
+    n_captures=7,
+    n_wanted=15,
+    streams=STREAMS,
+    drawing=Drawing("davis.frames", np.zeros((720, 1280), np.uint8), SQUARE, 0.8 * SQUARE + [500, 100]),
+    coverage=Coverage(0.3, 0.5, 1.0, 0.25, 0.0),
+    sigma_deg=0.12,
+    sigma_mm=8.3,
+    target_deg=0.2,
+    target_mm=10.0,
+    cues=(Cue(1, "captured"), Cue(2, "refused")),
+    log=("01:02 captured 000006 (0.12 s)", "01:04 not captured: " + 20 * "it stands there already "),
+    notes=("boards must stand still: " + 20 * "no clock is tied ", "second", "third"),
+)
+
+
+def drawn(state: LiveState) -> list[str]:
+    console = Console(width=80, height=24, file=io.StringIO(), force_terminal=False)
+    console.print(render(state))
+    out = console.file
+    assert isinstance(out, io.StringIO)
+    return out.getvalue().rstrip("\n").split("\n")
+
+
+def test_everything_fits_into_80_by_24() -> None:
+    lines = drawn(STATE)
+    assert len(lines) <= 24
+    assert max(len(line) for line in lines) <= 80
+    text = "\n".join(lines)
+    for wanted in ("HOLD STILL", "1.2 s", "7 of 15", "come 0.8 m closer", "3 lost", "1.20M/s", "+-0.12 deg"):
+        assert wanted in text
+    assert "captured 000006" in text and "boards must stand still" in text and "q stop" in text
+
+
+def test_a_state_without_pictures_guidance_or_figures_is_shown_all_the_same() -> None:
+    bare = replace(
+        STATE, drawing=None, coverage=None, sigma_deg=np.nan, sigma_mm=np.nan, hold_s=None, streams=()
+    )
+    text = "\n".join(drawn(bare))
+    assert "rotation   -" in text and "HOLD STILL" in text
+
+
+@pytest.mark.parametrize(
+    "phase", ["starting", "searching", "moving", "saving", "refused", "enough", "lost", "ended"]
+)
+def test_every_phase_has_a_look(phase: str) -> None:
+    assert drawn(replace(STATE, phase=phase))  # type: ignore[arg-type]
+
+
+def test_the_bell_rings_once_for_each_cue() -> None:
+    class Bells:
+        n = 0
+
+        def bell(self) -> None:
+            self.n += 1
+
+    class Screen:
+        def update(self, _what: object, *, refresh: bool) -> None:
+            assert refresh
+
+    bells = Bells()
+    view = ScreenView(Screen(), bells, has_keys=False)
+    view.show(STATE)
+    assert bells.n == 1 + 2
+    view.show(STATE)
+    assert bells.n == 3
+    view.show(replace(STATE, cues=(*STATE.cues, Cue(3, "tick"), Cue(4, "enough"))))
+    assert bells.n == 6
+
+
+def test_plain_lines_say_what_changes_once(capsys: pytest.CaptureFixture[str]) -> None:
+    view = PlainView()
+    moving = replace(
+        STATE, phase="moving", headline="one step left", hold_s=None, cues=(), log=(), notes=("a note",)
+    )
+    view.show(moving)
+    view.show(replace(moving, elapsed_s=75.4, headline="30 cm left"))
+    view.show(replace(moving, elapsed_s=79.0, headline="20 cm left", detail="2 rings"))
+    view.show(
+        replace(
+            moving,
+            elapsed_s=79.1,
+            headline="20 cm left",
+            cues=(Cue(1, "captured"),),
+            log=("01:19 captured 000001",),
+        )
+    )
+    view.show(replace(moving, elapsed_s=79.2, phase="ended", headline="over"))
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.splitlines() == [
+        "note: a note",
+        "01:15 moving: one step left",
+        "01:19 moving: 20 cm left (2 rings)",
+        "01:19 captured 000001",
+    ]
+
+
+def test_outlines_are_drawn_where_they_are() -> None:
+    square = np.array([[0.0, 0.0], [639, 0], [639, 359], [0, 359], [0, 0]])
+    lines = draw_outlines((1280, 720), square, None, (40, 9))
+    assert len(lines) == 9 and {len(line) for line in lines} == {len(lines[0])}
+    body = [line[1:-1] for line in lines[1:-1]]
+    filled = np.array([[character != chr(0x2800) for character in line] for line in body])
+    rows, columns = np.nonzero(filled)
+    # The left upper quarter, give or take a character.
+    assert rows.min() == columns.min() == 0
+    assert rows.max() <= filled.shape[0] // 2 and columns.max() <= filled.shape[1] // 2
+
+
+def test_outlines_that_leave_the_picture_or_the_lens_break_nothing() -> None:
+    beyond = np.array([[-500.0, 100.0], [np.nan, np.nan], [3000, 400], [100, 5000], [-500, 100]])
+    assert len(draw_outlines((346, 260), beyond, beyond, (40, 9))) == 9

@@ -1,0 +1,76 @@
+"""Simulated placements, shown to a live collection one after the other in real time."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+
+from lce_rig.collect.live.simulated import SimulatedSource
+from lce_rig.rig import Rig, load_rig
+from lce_rig.simulate import SimulatedCapture, simulate_captures
+
+PERIOD_NS = 100_000_000
+
+
+@cache
+def rig() -> Rig:
+    """Give the shipped event rig, whose small pictures are searched quickly."""
+    return load_rig("rles")
+
+
+@cache
+def placements(n: int = 4, seed: int = 5) -> tuple[SimulatedCapture, ...]:
+    """Simulate boards held still."""
+    return tuple(simulate_captures(rig(), n_captures=n, seed=seed))
+
+
+class Show:
+    """Shows captures to two sources, each for a while, stamped as if they were taken now.
+
+    Attributes:
+        sources: of the camera and the LiDAR.
+        stamps: of the scans that were sent, by placement.
+    """
+
+    def __init__(self, captures: Sequence[SimulatedCapture], each_s: float) -> None:
+        self.sources = [SimulatedSource("davis"), SimulatedSource("lidar")]
+        self.stamps: list[list[int]] = [[] for _ in captures]
+        self._captures = captures
+        self._each_s = each_s
+        self._stop = threading.Event()
+
+    @contextmanager
+    def running(self) -> Iterator["Show"]:
+        thread = threading.Thread(target=self._run, daemon=True)
+        thread.start()
+        try:
+            yield self
+        finally:
+            self._stop.set()
+            thread.join()
+
+    def _run(self) -> None:
+        began_s = due_s = time.monotonic()
+        while not self._stop.is_set():
+            k = int((due_s - began_s) / self._each_s) % len(self._captures)
+            self.send(k, time.time_ns() - PERIOD_NS)
+            due_s += 0.1
+            self._stop.wait(max(0.0, due_s - time.monotonic()))
+
+    def send(self, k: int, stamp_ns: int) -> None:
+        """Send a placement's picture and scan."""
+        capture = self._captures[k]
+        image = replace(capture.images[0], stamp_ns=stamp_ns + PERIOD_NS // 2, host_ns=stamp_ns + PERIOD_NS)
+        self.sources[0].put(image)
+        self.sources[1].put(replace(capture.scans[0], stamp_ns=stamp_ns, host_ns=stamp_ns + PERIOD_NS))
+        self.stamps[k].append(stamp_ns)
+
+
+def wait_for(is_so: Callable[[], bool], patience_s: float = 15.0) -> None:
+    """Wait until something is so."""
+    deadline_s = time.monotonic() + patience_s
+    while not is_so():
+        assert time.monotonic() < deadline_s, "it never came to be"
+        time.sleep(0.01)

@@ -1,0 +1,126 @@
+"""The live loop from end to end, on simulated placements that are shown in real time."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig.collect.live.collection import Key, LiveOptions, collect_live, make_guides
+from lce_rig.collect.live.state import LiveState
+from lce_rig.core.errors import SessionError, SourceError
+from lce_rig.session import Session
+from tests.collect.live.replay import Show, placements, rig
+
+QUICK = LiveOptions(n_wanted=3, timeout_s=40.0, hold_s=0.3)
+
+
+def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path: Path) -> None:
+    show, states = Show(placements(), each_s=2.0), list[LiveState]()
+    with show.running(), Session.create(tmp_path / "session", rig()) as session:
+        report = collect_live(session, show.sources, QUICK, states.append)
+        assert report.ending == "frames" and report.error is None
+        assert (
+            [capture.name for capture in session.captures]
+            == report.captured
+            == ["000000", "000001", "000002"]
+        )
+        for k, capture in enumerate(session.captures):
+            capture.check()
+            sent = placements()[k]
+            assert np.array_equal(capture.image("davis", "frames").pixels, sent.images[0].pixels)
+            assert np.array_equal(capture.scan("lidar").points, sent.scans[0].points)
+            assert capture.scan("lidar").stamp_ns in show.stamps[k]
+            (pair,) = capture.meta["pairs"]
+            assert abs(pair["difference_s"]) < 0.02 and pair["stream"] == "davis.frames"
+            assert capture.meta["still_boards_only"] is True
+            assert capture.meta["motion_m"] < rig().quality.max_motion_m
+    assert states[-1].phase == "ended" and states[-1].n_captures == 3
+    phases = {state.phase for state in states}
+    assert {"holding", "moving"} <= phases
+    held = [state.hold_s for state in states if state.phase == "holding"]
+    assert all(hold_s is not None and 0 <= hold_s <= 0.3 for hold_s in held)
+    sounds = [cue.sound for cue in {cue.number: cue for s in states for cue in s.cues}.values()]
+    assert sounds.count("captured") == 3
+    assert max(report.latencies_s) < 5.0
+
+
+def test_a_placement_that_was_captured_is_not_captured_twice(tmp_path: Path) -> None:
+    show, states = Show(placements()[:1], each_s=100.0), list[LiveState]()
+    options = replace(QUICK, timeout_s=6.0)
+    with show.running(), Session.create(tmp_path / "session", rig()) as session:
+        report = collect_live(session, show.sources, options, states.append)
+    assert report.ending == "timeout"
+    assert len(report.captured) == 1
+    assert states[-2].drawing is not None and states[-2].drawing.wanted_px is not None
+
+
+def test_a_session_is_continued_and_its_captures_count(tmp_path: Path) -> None:
+    path = tmp_path / "session"
+    show = Show(placements()[:2], each_s=2.0)
+    with show.running(), Session.create(path, rig()) as session:
+        collect_live(session, show.sources, replace(QUICK, n_wanted=2))
+    show = Show(placements(), each_s=2.0)
+    with show.running(), Session.resume(path, rig()) as session:
+        report = collect_live(session, show.sources, replace(QUICK, n_wanted=3))
+        assert report.captured == ["000002"]
+        pixels = session.captures[2].image("davis", "frames").pixels
+    assert any(np.array_equal(pixels, placements()[k].images[0].pixels) for k in (2, 3))
+
+
+def test_keys_capture_at_once_ask_for_another_place_and_stop(tmp_path: Path) -> None:
+    asked: list[Key | None] = [None] * 15 + ["next", "capture"] + [None] * 25 + ["stop"]
+    states: list[LiveState] = []
+    show = Show(placements()[:1], each_s=100.0)
+    with show.running(), Session.create(tmp_path / "session", rig()) as session:
+        options = LiveOptions(hold_s=20.0)
+        report = collect_live(
+            session, show.sources, options, states.append, lambda: asked.pop(0) if asked else "stop"
+        )
+        assert report.ending == "stopped"
+        assert [capture.meta.get("by_hand") for capture in session.captures] == [1.0]
+    wanted = [s.drawing.wanted for s in states if s.drawing is not None and s.drawing.wanted is not None]
+    assert len({each.tobytes() for each in wanted}) >= 2
+
+
+def test_a_sensor_that_is_gone_for_good_ends_the_collection_with_what_was_saved(tmp_path: Path) -> None:
+    states: list[LiveState] = []
+    show = Show(placements(), each_s=2.0)
+
+    def unplug(state: LiveState) -> None:
+        states.append(state)
+        if state.n_captures == 1:
+            show.sources[1].fail(SourceError("lidar: no packets for 2 s", "Check the cable."))
+
+    with show.running(), Session.create(tmp_path / "session", rig()) as session:
+        options = LiveOptions(hold_s=0.3, lost_s=1.0, timeout_s=30.0)
+        report = collect_live(session, show.sources, options, unplug)
+        assert report.ending == "lost" and report.error is not None
+        assert "no packets" in report.error.what
+        assert len(session.captures) >= 1
+    assert any(state.phase == "lost" and "lidar" in state.headline for state in states)
+    entries = [json.loads(line) for line in (tmp_path / "session/journal.jsonl").read_text().splitlines()]
+    assert entries[-1]["ending"] == "lost" and "no packets" in entries[-1]["error"]
+
+
+def test_a_session_that_cannot_be_written_ends_with_its_error_and_keeps_the_rest(tmp_path: Path) -> None:
+    show = Show(placements(), each_s=2.0)
+    path = tmp_path / "session"
+
+    def break_off(state: LiveState) -> None:
+        if state.n_captures == 1 and (path / "captures").is_dir():
+            (path / "captures").rename(path / "gone")
+
+    with (
+        show.running(),
+        Session.create(path, rig()) as session,
+        pytest.raises(SessionError, match="captures"),
+    ):
+        collect_live(session, show.sources, QUICK, break_off)
+    assert (path / "gone/000000/meta.json").exists()
+
+
+def test_every_camera_with_every_lidar_gets_a_guide() -> None:
+    (guide,) = make_guides(rig())
+    assert guide.key == ("davis", "frames") and guide.lidar == "lidar"

@@ -1,0 +1,82 @@
+"""When live boards are captured, by sightings that come one by one."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from lce_rig.collect.live.collection import make_guides
+from lce_rig.collect.live.gates import StillBoards
+from lce_rig.collect.pairing import Frame
+from lce_rig.collect.watching import Sighting
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.pipeline import detect_image, detect_scan
+from tests.collect.live.replay import PERIOD_NS, placements, rig
+
+HOLD_S = 0.6
+KEY = ("davis", "frames")
+
+
+@cache
+def boards(k: int = 0) -> tuple[ImageBoard, list[LidarBoard]]:
+    image, scan = detect_image(rig(), placements()[k].images[0]), detect_scan(rig(), placements()[k].scans[0])
+    assert isinstance(image, ImageBoard) and isinstance(scan, list)
+    return image, scan
+
+
+def sighting(step: int, shift_px: float = 0.0, k: int = 0) -> Sighting:
+    """Show a placement at a time, its corners shifted."""
+    image, scan = boards(k)
+    moved = replace(image, corners_px=image.corners_px + shift_px)
+    return Sighting(Frame(step * PERIOD_NS, (), ()), {KEY: moved}, {"lidar": scan})
+
+
+def present() -> Array:
+    return boards()[0].T_cam_board
+
+
+def test_a_board_is_captured_once_when_it_was_held_long_enough() -> None:
+    gate = StillBoards(rig(), HOLD_S)
+    taken = [step for step in range(40) if gate.take(sighting(step))]
+    # Half a second tells that it stands still, the hold comes after that.
+    assert taken == [12]
+
+
+def test_a_board_that_is_moved_on_before_its_time_is_not_captured() -> None:
+    gate = StillBoards(rig(), HOLD_S)
+    shifts = [0.0] * 9 + [30.0 * k for k in range(1, 6)] + [180.0] * 14
+    taken = [step for step, shift in enumerate(shifts) if gate.take(sighting(step, shift))]
+    assert taken == [14 + 12]
+
+
+def test_what_is_said_counts_the_hold_down_and_then_goes_on() -> None:
+    (guide,) = make_guides(rig())
+    guide.plan(None, 0.0)
+    gate = StillBoards(rig(), HOLD_S)
+    said = []
+    for step in range(20):
+        moments = gate.take(sighting(step))
+        if moments:
+            guide.add("000000", present())
+            guide.plan(None, 0.0)
+        said.append(gate.narrate(guide, present()))
+    assert [each.phase for each in said[:5]] == ["moving"] * 5
+    held = [each.hold_s for each in said if each.phase == "holding"]
+    assert held == sorted(held, reverse=True) and len(held) == 7
+    assert np.isclose(held[0], HOLD_S) and held[-1] < 0.1
+    # Captured, the board is wanted elsewhere, although it still stands.
+    assert {each.phase for each in said[13:]} == {"moving"}
+    assert all(each.headline not in ("", "hold still") for each in said[13:])
+
+
+def test_a_place_that_adds_nothing_is_refused_while_the_board_stands_there() -> None:
+    (guide,) = make_guides(rig())
+    guide.add("000007", present())
+    guide.plan(None, 0.0)
+    gate = StillBoards(rig(), HOLD_S)
+    for step in range(8):
+        gate.take(sighting(step))
+        said = gate.narrate(guide, present())
+    assert said.phase == "refused" and said.hold_s is None
+    assert "capture 000007" in said.detail

@@ -1,0 +1,89 @@
+"""Guidance over a session: what is wanted next, what adds nothing, what is learned on the way."""
+
+import numpy as np
+import pytest
+
+from lce_rig.collect.live.collection import make_guides
+from lce_rig.collect.live.guide import GIVE_UP_S, Guide, Learned
+from lce_rig.rig import Rig
+from tests.collect.live.replay import rig
+
+
+@pytest.fixture
+def guide() -> Guide:
+    (guide,) = make_guides(rig())
+    return guide
+
+
+def without_nominal() -> Rig:
+    return rig().model_copy(update={"nominal_extrinsics": ()})
+
+
+def test_each_capture_moves_the_wanted_placement_and_lowers_the_prediction(guide: Guide) -> None:
+    sigmas = []
+    for k in range(8):
+        guide.plan(None, float(k))
+        assert guide.wanted is not None and guide.guidance is not None
+        assert guide.adds_nothing(guide.wanted) is None
+        sigmas.append(guide.guidance.sigma_rotation_deg)
+        guide.add(f"{k:06d}", guide.wanted)
+    known = [sigma for sigma in sigmas if np.isfinite(sigma)]
+    assert known[-1] < known[0]
+    coverage = guide.coverage()
+    assert coverage is not None and coverage.left_right > 0 and coverage.tilt > 0
+    assert guide.n_held == 8
+
+
+def test_the_wanted_placement_stays_until_it_is_captured_or_given_up(guide: Guide) -> None:
+    guide.plan(None, 0.0)
+    first = guide.wanted
+    guide.plan(None, GIVE_UP_S - 1)
+    assert guide.wanted is first
+    guide.plan(None, GIVE_UP_S + 1)
+    assert first is not None and guide.wanted is not None
+    assert np.linalg.norm(guide.wanted[:3, 3] - first[:3, 3]) > 0.3
+    second = guide.wanted
+    guide.give_up()
+    guide.plan(None, GIVE_UP_S + 2)
+    assert guide.wanted is not None
+    for old in (first, second):
+        assert np.linalg.norm(guide.wanted[:3, 3] - old[:3, 3]) > 0.3
+
+
+def test_without_a_nominal_extrinsic_guidance_begins_with_the_first_calibration(guide: Guide) -> None:
+    (blind,) = make_guides(without_nominal())
+    blind.plan(None, 0.0)
+    assert blind.wanted is None and "nominal extrinsic of davis and lidar" in blind.problem
+    assert blind.coverage() is None and blind.adds_nothing(np.eye(4)) is None
+    nominal = rig().nominal("davis", "lidar")
+    assert nominal is not None
+    planner = blind.prepare(Learned(nominal.to_matrix(), 0.004, 0.006, 6))
+    assert planner is not None
+    blind.adopt(planner)
+    blind.plan(None, 1.0)
+    assert blind.wanted is not None and blind.problem == ""
+
+
+def test_what_captures_leave_over_raises_the_prediction(guide: Guide) -> None:
+    for k in range(6):
+        guide.plan(None, float(k))
+        assert guide.wanted is not None
+        guide.add(str(k), guide.wanted)
+    guide.plan(None, 10.0)
+    assert guide.guidance is not None
+    before = guide.guidance.sigma_rotation_deg
+    nominal = rig().nominal("davis", "lidar")
+    assert nominal is not None
+    planner = guide.prepare(Learned(nominal.to_matrix(), 0.02, 0.02, 6))
+    assert planner is not None
+    guide.adopt(planner)
+    guide.plan(None, 11.0)
+    assert guide.guidance is not None and guide.guidance.sigma_rotation_deg > 1.3 * before
+
+
+def test_a_lidar_whose_beams_are_not_known_is_collected_without_guidance() -> None:
+    lidar = rig().lidars["lidar"].model_copy(update={"model": "HDL-64"})
+    (guide,) = make_guides(rig().model_copy(update={"lidars": {"lidar": lidar}}))
+    guide.plan(None, 0.0)
+    assert guide.wanted is None and "HDL-64" in guide.problem
+    assert guide.outline_px(np.eye(4)) is None
