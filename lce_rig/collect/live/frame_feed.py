@@ -96,7 +96,7 @@ class FrameFeed:
 
     def _samples(self) -> Iterator[Sample]:
         while not self._stop.is_set():
-            self._clock.refresh(self._pumps.statuses())
+            self._clock.refresh(self._pumps.statuses)
             came = self._pumps.take(_WAIT_S)
             if came is None:
                 continue

@@ -6,7 +6,7 @@ and the board's answers. Without one everything stays on the computer's clock.
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
@@ -102,17 +102,17 @@ class RigClock:
             return [self._place(sample)]
         return [self._place(sample)]
 
-    def refresh(self, statuses: Mapping[str, SourceStatus]) -> None:
+    def refresh(self, ask: Callable[[], Mapping[str, SourceStatus]]) -> None:
         """Take new models, every half second at most.
 
         Args:
-            statuses: of the sensors, by name.
+            ask: gives the statuses of the sensors, by name; asked only when it is time.
         """
         now_s = time.monotonic()
         if now_s - self._refreshed_s < REFRESH_S:
             return
         self._refreshed_s = now_s
-        host = self._rig_from_host()
+        statuses, host = ask(), self._rig_from_host()
         for name in self._rig.lidars:
             is_own = statuses[name].figures.get("is_device_time", 0.0) > 0 if name in statuses else False
             self._tie(name, ClockModel.identity(_LOCKED_SIGMA_NS, "UTC by PPS and NMEA") if is_own else host)

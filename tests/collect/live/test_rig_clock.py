@@ -63,7 +63,7 @@ def scan(stamp_ns: int) -> Scan:
 
 def test_without_a_board_everything_keeps_its_time_and_boards_must_stand_still() -> None:
     clock = RigClock(load_rig("rlfs"), None)
-    clock.refresh({})
+    clock.refresh(dict)
     assert clock.take("cam", picture(T0_NS))[0].stamp_ns == T0_NS
     assert clock.take("lidar", scan(T0_NS))[0].stamp_ns == T0_NS
     assert clock.verdict().requires_still_boards and "no sync board" in str(clock.verdict())
@@ -72,7 +72,7 @@ def test_without_a_board_everything_keeps_its_time_and_boards_must_stand_still()
 def test_a_locked_lidar_keeps_its_utc_and_pictures_of_the_computers_time_are_brought_to_it() -> None:
     rig = load_rig("rlfs").model_copy(update={"sync": synced("rlfs", "cam").sync})
     clock = RigClock(rig, Board())
-    clock.refresh(LOCKED)
+    clock.refresh(lambda: LOCKED)
     assert clock.take("lidar", scan(T0_NS + 5_000_000_000))[0].stamp_ns == T0_NS + 5_000_000_000
     shown = clock.take("cam", picture(T0_NS + 5_000_000_000 + HOST_AHEAD_NS))[0]
     assert shown.stamp_ns == pytest.approx(T0_NS + 5_000_000_000, abs=2000)
@@ -81,14 +81,14 @@ def test_a_locked_lidar_keeps_its_utc_and_pictures_of_the_computers_time_are_bro
 
 def test_an_unlocked_lidar_counts_by_the_computers_clock() -> None:
     clock = RigClock(synced("rlfs", "cam"), Board())
-    clock.refresh({"lidar": SourceStatus("lidar", figures={"is_device_time": 0.0})})
+    clock.refresh(lambda: {"lidar": SourceStatus("lidar", figures={"is_device_time": 0.0})})
     placed = clock.take("lidar", scan(T0_NS + 2_000_000_000 + HOST_AHEAD_NS))[0]
     assert placed.stamp_ns == pytest.approx(T0_NS + 2_000_000_000, abs=2000)
 
 
 def test_pictures_take_the_time_of_the_pulses_that_made_them_not_of_their_arrival() -> None:
     clock = RigClock(synced("rlfs", "cam"), Board())
-    clock.refresh(LOCKED)
+    clock.refresh(lambda: LOCKED)
     rng = np.random.default_rng(3)
     errors_ns = []
     for k in range(60):
@@ -110,20 +110,20 @@ def test_lines_too_fast_for_their_delay_begin_slowly_and_then_run_at_full_rate()
     board = Board()
     clock = RigClock(synced("rlfs", "cam", max_delay_s=0.1), board)
     assert board.started_hz == [SLOW_TRIGGERS_HZ]
-    clock.refresh(LOCKED)
+    clock.refresh(lambda: LOCKED)
     for k in range(8):
         sent_ns = 1_000_000_000 + k * 250_000_000
         clock.take("sync", Pulse("cam", sent_ns, k, 0))
         clock.take("cam", picture(T0_NS + sent_ns + HOST_AHEAD_NS + 40_000_000, k))
     clock._refreshed_s = -1e9
-    clock.refresh(LOCKED)
+    clock.refresh(lambda: LOCKED)
     assert board.started_hz == [SLOW_TRIGGERS_HZ, None]
 
 
 def test_a_davis_is_tied_by_the_edges_it_saw() -> None:
     rig = synced("rles", "davis")
     clock = RigClock(rig, Board())
-    clock.refresh(LOCKED)
+    clock.refresh(lambda: LOCKED)
     assert "no edges yet" in clock.problems()[0]
     # Its clock was set on opening, 20 ms off, and gains 30 ppm.
     for k in range(40):
@@ -132,7 +132,7 @@ def test_a_davis_is_tied_by_the_edges_it_saw() -> None:
         seen_ns = T0_NS + HOST_AHEAD_NS + 20_000_000 + round(sent_ns * (1 + 30e-6))
         clock.take("davis", Pulse("davis", seen_ns, k, 0))
     clock._refreshed_s = -1e9
-    clock.refresh(LOCKED)
+    clock.refresh(lambda: LOCKED)
     assert clock.problems() == []
     stamp_ns = T0_NS + HOST_AHEAD_NS + 20_000_000 + round(8_000_000_000 * (1 + 30e-6))
     image = replace(picture(stamp_ns), sensor="davis")
