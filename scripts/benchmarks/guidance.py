@@ -1,7 +1,9 @@
 """Does guidance help? A simulated person who follows it, against the same number of random placements."""
 
-from collections.abc import Iterator
+import pickle
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -29,6 +31,10 @@ from lce_rig.simulate.placements import can_be_held, count_rings
 from lce_rig.simulate.stage import Stage, set_stage
 
 RIGS = ("rlfs", "rles")
+#: Sessions of lower seeds served to choose what guidance assumes of the sensors' errors.
+FIRST_SEED = 20
+#: Simulated sessions are kept here: to calibrate them again takes seconds.
+FOLDER = Path("build/guidance")
 # After so many tries a person gives a placement up: a wall is in the way, or the board is never seen whole.
 _TRIES = 8
 _PERSON, _OFFSET = 101, 102
@@ -52,27 +58,75 @@ class Outcome:
     claimed: tuple[float, float]
 
 
-def bench_guidance(n_seeds: int, n_captures: int = 15) -> None:
-    """Tabulate the errors of guided and of random sessions."""
+def bench_guidance(n_seeds: int, n_captures: int = 15, rigs: Sequence[str] = RIGS) -> None:
+    """Tabulate the errors of random and guided sessions, and of guided ones a third shorter."""
     head = "rig, placements, seeds, captures, offset, rms deg, rms mm, predicted deg / mm, claimed deg / mm"
     print_head(*head.split(", "))
-    for name in RIGS:
-        sessions = {
-            "random": [random_session(name, seed, n_captures) for seed in range(n_seeds)],
-            "guided": [guided_session(name, seed, n_captures) for seed in range(n_seeds)],
-        }
+    seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
+    for name in rigs:
+        random = [kept("random", name, seed, n_captures) for seed in seeds]
+        guided = [kept("guided", name, seed, n_captures) for seed in seeds]
+        fewer = [visits[: 2 * n_captures // 3] for visits in guided]
         for offset in ("none", "drawn"):
-            for kind, visits in sessions.items():
-                print_outcomes(name, kind, n_captures, offset, visits)
+            for kind, sessions in (("random", random), ("guided", guided), ("guided", fewer)):
+                print_outcomes(name, kind, len(sessions[0]), offset, seeds, sessions)
 
 
-def print_outcomes(name: str, kind: str, n_captures: int, offset: str, sessions: list[list[Visit]]) -> None:
-    """Calibrate sessions and print a row."""
-    outcomes = [
+def bench_prediction(n_seeds: int, n_captures: int = 15, rigs: Sequence[str] = ("rles",)) -> None:
+    """Tabulate the errors of guided sessions against what was predicted."""
+    print_head("rig", "seeds", "offset", "rms deg / mm", "predicted deg / mm", "predicted over actual")
+    seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
+    for name in rigs:
+        sessions = [kept("guided", name, seed, n_captures) for seed in seeds]
+        for offset in ("none", "drawn"):
+            outcomes = judge_sessions(name, seeds, sessions, is_offset=offset == "drawn")
+            errors = np.array([each.error for each in outcomes])
+            predicted = np.array([each.predicted for each in outcomes])
+            actual = rms(np.linalg.norm(errors[:, 3:], axis=1)), rms(np.linalg.norm(errors[:, :3], axis=1))
+            said = rms(predicted[:, 0]), rms(predicted[:, 1])
+            print_row(
+                name,
+                len(outcomes),
+                offset,
+                f"{np.degrees(actual[0]):.4f} / {1000 * actual[1]:.2f}",
+                f"{np.degrees(said[0]):.4f} / {1000 * said[1]:.2f}",
+                f"{said[0] / actual[0]:.2f} / {said[1] / actual[1]:.2f}",
+            )
+
+
+def kept(kind: str, name: str, seed: int, n_captures: int) -> list[Visit]:
+    """Simulate a session, or take it from the folder of those simulated before."""
+    path = FOLDER / f"{name}_{kind}_{seed}_{n_captures}.pkl"
+    if not path.exists():
+        simulate = guided_session if kind == "guided" else random_session
+        visits = simulate(name, seed, n_captures)
+        FOLDER.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(pickle.dumps(visits))
+    known: list[Visit] = pickle.loads(path.read_bytes())
+    return known
+
+
+def judge_sessions(
+    name: str, seeds: Sequence[int], sessions: Sequence[list[Visit]], *, is_offset: bool
+) -> list[Outcome]:
+    """Calibrate sessions and hold them against the truth."""
+    return [
         outcome
-        for seed, visits in enumerate(sessions)
-        for outcome in judge_session(name, seed, visits, is_offset=offset == "drawn")
+        for seed, visits in zip(seeds, sessions, strict=True)
+        for outcome in judge_session(name, seed, visits, is_offset=is_offset)
     ]
+
+
+def print_outcomes(
+    name: str,
+    kind: str,
+    n_captures: int,
+    offset: str,
+    seeds: Sequence[int],
+    sessions: Sequence[list[Visit]],
+) -> None:
+    """Calibrate sessions and print a row."""
+    outcomes = judge_sessions(name, seeds, sessions, is_offset=offset == "drawn")
     errors = np.array([each.error for each in outcomes])
     predicted, claimed = (
         np.array([getattr(each, key) for each in outcomes]) for key in ("predicted", "claimed")
