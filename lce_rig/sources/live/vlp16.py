@@ -28,8 +28,7 @@ N_SLOTS = 5
 _N_RATED = 30
 # A scan that is later than this lowers the rate.
 _RATED_LATE_S = 0.5
-# Datagrams from one port before the other is looked at again.
-_N_AT_ONCE = 64
+_GATHER_S = 0.005
 
 
 class Vlp16Source:
@@ -189,10 +188,14 @@ class Vlp16Source:
             ready, _, _ = select.select(self._ports, (), (), _WAIT_S)
             n_before = self._stream.counts.n_data
             for port in ready:
-                self._drain(port, self._stream)
+                is_data = port is self._ports[0]
+                for datagram in port.receive_many():
+                    self._take(datagram, self._stream, is_data=is_data)
             if self._stream.counts.n_data > n_before:
                 heard_s = time.monotonic()
                 self._has_begun.set()
+                # The kernel has stamped what comes meanwhile: several packets cost hardly more than one.
+                time.sleep(_GATHER_S)
             elif time.monotonic() - heard_s > self._silence_s:
                 raise explain_silence(
                     self.sensor,
@@ -202,13 +205,6 @@ class Vlp16Source:
                     self._silence_s,
                     self._web_port,
                 )
-
-    def _drain(self, port: UdpPort, stream: Vlp16Stream) -> None:
-        for _ in range(_N_AT_ONCE):
-            datagram = port.receive()
-            if datagram is None:
-                return
-            self._take(datagram, stream, is_data=port is self._ports[0])
 
     def _take(self, datagram: Datagram, stream: Vlp16Stream, *, is_data: bool) -> None:
         address = self._settings.driver.address or self._reception.address

@@ -22,7 +22,7 @@ from lce_rig.sources.base import SourceOptions
 from lce_rig.sources.datagrams import Datagram
 from lce_rig.sources.live.vlp16 import Vlp16Source
 from lce_rig.sources.live.vlp16_recorder import PcapRecorder
-from lce_rig.sources.live.vlp16_socket import UdpPort
+from lce_rig.sources.live.vlp16_socket import N_AT_ONCE, UdpPort
 from lce_rig.sources.live.vlp16_status import Reception, to_status
 from lce_rig.sources.pcap import PcapRecording
 from lce_rig.sources.velodyne_stream import Vlp16Stream
@@ -365,4 +365,27 @@ def test_arrivals_are_stamped_by_the_kernel_not_when_they_are_taken() -> None:
         # The kernel takes a moment to begin; datagrams before that are stamped when they are taken.
         wait_for(is_stamped_before_taken)
     assert port.receive() is None
+    port.close()
+
+
+def test_datagrams_taken_at_once_are_those_taken_one_by_one() -> None:
+    port = UdpPort(free_ports()[0], "test")
+    wanted = [b"%d" % k * (k % 5) for k in range(N_AT_ONCE + 6)]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind((HERE, 0))
+        before_ns = time.time_ns() - 1_000_000
+        for payload in wanted:
+            sender.sendto(payload, (HERE, port.port))
+        came = port.receive_many()
+        one = port.receive()
+        assert len(came) == N_AT_ONCE and one is not None
+        came += [one, *port.receive_many()]
+        assert [each.payload for each in came] == wanted
+        assert {(each.source, each.source_port, each.port) for each in came} == {
+            (*sender.getsockname(), port.port)
+        }
+    stamps_ns = [each.host_ns for each in came]
+    assert stamps_ns == sorted(stamps_ns)
+    assert before_ns < stamps_ns[0] and stamps_ns[-1] <= time.time_ns()
+    assert port.receive_many() == []
     port.close()
