@@ -15,6 +15,7 @@ from lce_rig.core.errors import LceRigError
 # runs, so that `lce-rig --help` stays instant.
 COMMANDS: dict[str, tuple[str, str]] = {
     "rigs": ("lce_rig.cli.rigs", "List, show, check and derive rig profiles."),
+    "doctor": ("lce_rig.cli.doctor", "Look at this computer and the sensors: fit to collect?"),
     "simulate": ("lce_rig.cli.simulate", "Make a session of a simulated rig, with exact truth."),
     "collect": ("lce_rig.cli.collect", "Build a session from recordings."),
     "reconstruct": ("lce_rig.cli.reconstruct", "Turn the events of a recording into pictures."),

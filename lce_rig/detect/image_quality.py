@@ -106,7 +106,7 @@ def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool 
         cause = f"contrast too low: grey values {low:.0f} to {bright:.0f}, no {wanted} inner corners seen"
         too_few = "move the board while events are recorded: only moving edges make them"
         return Refusal("image", cause, too_few if is_from_events else "light the board, expose longer")
-    width_px = _strongest_edge_px(grey, bright - low)
+    width_px = strongest_edge_px(grey, bright - low)
     if width_px > 6:
         cause = f"too blurred: the sharpest edges are {width_px:.0f} px wide, no {wanted} inner corners seen"
         action = MOVE_SLOWLY if is_from_events else "hold the board still, expose shorter, focus the lens"
@@ -198,7 +198,7 @@ def _side_beyond(grey: NDArray[np.uint8], grid_px: Array) -> str:
     return side if room[side] < 1.5 * square else ""
 
 
-def _strongest_edge_px(grey: NDArray[np.uint8], spread: float) -> float:
+def strongest_edge_px(grey: NDArray[np.uint8], spread: float) -> float:
     """Measure the width of the strongest edges: grey spread over the 99.9 percentile of the gradient."""
     dv, du = np.gradient(grey.astype(np.float32))
     return spread / max(float(np.percentile(np.hypot(du, dv), 99.9)), 1e-3)

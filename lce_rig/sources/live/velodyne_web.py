@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from http.client import HTTPException
 from typing import Any
-from urllib.error import URLError
+from urllib.error import HTTPError, URLError
 from urllib.parse import urlencode
 from urllib.request import ProxyHandler, Request, build_opener
 
@@ -142,6 +142,8 @@ class VelodyneWeb:
             with _OPENER.open(Request(self.url + path, data), timeout=self._timeout_s) as response:
                 return bytes(response.read(_MAX_BODY_BYTES))
         except (URLError, HTTPException, OSError, ValueError) as error:
+            if isinstance(error, HTTPError):
+                error.close()  # it is an open answer, too
             cause = getattr(error, "reason", None) or error
             raise SourceError(
                 f"{self.url}{path} does not answer: {cause}",

@@ -1,0 +1,101 @@
+"""`lce-rig doctor`: one screen on whether this computer and the rig's sensors are fit to collect."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lce_rig.cli import show
+from lce_rig.cli.options import FiniteRange
+
+_MARKS = {"green": "[green]ok[/]", "yellow": "[yellow]warn[/]", "red": "[bold red]FAIL[/]"}
+_EXIT_RED = 5
+_INDENT = 5
+
+
+@click.command()
+@click.option("--rig", "rig_name", required=True, metavar="NAME|FILE", help="Rig profile: a name or a file.")
+@click.option("--json", "as_json", is_flag=True, help="Print every figure as JSON.")
+@click.option(
+    "--duration",
+    type=FiniteRange(1, 3600),
+    default=5.0,
+    show_default=True,
+    metavar="S",
+    help="How long to watch the sensors; longer knows drifts better.",
+)
+@click.option(
+    "-o",
+    "--output",
+    "folder",
+    type=click.Path(path_type=Path),
+    default=".",
+    metavar="FOLDER",
+    help="Where sessions are to be written: its disk is measured. Default: here.",
+)
+def doctor(rig_name: str, as_json: bool, duration: float, folder: Path) -> int:
+    """Look at this computer and every sensor of a rig: a line each, with what to do about it.
+
+    ok: as it should be. warn: collecting works, but less well. FAIL: it does not work, or its data would be
+    wrong. What is absent is one line; everything else is looked at all the same.
+
+    Exits with 5 where a line says FAIL, else with 0.
+    """
+    from lce_rig.collect.health import worst
+    from lce_rig.pipeline.doctor import DoctorOptions, examine
+    from lce_rig.rig import load_rig
+
+    rig = load_rig(rig_name)
+    show.note(f"watching {', '.join([*rig.lidars, *rig.cameras, *(['sync'] if rig.sync else [])])} ...")
+    checks = examine(rig, DoctorOptions(duration, folder))
+    severity = worst(check.severity for check in checks)
+    if as_json:
+        show.print_json(_document(rig.name, severity, checks))
+    else:
+        show.print_table(_screen(checks))
+        show.say(_summary(checks))
+    return _EXIT_RED if severity == "red" else 0
+
+
+def _document(rig: str, severity: str, checks: list[Any]) -> dict[str, Any]:
+    return {
+        "format_version": 1,
+        "rig": rig,
+        "severity": severity,
+        "checks": [vars(check) | {"values": dict(check.values)} for check in checks],
+    }
+
+
+def _screen(checks: list[Any]) -> Any:
+    """Lay the lines out in columns, remedies below their line in the full width."""
+    from rich.console import Group
+    from rich.padding import Padding
+    from rich.table import Table
+
+    widths = [4, *(max(len(getattr(check, column)) for check in checks) for column in ("group", "name"))]
+    rows: list[Any] = []
+    last = ""
+    for check in checks:
+        row = Table.grid(padding=(0, 1))
+        for width in widths:
+            row.add_column(width=width)
+        row.add_column(overflow="fold")
+        group = "" if check.group == last else f"[bold]{show.escape(check.group)}[/]"
+        row.add_row(_MARKS[check.severity], group, check.name, show.escape(check.figure))
+        rows.append(row)
+        rows += [
+            Padding(f"[cyan]-> {show.escape(line)}[/]", (0, 0, 0, _INDENT))
+            for line in check.remedy.splitlines()
+        ]
+        last = check.group
+    return Group(*rows)
+
+
+def _summary(checks: list[Any]) -> str:
+    n = Counter(check.severity for check in checks)
+    if n["red"]:
+        return f"{n['red']} FAIL, {n['yellow']} warn, {n['green']} ok: see the lines after ->"
+    if n["yellow"]:
+        return f"{n['yellow']} warn, {n['green']} ok: fit to collect, with the limits above"
+    return f"all {n['green']} ok: fit to collect"

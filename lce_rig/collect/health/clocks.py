@@ -1,0 +1,180 @@
+"""The streams' clocks: what each is tied to, how they lie apart and drift, and whether boards may move."""
+
+import numpy as np
+
+from lce_rig.collect.edge_clock import EdgeClock
+from lce_rig.collect.health.check import Check, Severity
+from lce_rig.collect.health.examination import Examination
+from lce_rig.collect.health.observing import Observation
+from lce_rig.collect.health.remarks import as_remedy, remarks
+from lce_rig.collect.health.sensors import SYNC, driver_of
+from lce_rig.collect.sync import CommonClock, judge_sync
+from lce_rig.core.clock import ClockModel
+from lce_rig.core.clock_fit import fit_arrivals
+
+_RIG = "rig"
+_PPS_LINE = "pps"
+# A locked VLP-16 counts whole microseconds.
+_LOCKED_SIGMA_NS = 1_000.0
+# A DAVIS takes the computer's time when it is opened; as `collect` has it.
+_COARSE_EDGE_NS = 100_000_000.0
+_MAX_DRIFT_PPM = 200.0
+_STREAMS = ("scans", "events", "frames")
+
+
+def check_clock(exam: Examination, sensor: str) -> Check | None:
+    """Say what a camera's or sync board's stamps are tied to."""
+    status = exam.seen[sensor].status
+    if status is None:
+        return None
+    problems = remarks(status, "clock")
+    figure = status.clock or "no stamps yet"
+    return Check(sensor, "clock", "yellow" if problems else "green", figure, as_remedy(problems))
+
+
+def check_edges(exam: Examination, sensor: str) -> Check | None:
+    """Fit the clock of a camera that sees the board's pulses to them."""
+    if not _sees_edges(exam, sensor):
+        return None
+    model, problem, n_sent = _fit_edges(exam, sensor)
+    n_seen = len(exam.seen[sensor].pulses)
+    if model is None:
+        figure = f"{n_seen} edges seen of {n_sent} pulses, clock not fitted"
+        return Check(sensor, "edges", "red", figure, as_remedy([problem]))
+    drift_ppm, rms_us = -1e6 * model.drift, model.rms_ns / 1000
+    values = {"drift_ppm": drift_ppm, "rms_us": rms_us, "n_edges": float(n_seen), "n_pulses": float(n_sent)}
+    figure = f"{n_seen} of {n_sent} pulses, drift {drift_ppm:+.1f} ppm, scatter {rms_us:.1f} us"
+    return Check(sensor, "edges", "green", figure, values=values)
+
+
+def check_offsets(exam: Examination) -> Check | None:
+    """Measure every stream's offset and drift against this computer's clock, by when its samples arrive."""
+    words, strays = list[str](), list[str]()
+    values: dict[str, float] = {}
+    for sensor, seen in exam.seen.items():
+        model = seen.host_clock if sensor == SYNC else _by_arrivals(seen)
+        if model is None:
+            continue
+        # The model has the computer's time on the sensor's clock: its drift is the other way round.
+        drift_ppm, sigma_ppm = -1e6 * model.drift, 1e6 * float(np.sqrt(model.cov[1, 1]))
+        values |= {f"{sensor}.drift_ppm": drift_ppm, f"{sensor}.drift_sigma_ppm": sigma_ppm}
+        offset_ms = _offset_ms(seen, model)
+        if offset_ms is not None:
+            values[f"{sensor}.offset_ms"] = offset_ms
+        offset = "" if offset_ms is None else f" {_duration(offset_ms)},"
+        words.append(f"{sensor}{offset} {drift_ppm:+.0f} +- {max(sigma_ppm, 1):.0f} ppm")
+        if abs(drift_ppm) > _MAX_DRIFT_PPM + 3 * sigma_ppm:
+            strays.append(
+                f"{sensor} drifts more than any crystal does: is a clock being set, or the computer busy?"
+            )
+    if not words:
+        return None
+    severity: Severity = "yellow" if strays else "green"
+    return Check(_RIG, "clocks", severity, "; ".join(words), as_remedy(strays), values)
+
+
+def check_sync(exam: Examination) -> Check | None:
+    """Judge whether boards may move while they are captured; absent sensors are left out of it."""
+    rig, verdict = exam.rig, judge_sync(exam.rig, tie(exam))
+    if not verdict.requires_still_boards:
+        return Check(_RIG, "sync", "green", str(verdict))
+    absent = [sensor for sensor, seen in exam.seen.items() if not seen.has_opened]
+    reasons = [reason.partition(";")[0] for reason in verdict.reasons]
+    reasons = [
+        reason for reason in reasons if not any(f"the clock of {name} is" in reason for name in absent)
+    ]
+    if not reasons:
+        return None
+    figure = f"boards must stand still while they are captured: {'; '.join(reasons)}"
+    if all(sync == "none" for sync in _promises(exam)):
+        return Check(_RIG, "sync", "green", figure)
+    if rig.sync is None:
+        remedy = "The profile has no sync board: add `sync` (docs/wiring-and-sync.md) to let boards move."
+    else:
+        remedy = "See the lines of these sensors and of the sync board."
+    return Check(_RIG, "sync", "yellow", figure, remedy)
+
+
+def tie(exam: Examination) -> CommonClock:
+    """Put every sensor that can be onto the rig's clock: UTC as the sync board or this computer has it."""
+    clock, board = CommonClock(), exam.seen.get(SYNC)
+    host = None
+    if board is not None and board.host_clock is not None and board.utc_clock is not None:
+        host = board.host_clock.inverse().then(board.utc_clock)
+    for sensor, seen in exam.seen.items():
+        if seen.status is None or sensor == SYNC:
+            continue
+        model = host
+        if seen.status.figures.get("is_device_time"):
+            model = ClockModel.identity(_LOCKED_SIGMA_NS, "UTC by PPS and NMEA")
+        elif _sees_edges(exam, sensor):
+            fitted, _, _ = _fit_edges(exam, sensor)
+            utc = None if board is None else board.utc_clock
+            model = None if fitted is None or utc is None else fitted.then(utc)
+        if model is not None:
+            clock.tie(sensor, model)
+    return clock
+
+
+def _promises(exam: Examination) -> list[str]:
+    """List how the profile says that clocks are tied, stream by stream."""
+    found: list[str] = [lidar.timestamps.sync for lidar in exam.rig.lidars.values()]
+    for camera in exam.rig.cameras.values():
+        found += [channel.timestamps.sync for channel in camera.channels.values()]
+    return found
+
+
+def _sees_edges(exam: Examination, sensor: str) -> bool:
+    board, seen = exam.seen.get(SYNC), exam.seen[sensor]
+    is_davis = driver_of(exam.rig, sensor) == "davis"
+    return is_davis and seen.status is not None and board is not None and board.status is not None
+
+
+def _fit_edges(exam: Examination, sensor: str) -> tuple[ClockModel | None, str, int]:
+    """Fit the board's time on a sensor's clock; gives why not as well, and how many pulses were sent."""
+    board, seen = exam.seen[SYNC], exam.seen[sensor]
+    assert exam.rig.sync is not None
+    line = sensor if sensor in exam.rig.sync.triggers else _PPS_LINE
+    sent = [pulse for pulse in board.pulses if pulse.sensor == line]
+    edges = EdgeClock(sensor, _COARSE_EDGE_NS)
+    if board.host_clock is None:
+        return None, "the board's clock is not tied to this computer's", len(sent)
+    edges.set_clock(board.host_clock.inverse())
+    for pulse in sent:
+        edges.take_sent(pulse)
+    for pulse in seen.pulses:
+        edges.take_seen(pulse)
+    return edges.fit(), edges.problem.removeprefix(f"{sensor}: "), len(sent)
+
+
+def _by_arrivals(seen: Observation) -> ClockModel | None:
+    stream = next((name for name in _STREAMS if name in seen.stamps), None)
+    # Scans without time of their own are stamped by arrival, which says nothing of a clock.
+    is_arrival = (
+        stream == "scans" and seen.status is not None and not seen.status.figures.get("is_device_time")
+    )
+    if stream is None or is_arrival:
+        return None
+    stamps, arrivals = seen.times(stream)
+    if len(stamps) < 2 or (np.diff(stamps) <= 0).any():
+        return None
+    return fit_arrivals(stamps, arrivals, "arrivals")
+
+
+def _offset_ms(seen: Observation, model: ClockModel) -> float | None:
+    """Give by how much stamps are ahead of this computer's clock; what samples take to arrive is in it.
+
+    A LiDAR's scan arrives a revolution after its stamp, which its driver has taken off; None for a board,
+    whose clock counts from when it was switched on.
+    """
+    assert seen.status is not None
+    if seen.sensor == SYNC:
+        return None
+    if "scans" in seen.stamps:
+        ahead_s = seen.status.figures.get("device_ahead_s")
+        return None if ahead_s is None else 1000 * ahead_s
+    return (model.anchor_ns - model.reference_ns) * 1e-6
+
+
+def _duration(ms: float) -> str:
+    return f"{ms / 1000:+.3g} s" if abs(ms) >= 1000 else f"{ms:+.1f} ms"

@@ -1,0 +1,93 @@
+"""A VLP-16: how its web page says that it is set, and whether pulses and sentences give it UTC."""
+
+from lce_rig.collect.health.check import Check, Severity
+from lce_rig.collect.health.examination import Examination
+from lce_rig.collect.health.remarks import as_remedy
+from lce_rig.core import velodyne
+from lce_rig.core.errors import SourceError
+from lce_rig.rig import LidarSettings, Rig
+from lce_rig.sources.live.velodyne_web import VelodyneWeb, WebReport, find_problems
+
+_WEB_TIMEOUT_S = 1.0
+_PPS_PROBLEM = "PPS is "
+_CLOCK_FIGURES = ("pps_state", "nmea_fix", "device_ahead_s")
+
+
+def read_web(rig: Rig, lidar: str, port: int = 80) -> WebReport | SourceError:
+    """Ask the web page of a VLP-16; why it says nothing where it does not."""
+    address = rig.lidars[lidar].driver.address or velodyne.FACTORY_ADDRESS
+    try:
+        return VelodyneWeb(address, port, _WEB_TIMEOUT_S).read()
+    except SourceError as error:
+        return error
+
+
+def check_settings(exam: Examination, sensor: str) -> Check | None:
+    """Hold what the web page says against the profile."""
+    report = exam.web.get(sensor)
+    if report is None:
+        return None
+    if isinstance(report, SourceError):
+        # A sensor that sends nothing has a red line already, with all there is to check.
+        if not exam.seen[sensor].has_opened:
+            return None
+        remedy = f"{report.hint} Its firmware and settings stay unknown; packets come all the same."
+        return Check(sensor, "settings", "yellow", report.what, remedy)
+    problems = [
+        problem
+        for problem in find_problems(report, exam.rig.lidars[sensor])
+        if not problem.startswith(_PPS_PROBLEM)
+    ]
+    return Check(
+        sensor, "settings", "yellow" if problems else "green", _setting_words(report), as_remedy(problems)
+    )
+
+
+def check_pulse(exam: Examination, sensor: str) -> Check | None:
+    """Say whether the sensor is locked to pulses and knows UTC, and whose time its scans are stamped with."""
+    seen, report, lidar = exam.seen[sensor], exam.web.get(sensor), exam.rig.lidars[sensor]
+    if seen.status is None:
+        return None
+    figures = seen.status.figures
+    if "pps_state" in figures:
+        state = velodyne.PPS_STATES[round(figures["pps_state"])]
+    else:
+        state = report.pps if isinstance(report, WebReport) and report.pps else "unknown"
+    figure = f"{state}, {_nmea_words(figures)}; {seen.status.clock}"
+    values = {name: value for name, value in figures.items() if name in _CLOCK_FIGURES}
+    if figures.get("is_device_time"):
+        return Check(sensor, "PPS", "green", figure, values=values)
+    remedy = _lost_time_remedy(seen.status.clock, seen.status.problems)
+    return Check(sensor, "PPS", _without_lock(lidar), figure, remedy, values)
+
+
+def _without_lock(lidar: LidarSettings) -> Severity:
+    """Judge a clock that runs freely by what the profile promises."""
+    if lidar.timestamps.clock != "utc":
+        return "green"
+    return "red" if lidar.timestamps.sync == "hardware" else "yellow"
+
+
+def _nmea_words(figures: dict[str, float]) -> str:
+    if "nmea_past_hour_s" in figures:
+        minute, second = divmod(round(figures["nmea_past_hour_s"]), 60)
+        fix = "" if figures.get("nmea_fix") else ", no fix"
+        return f"NMEA {minute:02d}:{second:02d} past the hour{fix}"
+    return "no NMEA" if "pps_state" in figures else "no position packets"
+
+
+def _lost_time_remedy(clock: str, problems: tuple[str, ...]) -> str:
+    begin = f"scans are stamped with {clock}; "
+    found = [problem.removeprefix(begin) for problem in problems if problem.startswith(begin)]
+    otherwise = "without hardware: lidars.*.timestamps sync: none, clock: host; boards must then stand still"
+    return as_remedy([*found, otherwise]) if found else ""
+
+
+def _setting_words(report: WebReport) -> str:
+    rotor = None if report.rotor_hz is None else f"{60 * report.rotor_hz:.0f} rpm"
+    view = None if report.fov_deg is None else f"{report.fov_deg[0]:.0f} to {report.fov_deg[1]:.0f} deg"
+    ports = f"port {report.data_port}" if report.data_port else None
+    host = f"to {report.host}" if report.host else None
+    return ", ".join(
+        filter(None, (rotor, f"{report.returns} return" if report.returns else None, view, host, ports))
+    )

@@ -1,0 +1,77 @@
+"""`lce-rig doctor`: one screen for people, one document for machines, and an exit code."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from lce_rig.rig import dump_rig
+from lce_rig.simulate.vlp16_packets import Vlp16Clock
+from tests.collect.health.attached import Attached, attach, picture_of, scan_of
+from tests.collect.health.observed import make_rig
+
+
+@pytest.fixture
+def absent(tmp_path: Path) -> Path:
+    """The profile of a rig of which nothing is attached."""
+    path = tmp_path / "absent.yaml"
+    with attach(Attached(make_rig(), has_board=False), tmp_path) as (rig, _):
+        path.write_text(dump_rig(rig))
+    return path
+
+
+def test_absent_devices_are_red_with_what_to_check_and_exit_with_5(lce_rig, absent, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    done = lce_rig("doctor", "--rig", absent, "--duration", "1", "-o", tmp_path / "session")
+    assert done.code == 5
+    for group in ("lidar", "cam", "sync"):
+        assert any(line.startswith(f"FAIL {group} ") for line in done.out.splitlines())
+    assert "-> Check plug and cable, and sync.device" in done.out
+    assert str(tmp_path) in done.out
+    assert "3 FAIL" in done.out.splitlines()[-1]
+    assert "watching lidar, cam, sync" in done.err
+
+
+def test_json_holds_every_line_with_its_figures(lce_rig, absent):
+    done = lce_rig("doctor", "--rig", absent, "--duration", "1", "--json")
+    document = json.loads(done.out)
+    assert (done.code, document["severity"], document["rig"]) == (5, "red", "attached")
+    lines = {(line["group"], line["name"]): line for line in document["checks"]}
+    assert lines["computer", "disk"]["values"]["free_mb"] > 0
+    assert lines["lidar", "device"]["severity"] == "red" and lines["lidar", "device"]["remedy"]
+
+
+def test_warnings_alone_exit_with_0(lce_rig, tmp_path):
+    rig = make_rig(lidars={"lidar": {"timestamps": {"clock": "utc", "reference": "first_firing"}}})
+    board = rig.board.to_board()
+    unlocked = Vlp16Clock("absent", has_nmea=False, error_us=721_000_000)
+    attached = Attached(rig, picture_of(board), scan_of(board, 2.2), unlocked, has_board=False)
+    with attach(attached, tmp_path) as (reached, _):
+        path = tmp_path / "rig.yaml"
+        path.write_text(dump_rig(reached.model_copy(update={"sync": None})))
+        done = lce_rig("doctor", "--rig", path, "--duration", "2")
+    marks = {tuple(line.split()[:2]): line for line in done.out.splitlines()}
+    assert ("ok", "lidar") in marks and ("ok", "cam") in marks
+    assert marks["warn", "PPS"].split()[2].startswith("absent")
+    assert "FAIL" not in done.out and done.code == 0
+    assert done.out.splitlines()[-1].endswith("fit to collect, with the limits above")
+
+
+def test_a_rig_without_driver_lines_says_what_to_add(lce_rig, tmp_path):
+    document = make_rig(sync=None).model_dump()
+    document["cameras"]["cam"]["driver"] = {}
+    document["lidars"]["lidar"]["driver"]["address"] = "127.0.0.1"
+    path = tmp_path / "rig.yaml"
+    path.write_text(dump_rig(type(make_rig()).model_validate(document)))
+    done = lce_rig("doctor", "--rig", path, "--duration", "1")
+    assert done.code == 5
+    assert "Add to cameras.cam: driver: {type: v4l2, device: /dev/video0}" in done.out
+
+
+def test_help_says_what_the_exit_code_means(lce_rig):
+    done = lce_rig("doctor", "--help")
+    assert done.code == 0 and "Exits with 5" in done.out
+
+
+def test_an_unknown_rig_is_an_error_of_the_profile(lce_rig):
+    assert lce_rig("doctor", "--rig", "no-such-rig").code == 3

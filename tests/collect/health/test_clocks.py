@@ -1,0 +1,121 @@
+"""Clocks: offsets and drifts are recovered, and boards may move only where every clock is tied."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from lce_rig.collect.health.clocks import check_clock, check_edges, check_offsets, check_sync, tie
+from lce_rig.collect.health.observing import Observation
+from lce_rig.core.clock import ClockModel
+from lce_rig.core.errors import SourceError
+from lce_rig.rig import Rig
+from lce_rig.sources.live.base import Pulse
+
+from .observed import START_NS, S, camera, examination, lidar, make_rig, sync_board
+
+LOCKED = {"is_device_time": 1.0, "device_ahead_s": 0.0003}
+
+
+def with_utc(board: Observation) -> Observation:
+    """The board knows UTC, which the computer has exactly."""
+    assert board.host_clock is not None
+    return replace(board, utc_clock=board.host_clock)
+
+
+def davis_rig() -> Rig:
+    document = make_rig().model_dump()
+    document["cameras"]["cam"] |= {"model": "DAVIS346", "driver": {"type": "davis"}}
+    return Rig.model_validate(document)
+
+
+def davis(drift: float = -25e-6, offset_ns: int = 3_000_000, n: int = 20, **status: Any) -> Observation:
+    """A camera that sees each of the board's pulses, by a clock of its own."""
+    seen = camera(**status)
+    for number in range(n):
+        sent_ns = number * S // 4
+        stamp_ns = START_NS + offset_ns + round((1 + drift) * sent_ns)
+        seen.take(Pulse("cam", stamp_ns // 1000 * 1000, number, stamp_ns))
+    return seen
+
+
+def test_the_drift_and_offset_of_every_stream_are_measured_against_the_computer() -> None:
+    drifting = camera()
+    drifting.stamps["frames"] = [
+        (START_NS + round((1 + 30e-6) * (stamp_ns - START_NS)) - 7_000_000, host_ns)
+        for stamp_ns, host_ns in drifting.stamps["frames"]
+    ]
+    line = check_offsets(examination(lidar(figures=LOCKED), drifting, sync_board()))
+    assert line is not None and line.severity == "green"
+    assert line.values["lidar.offset_ms"] == pytest.approx(0.3)
+    assert line.values["cam.offset_ms"] == pytest.approx(-7.0, abs=0.2)
+    assert line.values["cam.drift_ppm"] == pytest.approx(30, abs=5)
+    assert line.values["sync.drift_ppm"] == pytest.approx(40)
+
+
+def test_a_clock_that_is_being_set_is_told() -> None:
+    stepped = camera()
+    stepped.stamps["frames"] = [
+        (START_NS + round(1.01 * (stamp_ns - START_NS)), host_ns)
+        for stamp_ns, host_ns in stepped.stamps["frames"]
+    ]
+    line = check_offsets(examination(stepped))
+    assert line is not None and line.severity == "yellow" and "more than any crystal" in line.remedy
+
+
+def test_scans_stamped_by_arrival_say_nothing_of_a_clock() -> None:
+    assert check_offsets(examination(lidar())) is None
+
+
+def test_a_davis_is_fitted_to_the_edges_it_saw() -> None:
+    exam = examination(davis(), sync_board(4.0, drift=0.0), rig=davis_rig())
+    line = check_edges(exam, "cam")
+    assert line is not None and line.severity == "green"
+    assert line.values["drift_ppm"] == pytest.approx(-25, abs=1)
+    assert line.values["rms_us"] < 2
+
+
+def test_a_davis_that_sees_no_edges_is_red_and_says_what_to_wire() -> None:
+    line = check_edges(examination(davis(n=0), sync_board(4.0), rig=davis_rig()), "cam")
+    assert line is not None and line.severity == "red"
+    assert line.figure.startswith("0 edges seen of 20 pulses") and "trigger input wired" in line.remedy
+
+
+def test_boards_may_move_where_every_clock_is_tied() -> None:
+    exam = examination(lidar(figures=LOCKED), camera(), with_utc(sync_board()))
+    line = check_sync(exam)
+    assert line is not None and (line.severity, line.figure) == (
+        "green",
+        "boards may move while they are captured",
+    )
+    model = tie(exam).model("cam")
+    assert isinstance(model, ClockModel)
+    assert model.convert(START_NS + S) == pytest.approx(START_NS + S, abs=1000)
+
+
+def test_a_clock_that_is_not_tied_is_named_with_the_way_out() -> None:
+    line = check_sync(examination(lidar(figures=LOCKED), camera(), rig=make_rig(sync=None)))
+    assert line is not None and line.severity == "yellow"
+    assert "the clock of cam is not tied" in line.figure and "add `sync`" in line.remedy
+
+
+def test_still_boards_are_no_fault_where_the_profile_promises_nothing() -> None:
+    rig = make_rig(
+        sync=None,
+        lidars={"lidar": {}},
+        cameras={"cam": {**make_rig().model_dump()["cameras"]["cam"], "channels": {"frames": {}}}},
+    )
+    line = check_sync(examination(lidar(), camera(), rig=rig))
+    assert line is not None and line.severity == "green" and "must stand still" in line.figure
+
+
+def test_absent_sensors_are_left_out_of_the_verdict() -> None:
+    absent = Observation("cam", failure=SourceError("it is not there"))
+    assert check_sync(examination(lidar(figures=LOCKED), absent, with_utc(sync_board()))) is None
+
+
+def test_doubts_of_a_driver_about_its_clock_stand_in_its_line() -> None:
+    problem = "no clock fits the stamps: arrival is taken, late by an unknown time"
+    line = check_clock(examination(camera(clock="arrival", problems=(problem,))), "cam")
+    assert line is not None and (line.severity, line.figure) == ("yellow", "arrival")
+    assert line.remedy.startswith("No clock fits")

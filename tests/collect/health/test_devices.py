@@ -1,0 +1,109 @@
+"""Devices and their streams: what is absent, slow, lost or stopped has a line that says so."""
+
+import pytest
+
+from lce_rig.collect.health.devices import check_device, check_stream, wanted_rate_hz
+from lce_rig.collect.health.observing import Observation
+from lce_rig.collect.health.sensors import driver_of, sensors, source_of
+from lce_rig.core.errors import SourceError
+from lce_rig.rig import Rig, load_rig
+from lce_rig.sources.live.velodyne_web import WebReport
+
+from .observed import S, camera, examination, lidar, make_rig
+
+
+def test_what_does_not_open_is_red_with_what_to_check() -> None:
+    seen = Observation("cam", failure=SourceError("camera 'cam': /dev/video0 is busy", "fuser -v names it."))
+    line = check_device(examination(seen), "cam")
+    assert (line.severity, line.figure, line.remedy) == ("red", "/dev/video0 is busy", "fuser -v names it.")
+    assert check_stream(examination(seen), "cam") is None
+
+
+def test_a_lidar_is_named_with_what_its_web_page_says() -> None:
+    web = {"lidar": WebReport(model="VLP-16", serial="AG43510116", firmware="3.0.41.1", temperature_c=41.2)}
+    line = check_device(examination(lidar(device="VLP-16 at 127.0.0.1"), web=web), "lidar")
+    assert line.figure == "VLP-16 at 127.0.0.1, firmware 3.0.41.1, serial AG43510116, 41 C"
+    assert line.severity == "green"
+
+
+def test_complaints_of_a_driver_stand_in_the_line_they_belong_to() -> None:
+    status = {
+        "device": "DAVIS346",
+        "problems": (
+            "it follows another camera: unplug the sync cable",
+            "3 pictures came damaged: check the cable",
+            "its clock began anew while it ran: open it again",
+        ),
+    }
+    exam = examination(camera(**status))
+    device, stream = check_device(exam, "cam"), check_stream(exam, "cam")
+    assert stream is not None
+    assert device.severity == stream.severity == "yellow"
+    assert device.remedy == "It follows another camera: unplug the sync cable."
+    assert stream.remedy == "3 pictures came damaged: check the cable."
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "severity", "remedy"), [(10.0, "green", ""), (20.0, "yellow", "rpm 600"), (10.3, "green", "")]
+)
+def test_the_rotors_rate_is_held_against_the_profile(rate_hz: float, severity: str, remedy: str) -> None:
+    line = check_stream(examination(lidar(rate_hz, figures={"data_packets": 3770.0})), "lidar")
+    assert line is not None
+    assert line.severity == severity and remedy in line.remedy
+    assert line.values["rate_hz"] == pytest.approx(rate_hz, rel=1e-3)
+    assert "(10 wanted), 3770 packets, none lost" in line.figure
+
+
+@pytest.mark.parametrize(("n_lost", "severity"), [(0, "green"), (1, "yellow"), (40, "red")])
+def test_losses_are_counted_and_judged_by_their_share(n_lost: int, severity: str) -> None:
+    line = check_stream(examination(lidar(n_lost=n_lost, figures={"data_packets": 3770.0})), "lidar")
+    assert line is not None and line.severity == severity
+    assert bool(line.remedy) == (n_lost > 0)
+
+
+def test_a_stream_that_stopped_before_the_end_is_red() -> None:
+    seen = camera(duration_s=2.0)
+    seen.ended_ns += 3 * S
+    line = check_stream(examination(seen), "cam")
+    assert line is not None and line.severity == "red" and "none for 3.0 s" in line.figure
+
+
+def test_a_triggered_camera_without_pictures_is_red() -> None:
+    line = check_stream(examination(camera(duration_s=0.0)), "cam")
+    assert line is not None and line.severity == "red" and line.figure.startswith("no frames (20 wanted)")
+
+
+def test_the_wanted_rate_is_the_triggers_the_drivers_or_the_davis_own() -> None:
+    assert wanted_rate_hz(make_rig(), "cam") == 20
+    assert wanted_rate_hz(make_rig(), "lidar") == 10
+    assert wanted_rate_hz(make_rig(sync=None), "cam") is None
+    assert wanted_rate_hz(load_rig("rles"), "davis") == 25
+
+
+def with_camera_driver(**driver: object) -> Rig:
+    document = make_rig().model_dump()
+    document["cameras"]["cam"]["driver"] = driver
+    return Rig.model_validate(document)
+
+
+@pytest.mark.parametrize(
+    ("driver", "says"),
+    [
+        ({}, "Add to cameras.cam: driver: {type: v4l2, device: /dev/video0} or"),
+        ({"type": "v4l2"}, "Add to cameras.cam.driver: type: v4l2, device: /dev/video0"),
+        ({"type": "command"}, "Add to cameras.cam.driver: type: command, command: [PROGRAM"),
+    ],
+)
+def test_a_camera_that_the_profile_does_not_reach_says_what_to_add(driver: dict[str, str], says: str) -> None:
+    with pytest.raises(SourceError, match="does not say how it is reached") as caught:
+        source_of(with_camera_driver(**driver), "cam")
+    assert caught.value.hint.startswith(says)
+
+
+def test_each_sensor_has_a_source_of_its_own_whatever_ails_the_others() -> None:
+    rig = with_camera_driver(type="nonsense")
+    assert sensors(rig) == ["lidar", "cam", "sync"]
+    assert source_of(rig, "lidar").sensor == "lidar" and source_of(rig, "sync").sensor == "sync"
+    assert driver_of(rig, "cam") == ""
+    with pytest.raises(SourceError, match="'nonsense' is unknown"):
+        source_of(rig, "cam")

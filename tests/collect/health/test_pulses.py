@@ -1,0 +1,67 @@
+"""Frames equal pulses, or the line says so."""
+
+from dataclasses import replace
+
+import pytest
+
+from lce_rig.collect.health.pulses import check_frames_of_pulses, check_pulses_sent
+from lce_rig.rig import Rig
+
+from .observed import camera, examination, make_rig, sync_board
+
+
+def with_trigger(**trigger: float) -> Rig:
+    sync = {"device": "/dev/null", "triggers": {"cam": {"channel": 0, "rate_hz": 20.0, **trigger}}}
+    return make_rig(sync=sync)
+
+
+def test_as_many_frames_as_pulses_are_green_with_their_delay() -> None:
+    line = check_frames_of_pulses(examination(camera(), sync_board()), "cam")
+    assert line is not None and line.severity == "green"
+    assert abs(line.values["n_frames"] - line.values["n_pulses"]) <= 1
+    # A board that is 40 ppm fast is tied to the computer's clock: the delay comes out all the same.
+    assert line.values["delay_ms"] == pytest.approx(15.0, abs=0.01)
+    assert line.values["delay_scatter_ms"] < 0.01
+
+
+def test_a_camera_that_runs_freely_is_red() -> None:
+    line = check_frames_of_pulses(examination(camera(rate_hz=30.0), sync_board()), "cam")
+    assert line is not None and line.severity == "red"
+    assert "trigger mode" in line.remedy
+
+
+def test_frames_that_come_too_late_for_their_pulses_are_not_matched() -> None:
+    line = check_frames_of_pulses(
+        examination(camera(delay_s=0.045), sync_board(), rig=with_trigger(max_delay_s=0.03)), "cam"
+    )
+    assert line is not None and line.severity == "red" and "not matched" in line.figure
+
+
+def test_where_two_pulses_could_have_made_a_frame_they_are_counted() -> None:
+    exam = examination(camera(), sync_board(), rig=with_trigger(max_delay_s=0.1))
+    line = check_frames_of_pulses(exam, "cam")
+    assert line is not None and line.severity == "green" and "counted only" in line.figure
+    free = examination(camera(rate_hz=30.0), sync_board(), rig=with_trigger(max_delay_s=0.1))
+    line = check_frames_of_pulses(free, "cam")
+    assert line is not None and line.severity == "red"
+
+
+def test_lost_frames_count_by_their_numbers() -> None:
+    seen = camera()
+    seen.frames = [frame for frame in seen.frames if frame.count is not None and frame.count % 10]
+    line = check_frames_of_pulses(examination(seen, sync_board()), "cam")
+    assert line is not None and line.severity == "green"
+
+
+def test_the_boards_lines_are_held_against_the_profile() -> None:
+    line = check_pulses_sent(examination(sync_board()))
+    assert line is not None and line.severity == "green"
+    assert line.values["cam_hz"] == pytest.approx(20.0, rel=1e-3) and line.figure.startswith("pps none")
+    slow = check_pulses_sent(examination(sync_board(rate_hz=10.0)))
+    assert slow is not None and slow.severity == "yellow" and "should pulse at 20 Hz" in slow.remedy
+    dead = check_pulses_sent(examination(replace(sync_board(), pulses=[])))
+    assert dead is not None and dead.severity == "red"
+
+
+def test_without_a_board_there_is_no_line() -> None:
+    assert check_frames_of_pulses(examination(camera(), rig=make_rig(sync=None)), "cam") is None
