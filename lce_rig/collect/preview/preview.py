@@ -41,7 +41,7 @@ class Preview:
         self._token = None if token is None else check_token(token)
         self._thread: threading.Thread | None = None
         self._is_ready = threading.Event()
-        self._feed: Feed | None = None
+        self._feed = Feed()
         self._server: Server | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop: asyncio.Event | None = None
@@ -63,8 +63,7 @@ class Preview:
 
     def publish(self, state: LiveState) -> None:
         """Show a state; never blocks, and the newest wins. Call it from one thread."""
-        if self._feed is not None:
-            self._feed.publish(state)
+        self._feed.publish(state)
 
     @property
     def n_pictures(self) -> int:
@@ -100,7 +99,6 @@ class Preview:
 
     async def _serve(self, opened: socket.socket) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
-        self._feed = Feed(self._loop)
         gate = Gate(opened.getsockname()[1], self._token, self._address)
         self._server = Server(gate, self._feed)
         runner = web.AppRunner(

@@ -1,6 +1,7 @@
 """One open page: told the newest state as fast as it can follow, and no faster."""
 
 import asyncio
+import contextlib
 import json
 import time
 
@@ -41,34 +42,44 @@ class Viewer:
 
     async def serve(self) -> None:
         """Feed the connection until the page goes away."""
-        writer = asyncio.create_task(self._write())
+        tasks = {asyncio.create_task(self._read()), asyncio.create_task(self._write())}
         try:
-            async for received in self._socket:
-                if received.type is not WSMsgType.TEXT or not self._take(received.data):
-                    await self._socket.close(code=1008, message=b"only answers to updates are read")
-                    break
+            ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in ended:
+                task.result()
         finally:
-            writer.cancel()
-            await asyncio.gather(writer, return_exceptions=True)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
 
     def is_up_to_date(self) -> bool:
         """Tell whether the newest state has been sent."""
         newest = self._feed.newest()
         return newest is None or newest[0] <= self._delivered
 
+    async def _read(self) -> None:
+        async for received in self._socket:
+            if received.type is not WSMsgType.TEXT or not self._take(received.data):
+                await self._socket.close(code=1008, message=b"only answers to updates are read")
+                return
+
     async def _write(self) -> None:
-        while True:
-            await self._has_room.wait()
-            if not await self._feed.wait_beyond(self._state, BEAT_S):
-                await self._socket.send_str(message.beat(self._feed.age_s()))
-                continue
-            began_s = time.monotonic()
-            newest = self._feed.newest()
-            if newest is not None:
-                self._state, state = newest
-                await self._send(state)
-                self._delivered = newest[0]
-            await asyncio.sleep(max(0.0, began_s + PERIOD_S - time.monotonic()))
+        with contextlib.suppress(ConnectionError):  # the page went away
+            while True:
+                await self._has_room.wait()
+                if await self._feed.wait_beyond(self._state, BEAT_S):
+                    began_s = time.monotonic()
+                    await self._send_newest()
+                    await asyncio.sleep(max(0.0, began_s + PERIOD_S - time.monotonic()))
+                else:
+                    await self._socket.send_str(message.beat(self._feed.age_s()))
+
+    async def _send_newest(self) -> None:
+        newest = self._feed.newest()
+        if newest is not None:
+            self._state, state = newest
+            await self._send(state)
+            self._delivered = newest[0]
 
     async def _send(self, state: LiveState) -> None:
         jpeg = None

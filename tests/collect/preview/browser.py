@@ -135,7 +135,7 @@ class Page:
         """Give the text of the element with this id."""
         return str(self.evaluate(f"document.getElementById({element!r})?.innerText ?? ''"))
 
-    def wait_until(self, expression: str, timeout_s: float = 10.0) -> None:
+    def wait_until(self, expression: str, timeout_s: float = 20.0) -> None:
         """Wait until an expression is true."""
         deadline = time.monotonic() + timeout_s
         while not self.evaluate(expression):

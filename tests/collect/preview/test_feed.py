@@ -47,14 +47,25 @@ def test_all_of_a_state_arrives(preview: Preview) -> None:
     assert np.abs(decoded.astype(int) - picture()).mean() < 1
 
 
-@pytest.mark.parametrize("shape", [(720, 1280, 3), (720, 1280), (260, 346), (2160, 3840, 3), (1, 5000)])
-def test_pictures_are_made_small_enough_for_a_phone(shape: tuple[int, ...]) -> None:
-    decoded = cv2.imdecode(
-        np.frombuffer(encode_picture(np.zeros(shape, np.uint8)), np.uint8), cv2.IMREAD_COLOR
-    )
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [
+        ((720, 1280, 3), (540, 960)),
+        ((720, 1280), (540, 960)),
+        ((260, 346), (260, 346)),
+        ((2048, 2448, 3), (683, 816)),
+        ((2160, 3840, 3), (540, 960)),
+        ((1, 5000), (1, 833)),
+    ],
+)
+def test_pictures_are_made_small_enough_for_a_phone(shape: tuple[int, ...], size: tuple[int, int]) -> None:
+    pixels = np.zeros(shape, np.uint8)
+    pixels[: shape[0] // 2] = 200
+    decoded = cv2.imdecode(np.frombuffer(encode_picture(pixels), np.uint8), cv2.IMREAD_GRAYSCALE)
     assert decoded is not None
-    assert decoded.shape[1] == min(shape[1], MAX_WIDTH_PX)
-    assert decoded.shape[0] == max(1, round(shape[0] * decoded.shape[1] / shape[1]))
+    assert decoded.shape == size
+    assert decoded.shape[1] <= MAX_WIDTH_PX
+    assert abs(decoded.mean() - pixels.mean()) < 2
 
 
 def test_pictures_are_compressed_while_somebody_looks_and_once_for_all(preview: Preview) -> None:
@@ -99,7 +110,7 @@ def test_states_come_at_most_ten_times_a_second_and_the_newest_wins(preview: Pre
             seen.append(watcher.next_state()[0]["n_captures"])
         took_s = time.monotonic() - began_s
     assert seen == sorted(set(seen))
-    assert 5 <= len(seen) <= 10 * took_s + 2
+    assert 3 <= len(seen) <= 10 * took_s + 2
 
 
 def _publish_for(preview: Preview, duration_s: float) -> None:
@@ -151,6 +162,7 @@ def test_a_page_that_vanished_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> N
             while watcher.get("live")[0] == 503:
                 assert time.monotonic() < deadline_s
                 time.sleep(0.1)
+        monkeypatch.undo()
         watcher.watch()
         assert watcher.next_state()[0]["n_captures"] == 7
 
@@ -189,6 +201,14 @@ def test_noise_on_the_port_is_survived_in_silence(preview: Preview, caplog: pyte
     assert not caplog.records
 
 
+def test_failures_of_the_page_itself_are_logged(preview: Preview, caplog: pytest.LogCaptureFixture) -> None:
+    preview.publish(state(drawing=Drawing("cam", np.zeros((4, 4, 2), np.uint8))))
+    with Watcher(preview.urls[0]) as watcher:
+        watcher.watch()
+        assert isinstance(watcher.receive(), int)
+    assert "Error handling request" in caplog.text
+
+
 def test_pages_have_the_last_state_when_the_collection_ends() -> None:
     preview = Preview(port=0)
     with Watcher(preview.start()) as watcher:
@@ -216,7 +236,7 @@ def test_closing_does_not_wait_for_pages_that_are_stuck() -> None:
             time.sleep(0.02)
         began_s = time.monotonic()
         preview.close()
-        assert time.monotonic() - began_s < 2.5
+        assert time.monotonic() - began_s < 5
 
 
 def test_silence_of_the_collection_is_told(preview: Preview) -> None:
@@ -227,4 +247,4 @@ def test_silence_of_the_collection_is_told(preview: Preview) -> None:
         watcher.next_state()
         beat = watcher.receive()
         assert beat["beat"]
-        assert 0.8 < beat["age_s"] < 3
+        assert 0.8 < beat["age_s"] < 5

@@ -9,7 +9,7 @@ import pytest
 from lce_rig.collect.live.state import Cue, Drawing, StreamState
 from lce_rig.collect.preview import Preview
 
-from .browser import Browser
+from .browser import Browser, Page
 from .conftest import HEIGHT_PX, PRESENT_PX, WANTED_PX, WIDTH_PX, picture, state
 from .screen import OPEN, has_text, shown
 
@@ -67,18 +67,21 @@ def test_a_state_is_on_the_screen_whole(preview: Preview, browser: Browser, widt
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-@pytest.mark.parametrize("mirrored", [True, False])
 def test_outlines_lie_where_the_boards_are_in_the_picture(
-    preview: Preview, browser: Browser, width: int, height: int, mirrored: bool
+    preview: Preview, browser: Browser, width: int, height: int
 ) -> None:
     page = browser.open(preview.urls[0], width, height)
     shown(preview, page, "document.querySelector('#wanted .ink') !== null")
-    if not mirrored:
+    for is_mirrored in (True, False):
+        _compare_with_picture(page, is_mirrored)
         page.tap("mirror")
+    assert not page.complaints
+
+
+def _compare_with_picture(page: Page, is_mirrored: bool) -> None:
     found = np.array(page.evaluate(_ON_SCREEN % "present"))
     wanted = np.array(page.evaluate(_ON_SCREEN % "wanted"))
-    page.evaluate("document.getElementById('outlines').style.display = 'none'")
-    page.evaluate("document.getElementById('legend').style.display = 'none'")
+    page.evaluate("document.querySelectorAll('#outlines, #legend').forEach((each) => each.style.opacity = 0)")
     screen = cv2.cvtColor(page.screenshot(), cv2.COLOR_BGR2GRAY)
     # The bright square of the picture, as the browser painted it.
     left, top = np.floor(found.min(axis=0)).astype(int) - 15
@@ -94,8 +97,7 @@ def test_outlines_lie_where_the_boards_are_in_the_picture(
     assert np.allclose(np.ptp(wanted, axis=0), scale * np.ptp(WANTED_PX, axis=0))
     stage = page.evaluate("document.getElementById('stage').getBoundingClientRect().toJSON()")
     assert np.isclose(scale[0], min(stage["width"] / WIDTH_PX, stage["height"] / HEIGHT_PX), rtol=1e-3)
-    assert (wanted[:, 0].mean() > found[:, 0].mean()) is not mirrored
-    assert not page.complaints
+    assert (wanted[:, 0].mean() < found[:, 0].mean()) == is_mirrored
 
 
 def test_pictures_follow_one_another(preview: Preview, browser: Browser) -> None:
@@ -158,27 +160,24 @@ def test_the_countdown_runs_while_the_board_is_held(preview: Preview, browser: B
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-@pytest.mark.parametrize(
-    "words",
-    [
+def test_instructions_are_as_large_as_fits(
+    preview: Preview, browser: Browser, width: int, height: int
+) -> None:
+    page = browser.open(preview.urls[0], width, height)
+    for words in (
         "hold still",
         "2 steps right, 1.2 m back, turn the left side a little towards the rig",
         "the LiDAR sees 2 rings of the board, 4 are needed: lower it by 20 cm, come closer, hold it upright",
-        "x" * 120,
-    ],
-)
-def test_instructions_are_as_large_as_fits(
-    preview: Preview, browser: Browser, width: int, height: int, words: str
-) -> None:
-    page = browser.open(preview.urls[0], width, height)
-    shown(preview, page, has_text("headline", words), headline=words, detail="")
-    box, text = (
-        page.evaluate(f"document.querySelector('{each}').getBoundingClientRect().toJSON()")
-        for each in ("#headline", "#headline span")
-    )
-    assert text["height"] <= box["height"] + 1
-    assert text["width"] <= box["width"] + 1
-    assert text["height"] > 0.4 * box["height"] or text["width"] > 0.7 * box["width"]
+        120 * "x",
+    ):
+        shown(preview, page, has_text("headline", words), headline=words, detail="")
+        box, text = (
+            page.evaluate(f"document.querySelector('{each}').getBoundingClientRect().toJSON()")
+            for each in ("#headline", "#headline span")
+        )
+        assert text["height"] <= box["height"] + 1
+        assert text["width"] <= box["width"] + 1
+        assert text["height"] > 0.4 * box["height"] or text["width"] > 0.7 * box["width"]
 
 
 def test_what_sensors_say_is_text_and_not_markup(preview: Preview, browser: Browser) -> None:
@@ -218,6 +217,40 @@ def test_sounds_are_played_once_each_after_a_tap(preview: Preview, browser: Brow
     page.tap("sound")
     shown(preview, page, has_text("count", "13"), n_captures=13, cues=(Cue(7, "tick"),))
     assert page.evaluate("window.tones.length") == 8
+    assert not page.complaints
+
+
+def test_the_voice_reads_settled_instructions_once_and_is_quiet_while_the_board_is_held(
+    preview: Preview, browser: Browser
+) -> None:
+    # Headless browsers have no voices: this one remembers what it is told to say.
+    listening = """
+      window.said = [];
+      const voice = {
+        speaking: false, getVoices: () => [{ lang: 'en-GB', localService: true }],
+        addEventListener() {}, cancel() {}, speak: (words) => window.said.push(words.text),
+      };
+      Object.defineProperty(window, 'speechSynthesis', { value: voice });
+      window.SpeechSynthesisUtterance = class { constructor(text) { this.text = text; } };
+    """
+    page = browser.open(preview.urls[0], first=listening)
+    page.wait_until(OPEN)
+
+    def stand(headline: str, phase: str, duration_s: float) -> None:
+        end_s = time.monotonic() + duration_s
+        while time.monotonic() < end_s:
+            preview.publish(state(headline=headline, phase=phase, drawing=None))
+            time.sleep(0.1)
+
+    stand("raise it 20 cm", "moving", 1.0)
+    assert page.evaluate("window.said") == []
+    page.tap("speech")
+    for distance in range(8):
+        stand(f"0.{9 - distance} m closer", "moving", 0.1)
+    stand("one step left", "moving", 2.0)
+    stand("hold still", "holding", 1.2)
+    page.wait_until(has_text("headline", "hold still"))
+    assert page.evaluate("window.said") == ["one step left"]
     assert not page.complaints
 
 

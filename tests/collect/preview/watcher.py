@@ -63,7 +63,7 @@ class Watcher:
 
     def next_state(self, visible: bool = True) -> tuple[dict[str, Any], bytes | None]:
         """Give the next state and its picture, and answer that it is on the screen."""
-        while (state := self.receive()).get("beat"):
+        while "beat" in (state := self.receive()):
             pass
         has_picture = state["drawing"] is not None and state["drawing"]["has_picture"]
         jpeg = self.receive() if has_picture else None

@@ -25,19 +25,16 @@ connect(
     document.title = `${state.n_captures} · ${state.headline}`;
   },
   (isOpen, isRefused) => {
-    document.body.dataset.connection = isOpen ? "open" : "lost";
-    if (isOpen) {
-      wasOpen = true;
-      setBanner("");
-      return;
-    }
-    isAfterGap = true;
-    showHold(null);
+    const isOver = phase === "ended" && !isRefused;
+    document.body.dataset.connection = isOpen ? "open" : isOver ? "over" : "lost";
     if (isRefused) setBanner("This link is no longer valid. Open the one that the rig shows now.");
-    else if (phase === "ended") setBanner("The collection has ended.");
-    else setBanner("Connection to the rig lost. Trying again …");
-    if (wasOpen && phase !== "ended") play("lost");
-    wasOpen = false;
+    else setBanner(isOpen || isOver ? "" : "Connection to the rig lost. Trying again …");
+    if (!isOpen) {
+      isAfterGap = true;
+      showHold(null);
+      if (wasOpen && !isOver) play("lost");
+    }
+    wasOpen = isOpen;
   },
   (ageS) => {
     if (ageS !== null && ageS > STALE_S && phase !== "ended") {

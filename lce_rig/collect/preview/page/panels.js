@@ -22,7 +22,8 @@ let fitted = "";
 export function showPanels(state) {
   document.body.dataset.phase = state.phase;
   setText("phase", PHASES[state.phase] ?? state.phase);
-  setText("rig", `${state.rig} · ${state.session}`);
+  setText("rig", `${state.rig} · ${state.session.split("/").pop()}`);
+  byId("rig").title = state.session;
   setText("elapsed", clock(state.elapsed_s ?? 0));
   setText("detail", state.detail);
   showHeadline(state.headline);

@@ -26,6 +26,7 @@ export async function showDrawing(drawing, jpeg) {
     // Pixel centres lie at integers.
     outlines.setAttribute("viewBox", `-0.5 -0.5 ${drawing.width_px} ${drawing.height_px}`);
     outlines.classList.toggle("there", drawing.is_there);
+    byId("legend").hidden = drawing.is_there;
     keepClear(centre(drawing.present_px), drawing.width_px);
   }
   drawOutline("present", drawing?.present_px ?? null);
