@@ -1,17 +1,26 @@
 """`lce-rig doctor`: one screen on whether this computer and the rig's sensors are fit to collect."""
 
+import math
+import sys
 from collections import Counter
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange
 
+if TYPE_CHECKING:
+    from lce_rig.collect.health import Check
+
 _MARKS = {"green": "[green]ok[/]", "yellow": "[yellow]warn[/]", "red": "[bold red]FAIL[/]"}
 _EXIT_RED = 5
 _INDENT = 5
+# What the program says before and after, and the next prompt.
+_N_OTHER_LINES = 3
+_FILE_WIDTH = 160
 
 
 @click.command()
@@ -53,21 +62,45 @@ def doctor(rig_name: str, as_json: bool, duration: float, folder: Path) -> int:
     if as_json:
         show.print_json(_document(rig.name, severity, checks))
     else:
-        show.print_table(_screen(checks))
+        _print_screen(checks)
         show.say(_summary(checks))
     return _EXIT_RED if severity == "red" else 0
 
 
-def _document(rig: str, severity: str, checks: list[Any]) -> dict[str, Any]:
-    return {
-        "format_version": 1,
-        "rig": rig,
-        "severity": severity,
-        "checks": [vars(check) | {"values": dict(check.values)} for check in checks],
-    }
+def _document(rig: str, severity: str, checks: "list[Check]") -> dict[str, Any]:
+    """Give every line; a figure that could not be measured is null."""
+    lines = [
+        asdict(check) | {"values": {k: v if math.isfinite(v) else None for k, v in check.values.items()}}
+        for check in checks
+    ]
+    return {"format_version": 1, "rig": rig, "severity": severity, "checks": lines}
 
 
-def _screen(checks: list[Any]) -> Any:
+def _print_screen(checks: "list[Check]") -> None:
+    """Print all lines; where the terminal is too small for them, those that are ok share one a group."""
+    from rich.console import Console
+
+    console = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
+    room = console.height - _N_OTHER_LINES
+    for group in dict.fromkeys(check.group for check in checks):
+        if not sys.stdout.isatty() or len(console.render_lines(_screen(checks))) <= room:
+            break
+        checks = _together(checks, group)
+    console.print(_screen(checks))
+
+
+def _together(checks: "list[Check]", group: str) -> "list[Check]":
+    """Put a group's lines that are ok into one, before those that are not."""
+    fine = [check for check in checks if check.group == group and check.severity == "green"]
+    if len(fine) < 2:
+        return checks
+    names = ", ".join(check.name for check in fine)
+    at = next(index for index, check in enumerate(checks) if check.group == group)
+    rest = [check for check in checks if check not in fine]
+    return [*rest[:at], replace(fine[0], name="", figure=names), *rest[at:]]
+
+
+def _screen(checks: "list[Check]") -> Any:
     """Lay the lines out in columns, remedies below their line in the full width."""
     from rich.console import Group
     from rich.padding import Padding
@@ -92,7 +125,7 @@ def _screen(checks: list[Any]) -> Any:
     return Group(*rows)
 
 
-def _summary(checks: list[Any]) -> str:
+def _summary(checks: "list[Check]") -> str:
     n = Counter(check.severity for check in checks)
     if n["red"]:
         return f"{n['red']} FAIL, {n['yellow']} warn, {n['green']} ok: see the lines after ->"

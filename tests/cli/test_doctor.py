@@ -1,6 +1,10 @@
 """`lce-rig doctor`: one screen for people, one document for machines, and an exit code."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -75,3 +79,33 @@ def test_help_says_what_the_exit_code_means(lce_rig):
 
 def test_an_unknown_rig_is_an_error_of_the_profile(lce_rig):
     assert lce_rig("doctor", "--rig", "no-such-rig").code == 3
+
+
+def test_an_interrupted_examination_leaves_nothing_running(tmp_path):
+    rig = make_rig(sync=None)
+    with attach(Attached(rig, picture_of(rig.board.to_board()), has_board=False), tmp_path) as (reached, _):
+        document = reached.model_dump()
+        document["sync"] = None
+        code, *arguments = document["cameras"]["cam"]["driver"]["command"][2:]
+        program = f"import os; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); {code!s}"
+        document["cameras"]["cam"]["driver"]["command"] = [sys.executable, "-c", program, *arguments]
+        (tmp_path / "rig.yaml").write_text(dump_rig(type(rig).model_validate(document)))
+        words = ["doctor", "--rig", str(tmp_path / "rig.yaml"), "--duration", "60"]
+        with subprocess.Popen([sys.executable, "-m", "lce_rig", *words], stderr=subprocess.PIPE) as process:
+            wait_for(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 130
+        pid = (tmp_path / "pid").read_text()
+        wait_for(lambda: is_gone(pid))
+
+
+def is_gone(pid: str) -> bool:
+    state = Path(f"/proc/{pid}/stat")
+    return not state.exists() or state.read_text().rpartition(") ")[2][0] in "ZX"
+
+
+def wait_for(is_so) -> None:
+    end_s = time.monotonic() + 30
+    while not is_so():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)

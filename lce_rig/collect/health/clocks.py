@@ -61,8 +61,9 @@ def check_offsets(exam: Examination) -> Check | None:
         offset_ms = _offset_ms(seen, model)
         if offset_ms is not None:
             values[f"{sensor}.offset_ms"] = offset_ms
-        offset = "" if offset_ms is None else f" {_duration(offset_ms)},"
-        words.append(f"{sensor}{offset} {drift_ppm:+.0f} +- {max(sigma_ppm, 1):.0f} ppm")
+        if sensor != SYNC:  # the board's own line has it
+            offset = "" if offset_ms is None else f" {_duration(offset_ms)},"
+            words.append(f"{sensor}{offset} {drift_ppm:+.0f} +- {max(sigma_ppm, 1):.0f} ppm")
         if abs(drift_ppm) > _MAX_DRIFT_PPM + 3 * sigma_ppm:
             strays.append(
                 f"{sensor} drifts more than any crystal does: is a clock being set, or the computer busy?"

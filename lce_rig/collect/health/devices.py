@@ -18,7 +18,7 @@ _MAX_OFF_RATE = 0.05
 _MAX_LOST_SHARE = 0.01
 _STOPPED_S = 1.0
 _US_PER_S = 1e6
-_MAX_NAME = 80
+_MAX_COMMAND = 50
 
 
 def check_device(exam: Examination, sensor: str) -> Check:
@@ -37,7 +37,8 @@ def check_device(exam: Examination, sensor: str) -> Check:
     assert seen.status is not None  # what neither opened nor failed is a failure of its own
     problems = remarks(seen.status, "device")
     named = seen.status.device or f"answers (driver {driver_of(exam.rig, sensor)})"
-    named = shorten(named, _MAX_NAME, placeholder=" ...")  # the whole of a camera's command, say
+    if driver_of(exam.rig, sensor) == "command":
+        named = shorten(named, _MAX_COMMAND, placeholder=" ...")
     figure = ", ".join(filter(None, (named, _web_words(exam.web.get(sensor)))))
     return Check(sensor, "device", "yellow" if problems else "green", figure, as_remedy(problems))
 

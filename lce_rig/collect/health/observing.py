@@ -114,10 +114,17 @@ def observe(
     """
     start_s = time.monotonic()
     watches = {sensor: _Watch(sensor, make) for sensor, make in sources.items()}
-    for work in meanwhile:
-        work()
-    while _goes_on(list(watches.values()), time.monotonic() - start_s, duration_s):
-        time.sleep(_POLL_S)
+    try:
+        for work in meanwhile:
+            work()
+        while _goes_on(list(watches.values()), time.monotonic() - start_s, duration_s):
+            time.sleep(_POLL_S)
+    except BaseException:  # Ctrl-C too: what a source has started must not outlive the program.
+        for watch in watches.values():
+            watch.stop.set()
+        for watch in watches.values():
+            watch.result(PATIENCE_S)
+        raise
     for watch in watches.values():
         watch.stop.set()
     limit_s = max(duration_s, time.monotonic() - start_s) + PATIENCE_S

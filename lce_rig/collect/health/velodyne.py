@@ -31,7 +31,7 @@ def check_settings(exam: Examination, sensor: str) -> Check | None:
         # A sensor that sends nothing has a red line already, with all there is to check.
         if not exam.seen[sensor].has_opened:
             return None
-        remedy = f"{report.hint} Its firmware and settings stay unknown; packets come all the same."
+        remedy = "Firmware and settings stay unknown. Is driver.address its own, and no firewall in the way?"
         return Check(sensor, "settings", "yellow", report.what, remedy)
     problems = [
         problem
