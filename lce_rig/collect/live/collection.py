@@ -204,7 +204,7 @@ class _Loop:
         report.n_skipped = self._feed.n_skipped
         for name, status in self._pumps.statuses().items():
             report.n_lost[name] = status.n_lost + status.n_dropped
-        report.notes += self._keeper.notes() + self._clock.problems()
+        report.notes += self._keeper.notes() + self._clock.problems() + self._clock.account()
         if self._recorder is not None:
             report.notes += self._recorder.problems()
         self._session.journal(

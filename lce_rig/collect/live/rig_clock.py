@@ -127,6 +127,15 @@ class RigClock:
         edges = [each.problem for each in self._edges.values() if each.problem]
         return matchers + edges
 
+    def account(self) -> list[str]:
+        """Say which cameras' counts slipped against their pulses so far."""
+        return [
+            f"{name}: its count slipped against the pulses {counts.n_slips} times and began anew "
+            f"{counts.n_restarts} times; {counts.n_matched} pictures were matched, {counts.n_unmatched} not"
+            for name, counts in ((name, matcher.counts) for name, matcher in self._matchers.items())
+            if counts.n_slips or counts.n_restarts
+        ]
+
     def verdict(self) -> SyncVerdict:
         """Judge whether boards must stand still while they are captured."""
         if self._board is None:

@@ -106,6 +106,21 @@ def test_pictures_take_the_time_of_the_pulses_that_made_them_not_of_their_arriva
     assert abs(np.mean(errors_ns)) < 2_000_000
 
 
+def test_a_pulse_that_the_camera_missed_is_found_and_told() -> None:
+    clock = RigClock(synced("rlfs", "cam"), Board())
+    clock.refresh(lambda: LOCKED)
+    number = 100
+    for k in range(60):
+        sent_ns = 1_000_000_000 + k * PERIOD_NS
+        clock.take("sync", Pulse("cam", sent_ns, k + 9, T0_NS + sent_ns + HOST_AHEAD_NS))
+        if k == 30:
+            continue  # No frame, and its number is given to the next.
+        placed = clock.take("cam", picture(T0_NS + sent_ns + HOST_AHEAD_NS + 10_000_000, number))
+        number += 1
+    assert abs(int(placed[-1].stamp_ns or 0) - T0_NS - sent_ns - 10_000_000) < 1_000_000
+    assert "slipped against the pulses 1 times" in clock.account()[0]
+
+
 def test_lines_too_fast_for_their_delay_begin_slowly_and_then_run_at_full_rate() -> None:
     board = Board()
     clock = RigClock(synced("rlfs", "cam", max_delay_s=0.1), board)
