@@ -6,16 +6,19 @@
     scripts/bench.py events      boards moved before an event camera: the same, frames against events
     scripts/bench.py intrinsics  stale intrinsics: how often they are found
     scripts/bench.py guidance    a person who follows the guidance against random placements
+    scripts/bench.py paper       the experiments of the LCE-Calib paper: tables and figures, every method
     scripts/bench.py speed       detection, Algorithm 1, the command line
 
-Detections are made anew; random choices are seeded. Run it on a machine that does nothing else.
+Detections are made anew, but for those that `paper` keeps in its folder; random choices are seeded. Run it
+on a machine that does nothing else.
 """
 
 import argparse
 from importlib import import_module
+from pathlib import Path
 
 # Part -> module, and how many simulated sessions it takes by default.
-PARTS = {"real": 0, "simulated": 20, "events": 10, "intrinsics": 20, "guidance": 20, "speed": 0}
+PARTS = {"real": 0, "simulated": 20, "events": 10, "intrinsics": 20, "guidance": 20, "paper": 20, "speed": 0}
 
 
 def main() -> None:
@@ -26,11 +29,20 @@ def main() -> None:
     parser.add_argument("part", choices=list(PARTS))
     parser.add_argument("--seeds", type=int, help="simulated sessions (default 20, of moving boards 10)")
     parser.add_argument("--splits", type=int, default=20, help="random split halves (default 20)")
-    parser.add_argument("--only", default="", help="recorded sets whose name contains this")
+    parser.add_argument(
+        "--only", default="", help="recorded sets whose name contains this; of `paper` also: simulated"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("build/paper"), help="folder of `paper` (build/paper)"
+    )
+    parser.add_argument("--methods", default="", help="methods that `paper` runs anew (default all)")
     arguments = parser.parse_args()
     bench = getattr(import_module(f"benchmarks.{arguments.part}"), f"bench_{arguments.part}")
     if arguments.part == "real":
         bench(arguments.splits, arguments.only)
+    elif arguments.part == "paper":
+        methods = arguments.methods.split(",") if arguments.methods else ()
+        bench(arguments.seeds or PARTS["paper"], arguments.output, methods, arguments.only)
     elif arguments.part == "speed":
         bench()
     else:

@@ -55,9 +55,12 @@ class RecordedSet:
 
 SETS = (
     RecordedSet("rlfs01", "rlfs", (("rlfs01", "frames"),)),
+    RecordedSet("rlfs02", "rlfs", (("rlfs02", "frames"),)),
+    RecordedSet("rlfs03", "rlfs", (("rlfs03", "frames"),)),
     RecordedSet("sss_noise15mm", "sss", (("sss_noise15mm", "frames"),)),
     RecordedSet("rles01", "rles", (("rles01_lf", "frames"), ("rles01_le", "events"))),
     RecordedSet("rles02", str(RIGS / "rles02.yaml"), (("rles02_lf", "frames"), ("rles02_le", "events"))),
+    RecordedSet("rles03", str(RIGS / "rles02.yaml"), (("rles03_lf", "frames"), ("rles03_le", "events"))),
     RecordedSet("acfr_vlp16", str(RIGS / "acfr.yaml"), (("acfr_vlp16", "frames"),)),
 )
 
