@@ -87,7 +87,7 @@ def examine(rig: Rig, options: DoctorOptions | None = None) -> list[Check]:
             [lambda: computer.extend(_applying(COMPUTER_CHECKS, rig, options.folder))],
         )
         web: dict[str, WebReport | SourceError] = {name: answer.result() for name, answer in asked.items()}
-    exam = Examination(rig, seen, web, _look_for_boards(rig, seen))
+    exam = Examination(rig, seen, web, look_for_boards(rig, seen))
     checks = list(computer)
     for names, table in (
         (list(rig.lidars), LIDAR_CHECKS),
@@ -104,7 +104,7 @@ def _applying(table: tuple[Callable[..., Check | None], ...], *arguments: object
     return [line for line in (check(*arguments) for check in table) if line is not None]
 
 
-def _look_for_boards(rig: Rig, seen: Mapping[str, Observation]) -> dict[tuple[str, str], Sight]:
+def look_for_boards(rig: Rig, seen: Mapping[str, Observation]) -> dict[tuple[str, str], Sight]:
     """Look for the board in each sensor's last sample; in events only where a camera has no pictures."""
     sights = {}
     for sensor, observation in seen.items():

@@ -1,16 +1,19 @@
 """The doctor examines a rig over real transports: all of it attached, parts of it, or none."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from lce_rig.collect.health import Check, worst
-from lce_rig.pipeline.doctor import DoctorOptions, examine
+from lce_rig.collect.health.observing import Observation
+from lce_rig.pipeline.doctor import DoctorOptions, examine, look_for_boards
 from lce_rig.rig import Rig
 from lce_rig.simulate.vlp16_packets import Vlp16Clock
 from tests.collect.health.attached import Attached, attach, picture_of, scan_of
 from tests.collect.health.observed import make_rig
+from tests.detect.moving_board import CENTRE_PX, HEIGHT_PX, WIDTH_PX, Motion, board_events
 
 Lines = dict[tuple[str, str], Check]
 
@@ -43,19 +46,19 @@ def test_every_device_of_an_attached_rig_answers_by_name(everything: tuple[Lines
 
 def test_its_streams_come_and_none_of_them_is_lost(everything: tuple[Lines, float]) -> None:
     lines, _ = everything
-    # A busy computer sends late, at any lower rate: how rates are judged is tested by themselves.
-    assert 0 < lines["lidar", "stream"].values["rate_hz"] < 12
-    assert 0 < lines["cam", "stream"].values["rate_hz"] < 30
+    # A busy computer sends late and in bursts: how rates are judged is tested by itself.
+    assert lines["lidar", "stream"].values["rate_hz"] > 0 and lines["cam", "stream"].values["rate_hz"] > 0
+    assert lines["lidar", "stream"].values["data_packets"] > 200
     assert lines["lidar", "stream"].values["n_lost"] == lines["cam", "stream"].values["n_lost"] == 0
     assert lines["cam", "pulses"].values["n_pulses"] > 3 and lines["cam", "pulses"].values["n_frames"] > 3
-    assert 0 < lines["sync", "pulses"].values["cam_hz"] < 30
+    assert lines["sync", "pulses"].values["cam_hz"] > 0
 
 
 def test_its_lidar_is_locked_and_set_as_the_profile_wants(everything: tuple[Lines, float]) -> None:
     lines, _ = everything
     assert lines["lidar", "PPS"].figure.startswith("locked, NMEA ")
     assert (lines["lidar", "settings"].severity, lines["lidar", "settings"].remedy) == ("green", "")
-    assert lines["lidar", "settings"].figure.startswith("599 rpm, strongest return, 0 to 359 deg")
+    assert lines["lidar", "settings"].figure.startswith("599 rpm, strongest, 0 to 359 deg")
 
 
 def test_its_board_is_seen_by_both_sensors(everything: tuple[Lines, float]) -> None:
@@ -70,7 +73,7 @@ def test_its_board_is_seen_by_both_sensors(everything: tuple[Lines, float]) -> N
 
 def test_its_clocks_are_compared(everything: tuple[Lines, float]) -> None:
     lines, _ = everything
-    assert {"cam.drift_ppm", "sync.drift_ppm", "cam.offset_ms"} <= set(lines["rig", "clocks"].values)
+    assert {"lidar.drift_ppm", "lidar.offset_ms", "sync.drift_ppm"} <= set(lines["rig", "clocks"].values)
     assert lines["rig", "sync"].severity in ("green", "yellow")
 
 
@@ -117,3 +120,21 @@ def test_a_picture_without_a_board_says_what_to_show(tmp_path: Path) -> None:
     with attach(Attached(rig, pixels, has_board=False), tmp_path) as (reached, web_port):
         lines = doctor(reached, tmp_path, web_port, 1.0)
     assert lines["cam", "board"].severity == "yellow" and lines["cam", "board"].remedy
+
+
+@pytest.mark.parametrize(("pause_s", "is_seen"), [(10.0, True), (0.0, False)])
+def test_a_camera_of_events_alone_sees_the_board_while_it_moves(pause_s: float, is_seen: bool) -> None:
+    camera = {
+        "resolution_px": (WIDTH_PX, HEIGHT_PX),
+        "intrinsics": {"fx_px": 200.0, "fy_px": 200.0, "cx_px": CENTRE_PX[0], "cy_px": CENTRE_PX[1]},
+        "channels": {"events": {"kind": "events"}},
+    }
+    board = {"inner_corners": (6, 4), "square_m": 0.07, "width_m": 0.546, "height_m": 0.406}
+    rig = make_rig(sync=None, board=board, cameras={"cam": camera})
+    seen = Observation("cam")
+    seen.take(replace(board_events(Motion(pause_s=pause_s), 1.4, threshold=0.6), sensor="cam"))
+    sight = look_for_boards(rig, {"cam": seen})["cam", "events"]
+    assert (sight.refusal is None) == is_seen
+    if is_seen:
+        # Squares of 70 mm are 14 px wide through a lens of 200 px.
+        assert sight.values["distance_m"] == pytest.approx(1.0, rel=0.03)

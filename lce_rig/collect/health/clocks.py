@@ -28,8 +28,13 @@ def check_clock(exam: Examination, sensor: str) -> Check | None:
     if status is None:
         return None
     problems = remarks(status, "clock")
-    figure = status.clock or "no stamps yet"
-    return Check(sensor, "clock", "yellow" if problems else "green", figure, as_remedy(problems))
+    figure, figures = status.clock or "no stamps yet", status.figures
+    if "delay_ms" in figures:
+        figure += f"; {figures['delay_ms']:.0f} ms old on arrival"
+    if "round_trip_us" in figures:
+        figure += f"; round trip {figures['round_trip_us'] / 1000:.1f} ms"
+    severity: Severity = "yellow" if problems else "green"
+    return Check(sensor, "clock", severity, figure, as_remedy(problems), figures)
 
 
 def check_edges(exam: Examination, sensor: str) -> Check | None:
@@ -52,7 +57,7 @@ def check_offsets(exam: Examination) -> Check | None:
     words, strays = list[str](), list[str]()
     values: dict[str, float] = {}
     for sensor, seen in exam.seen.items():
-        model = seen.host_clock if sensor == SYNC else _by_arrivals(seen)
+        model = seen.host_clock if sensor == SYNC else _by_arrivals(exam, seen)
         if model is None:
             continue
         # The model has the computer's time on the sensor's clock: its drift is the other way round.
@@ -148,13 +153,12 @@ def _fit_edges(exam: Examination, sensor: str) -> tuple[ClockModel | None, str, 
     return edges.fit(), edges.problem.removeprefix(f"{sensor}: "), len(sent)
 
 
-def _by_arrivals(seen: Observation) -> ClockModel | None:
+def _by_arrivals(exam: Examination, seen: Observation) -> ClockModel | None:
+    """Fit this computer's time on a sensor's clock; None of stamps that are arrivals themselves."""
     stream = next((name for name in _STREAMS if name in seen.stamps), None)
-    # Scans without time of their own are stamped by arrival, which says nothing of a clock.
-    is_arrival = (
-        stream == "scans" and seen.status is not None and not seen.status.figures.get("is_device_time")
-    )
-    if stream is None or is_arrival:
+    if stream is None or seen.status is None or driver_of(exam.rig, seen.sensor) == "command":
+        return None
+    if stream == "scans" and not seen.status.figures.get("is_device_time"):
         return None
     stamps, arrivals = seen.times(stream)
     if len(stamps) < 2 or (np.diff(stamps) <= 0).any():

@@ -53,10 +53,13 @@ def check_pulse(exam: Examination, sensor: str) -> Check | None:
         state = velodyne.PPS_STATES[round(figures["pps_state"])]
     else:
         state = report.pps if isinstance(report, WebReport) and report.pps else "unknown"
-    figure = f"{state}, {_nmea_words(figures)}; {seen.status.clock}"
+    figure = f"{state}, {_nmea_words(figures)}"
     values = {name: value for name, value in figures.items() if name in _CLOCK_FIGURES}
     if figures.get("is_device_time"):
-        return Check(sensor, "PPS", "green", figure, values=values)
+        return Check(sensor, "PPS", "green", f"{figure}; {seen.status.clock}", values=values)
+    cause = seen.status.clock.partition("by arrival: ")[2]
+    is_said = cause in ("", f"PPS is {state}", f"PPS is {state}, but no NMEA arrives")
+    figure += "; scans are stamped by arrival" if is_said else f"; scans are stamped by arrival: {cause}"
     remedy = _lost_time_remedy(seen.status.clock, seen.status.problems)
     return Check(sensor, "PPS", _without_lock(lidar), figure, remedy, values)
 
@@ -86,8 +89,6 @@ def _lost_time_remedy(clock: str, problems: tuple[str, ...]) -> str:
 def _setting_words(report: WebReport) -> str:
     rotor = None if report.rotor_hz is None else f"{60 * report.rotor_hz:.0f} rpm"
     view = None if report.fov_deg is None else f"{report.fov_deg[0]:.0f} to {report.fov_deg[1]:.0f} deg"
-    ports = f"port {report.data_port}" if report.data_port else None
-    host = f"to {report.host}" if report.host else None
-    return ", ".join(
-        filter(None, (rotor, f"{report.returns} return" if report.returns else None, view, host, ports))
-    )
+    port = f":{report.data_port}" if report.data_port else ""
+    host = f"to {report.host}{port}" if report.host or port else None
+    return ", ".join(filter(None, (rotor, report.returns, view, host)))

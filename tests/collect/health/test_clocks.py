@@ -23,6 +23,12 @@ def with_utc(board: Observation) -> Observation:
     return replace(board, utc_clock=board.host_clock)
 
 
+def v4l2_rig() -> Rig:
+    document = make_rig().model_dump()
+    document["cameras"]["cam"]["driver"] = {"type": "v4l2", "device": "/dev/video0"}
+    return Rig.model_validate(document)
+
+
 def davis_rig() -> Rig:
     document = make_rig().model_dump()
     document["cameras"]["cam"] |= {"model": "DAVIS346", "driver": {"type": "davis"}}
@@ -45,7 +51,7 @@ def test_the_drift_and_offset_of_every_stream_are_measured_against_the_computer(
         (START_NS + round((1 + 30e-6) * (stamp_ns - START_NS)) - 7_000_000, host_ns)
         for stamp_ns, host_ns in drifting.stamps["frames"]
     ]
-    line = check_offsets(examination(lidar(figures=LOCKED), drifting, sync_board()))
+    line = check_offsets(examination(lidar(figures=LOCKED), drifting, sync_board(), rig=v4l2_rig()))
     assert line is not None and line.severity == "green"
     assert line.values["lidar.offset_ms"] == pytest.approx(0.3)
     assert line.values["cam.offset_ms"] == pytest.approx(-7.0, abs=0.2)
@@ -59,12 +65,12 @@ def test_a_clock_that_is_being_set_is_told() -> None:
         (START_NS + round(1.01 * (stamp_ns - START_NS)), host_ns)
         for stamp_ns, host_ns in stepped.stamps["frames"]
     ]
-    line = check_offsets(examination(stepped))
+    line = check_offsets(examination(stepped, rig=v4l2_rig()))
     assert line is not None and line.severity == "yellow" and "more than any crystal" in line.remedy
 
 
-def test_scans_stamped_by_arrival_say_nothing_of_a_clock() -> None:
-    assert check_offsets(examination(lidar())) is None
+def test_scans_and_pictures_stamped_by_arrival_say_nothing_of_a_clock() -> None:
+    assert check_offsets(examination(lidar(), camera())) is None
 
 
 def test_a_davis_is_fitted_to_the_edges_it_saw() -> None:
@@ -112,6 +118,17 @@ def test_still_boards_are_no_fault_where_the_profile_promises_nothing() -> None:
 def test_absent_sensors_are_left_out_of_the_verdict() -> None:
     absent = Observation("cam", failure=SourceError("it is not there"))
     assert check_sync(examination(lidar(figures=LOCKED), absent, with_utc(sync_board()))) is None
+
+
+def test_how_old_pictures_are_and_how_long_the_board_takes_to_answer_is_said() -> None:
+    exam = examination(
+        camera(clock="start of frame by clock monotonic", figures={"delay_ms": 12.4}),
+        sync_board(clock="the board's own", figures={"round_trip_us": 240.0}),
+    )
+    of_camera, of_board = check_clock(exam, "cam"), check_clock(exam, "sync")
+    assert of_camera is not None and of_board is not None
+    assert of_camera.figure == "start of frame by clock monotonic; 12 ms old on arrival"
+    assert of_board.figure == "the board's own; round trip 0.2 ms"
 
 
 def test_doubts_of_a_driver_about_its_clock_stand_in_its_line() -> None:

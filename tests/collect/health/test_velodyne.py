@@ -43,14 +43,15 @@ def test_a_sensor_without_pulses_is_judged_by_what_the_profile_promises(
     seen = lidar(figures=ABSENT, clock=ARRIVAL, problems=(problem,))
     line = check_pulse(examination(seen, rig=with_timestamps(**timestamps)), "lidar")
     assert line is not None and line.severity == severity
-    assert line.figure.startswith("absent, no NMEA")
+    assert line.figure == "absent, no NMEA; scans are stamped by arrival"
     assert line.remedy.splitlines()[0] == "Check the pulse at the LiDAR's interface box."
 
 
 def test_without_position_packets_the_web_page_tells_of_the_pulse() -> None:
     seen = lidar(clock="this computer's clock, by arrival: no position packets have come")
     line = check_pulse(examination(seen, web={"lidar": WebReport(pps="locked")}), "lidar")
-    assert line is not None and line.figure.startswith("locked, no position packets")
+    assert line is not None
+    assert line.figure.startswith("locked, no position packets; scans are stamped by arrival: no position")
 
 
 def test_settings_that_differ_from_the_profile_are_named_once() -> None:
@@ -64,7 +65,7 @@ def test_settings_that_differ_from_the_profile_are_named_once() -> None:
     )
     line = check_settings(examination(lidar(), web={"lidar": report}), "lidar")
     assert line is not None and line.severity == "yellow"
-    assert line.figure == "1200 rpm, strongest return, 10 to 350 deg, port 2369"
+    assert line.figure == "1200 rpm, strongest, 10 to 350 deg, to :2369"
     remedies = line.remedy.splitlines()
     # The pulse has a line of its own.
     assert len(remedies) == 3 and not any("PPS" in remedy for remedy in remedies)
