@@ -71,7 +71,7 @@ def check_offsets(exam: Examination) -> Check | None:
             words.append(f"{sensor}{offset} {drift_ppm:+.0f} +- {max(sigma_ppm, 1):.0f} ppm")
         if abs(drift_ppm) > _MAX_DRIFT_PPM + 3 * sigma_ppm:
             strays.append(
-                f"{sensor} drifts more than any crystal does: is a clock being set, or the computer busy?"
+                f"the clock of {sensor} drifts as no crystal does: is one being set, or the computer busy?"
             )
     if not words:
         return None

@@ -78,7 +78,13 @@ def wanted_rate_hz(rig: Rig, sensor: str) -> float | None:
 
 
 def rate_hz(seen: Observation, stream: str) -> float:
-    """Measure how many a second came; 0 where fewer than two did."""
+    """Measure how many a second came; 0 where fewer than two did.
+
+    A LiDAR's is its rotor's speed, by its own clock: scans arrive late on a busy computer.
+    """
+    rotor_hz = 0.0 if seen.status is None else seen.status.figures.get("rotor_hz", 0.0)
+    if stream == "scans" and seen.stamps.get(stream) and rotor_hz > 0:
+        return rotor_hz
     _, arrivals = seen.times(stream)
     span_ns = int(arrivals[-1] - arrivals[0]) if len(arrivals) > 1 else 0
     return 1e9 * (len(arrivals) - 1) / span_ns if span_ns > 0 else 0.0

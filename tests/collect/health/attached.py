@@ -26,8 +26,8 @@ from tests.sources.live.test_vlp16_web import PAGES, serving
 from tests.sources.vlp16_room import T0_NS, room_scan
 
 HERE = "127.0.0.1"
-PERIOD_S = 0.05
-# Pictures come so long after the beginning of each twentieth of a second, at which the board pulses.
+PERIOD_S = 0.1
+# Pictures come so long after the beginning of each tenth of a second, at which the board pulses.
 DELAY_S = 0.015
 CAMERA = """
 import sys, time

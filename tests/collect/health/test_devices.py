@@ -54,6 +54,11 @@ def test_the_rotors_rate_is_held_against_the_profile(rate_hz: float, severity: s
     assert "(10 wanted), 3770 packets, none lost" in line.figure
 
 
+def test_scans_that_arrive_late_do_not_make_the_rotor_slow() -> None:
+    line = check_stream(examination(lidar(8.0, figures={"rotor_hz": 10.01})), "lidar")
+    assert line is not None and line.severity == "green" and line.figure.startswith("10.0 scans/s")
+
+
 @pytest.mark.parametrize(("n_lost", "severity"), [(0, "green"), (1, "yellow"), (40, "red")])
 def test_losses_are_counted_and_judged_by_their_share(n_lost: int, severity: str) -> None:
     line = check_stream(examination(lidar(n_lost=n_lost, figures={"data_packets": 3770.0})), "lidar")

@@ -1,6 +1,7 @@
 """Frames equal pulses, or the line says so."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -10,9 +11,12 @@ from lce_rig.rig import Rig
 from .observed import camera, examination, make_rig, sync_board
 
 
+def with_sync(**sync: Any) -> Rig:
+    return make_rig(sync={"device": "/dev/null", **sync})
+
+
 def with_trigger(**trigger: float) -> Rig:
-    sync = {"device": "/dev/null", "triggers": {"cam": {"channel": 0, "rate_hz": 20.0, **trigger}}}
-    return make_rig(sync=sync)
+    return with_sync(triggers={"cam": {"channel": 0, "rate_hz": 20.0, **trigger}})
 
 
 def test_as_many_frames_as_pulses_are_green_with_their_delay() -> None:
@@ -61,6 +65,15 @@ def test_the_boards_lines_are_held_against_the_profile() -> None:
     assert slow is not None and slow.severity == "yellow" and "should pulse at 20 Hz" in slow.remedy
     dead = check_pulses_sent(examination(replace(sync_board(), pulses=[])))
     assert dead is not None and dead.severity == "red"
+
+
+def test_a_pulse_per_second_that_is_none_is_told() -> None:
+    line = check_pulses_sent(examination(sync_board(rate_hz=2.0, line="pps"), rig=with_sync(triggers={})))
+    assert line is not None and line.severity == "yellow" and "pps should pulse at 1 Hz" in line.remedy
+
+
+def test_a_receiver_that_tells_the_time_only_has_no_pulses_to_count() -> None:
+    assert check_pulses_sent(examination(sync_board(), rig=with_sync(type="nmea"))) is None
 
 
 def test_without_a_board_there_is_no_line() -> None:
