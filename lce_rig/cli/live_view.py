@@ -65,9 +65,10 @@ class PlainView:
             if note not in self._notes:
                 self._notes.add(note)
                 _print(f"note: {note}")
-        for text in _new(state, self._n_logged):
+        n_new = min(state.n_logged - self._n_logged, len(state.log))
+        for text in state.log[len(state.log) - n_new :]:
             _print(text)
-        self._n_logged = state.cues[-1].number if state.cues else 0
+        self._n_logged = state.n_logged
         said = (state.phase, state.headline)
         is_due = (
             self._said is None or said[0] != self._said[0] or state.elapsed_s - self._said_s > _PLAIN_EVERY_S
@@ -194,12 +195,6 @@ def _drawing(state: LiveState) -> Any:
     height, width = drawing.pixels.shape[:2]
     rows = draw_outlines((width, height), drawing.wanted_px, drawing.present_px, _DRAWING_SIZE)
     return Text("\n".join(rows), style="green" if drawing.is_there else "", no_wrap=True)
-
-
-def _new(state: LiveState, n_known: int) -> list[str]:
-    """List the messages that belong to cues not known yet."""
-    n_new = sum(1 for cue in state.cues if cue.number > n_known and cue.sound != "tick")
-    return list(state.log[-n_new:]) if n_new else []
 
 
 def _clock(state: LiveState) -> str:

@@ -111,9 +111,12 @@ def test_plain_lines_say_what_changes_once(capsys: pytest.CaptureFixture[str]) -
             headline="20 cm left",
             cues=(Cue(1, "captured"),),
             log=("01:19 captured 000001",),
+            n_logged=1,
         )
     )
-    view.show(replace(moving, elapsed_s=79.2, phase="ended", headline="over"))
+    # A message without a sound, such as a sensor that is back, is said as well.
+    told = ("01:19 captured 000001", "01:19 lidar is back")
+    view.show(replace(moving, elapsed_s=79.2, phase="ended", headline="over", log=told, n_logged=2))
     out, err = capsys.readouterr()
     assert out == ""
     assert err.splitlines() == [
@@ -121,6 +124,7 @@ def test_plain_lines_say_what_changes_once(capsys: pytest.CaptureFixture[str]) -
         "01:15 moving: one step left",
         "01:19 moving: 20 cm left (2 rings)",
         "01:19 captured 000001",
+        "01:19 lidar is back",
     ]
 
 

@@ -41,6 +41,7 @@ class Monitor:
         self._cues: deque[Cue] = deque(maxlen=_N_CUES)
         self._n_cues = 0
         self._log: deque[str] = deque(maxlen=_N_LOG)
+        self._n_logged = 0
         self._narration = Narration("starting", "waiting for the sensors")
         self._guide: Guide | None = None
         self._drawing: Drawing | None = None
@@ -89,6 +90,7 @@ class Monitor:
     def log(self, text: str) -> None:
         """Log a message, with the time since the beginning."""
         elapsed_s = int(time.monotonic() - self._began_s)
+        self._n_logged += 1
         self._log.append(f"{elapsed_s // 60:02d}:{elapsed_s % 60:02d} {text}")
 
     def is_due(self) -> bool:
@@ -124,6 +126,7 @@ class Monitor:
             cues=tuple(self._cues),
             log=tuple(self._log),
             notes=self._notes(),
+            n_logged=self._n_logged,
         )
 
     def _phase(self, *, is_enough: bool, has_ended: bool) -> tuple[Phase, str, str]:

@@ -97,17 +97,23 @@ class Pumps:
             try:
                 for sample in source.samples():
                     self._queue.put((source.sensor, sample))
+                    self._note_back(source.sensor)
                 if self._stop.is_set():
                     return
                 error = SourceError(f"{source.sensor} ended", "Start it again.")
             except SourceError as failure:
                 error = failure
             with self._lock:
-                self._lost[source.sensor] = error, time.monotonic()
+                since_s = self._lost[source.sensor][1] if source.sensor in self._lost else time.monotonic()
+                self._lost[source.sensor] = error, since_s
             if not self._reopen(source):
                 return
+
+    def _note_back(self, sensor: str) -> None:
+        """Call a sensor back when it sends: a program that can be started may still find no camera."""
+        if sensor in self._lost:
             with self._lock:
-                del self._lost[source.sensor]
+                del self._lost[sensor]
                 self._n_reopened += 1
 
     def _reopen(self, source: LiveSource) -> bool:

@@ -95,6 +95,7 @@ class LiveState:
         cues: the latest few, oldest first.
         log: the latest messages, oldest first.
         notes: what holds all the time: "boards must stand still: ...".
+        n_logged: messages since the beginning, of which `log` holds the latest.
     """
 
     rig: str
@@ -116,3 +117,4 @@ class LiveState:
     cues: tuple[Cue, ...] = ()
     log: tuple[str, ...] = ()
     notes: tuple[str, ...] = field(default=())
+    n_logged: int = 0

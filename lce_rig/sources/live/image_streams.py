@@ -179,9 +179,8 @@ class PnmPictures(PictureStream):
         shape = (height, width, 3) if match.group(1) == b"P6" else (height, width)
         values = np.frombuffer(payload, ">u2" if most > 255 else "u1", offset=match.end()).reshape(shape)
         if most != 255:
-            values = values * (255.0 / most)
-        pixels = np.asarray(np.rint(np.minimum(values, 255)), dtype=np.uint8)
-        return pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[:, :, ::-1])
+            values = np.rint(np.minimum(values * (255.0 / most), 255)).astype(np.uint8)
+        return np.array(values if values.ndim == 2 else values[:, :, ::-1])
 
 
 class JpegPictures(PictureStream):
