@@ -69,7 +69,7 @@ def plot_noise(path: Path, runs: Sequence[Run], normals_deg: Mapping[int, float]
             values = [normals_deg[level] for level in LEVELS]
             panel.plot(_NOISE_CM, values, "o-", color="black", **_LINE, label="ours: boards found in scans")
         panel.set_title(title, fontsize=9)
-        _logarithmic(panel)
+        _scale(panel)
     for panel in axes[1]:
         panel.set_xlabel("range noise [cm]")
     _finish(figure, path)
@@ -90,7 +90,7 @@ def plot_frames(path: Path, columns: Mapping[str, FrameErrors]) -> None:
             for method, values in errors.items():
                 panel.plot(counts, values[:, row], **_style(list(errors), method))
             panel.set_ylabel(unit)
-            _logarithmic(panel)
+            _scale(panel)
         panels[1].set_xlabel("frames")
     _finish(figure, path)
 
@@ -130,12 +130,17 @@ def _style(methods: Sequence[str], method: str) -> dict[str, Any]:
     return {"marker": _MARKERS[k], "color": _COLOURS[k], "label": label_of(method), **_LINE}
 
 
-def _logarithmic(panel: Any) -> None:
+def _scale(panel: Any) -> None:
+    """Choose a logarithmic axis where the lines of a panel span a decade, else one from zero."""
+    values = np.concatenate([line.get_ydata() for line in panel.lines])
+    panel.grid(True, which="both", alpha=0.25, linewidth=0.5)
+    if np.nanmax(values) < 10 * np.nanmin(values):
+        panel.set_ylim(bottom=0)
+        return
     panel.set_yscale("log")
     panel.yaxis.set_major_formatter("{x:g}")
     panel.yaxis.set_minor_formatter(_few_ticks)
     panel.tick_params(axis="y", which="minor", labelsize=7)
-    panel.grid(True, which="both", alpha=0.25, linewidth=0.5)
 
 
 def _few_ticks(value: float, _position: int) -> str:
@@ -150,8 +155,14 @@ def _finish(figure: Figure, path: Path) -> None:
     for panel in figure.axes:
         handles, labels = panel.get_legend_handles_labels()
         entries |= dict(zip(labels, handles, strict=True))
+    n_columns = int(figure.get_figwidth() / 2.4)
     figure.legend(
-        entries.values(), entries.keys(), loc="outside lower center", ncols=3, fontsize=8, frameon=False
+        entries.values(),
+        entries.keys(),
+        loc="outside lower center",
+        ncols=n_columns,
+        fontsize=8,
+        frameon=False,
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     for suffix in (".png", ".pdf"):
