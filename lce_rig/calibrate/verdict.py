@@ -1,80 +1,93 @@
 """May this extrinsic be used? Each doubt is one reason with its figure and what to do about it."""
 
-from dataclasses import dataclass
-from typing import Literal
-
 import numpy as np
 
 from lce_rig.calibrate.channels import ChannelsEstimate
+from lce_rig.calibrate.control import doubt_control
+from lce_rig.calibrate.doubt import Doubt, Verdict, weigh
 from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.scale import ScaleCheck, compare_scales
+from lce_rig.calibrate.examination import Examination
+from lce_rig.calibrate.halves import doubt_halves
+from lce_rig.calibrate.intrinsics_check import explain
+from lce_rig.calibrate.nuisances import doubt_nuisances
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import rotation_angle
 from lce_rig.core.results import Metrics
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 
-Verdict = Literal["pass", "marginal", "fail"]
-_ORDER: tuple[Verdict, ...] = ("pass", "marginal", "fail")
-
-# Camera and LiDAR distances: intrinsics and squares measured with care agree to about 1 %.
-SCALE_MARGINAL, SCALE_FAIL = 0.01, 0.025
 # A side of the plate counts as measured below this deviation; 5 % of it is more than the beam's spot.
 PLATE_KNOWN_M, PLATE_FAIL = 0.03, 0.05
-# Planes of both sensors agree to 6-8 mm where boards stand still, to 20-30 mm where they are hand-held.
-MOVING_M = 0.012
 # 99 % of the chi-squared distribution of six freedoms.
 CHANNELS_CHI2 = 16.81
+_AXES = ("x right", "y down", "z forward")
 # What helps where more captures do not.
 MEASURE_RANGES = (
     "the LiDAR's constant range errors alone exceed it: measure them, correct them in its driver and lower "
     "range_offset_sigma_m and laser_bias_sigma_m in the profile, or put more rings on the board"
 )
-# How many times the target a deviation may be before the result is of no use.
-SIGMA_FAIL = 3.0
-# Held-out residuals of a sound model exceed the fitted ones only slightly.
-HELD_OUT_MARGINAL = 1.6
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """One reason against a result, and how bad it is."""
-
-    verdict: Verdict
-    text: str
 
 
 def judge(
-    result: ChannelsEstimate, rig: Rig, camera: str, lidar: str, n_captures: int
+    result: ChannelsEstimate,
+    examination: Examination,
+    rig: Rig,
+    camera: str,
+    lidar: str,
+    n_captures: int,
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Weigh everything known about an extrinsic.
 
     Args:
-        result: the extrinsic with its residuals and refusals, and what each channel says.
+        result: what each channel says.
+        examination: the extrinsic with its residuals and refusals, and what checks on its captures found.
         rig: thresholds, targets and the nominal extrinsic.
         camera: name of the camera.
         lidar: name of the LiDAR.
         n_captures: captures looked at, with those in which no board was found.
 
     Returns:
-        The verdict, and the reasons for anything but a pass: worst first, causes before symptoms.
+        The verdict, and the reasons for anything but a pass: worst first, causes before symptoms. A remark on
+        a widened standard deviation may stand beside a pass.
     """
-    estimate = result.estimate
+    estimate = examination.estimate
     doubts = [
         *_certificate(estimate),
-        *_scale(estimate, rig.board.to_board()),
+        *_intrinsics(examination, rig),
         *_plate(estimate, rig.board.to_board()),
-        *_motion(result),
+        *_shared(examination, rig, lidar),
+        *doubt_halves(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
+        *_motion(result, estimate, rig.verdict.max_plane_misfit_m),
         *_channels(result, rig),
         *_residuals(estimate, rig),
+        *_control(examination, rig),
         *_refusals(estimate),
         *_detected(estimate, n_captures, rig.quality.min_detected_fraction),
         *_placements(estimate, rig.quality.min_captures),
         *_nominal(estimate, rig.nominal(camera, lidar)),
         *_precision(estimate, rig),
     ]
-    doubts.sort(key=lambda doubt: -_ORDER.index(doubt.verdict))
-    verdict = doubts[0].verdict if doubts else "pass"
-    return verdict, tuple(doubt.text for doubt in doubts)
+    if examination.remark:
+        doubts.append(Doubt("pass", examination.remark))
+    return weigh(doubts)
+
+
+def _intrinsics(examination: Examination, rig: Rig) -> list[Doubt]:
+    check, target_deg = examination.intrinsics, rig.calibration.target_sigma_deg
+    if check is None or check.verdict(target_deg) == "pass":
+        return []
+    return [Doubt(check.verdict(target_deg), explain(check, target_deg))]
+
+
+def _shared(examination: Examination, rig: Rig, lidar: str) -> list[Doubt]:
+    if examination.nuisances is None:
+        return []
+    return doubt_nuisances(examination.nuisances, rig.board.to_board(), rig.lidars[lidar], rig.verdict)
+
+
+def _control(examination: Examination, rig: Rig) -> list[Doubt]:
+    if examination.control is None:
+        return []
+    return doubt_control(examination.control, rig.verdict.control_sigmas)
 
 
 def _certificate(estimate: CalibrationEstimate) -> list[Doubt]:
@@ -90,21 +103,22 @@ def _certificate(estimate: CalibrationEstimate) -> list[Doubt]:
 def _precision(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
     doubts = []
     target = rig.calibration
-    rotation_deg = float(np.degrees(np.sqrt(np.trace(estimate.cov[3:, 3:]))))
-    translation_m = float(np.sqrt(np.trace(estimate.cov[:3, :3])))
-    for sigma, goal, what, unit, scale in (
-        (rotation_deg, target.target_sigma_deg, "rotation", "deg", 1.0),
-        (translation_m, target.target_sigma_m, "translation", "mm", 1000.0),
+    sigmas = np.sqrt(np.diag(estimate.cov))
+    for axes, goal, what, unit, scale in (
+        (np.degrees(sigmas[3:]), target.target_sigma_deg, "rotation", "deg", 1.0),
+        (sigmas[:3], target.target_sigma_m, "translation", "mm", 1000.0),
     ):
+        sigma = float(np.linalg.norm(axes))
         if sigma > goal:
-            verdict: Verdict = "fail" if sigma > SIGMA_FAIL * goal else "marginal"
+            verdict: Verdict = "fail" if sigma > rig.verdict.fail_factor * goal else "marginal"
             figures = f"{scale * sigma:.2g} {unit}, target {scale * goal:.2g} {unit}"
+            by_axis = ", ".join(f"{name} {scale * axis:.2g}" for name, axis in zip(_AXES, axes, strict=True))
             key = f"sigma_systematic_{what}_{'deg' if what == 'rotation' else 'm'}"
             # Where the LiDAR's own errors alone miss the target, no number of captures will reach it.
             is_lidar = estimate.diagnostics.get(key, 0.0) > goal
             advice = MEASURE_RANGES if is_lidar else "collect more captures"
             weakest = f"weakest: {estimate.weak_direction}"
-            doubts.append(Doubt(verdict, f"{what} known to {figures}: {advice}; {weakest}"))
+            doubts.append(Doubt(verdict, f"{what} known to {figures} ({by_axis}): {advice}; {weakest}"))
     return doubts
 
 
@@ -124,15 +138,15 @@ def _residuals(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
     advice = "was the board moving, or are board size or intrinsics wrong?"
     doubts = [Doubt("fail", f"{text}: {advice}") for text in residuals_beyond(estimate.metrics, rig.quality)]
     fitted = float(np.mean([np.hypot(r.plane_rms_m, r.edge_rms_m) for r in estimate.residuals]))
-    if np.isfinite(estimate.held_out_m) and estimate.held_out_m > HELD_OUT_MARGINAL * fitted:
+    if np.isfinite(estimate.held_out_m) and estimate.held_out_m > rig.verdict.max_held_out_ratio * fitted:
         text = f"captures left out fit worse ({1000 * estimate.held_out_m:.1f} mm) than captures used"
         doubts.append(Doubt("marginal", f"{text} ({1000 * fitted:.1f} mm): collect more captures"))
     return doubts
 
 
-def _motion(result: ChannelsEstimate) -> list[Doubt]:
-    rms_m = result.estimate.diagnostics.get("fit_plane_rms_m", 0.0)
-    if rms_m <= MOVING_M:
+def _motion(result: ChannelsEstimate, estimate: CalibrationEstimate, limit_m: float) -> list[Doubt]:
+    rms_m = estimate.diagnostics.get("fit_plane_rms_m", 0.0)
+    if rms_m <= limit_m:
         return []
     is_compensated = any(channel.time_offset_s is not None for channel in result.channels)
     still = "with their motion taken off" if is_compensated else "under 10 mm for still boards"
@@ -158,7 +172,7 @@ def _channels(result: ChannelsEstimate, rig: Rig) -> list[Doubt]:
     if surprise <= CHANNELS_CHI2 or excess <= 1:
         return []
     names = " and ".join(channel.channel for channel in result.channels)
-    verdict: Verdict = "fail" if excess > SIGMA_FAIL else "marginal"
+    verdict: Verdict = "fail" if excess > rig.verdict.fail_factor else "marginal"
     text = f"{names} of one camera disagree by {rotation_deg:.2f} deg, {1000 * translation_m:.0f} mm"
     advice = (
         "beyond their uncertainty: calibrate each alone (--channels) and see which captures contradict it"
@@ -208,17 +222,6 @@ def _nominal(estimate: CalibrationEstimate, nominal: NominalExtrinsic | None) ->
     return [Doubt("fail", f"{text} ({limit}): {advice}")]
 
 
-def _scale(estimate: CalibrationEstimate, board: Board) -> list[Doubt]:
-    observations = [estimate.observations[name] for name in estimate.used]
-    if len(observations) < 4:
-        return []
-    check = compare_scales(observations)
-    if not check.is_off(SCALE_MARGINAL):
-        return []
-    verdict: Verdict = "fail" if check.is_off(SCALE_FAIL) else "marginal"
-    return [Doubt(verdict, explain_scale(check, board))]
-
-
 def _plate(estimate: CalibrationEstimate, board: Board) -> list[Doubt]:
     """Compare the plate as the LiDAR measures it with the profile; sigmas are mostly the beam's spot."""
     doubts = []
@@ -237,15 +240,3 @@ def _plate(estimate: CalibrationEstimate, board: Board) -> list[Doubt]:
             text += f" than the profile says ({wanted_m:.3f} m): measure the plate"
             doubts.append(Doubt(verdict, text))
     return doubts
-
-
-def explain_scale(check: ScaleCheck, board: Board) -> str:
-    """Say by how much distances differ, and what the squares would measure if they are the cause."""
-    percent = 100 * abs(check.ratio - 1)
-    longer = "longer" if check.ratio > 1 else "shorter"
-    square_mm = 1000 * board.square_m / check.ratio
-    return (
-        f"camera distances are {percent:.1f} +- {100 * check.sigma:.1f} % {longer} than the LiDAR's: "
-        f"the squares measure {square_mm:.1f} mm instead of {1000 * board.square_m:.1f} mm, "
-        "or the intrinsics belong to another lens"
-    )

@@ -139,7 +139,7 @@ def _board_table(rig: "Rig") -> Any:
 def _limit_table(rig: "Rig") -> Any:
 
     table = screen.plain_table("", "threshold or weight", "value", "default")
-    for block in ("quality", "calibration"):
+    for block in ("quality", "calibration", "verdict"):
         settings = getattr(rig, block)
         for key, field in type(settings).model_fields.items():
             value = getattr(settings, key)

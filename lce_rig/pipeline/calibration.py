@@ -17,11 +17,13 @@ from lce_rig.calibrate import (
     calibrate_channels,
 )
 from lce_rig.calibrate.consensus import find_consensus
+from lce_rig.calibrate.examination import Examination, examine
+from lce_rig.calibrate.intrinsics_estimate import View
 from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.calibrate.verdict import judge
 from lce_rig.core.errors import NotEnoughDataError, UsageError
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration, Refusal
+from lce_rig.core.results import Calibration, ImageBoard, Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.pipeline.progress import Progress, silent
@@ -109,12 +111,28 @@ def _calibrate_sensors(
     )
     clocks = clocks_of(rig, camera, lidar)
     result = calibrate_channels(candidates, rig.board.to_board(), pair_options, clocks, progress)
+    lens = rig.cameras[camera].to_intrinsics()
+    views = _views(detections, pairs, result)
+    examination = examine(result.estimate, rig, settings, lens, views)
     n_captures = len({name for pair in pairs for name in detections.captures(pair)})
-    calibration = _judged(rig, camera, lidar, result, n_captures=n_captures, refused=refused)
+    calibration = _judged(rig, camera, lidar, result, examination, n_captures=n_captures, refused=refused)
     truth = reference.of(camera, lidar) if reference else None
     if truth is not None:
         calibration = compare_with_reference(calibration, truth)
-    return calibration, result.estimate
+    return calibration, examination.estimate
+
+
+def _views(detections: Detections, pairs: Sequence[Pair], result: ChannelsEstimate) -> list[View]:
+    """List the pictures of the captures behind an extrinsic, of the channels that gave it."""
+    used = sorted(_single(result.estimate.used))
+    channels = {channel.channel for channel in result.channels}
+    views = []
+    for name in used:
+        for pair in pairs:
+            image = detections.images[pair.camera, pair.channel].get(name)
+            if pair.channel in channels and isinstance(image, ImageBoard):
+                views.append(View(name, pair.channel, image))
+    return views
 
 
 def _usable(
@@ -196,12 +214,13 @@ def _judged(
     camera: str,
     lidar: str,
     result: ChannelsEstimate,
+    examination: Examination,
     *,
     n_captures: int,
     refused: dict[str, Refusal],
 ) -> Calibration:
-    verdict, reasons = judge(result, rig, camera, lidar, n_captures)
-    estimate = result.estimate
+    verdict, reasons = judge(result, examination, rig, camera, lidar, n_captures)
+    estimate = examination.estimate
     diagnostics = dict(estimate.diagnostics)
     if result.difference is not None:
         diagnostics["channels_rotation_deg"] = float(np.degrees(np.linalg.norm(result.difference[3:])))

@@ -16,7 +16,7 @@ from lce_rig.rig.sensors import (
     TimestampSettings,
 )
 from lce_rig.rig.sync import SyncSettings, TriggerSettings
-from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings
+from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
 __all__ = [
     "BoardSettings",
@@ -34,6 +34,7 @@ __all__ = [
     "SyncSettings",
     "TimestampSettings",
     "TriggerSettings",
+    "VerdictSettings",
     "derive_text",
     "dump_rig",
     "find_profile",

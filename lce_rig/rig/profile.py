@@ -11,7 +11,7 @@ from lce_rig.rig.extrinsics import NominalExtrinsic
 from lce_rig.rig.sensors import CameraSettings, LidarSettings
 from lce_rig.rig.settings import FrameName, Name, RigName, Settings, problem
 from lce_rig.rig.sync import SyncSettings
-from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings
+from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
 
 class Rig(Settings):
@@ -39,6 +39,7 @@ class Rig(Settings):
     sync: SyncSettings | None = None
     quality: QualitySettings = QualitySettings()
     calibration: CalibrationSettings = CalibrationSettings()
+    verdict: VerdictSettings = VerdictSettings()
 
     @model_validator(mode="after")
     def _frames_are_unique(self) -> "Rig":

@@ -75,3 +75,36 @@ class CalibrationSettings(Settings):
     edge_weight: Positive = 3.0
     target_sigma_deg: Positive = 0.2
     target_sigma_m: Positive = 0.01
+
+
+class VerdictSettings(Settings):
+    """When a result passes; what is beyond a limit is marginal, and fails where a second limit says so.
+
+    Attributes:
+        fail_factor: a deviation, or a difference between two answers, this many times the target fails.
+        max_scale_error: how far camera and LiDAR distances may differ, as a fraction; 2.5 times that fails.
+        max_edge_shift_m: how far ring ends may lie beyond the plate's edge; beams are not wider.
+        max_plane_misfit_m: rms between the planes of both sensors that boards held still stay below.
+        max_held_out_ratio: how many times worse captures may fit that were left out.
+        max_prior_sigmas: how many of the profile's `laser_bias_sigma_m` a laser's range offset may reach.
+        max_change: largest difference of earlier and later captures, in targets; twice it fails.
+        max_contrast: the same between near and far, left and right, upper and lower boards, whose differences
+            all but cancel in the whole.
+        least_chance: such a difference counts where chance makes it this rarely.
+        control_sigmas: how many standard deviations the result is moved for the control; captures that
+            were left out must then fit worse.
+        max_spread_ratio: where resampled captures spread the result by more than this many claimed standard
+            deviations, the claim is widened.
+    """
+
+    fail_factor: Annotated[float, Field(gt=1)] = 3.0
+    max_scale_error: Positive = 0.008
+    max_edge_shift_m: Positive = 0.03
+    max_plane_misfit_m: Positive = 0.012
+    max_held_out_ratio: Annotated[float, Field(gt=1)] = 1.6
+    max_prior_sigmas: Positive = 4.0
+    max_change: Positive = 1.5
+    max_contrast: Positive = 2.5
+    least_chance: Annotated[float, Field(gt=0, lt=0.5)] = 0.001
+    control_sigmas: Positive = 3.0
+    max_spread_ratio: Annotated[float, Field(ge=1)] = 1.2

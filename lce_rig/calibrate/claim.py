@@ -1,0 +1,106 @@
+"""Is the claimed uncertainty as large as captures drawn anew, left out singly or split in halves show?"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.expansion import Expansion
+from lce_rig.core.geometry import Array
+from lce_rig.rig import VerdictSettings
+
+_N_DRAWS = 300
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """How far resampled captures spread the extrinsic; covariances (6, 6) of the result from each way.
+
+    Attributes:
+        bootstrap: placements drawn with replacement.
+        left_out: each placement left out in turn (jackknife).
+        halves: random halves, their difference halved.
+    """
+
+    bootstrap: Array
+    left_out: Array
+    halves: Array
+
+    def ratio_to(self, cov: Array) -> tuple[float, str]:
+        """Compare with a claimed covariance (6, 6).
+
+        Returns:
+            By how much the largest of the three exceeds the claim, in standard deviations of rotation or of
+            translation, and which it is, in words.
+        """
+        ways = {
+            "captures drawn anew": self.bootstrap,
+            "captures left out one by one": self.left_out,
+            "random halves of the captures": self.halves,
+        }
+        ratios = {
+            words: float(
+                np.sqrt(
+                    max(
+                        np.trace(spread[part, part]) / np.trace(cov[part, part])
+                        for part in (slice(0, 3), slice(3, 6))
+                    )
+                )
+            )
+            for words, spread in ways.items()
+        }
+        words = max(ratios, key=lambda name: ratios[name])
+        return ratios[words], words
+
+
+def resample(expansion: Expansion, seed: int = 0) -> Spread:
+    """Spread the extrinsic by resampling placements.
+
+    Args:
+        expansion: of the captures, settled.
+        seed: of the draws.
+    """
+    rng = np.random.default_rng(seed)
+    groups = expansion.groups
+    n = len(groups)
+    drawn = rng.multinomial(n, np.full(n, 1 / n), size=_N_DRAWS).astype(np.float64)
+    # Draws of few different placements may leave a direction open.
+    drawn = drawn[np.count_nonzero(drawn, axis=1) >= min(n, 4)]
+    halves = (np.argsort(rng.random((_N_DRAWS, n)), axis=1) < n // 2).astype(np.float64)
+    without = expansion.solve(1 - groups)[:, :6]
+    apart = (expansion.solve(halves @ groups) - expansion.solve((1 - halves) @ groups))[:, :6] / 2
+    return Spread(
+        bootstrap=_robust_cov(expansion.solve(drawn @ groups)[:, :6]),
+        left_out=np.asarray(
+            (n - 1) / n * (without - without.mean(axis=0)).T @ (without - without.mean(axis=0))
+        ),
+        halves=_robust_cov(np.concatenate([apart, -apart])),
+    )
+
+
+def _robust_cov(tangents: Array) -> Array:
+    """Estimate a covariance (6, 6) by those nine tenths of the draws (B, 6) that lie nearest to the middle.
+
+    A draw that happens to leave a direction nearly open lies anywhere, and says nothing of all captures.
+    """
+    about = tangents - np.median(tangents, axis=0)
+    scale = np.median(np.abs(about), axis=0) + 1e-12
+    far = np.linalg.norm(about / scale, axis=1)
+    kept = about[far <= np.quantile(far, 0.9)]
+    return np.asarray(kept.T @ kept / len(kept))
+
+
+def widen(
+    estimate: CalibrationEstimate, spread: Spread, limits: VerdictSettings
+) -> tuple[CalibrationEstimate, str]:
+    """Widen a claimed covariance that is smaller than the spread of resampled captures.
+
+    Returns:
+        The estimate, its covariance multiplied where that is needed, and a remark that says why; else empty.
+    """
+    ratio, words = spread.ratio_to(estimate.cov)
+    if ratio <= limits.max_spread_ratio:
+        return estimate, ""
+    figures = {**estimate.diagnostics, "sigma_widened": ratio}
+    remark = f"standard deviations are {ratio:.1f} times what the method claims: {words} spread that far"
+    return replace(estimate, cov=ratio**2 * estimate.cov, diagnostics=figures), remark

@@ -1,0 +1,104 @@
+"""A control that must fail: an extrinsic known to be bad has to fit captures worse that were left out.
+
+Where it does not, the captures cannot tell the result from one that is several of its standard deviations
+away: then either the result is not the best one, or its uncertainty is larger than it says.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lce_rig.calibrate.doubt import Doubt, Verdict
+from lce_rig.calibrate.expansion import PLANE_FREEDOMS, Expansion, nearest_edge
+from lce_rig.calibrate.features import extract_features
+from lce_rig.calibrate.observability import name_direction
+from lce_rig.calibrate.options import CalibrateOptions
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, perturb, transform
+from lce_rig.core.results import Observation
+
+# A gain in the wrong direction that is this many of its standard errors sure is no chance.
+_SURE = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """What moving the result does to the residuals of captures left out.
+
+    Attributes:
+        moves: (B, 6) tangents by which the result was moved.
+        worse: (B,) mean increase of a left-out capture's cost over the result's own, in units of that.
+        worse_sigma: (B,) standard error of it.
+    """
+
+    moves: Array
+    worse: Array
+    worse_sigma: Array
+
+
+def run_control(
+    observations: Sequence[Observation],
+    board: Board,
+    T_cam_lidar: Array,
+    cov: Array,
+    expansion: Expansion,
+    n_sigmas: float,
+) -> Control:
+    """Move an extrinsic both ways along the axes of its covariance, and judge it on captures left out.
+
+    Each capture is judged under the extrinsic that the captures of the other placements give.
+
+    Args:
+        observations: F captures.
+        board: the board.
+        T_cam_lidar: (4, 4) the result.
+        cov: (6, 6) as it claims.
+        expansion: of these captures, settled.
+        n_sigmas: by how many standard deviations it is moved.
+    """
+    lever_m = float(np.sqrt(np.mean(np.sum(expansion.centres**2, axis=1))))
+    scale = np.r_[np.ones(3), np.full(3, lever_m)]
+    values, vectors = np.linalg.eigh(cov * np.outer(scale, scale))
+    steps = n_sigmas * (np.sqrt(np.maximum(values, 0)) * vectors).T / scale
+    moves = np.concatenate([steps, -steps])
+    left_out = expansion.solve(1 - expansion.groups)[:, :6][expansion.placement]
+    own = perturb(T_cam_lidar, left_out)
+    costs = np.array(
+        [
+            _costs(seen, board, perturb(T, np.vstack([np.zeros(6), moves])), expansion)
+            for seen, T in zip(observations, own, strict=True)
+        ]
+    )
+    usual = float(np.median(costs[:, 0]))
+    increase = (costs[:, 1:] - costs[:, :1]) / max(usual, 1e-12)
+    return Control(moves, increase.mean(axis=0), increase.std(axis=0, ddof=1) / np.sqrt(len(observations)))
+
+
+def _costs(seen: Observation, board: Board, T: Array, expansion: Expansion) -> Array:
+    """Sum a capture's squared distances from plane and edges, weighed as the expansion does: (B,)."""
+    f = extract_features(seen, board, CalibrateOptions())
+    plane = ((transform(T, f.plane_points) - f.centre) @ f.normal) ** 2
+    ends = transform(f.T_board_cam @ T, f.edge_points)
+    anchors, normals = board.edges()
+    edge = nearest_edge(ends, board)
+    beyond = np.sum((ends - anchors[edge]) * normals[edge], axis=-1)
+    # Returns reach beyond the plate by the beam's width, alike on all sides.
+    own = beyond - beyond.mean(axis=1, keepdims=True) if beyond.shape[1] else beyond
+    by_plane = PLANE_FREEDOMS * plane.mean(axis=1) / expansion.plane_sigma_m**2
+    return np.asarray(by_plane + np.sum(own**2, axis=1) / expansion.end_sigma_m**2)
+
+
+def doubt_control(control: Control, n_sigmas: float) -> list[Doubt]:
+    """Doubt a result that captures left out do not tell from a bad one."""
+    worst = int(np.argmin(control.worse / control.worse_sigma))
+    if control.worse[worst] > 0:
+        return []
+    move = control.moves[worst]
+    verdict: Verdict = "fail" if control.worse[worst] < -_SURE * control.worse_sigma[worst] else "marginal"
+    figures = f"{np.degrees(np.linalg.norm(move[3:])):.2f} deg and {1000 * np.linalg.norm(move[:3]):.0f} mm"
+    text = (
+        f"moved by {figures} ({n_sigmas:g} of its standard deviations, {name_direction(move)}) the result "
+        "fits captures left out as well or better"
+    )
+    return [Doubt(verdict, f"{text}: collect more captures; if it stays, measure the board anew")]

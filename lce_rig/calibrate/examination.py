@@ -1,0 +1,79 @@
+"""What is held against a result before it is judged: checks that need the captures themselves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from lce_rig.calibrate.claim import resample, widen
+from lce_rig.calibrate.control import Control, run_control
+from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.expansion import expand
+from lce_rig.calibrate.halves import Contrast, contrast_halves
+from lce_rig.calibrate.intrinsics_check import IntrinsicsCheck, check_intrinsics
+from lce_rig.calibrate.intrinsics_estimate import View
+from lce_rig.calibrate.nuisances import Nuisances, estimate_nuisances
+from lce_rig.core.camera import Intrinsics
+from lce_rig.rig import LidarSettings, Rig
+
+# Fewer placements leave nothing to be left out.
+_MIN_PLACEMENTS = 4
+# More pictures say no more about a lens that is wrong, and take their time.
+_MAX_VIEWS = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Examination:
+    """What the checks found.
+
+    Attributes:
+        estimate: the result, its covariance widened where captures spread it farther than it claims.
+        remark: why it was widened; empty where it was not.
+        contrasts: shares of the captures that ought to agree.
+        control: what happens to left-out captures when the result is moved.
+        nuisances: what the captures share beside the extrinsic.
+        intrinsics: the profile's, against those that the boards ask for; None where too few boards tell.
+    """
+
+    estimate: CalibrationEstimate
+    remark: str
+    contrasts: tuple[Contrast, ...]
+    control: Control | None
+    nuisances: Nuisances | None
+    intrinsics: IntrinsicsCheck | None
+
+
+def examine(
+    estimate: CalibrationEstimate, rig: Rig, lidar: LidarSettings, lens: Intrinsics, views: Sequence[View]
+) -> Examination:
+    """Check a result on its own captures.
+
+    Args:
+        estimate: the result of any method.
+        rig: board, targets and limits.
+        lidar: which errors its ranges may have.
+        lens: of the camera.
+        views: its pictures of the board, of the captures used.
+    """
+    board = rig.board.to_board()
+    intrinsics = check_intrinsics(_thinned(views), lens, board) if views else None
+    observations = [estimate.observations[name] for name in estimate.used]
+    expansion = expand(
+        observations,
+        board,
+        estimate.T_cam_lidar,
+        laser_bias_sigma_m=lidar.laser_bias_sigma_m,
+        range_offset_sigma_m=lidar.range_offset_sigma_m,
+    )
+    if len(expansion.groups) < _MIN_PLACEMENTS:
+        return Examination(estimate, "", (), None, None, intrinsics)
+    settled = expansion.settled()
+    widened, remark = widen(estimate, resample(settled), rig.verdict)
+    control = run_control(
+        observations, board, estimate.T_cam_lidar, widened.cov, settled, rig.verdict.control_sigmas
+    )
+    nuisances = estimate_nuisances(expansion)
+    return Examination(widened, remark, contrast_halves(settled), control, nuisances, intrinsics)
+
+
+def _thinned(views: Sequence[View]) -> list[View]:
+    every = -(-len(views) // _MAX_VIEWS)
+    return list(views[::every])

@@ -1,0 +1,149 @@
+"""Do two shares of the captures give the same extrinsic? Early and late, near and far, left and right.
+
+Shares drawn by lot differ by noise; so do these, unless something changed on the way or is bent: a sensor
+that was nudged, a lens that is not the profile's. How far shares drawn by lot differ is the measure.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lce_rig.calibrate.doubt import Doubt, Verdict
+from lce_rig.calibrate.expansion import Expansion
+from lce_rig.core.geometry import Array
+from lce_rig.rig import CalibrationSettings, VerdictSettings
+
+# Fewer placements are not worth halving.
+_MIN_PLACEMENTS = 6
+_MIN_SHARE = 3
+_N_LOTS = 400
+# Median of the chi-squared distribution of six freedoms.
+_MEDIAN_CHI2 = 5.348
+# Differences beyond this many limits leave nothing to be used.
+_FAIL = 2.0
+_CAUSES = {
+    "near": "is the squares' size or the focal length wrong, or the board bent?",
+    "left": "do the intrinsics belong to this lens? Is the board flat?",
+    "upper": "do the intrinsics belong to this lens? Is the board flat?",
+}
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """Two shares of the captures, calibrated apart.
+
+    Attributes:
+        first, second: what tells them apart, in words: "near" and "far".
+        rotation_deg, translation_m: angle and distance between their extrinsics.
+        chance: how often shares drawn by lot differ as much, in units of their noise.
+        n_first: captures in the first share.
+    """
+
+    first: str
+    second: str
+    rotation_deg: float
+    translation_m: float
+    chance: float
+    n_first: int
+
+
+def contrast_halves(expansion: Expansion, seed: int = 0) -> tuple[Contrast, ...]:
+    """Compare shares that ought to agree.
+
+    Args:
+        expansion: of captures in the order in which they were taken, settled.
+        seed: of the lots.
+
+    Returns:
+        Before and after the capture where the session splits best, near and far, left and right, upper and
+        lower; none for fewer than 6 placements.
+    """
+    n_placements = len(expansion.groups)
+    if n_placements < _MIN_PLACEMENTS:
+        return ()
+    order = np.argsort(np.random.default_rng(seed).random((_N_LOTS, n_placements)), axis=1)
+    by_lot, _ = _chi2(expansion, (order < n_placements // 2) @ expansion.groups)
+    unit = max(float(np.median(by_lot)) / _MEDIAN_CHI2, 1e-12)
+    x, y, z = expansion.centres.T
+    found = [_changed_on_the_way(expansion, unit)]
+    for first, second, key in (
+        ("near", "far", np.linalg.norm(expansion.centres, axis=1)),
+        ("left", "right", x / z),
+        ("upper", "lower", y / z),
+    ):
+        is_first = (np.argsort(np.argsort(key)) < len(key) // 2)[None].astype(np.float64)
+        chi2, apart = _chi2(expansion, is_first)
+        found.append(_contrast(first, second, apart[0], _tail(chi2[0] / unit), int(is_first.sum())))
+    return tuple(found)
+
+
+def _changed_on_the_way(expansion: Expansion, unit: float) -> Contrast:
+    """Find the capture from which on the others differ most; with as many chances as there are captures."""
+    n = len(expansion.gradients)
+    cuts = np.arange(_MIN_SHARE, n - _MIN_SHARE + 1)
+    chi2, apart = _chi2(expansion, (np.arange(n)[None] < cuts[:, None]).astype(np.float64))
+    best = int(np.argmax(chi2))
+    chance = min(len(cuts) * _tail(chi2[best] / unit), 1.0)
+    return _contrast("before", "after", apart[best], chance, int(cuts[best]))
+
+
+def _tail(chi2: float) -> float:
+    from scipy.stats import chi2 as distribution
+
+    return float(distribution.sf(chi2, 6))
+
+
+def _chi2(expansion: Expansion, shares: Array) -> tuple[Array, Array]:
+    """Hold shares (B, F) against the rest: squared distance (B,) in units of noise, tangents (B, 6)."""
+    H_first = np.tensordot(shares, expansion.hessians, axes=1)
+    g_first = shares @ expansion.gradients
+    H_rest = expansion.hessians.sum(axis=0) - H_first
+    g_rest = expansion.gradients.sum(axis=0) - g_first
+    # A share of few captures may leave a direction all but open; a floor of 1 m and 1 rad keeps it finite.
+    floor = np.eye(6)
+    C_first, C_rest = np.linalg.inv(H_first + floor), np.linalg.inv(H_rest + floor)
+    apart = -(C_first @ g_first[..., None] - C_rest @ g_rest[..., None])[..., 0]
+    scaled = np.linalg.solve(C_first + C_rest, apart[..., None])[..., 0]
+    return np.asarray(np.sum(apart * scaled, axis=1)), np.asarray(apart)
+
+
+def _contrast(first: str, second: str, apart: Array, chance: float, n_first: int) -> Contrast:
+    rotation_deg, translation_m = (
+        float(np.degrees(np.linalg.norm(apart[3:]))),
+        float(np.linalg.norm(apart[:3])),
+    )
+    return Contrast(first, second, rotation_deg, translation_m, chance, n_first)
+
+
+def doubt_halves(
+    contrasts: Sequence[Contrast],
+    captures: Sequence[str],
+    target: CalibrationSettings,
+    limits: VerdictSettings,
+) -> list[Doubt]:
+    """Doubt a result whose shares differ by more than the target, and more than lots make them.
+
+    Args:
+        contrasts: see `contrast_halves`.
+        captures: names, in the order in which they were taken.
+        target: standard deviations to reach.
+        limits: of the profile.
+    """
+    doubts = []
+    for c in contrasts:
+        is_change = c.first == "before"
+        excess = max(c.rotation_deg / target.target_sigma_deg, c.translation_m / target.target_sigma_m)
+        excess /= limits.max_change if is_change else limits.max_contrast
+        if c.chance > limits.least_chance or excess <= 1:
+            continue
+        verdict: Verdict = "fail" if excess > _FAIL else "marginal"
+        by = f"by {c.rotation_deg:.2f} deg and {1000 * c.translation_m:.0f} mm, more than by chance"
+        if is_change:
+            text = (
+                f"captures before {captures[c.n_first]} and from it on differ {by}: was a sensor nudged then?"
+            )
+            doubts.append(Doubt(verdict, f"{text} Fasten it and collect anew"))
+        else:
+            doubts.append(Doubt(verdict, f"{c.first} and {c.second} boards differ {by}: {_CAUSES[c.first]}"))
+    return doubts
