@@ -8,6 +8,7 @@ from lce_rig.calibrate.baselines.corners import calibrate_by_corners
 from lce_rig.calibrate.baselines.zhou2018 import calibrate_by_lines_and_planes
 from lce_rig.calibrate.consensus import Consensus, find_consensus
 from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.likelihood import calibrate_by_likelihood
 from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates, Method
 from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
@@ -18,6 +19,7 @@ Progress = Callable[[int, int], None]
 METHODS: Mapping[
     Method, Callable[[Sequence[Observation], Board, CalibrateOptions, Progress | None], CalibrationEstimate]
 ] = {
+    "ml": calibrate_by_likelihood,
     "paper": calibrate_by_algorithm_1,
     "zhou": calibrate_by_lines_and_planes,
     "corners": calibrate_by_corners,

@@ -6,7 +6,7 @@ from typing import Literal
 
 from lce_rig.core.results import ImageBoard, LidarBoard
 
-Method = Literal["paper", "zhou", "corners"]
+Method = Literal["ml", "paper", "zhou", "corners"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +29,10 @@ class CalibrateOptions:
     """Switches of the algorithm; the defaults are the recommended set.
 
     Attributes:
-        method: how the extrinsic is found: "paper" (Algorithm 1 of LCE-Calib), "zhou" (lines and planes of
-            Zhou, Li, Kaess, 2018) or "corners" (corner to corner); what follows matters to the first alone.
+        method: how the extrinsic is found: "ml" (from Algorithm 1's solution on, the extrinsic, all board
+            poses and the sensors' constant errors that are most probable together), "paper" (Algorithm 1 of
+            LCE-Calib), "zhou" (lines and planes of Zhou, Li, Kaess, 2018) or "corners" (corner to corner);
+            what follows matters to the first two alone.
         n_draws: I, subsets drawn for each subset size.
         n_rounds: rounds of re-association in each draw.
         seed: of the draws.

@@ -34,11 +34,11 @@ _COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 )
 @click.option(
     "--method",
-    type=click.Choice(["paper", "zhou", "corners"]),
+    type=click.Choice(["ml", "paper", "zhou", "corners"]),
     default="paper",
     show_default=True,
-    help="How the extrinsic is found: Algorithm 1 of LCE-Calib; for comparison lines and planes "
-    "(Zhou et al., 2018) or the plate's corners.",
+    help="How the extrinsic is found: maximum likelihood of everything together, Algorithm 1 of LCE-Calib "
+    "alone, or for comparison lines and planes (Zhou et al., 2018) or the plate's corners.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export a failed result too, marked as failed.")

@@ -1,0 +1,85 @@
+"""The joint estimate as a method of calibration: Algorithm 1 finds the place, the likelihood the optimum."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from lce_rig.calibrate.algorithm_1 import calibrate_by_algorithm_1
+from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.features import extract_features
+from lce_rig.calibrate.likelihood.levels import Levels, Priors
+from lce_rig.calibrate.likelihood.refine import JointEstimate, refine
+from lce_rig.calibrate.likelihood.spread import inflate
+from lce_rig.calibrate.metrics import error_to_reference
+from lce_rig.calibrate.options import CalibrateOptions
+from lce_rig.calibrate.placements import group_placements
+from lce_rig.calibrate.report import report_estimate
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Observation
+
+# A profile that states no error of the ranges is taken at its word.
+_EXACT_M = 1e-6
+
+
+def calibrate_by_likelihood(
+    observations: Sequence[Observation],
+    board: Board,
+    options: CalibrateOptions,
+    progress: Callable[[int, int], None] | None = None,
+) -> CalibrationEstimate:
+    """Estimate T_cam_lidar from boards whose pairing is settled.
+
+    Outliers, certificate and held-out residuals are those of Algorithm 1, from whose solution the joint
+    estimate starts.
+
+    Args:
+        observations: one a capture.
+        board: its specification.
+        options: switches of Algorithm 1, and what is known of the LiDAR's ranges.
+        progress: called with (subsets done, subsets in all).
+
+    Raises:
+        NotEnoughDataError: the captures leave a direction undetermined, which is named.
+    """
+    start = calibrate_by_algorithm_1(observations, board, options, progress)
+    used = [start.observations[name] for name in start.used]
+    priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=options.edge_shift_sigma_m)
+    joint = refine([used], board, [start.T_cam_lidar], priors, Levels(laser_m=options.laser_bias_sigma_m))
+    cov, inflation = inflate(joint, group_placements(used))
+    figures = _figures(joint, start.T_cam_lidar) | {"covariance_inflation": inflation}
+    return report_estimate(
+        joint.T_cam_lidar[0],
+        cov,
+        used,
+        [extract_features(observation, board, options) for observation in used],
+        board,
+        certificate=start.certificate,
+        held_out_m=np.array([residual.held_out_m for residual in start.residuals]),
+        refused=start.refused,
+        diagnostics={**start.diagnostics, **figures},
+    )
+
+
+def _figures(joint: JointEstimate, T_start: Array) -> dict[str, float]:
+    """Name the constant errors and noise levels; those of Algorithm 1 that they replace are overwritten."""
+    offset_deg, offset_m = error_to_reference(joint.T_cam_lidar[0], T_start)
+    levels = joint.levels
+    return {
+        "edge_shift_m": joint.shift_m,
+        "edge_shift_sigma_m": float(joint.constants_sigma[-1]),
+        "range_offset_m": float(np.mean(joint.offset_m)),
+        "laser_spread_m": float(np.std(joint.offset_m)),
+        "lens_lateral_m": float(joint.lens_m[0]),
+        "lens_vertical_m_per_rad": float(joint.lens_m[1]),
+        "camera_scale": 1.0 + float(joint.scale[0]),
+        "noise_range_m": levels.range_m,
+        "noise_ring_m": levels.ring_m,
+        "noise_ring_end_m": levels.edge_m,
+        "noise_tilt_deg": float(np.degrees(levels.tilt_rad)),
+        "noise_spin_deg": float(np.degrees(levels.spin_rad)),
+        "noise_depth_m": levels.depth_m,
+        "noise_across_m": levels.across_m,
+        "algorithm_1_offset_deg": offset_deg,
+        "algorithm_1_offset_m": offset_m,
+    }

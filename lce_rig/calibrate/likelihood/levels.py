@@ -1,0 +1,73 @@
+"""Sizes of the errors that the likelihood knows, and what is believed of them before any capture is seen."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from lce_rig.core.geometry import Array
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Standard deviations of errors that differ from one measurement to the next; estimated.
+
+    The defaults are what is usual; how far from that they may well lie stands in `LOG_SIGMA`.
+
+    Attributes:
+        range_m: noise of a single range.
+        ring_m: error that the returns of one ring in one capture share, beyond the laser's offset.
+        edge_m: tau, of a ring end beyond the width of its step.
+        tilt_rad, spin_rad: errors of a board's turn in a picture beyond corner noise.
+        depth_m, across_m: errors of its place, along and across the line of sight.
+        laser_m: of the lasers' range offsets about their mean.
+    """
+
+    range_m: float = 0.010
+    ring_m: float = 0.002
+    edge_m: float = 0.003
+    tilt_rad: float = 1e-3
+    spin_rad: float = 5e-4
+    depth_m: float = 0.002
+    across_m: float = 0.001
+    laser_m: float = 0.008
+
+    @property
+    def pose(self) -> Array:
+        """Deviations of a picture's pose in the order of `Pictures.shapes`."""
+        return np.array([self.tilt_rad, self.spin_rad, self.depth_m, self.across_m])
+
+    def to_logs(self) -> Array:
+        """Take logs, in the order of the fields."""
+        return np.log([getattr(self, field.name) for field in fields(self)])
+
+    @classmethod
+    def from_logs(cls, logs: Array) -> "Levels":
+        """Undo `to_logs`."""
+        return cls(*(float(value) for value in np.exp(logs)))
+
+
+# One deviation of the logarithm of each level, a priori; the lasers' spread is the profile's to state.
+LOG_SIGMA = np.array([1.0, 1.0, 1.0, 1.5, 1.5, 1.5, 1.5, 0.5])
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Standard deviations a priori of the constant errors, which are the same in every capture.
+
+    Attributes:
+        offset_m: range offset common to all lasers.
+        shift_m: edge shift d.
+        lateral_m: lens beside the LiDAR's axis, `scans`.
+        vertical_m: its height, per rad of elevation.
+        scale: of the camera's distances, by which squares or focal length are off.
+    """
+
+    offset_m: float = 0.005
+    shift_m: float = 0.015
+    lateral_m: float = 0.03
+    vertical_m: float = 0.04
+    scale: float = 0.001
+
+
+# Offsets of lasers that the profile says have none.
+NO_LASER_M = 1e-6

@@ -1,0 +1,140 @@
+"""Joint refinement: extrinsics of cameras that share one LiDAR, board poses, constant errors, noise levels.
+
+Gauss-Newton on all terms, with noise levels and robust weights made anew in between (iteratively reweighted
+least squares: a ring end's error has Student's distribution).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lce_rig.calibrate.likelihood.levels import NO_LASER_M, Levels, Priors
+from lce_rig.calibrate.likelihood.levels_fit import fit_levels
+from lce_rig.calibrate.likelihood.picture_terms import Pictures, stack_pictures
+from lce_rig.calibrate.likelihood.scans import N_FIELDS, lens_fields, stack_scans
+from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, System, Terms, assemble, linearise
+from lce_rig.calibrate.placements import group_placements
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, invert
+from lce_rig.core.results import Observation
+from lce_rig.solvers.covariance import symmetric_inverse
+
+# Freedoms of Student's distribution of ring ends.
+_FREEDOMS = 5.0
+_LEVEL_ROUNDS, _STEPS = 3, 3
+_SETTLED = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class JointEstimate:
+    """The optimum.
+
+    Attributes:
+        T_cam_lidar: (C, 4, 4).
+        T_lidar_board: (F, 4, 4).
+        cov: (C, 6, 6) of each extrinsic, everything else marginalised, tangent (translation m, rotation rad).
+        to_extrinsics: (C, 6, G) derivative of each extrinsic's tangent by the unknowns z of `system`.
+        offset_m: (L,) by which ranges of each ring read too long.
+        lens_m: (2,) lateral and vertical displacement of the LiDAR's lens, `scans`.
+        shift_m: edge shift.
+        scale: (C,) by how much of themselves each camera's distances are too short.
+        constants_sigma: (L + 3,) standard deviations of offsets, lens and edge shift.
+        levels: of the noise.
+        system: normal equations at the optimum.
+    """
+
+    T_cam_lidar: Array
+    T_lidar_board: Array
+    cov: Array
+    to_extrinsics: Array
+    offset_m: Array
+    lens_m: Array
+    shift_m: float
+    scale: Array
+    constants_sigma: Array
+    levels: Levels
+    system: System
+
+
+def refine(
+    cameras: Sequence[Sequence[Observation]],
+    board: Board,
+    T_cam_lidar: Sequence[Array],
+    priors: Priors | None = None,
+    usual: Levels | None = None,
+    levels: Levels | None = None,
+) -> JointEstimate:
+    """Refine extrinsics of C cameras; captures of the same name share their scan and the board's pose.
+
+    Args:
+        cameras: observations of each.
+        board: the board.
+        T_cam_lidar: (4, 4) of each, good to some degrees and centimetres.
+        priors: of the constant errors.
+        usual: what the noise levels usually are.
+        levels: of the noise, where they are known; else estimated.
+    """
+    priors, usual = priors or Priors(), usual or Levels()
+    usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
+    seen = {o.capture: (o, T) for own, T in zip(cameras, T_cam_lidar, strict=True) for o in own}
+    order = {name: k for k, name in enumerate(sorted(seen))}
+    scans = stack_scans([seen[name][0].lidar for name in order])
+    pictures = tuple(_pictures(own, order) for own in cameras)
+    state = State(
+        np.array(T_cam_lidar),
+        np.array([invert(T) @ o.image.T_cam_board for o, T in (seen[name] for name in order)]),
+        np.zeros(PER_CAMERA * len(cameras) + len(scans.rings) + N_FIELDS + 1),
+    )
+    now = levels or usual
+    for round_ in range(_LEVEL_ROUNDS + 1):
+        for _ in range(_STEPS):
+            terms = linearise(scans, pictures, board, state)
+            z, y = assemble(terms, now, priors, end_weights(terms, now)).step()
+            state = state.moved(z, y)
+            if np.abs(z).max() < _SETTLED:
+                break
+        terms = linearise(scans, pictures, board, state)
+        if levels is None and round_ < _LEVEL_ROUNDS:
+            now = fit_levels(terms, now, usual, priors, end_weights(terms, now))
+    return _summarise(state, assemble(terms, now, priors, end_weights(terms, now)), now)
+
+
+def _pictures(observations: Sequence[Observation], order: dict[str, int]) -> Pictures:
+    placement = group_placements(observations)
+    capture = np.array([order[o.capture] for o in observations], dtype=np.intp)
+    n_repeats = np.bincount(placement)[placement].astype(np.float64)
+    return stack_pictures(capture, [o.image for o in observations], n_repeats)
+
+
+def end_weights(terms: Terms, levels: Levels) -> Array:
+    """Compute (nu + 1) / (nu + (e / sigma)^2) for the ring ends (M,)."""
+    squares = terms.edge_residuals_m() ** 2 / terms.edges.variance(levels.edge_m)
+    return np.asarray((_FREEDOMS + 1) / (_FREEDOMS + squares))
+
+
+def _summarise(state: State, system: System, levels: Levels) -> JointEstimate:
+    C = len(state.T_cam_lidar)
+    cov = symmetric_inverse(system.information)
+    rest = state.constants[PER_CAMERA * C :]
+    to_extrinsics, T_cam_lidar = np.zeros((C, 6, len(cov))), state.T_cam_lidar.copy()
+    for c, T in enumerate(state.T_cam_lidar):
+        # Straight ahead of the camera a lateral lens is a shift of the whole sensor: it goes to the
+        # extrinsic, which is to be used with points as the driver gives them.
+        ahead = T[:3, :3] @ lens_fields(T[2:3, :3])[0, :, 0]
+        to_extrinsics[c, :, PER_CAMERA * c : PER_CAMERA * c + 6] = np.eye(6)
+        to_extrinsics[c, :3, -N_FIELDS - 1] = ahead
+        T_cam_lidar[c, :3, 3] += ahead * rest[-N_FIELDS - 1]
+    return JointEstimate(
+        T_cam_lidar=T_cam_lidar,
+        T_lidar_board=state.T_lidar_board,
+        cov=to_extrinsics @ cov @ np.swapaxes(to_extrinsics, 1, 2),
+        to_extrinsics=to_extrinsics,
+        offset_m=rest[: -N_FIELDS - 1],
+        lens_m=rest[-N_FIELDS - 1 : -1],
+        shift_m=float(rest[-1]),
+        scale=state.constants[PER_CAMERA * np.arange(C) + 6],
+        constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
+        levels=levels,
+        system=system,
+    )

@@ -1,0 +1,48 @@
+"""Do placements disagree by more than the likelihood says they may?
+
+With g_k and H_k of all captures of placement k, leaving it out moves the optimum by (H - H_k)^-1 g_k. The
+spread of these moves (jackknife) knows nothing of the noise model; where it exceeds the model's covariance
+by more than chance allows, errors are at work that the model does not have, and the covariance is
+multiplied.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.calibrate.likelihood.refine import JointEstimate
+from lce_rig.core.geometry import Array
+from lce_rig.solvers.covariance import symmetric_inverse
+
+# So many standard deviations of its own must the ratio of covariances lie above 1 to count.
+_SURE = 2.0
+
+
+def inflate(joint: JointEstimate, placement: NDArray[np.intp]) -> tuple[Array, float]:
+    """Multiply the first camera's covariance (6, 6) by what the spread over placements shows.
+
+    Args:
+        joint: of F captures.
+        placement: (F,) number of each capture's placement.
+
+    Returns:
+        The covariance and the factor, 1 where model and spread agree.
+    """
+    cov = joint.cov[0]
+    n = int(placement.max()) + 1
+    ratio = float(np.trace(symmetric_inverse(cov) @ jackknife(joint, placement))) / len(cov)
+    # A mean of 6 chi squares over n - 1 freedoms each.
+    chance = np.sqrt(2 / (len(cov) * max(n - 1, 1)))
+    factor = ratio if ratio > 1 + _SURE * chance else 1.0
+    return factor * cov, factor
+
+
+def jackknife(joint: JointEstimate, placement: NDArray[np.intp]) -> Array:
+    """Compute the jackknife covariance (6, 6) of the first camera's extrinsic over placements."""
+    n = int(placement.max()) + 1
+    system = joint.system
+    hessians, gradients = (np.zeros((n, *a.shape[1:])) for a in (system.hessians, system.gradients))
+    np.add.at(hessians, placement, system.hessians)
+    np.add.at(gradients, placement, system.gradients)
+    steps = -(symmetric_inverse(system.information - hessians) @ gradients[..., None])[..., 0]
+    moves = steps @ joint.to_extrinsics[0].T
+    return np.asarray((n - 1) / n * moves.T @ moves)

@@ -1,0 +1,181 @@
+"""All terms at one state, and their normal equations for any levels of noise.
+
+Unknowns are the tangent y_k (6) of each board's T_lidar_board, and z, which all captures share:
+
+    z = [tangent of T_cam_lidar (6) and scale of each camera, range offset of each ring (L), lens (2),
+         edge shift]
+
+A board pose meets only the terms of its own capture: the matrix is an arrow head, and y_k is eliminated
+capture by capture (Schur complement).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lce_rig.calibrate.likelihood.edge_terms import EdgeRows, edge_rows, edge_system
+from lce_rig.calibrate.likelihood.levels import Levels, Priors
+from lce_rig.calibrate.likelihood.picture_terms import Pictures, picture_rows
+from lce_rig.calibrate.likelihood.range_terms import RangeSums, range_system, sum_ranges, weigh_ranges
+from lce_rig.calibrate.likelihood.scans import N_FIELDS, StackedScans
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, perturb
+
+PER_CAMERA = 7
+# The mean of the lasers' own offsets is not theirs but the common one: this much of it is left.
+_MEAN_FLOOR_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Values of all unknowns.
+
+    Attributes:
+        T_cam_lidar: (C, 4, 4).
+        T_lidar_board: (F, 4, 4).
+        constants: (7 C + L + 3,) z, zero in the places of the tangents.
+    """
+
+    T_cam_lidar: Array
+    T_lidar_board: Array
+    constants: Array
+
+    def moved(self, z: Array, y: Array) -> "State":
+        """Apply a step."""
+        tangents = np.arange(PER_CAMERA * len(self.T_cam_lidar)).reshape(-1, PER_CAMERA)[:, :6]
+        constants = self.constants + z
+        constants[tangents] = 0
+        return State(perturb(self.T_cam_lidar, z[tangents]), perturb(self.T_lidar_board, y), constants)
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """All residuals at one state, before they are weighted; linear in z, with the constants at zero."""
+
+    ranges: RangeSums
+    edges: EdgeRows
+    pictures: tuple[Pictures, ...]
+    picture_rows: tuple[Array, ...]
+    constants: Array
+
+    @property
+    def n_rings(self) -> int:
+        """L."""
+        return int(self.ranges.sums.shape[1])
+
+    def edge_residuals_m(self) -> Array:
+        """Residuals (M,) of the ring ends."""
+        rows = self.edges.rows
+        return np.asarray(rows[:, -1] + rows[:, 6:-1] @ self.constants[-N_FIELDS - 1 :])
+
+
+def linearise(scans: StackedScans, pictures: Sequence[Pictures], board: Board, state: State) -> Terms:
+    """Linearise all terms."""
+    return Terms(
+        sum_ranges(scans, state.T_lidar_board),
+        edge_rows(scans, state.T_lidar_board, board),
+        tuple(pictures),
+        tuple(
+            picture_rows(own, T, state.T_lidar_board)
+            for own, T in zip(pictures, state.T_cam_lidar, strict=True)
+        ),
+        state.constants,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """Normal equations with the board poses eliminated.
+
+    Attributes:
+        hessians: (F, G, G) each capture's information on z.
+        gradients: (F, G) half the gradient of its cost, at the constants' present values.
+        prior: (G, G) information of the priors.
+        prior_gradient: (G,) half the gradient of theirs.
+        board_steps: (F, 6, G + 1), y = -board_steps [z; 1].
+        minus_2_log_evidence: -2 ln p(data | levels) up to a constant, all unknowns integrated out.
+    """
+
+    hessians: Array
+    gradients: Array
+    prior: Array
+    prior_gradient: Array
+    board_steps: Array
+    minus_2_log_evidence: float
+
+    @property
+    def information(self) -> Array:
+        """(G, G) of all captures and priors."""
+        return np.asarray(self.hessians.sum(axis=0) + self.prior)
+
+    def step(self) -> tuple[Array, Array]:
+        """Solve for z (G,) and y (F, 6)."""
+        z = -np.linalg.solve(self.information, self.gradients.sum(axis=0) + self.prior_gradient)
+        return z, -self.board_steps @ np.append(z, 1.0)
+
+
+def assemble(terms: Terms, levels: Levels, priors: Priors, end_weights: Array) -> System:
+    """Weigh all terms and eliminate the board poses.
+
+    Args:
+        terms: of F captures.
+        levels: of their noise.
+        priors: of the constants.
+        end_weights: (M,) robust weights of the ring ends.
+    """
+    F, L, C = len(terms.ranges.sums), terms.n_rings, len(terms.pictures)
+    G = PER_CAMERA * C + L + N_FIELDS + 1
+    M = np.zeros((F, 6 + G + 1, 6 + G + 1))
+    weighted, log_volumes = weigh_ranges(terms.ranges, levels.range_m, levels.ring_m)
+    log_volume = float(log_volumes.sum())
+    place = np.r_[0:6, 6 + PER_CAMERA * C : 6 + G - 1, 6 + G]
+    M[:, place[:, None], place] += range_system(terms.ranges, weighted)
+    variance = terms.edges.variance(levels.edge_m)
+    place = np.r_[0:6, 6 + G - N_FIELDS - 1 : 6 + G + 1]
+    M[:, place[:, None], place] += edge_system(terms.edges, end_weights / variance, F)
+    log_volume += float(np.sum(np.log(variance)))
+    for c, (pictures, rows) in enumerate(zip(terms.pictures, terms.picture_rows, strict=True)):
+        cov = pictures.total_cov(levels.pose)
+        products = np.swapaxes(rows, 1, 2) @ np.linalg.solve(cov, rows)
+        own = 6 + PER_CAMERA * c
+        place = np.r_[own : own + 6, 0:6, own + 6, 6 + G]
+        M[pictures.capture[:, None, None], place[:, None], place] += products
+        log_volume += float(np.linalg.slogdet(cov)[1].sum())
+    return _eliminate(M, terms, levels, priors, log_volume)
+
+
+def _eliminate(M: Array, terms: Terms, levels: Levels, priors: Priors, log_volume: float) -> System:
+    """Move the residuals to the constants' values and take the board poses out of M (F, 6 + G + 1, ...)."""
+    move = np.eye(M.shape[1])
+    move[6:-1, -1] = terms.constants
+    M = move.T @ M @ move
+    of_boards, rest = M[:, :6, :6], M[:, :6, 6:]
+    steps = np.linalg.solve(of_boards, rest)
+    reduced = M[:, 6:, 6:] - np.swapaxes(rest, 1, 2) @ steps
+    hessians, gradients, costs = reduced[:, :-1, :-1], reduced[:, :-1, -1], reduced[:, -1, -1]
+    prior, log_prior_volume = _prior(terms, levels, priors)
+    prior_gradient = np.asarray(prior @ terms.constants)
+    information, gradient = hessians.sum(axis=0) + prior, gradients.sum(axis=0) + prior_gradient
+    cost = costs.sum() + terms.constants @ prior_gradient
+    cost -= gradient @ np.linalg.solve(information, gradient)
+    log_volume += np.linalg.slogdet(of_boards)[1].sum() + np.linalg.slogdet(information)[1]
+    evidence = float(cost + log_volume + log_prior_volume)
+    return System(hessians, gradients, prior, prior_gradient, np.asarray(steps), evidence)
+
+
+def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, float]:
+    """Build the information (G, G) of the priors and the log of their covariance's determinant.
+
+    Offsets of L rings have the covariance sigma_laser^2 (I - 1 1^T / L) + sigma_offset^2 1 1^T.
+    """
+    L, C = terms.n_rings, len(terms.pictures)
+    prior = np.zeros((len(terms.constants), len(terms.constants)))
+    scale = PER_CAMERA * np.arange(C) + 6
+    prior[scale, scale] = 1 / priors.scale**2
+    cov = levels.laser_m**2 * (np.eye(L) - 1 / L) + priors.offset_m**2 + _MEAN_FLOOR_M**2 * np.eye(L)
+    ring = np.arange(PER_CAMERA * C, PER_CAMERA * C + L)
+    prior[ring[:, None], ring] = np.linalg.inv(cov)
+    last = np.arange(PER_CAMERA * C + L, len(prior))
+    prior[last, last] = 1 / np.square([priors.lateral_m, priors.vertical_m, priors.shift_m])
+    return prior, float(np.linalg.slogdet(cov)[1])
