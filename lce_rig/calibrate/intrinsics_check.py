@@ -28,7 +28,7 @@ _CHANCE = 0.002
 # principal point turns the extrinsic by the same angle, and three times the target counts as wrong.
 _BENT_MARGINAL, _BENT_FAIL = 0.5, 1.0
 _TURN_MARGINAL, _TURN_FAIL = 1.5, 2.5
-_N_FOLDS = 5
+_N_FOLDS = 2
 # Residuals by this much above the possible ones can be seen with the eye.
 _VISIBLE = 1.2
 

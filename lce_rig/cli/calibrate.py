@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
+from lce_rig.cli.uncertainty import uncertainty_lines
 from lce_rig.core.results import Calibration
 from lce_rig.detect.detection import Pair
 
@@ -170,7 +171,7 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
         f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/]",
         "  T_cam_lidar (p_cam = R p_lidar + t)",
         *("    " + "  ".join(f"{value: .6f}" for value in row) for row in c.T_cam_lidar[:3]),
-        f"  known to     {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
+        *uncertainty_lines(c),
         f"               weakest: {weak_direction}",
         f"  captures     {len(c.captures_used)} used of {c.n_captures}, "
         f"board found by both sensors in {c.n_detected}",

@@ -177,6 +177,23 @@ class ChannelResult:
     time_offset_sigma_s: float | None = None
 
 
+@dataclass(frozen=True)
+class PointUncertainty:
+    """How far the LiDAR's points may be off, seen by the camera: standard deviations of the error's size.
+
+    Attributes:
+        distance_m: of the point from the camera.
+        centre_px, centre_m: in the middle of the picture; in it, and in space.
+        corner_px, corner_m: in the least certain corner.
+    """
+
+    distance_m: float
+    centre_px: float
+    centre_m: float
+    corner_px: float
+    corner_m: float
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """The extrinsic of one camera and one LiDAR, with everything needed to judge it.
@@ -192,6 +209,7 @@ class Calibration:
         captures_refused: why each other capture is not.
         diagnostics: further figures by name.
         method: that found the extrinsic, as `CalibrateOptions.method`.
+        uncertainty: what `cov` means for points at several distances; empty where no lens was at hand.
     """
 
     camera: str
@@ -212,6 +230,7 @@ class Calibration:
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     channel_results: tuple[ChannelResult, ...] = ()
     method: str = "paper"
+    uncertainty: tuple[PointUncertainty, ...] = ()
 
     @property
     def channels(self) -> tuple[str, ...]:

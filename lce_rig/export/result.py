@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from lce_rig.core.errors import ResultRefusedError, SessionError
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration, ChannelResult
+from lce_rig.core.results import Calibration, ChannelResult, PointUncertainty
 from lce_rig.export.result_schema import ChannelRecord, PairRecord, ResultRecord
 from lce_rig.export.writing import MADE_BY, write_atomically
 
@@ -69,6 +69,7 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
         "diagnostics": {name: _figure(value) for name, value in sorted(calibration.diagnostics.items())},
         "channels": [_channel(result, calibration) for result in calibration.channel_results],
         "method": calibration.method,
+        "uncertainty": [asdict(each) for each in calibration.uncertainty],
     }
 
 
@@ -194,6 +195,7 @@ def _calibration(pair: PairRecord) -> Calibration:
         diagnostics={name: figure(value) for name, value in pair.diagnostics.items()},
         channel_results=tuple(_channel_result(record) for record in pair.channels),
         method=pair.method,
+        uncertainty=tuple(PointUncertainty(**each.model_dump()) for each in pair.uncertainty),
     )
 
 

@@ -44,6 +44,16 @@ class ChannelRecord(_Record):
     time_offset_sigma_s: _NotNegative | None = None
 
 
+class UncertaintyRecord(_Record):
+    """What the covariance means for a point at a distance, in the picture's centre and worst corner."""
+
+    distance_m: Annotated[float, Field(gt=0)]
+    centre_px: _NotNegative
+    centre_m: _NotNegative
+    corner_px: _NotNegative
+    corner_m: _NotNegative
+
+
 class PairRecord(_Record):
     """One camera and one LiDAR; figures that could not be computed are null."""
 
@@ -70,6 +80,7 @@ class PairRecord(_Record):
     diagnostics: dict[str, float | None] = Field(default_factory=dict)
     channels: list[ChannelRecord] = Field(default_factory=list)
     method: str = "paper"
+    uncertainty: list[UncertaintyRecord] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "PairRecord":

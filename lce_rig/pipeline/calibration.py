@@ -20,6 +20,7 @@ from lce_rig.calibrate.consensus import find_consensus
 from lce_rig.calibrate.examination import Examination, examine
 from lce_rig.calibrate.intrinsics_estimate import View
 from lce_rig.calibrate.metrics import error_to_reference
+from lce_rig.calibrate.reach import point_uncertainties
 from lce_rig.calibrate.verdict import judge
 from lce_rig.core.errors import NotEnoughDataError, UsageError
 from lce_rig.core.geometry import Array
@@ -114,8 +115,10 @@ def _calibrate_sensors(
     lens = rig.cameras[camera].to_intrinsics()
     views = _views(detections, pairs, result)
     examination = examine(result.estimate, rig, settings, lens, views)
+    uncertainty = point_uncertainties(result.estimate.T_cam_lidar, examination.estimate.cov, lens)
     n_captures = len({name for pair in pairs for name in detections.captures(pair)})
     calibration = _judged(rig, camera, lidar, result, examination, n_captures=n_captures, refused=refused)
+    calibration = replace(calibration, uncertainty=uncertainty)
     truth = reference.of(camera, lidar) if reference else None
     if truth is not None:
         calibration = compare_with_reference(calibration, truth)

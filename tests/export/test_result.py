@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from lce_rig.core.errors import ResultRefusedError, SessionError
 from lce_rig.core.geometry import exp_so3, pose
-from lce_rig.core.results import Calibration, Certificate, Metrics
+from lce_rig.core.results import Calibration, Certificate, Metrics, PointUncertainty
 from lce_rig.export.result import read_result, result_text, to_json_dict, write_result
 
 Make = Callable[..., Calibration]
@@ -215,3 +215,16 @@ def test_a_writer_killed_at_any_moment_leaves_a_whole_file(tmp_path: Path) -> No
                 pass
             os.kill(writer.pid, signal.SIGKILL)
         assert path.read_text(encoding="utf-8") in ("a" * 200_000, "b" * 200_000)
+
+
+def test_what_the_uncertainty_means_at_distances_is_read_back(make: Make, tmp_path: Path) -> None:
+    stated = (PointUncertainty(5.0, 1.25, 0.0125, 1.5, 0.015), PointUncertainty(10.0, 1.0, 0.02, 1.2, 0.03))
+    path = tmp_path / "result.json"
+    write_result(path, "rles", [replace(make(), uncertainty=stated)])
+    assert read_result(path).calibrations[0].uncertainty == stated
+    document = json.loads(path.read_text())
+    assert document["pairs"][0]["uncertainty"][0]["corner_m"] == 0.015
+    document["pairs"][0]["uncertainty"][0]["corner_m"] = -1.0
+    path.write_text(json.dumps(document))
+    with pytest.raises(SessionError, match="corner_m"):
+        read_result(path)

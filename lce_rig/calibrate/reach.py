@@ -1,0 +1,59 @@
+"""What the uncertainty of an extrinsic means for a point that the LiDAR measures: pixels, and centimetres.
+
+A point p = R q + t before the camera moves with the extrinsic by [I, -(p - t)^] times its tangent, as a
+rotation turns it about the LiDAR's origin.
+"""
+
+import numpy as np
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array, skew
+from lce_rig.core.results import PointUncertainty
+
+DISTANCES_M = (5.0, 10.0, 20.0)
+# Beyond some radius a lens's distortion is not defined: corners are taken as far out as it is.
+_INWARDS = np.linspace(0.0, 1.0, 41)[:-1]
+_STEP_M = 1e-4
+
+
+def point_uncertainties(T_cam_lidar: Array, cov: Array, lens: Intrinsics) -> tuple[PointUncertainty, ...]:
+    """Propagate a covariance to points in the middle and in the corners of the picture.
+
+    Args:
+        T_cam_lidar: (4, 4).
+        cov: (6, 6) tangent (translation m, rotation rad).
+        lens: of the camera.
+
+    Returns:
+        One for each of `DISTANCES_M`: of the four corners the least certain counts.
+    """
+    middle = np.array([[(lens.width_px - 1) / 2, (lens.height_px - 1) / 2]])
+    rays = lens.unproject(np.concatenate([middle, _corners(lens, middle[0])]))
+    found = []
+    for distance_m in DISTANCES_M:
+        sigmas = [_sigmas(distance_m * ray, T_cam_lidar[:3, 3], cov, lens) for ray in rays]
+        corner_px, corner_m = np.max(sigmas[1:], axis=0)
+        found.append(PointUncertainty(distance_m, *sigmas[0], float(corner_px), float(corner_m)))
+    return tuple(found)
+
+
+def _corners(lens: Intrinsics, middle: Array) -> Array:
+    """Find the picture's corners (4, 2), or where the lens ends on the way to them."""
+    w, h = lens.width_px - 1.0, lens.height_px - 1.0
+    corners = []
+    for corner in np.array([[0, 0], [w, 0], [0, h], [w, h]]):
+        on_the_way = corner + _INWARDS[:, None] * (middle - corner)
+        is_drawn = np.isfinite(lens.unproject(on_the_way)).all(axis=1)
+        corners.append(on_the_way[int(np.argmax(is_drawn))])
+    return np.array(corners)
+
+
+def _sigmas(point: Array, t: Array, cov: Array, lens: Intrinsics) -> tuple[float, float]:
+    """Compute the expected size of a point's error in the picture, px, and in space, m."""
+    by_tangent = np.concatenate([np.eye(3), -skew(point - t)], axis=1)
+    cov_point = by_tangent @ cov @ by_tangent.T
+    steps = _STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
+    pixels, _ = lens.project(point + steps)
+    by_point = (pixels[:3] - pixels[3:]).T / (2 * _STEP_M)
+    cov_px = by_point @ cov_point @ by_point.T
+    return float(np.sqrt(np.trace(cov_px))), float(np.sqrt(np.trace(cov_point)))
