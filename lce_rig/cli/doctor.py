@@ -52,11 +52,12 @@ def doctor(rig_name: str, as_json: bool, duration: float, folder: Path) -> int:
     Exits with 5 where a line says FAIL, else with 0.
     """
     from lce_rig.collect.health import worst
+    from lce_rig.collect.health.sensors import sensors
     from lce_rig.pipeline.doctor import DoctorOptions, examine
     from lce_rig.rig import load_rig
 
     rig = load_rig(rig_name)
-    show.note(f"watching {', '.join([*rig.lidars, *rig.cameras, *(['sync'] if rig.sync else [])])} ...")
+    show.note(f"watching {', '.join(sensors(rig))} ...")
     checks = examine(rig, DoctorOptions(duration, folder))
     severity = worst(check.severity for check in checks)
     if as_json:

@@ -1,9 +1,16 @@
 """`lce-rig doctor`: one screen for people, one document for machines, and an exit code."""
 
+import contextlib
+import fcntl
 import json
+import os
+import pty
+import re
 import signal
+import struct
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 
@@ -34,6 +41,25 @@ def test_absent_devices_are_red_with_what_to_check_and_exit_with_5(lce_rig, abse
     assert str(tmp_path) in done.out
     assert "3 FAIL" in done.out.splitlines()[-1]
     assert "watching lidar, cam, sync" in done.err
+
+
+def test_on_a_small_terminal_lines_that_are_ok_share_one(absent):
+    words = [sys.executable, "-m", "lce_rig", "doctor", "--rig", str(absent), "--duration", "1"]
+    host, terminal = pty.openpty()
+    n_rows, n_columns = 12, 80
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", n_rows, n_columns, 0, 0))
+    environment = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "LINES")}
+    environment |= {"TERM": "xterm"}
+    with subprocess.Popen(words, stdout=terminal, stderr=subprocess.PIPE, env=environment) as process:
+        os.close(terminal)
+        screen = read_all(host)
+        assert process.wait(60) == 5
+    os.close(host)
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", screen).splitlines()
+    assert max(map(len, lines)) <= n_columns
+    folded = next(line for line in lines if line.startswith("ok   computer"))
+    assert "python, packages, libraries" in folded
+    assert sum(line.startswith("FAIL") for line in lines) == 3
 
 
 def test_json_holds_every_line_with_its_figures(lce_rig, absent):
@@ -97,6 +123,15 @@ def test_an_interrupted_examination_leaves_nothing_running(tmp_path):
             assert process.wait(30) == 130
         pid = (tmp_path / "pid").read_text()
         wait_for(lambda: is_gone(pid))
+
+
+def read_all(terminal: int) -> str:
+    """Read what a program writes to its terminal until it ends."""
+    parts = []
+    with contextlib.suppress(OSError):  # The other end is closed.
+        while part := os.read(terminal, 4096):
+            parts.append(part)
+    return b"".join(parts).decode()
 
 
 def is_gone(pid: str) -> bool:
