@@ -171,8 +171,7 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
         f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/]",
         "  T_cam_lidar (p_cam = R p_lidar + t)",
         *("    " + "  ".join(f"{value: .6f}" for value in row) for row in c.T_cam_lidar[:3]),
-        *uncertainty_lines(c),
-        f"               weakest: {weak_direction}",
+        *uncertainty_lines(c, weak_direction),
         f"  captures     {len(c.captures_used)} used of {c.n_captures}, "
         f"board found by both sensors in {c.n_detected}",
         f"  residuals    planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm, "

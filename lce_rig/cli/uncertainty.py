@@ -8,14 +8,15 @@ from lce_rig.core.results import Calibration
 _AXES = ("x right", "y down", "z forward")
 
 
-def uncertainty_lines(calibration: Calibration) -> list[str]:
-    """State an extrinsic's standard deviations in lines that fit 80 columns."""
+def uncertainty_lines(calibration: Calibration, weak_direction: str) -> list[str]:
+    """State an extrinsic's standard deviations, and its least certain motion, in lines that fit 80 columns."""
     c = calibration
     sigmas = np.sqrt(np.diag(c.cov))
     return [
         f"  known to     {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
         f"               about {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
         f"               along {_by_axis(1000 * sigmas[:3], '.1f')} mm",
+        f"  weakest: {weak_direction}",
         *_at_distances(c),
     ]
 
