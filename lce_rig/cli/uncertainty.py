@@ -9,7 +9,7 @@ _AXES = ("x right", "y down", "z forward")
 
 
 def uncertainty_lines(calibration: Calibration, weak_direction: str) -> list[str]:
-    """State an extrinsic's standard deviations, and its least certain motion, in lines that fit 80 columns."""
+    """State an extrinsic's standard deviations and its least certain motion, in lines of 80 columns."""
     c = calibration
     sigmas = np.sqrt(np.diag(c.cov))
     return [
