@@ -102,7 +102,7 @@ class BoardWatcher:
         if camera.channels[image.channel].kind == "events":
             found = find_in_reconstruction(image, self._board, intrinsics, self.rig.quality, region)
         else:
-            found = find_image_board(image, self._board, intrinsics, region=region)
+            found = find_image_board(image, self._board, intrinsics, region=region, last=last)
         if isinstance(found, ImageBoard):
             self._seen[key] = found
         return found

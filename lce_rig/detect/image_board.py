@@ -1,5 +1,7 @@
 """The board in a picture: corners, both poses and figures, or why there is none."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,7 +11,7 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import ImageBoard, Refusal
-from lce_rig.detect.image_corners import find_grid, seen_grid
+from lce_rig.detect.image_corners import find_grid, order_corners, seen_grid
 from lce_rig.detect.image_quality import (
     explain_absence,
     explain_other_grid,
@@ -28,6 +30,8 @@ _AMBIGUOUS_CHI2 = 9.0
 _CUT_FRACTION = 0.02
 # Corners that the finder misplaced, or that an artefact covers, at most.
 _MAX_MISPLACED = 0.08
+# A board whose corners have moved by less is where it was.
+_RESTING_PX = 0.5
 # A grid of corners of which fewer can be measured is none.
 _MIN_FITTED = 0.5
 # The outer squares of a line that is not on the board are all alike.
@@ -40,6 +44,7 @@ def find_image_board(
     intrinsics: Intrinsics,
     *,
     region: Region | None = None,
+    last: ImageBoard | None = None,
     max_reprojection_px: float = 1.0,
     min_contrast: float = 12.0,
     min_sharpness: float = 1.5,
@@ -56,6 +61,8 @@ def find_image_board(
         intrinsics: of the camera, at the picture's resolution.
         region: (u0, v0, u1, v1) px to search first, from `region_around` the board in the last live picture;
             the whole picture follows where it is not there.
+        last: the board in the last live picture: where it is there still, or within a third of a square,
+            nothing is searched.
         max_reprojection_px: refuse where the corners' rms distance from the board's picture is larger.
         min_contrast: refuse where black and white differ by fewer grey values.
         min_sharpness: refuse where fewer edge widths fit into a square.
@@ -65,7 +72,7 @@ def find_image_board(
         ProfileError: the intrinsics belong to pictures of another size.
     """
     grey = crop_to_intrinsics(image, intrinsics)
-    crossings = _find_in_region(grey, board, region) or find_grid(grey, board)
+    crossings = _follow(grey, board, last) or _find_in_region(grey, board, region) or find_grid(grey, board)
     if crossings is None or np.mean(crossings.is_fitted) < _MIN_FITTED:
         return explain_absence(grey, board, is_from_events)
     quality = grid_quality(grey, crossings)
@@ -145,6 +152,26 @@ def _is_blank_beyond(grey: NDArray[np.uint8], width_px: int, height_px: int) -> 
     return bool(np.percentile(beyond, 99) <= max(0.3 * inside, 2.0))
 
 
+def _follow(grey: NDArray[np.uint8], board: Board, last: ImageBoard | None) -> Crossings | None:
+    """Fit the corners from where they were; None where the board is not all there.
+
+    A board that moved by a whole square is not taken for itself: on one side squares are missing then.
+    """
+    if last is None:
+        return None
+    start_px = last.corners_px.reshape(board.rows, board.cols, 2)
+    crossings = fit_crossings(grey, start_px)
+    if np.abs(crossings.grid_px - start_px).max() > _RESTING_PX:
+        # Patches that lie aside of their corners pull at them.
+        crossings = fit_crossings(grey, crossings.grid_px)
+    if not crossings.is_fitted.all():
+        return None
+    fitted_px = crossings.grid_px.reshape(-1, 2)
+    is_in_order = np.array_equal(order_corners(grey, fitted_px, board), fitted_px)
+    outer_contrast, goes_on = extent(grey, crossings.grid_px)
+    return crossings if is_in_order and outer_contrast >= _MIN_OUTER_CONTRAST and not goes_on else None
+
+
 def _find_in_region(grey: NDArray[np.uint8], board: Board, region: Region | None) -> Crossings | None:
     if region is None:
         return None
@@ -153,7 +180,7 @@ def _find_in_region(grey: NDArray[np.uint8], board: Board, region: Region | None
     if min(part.shape) < 16:
         return None
     found = find_grid(np.ascontiguousarray(part), board)
-    return None if found is None else fit_crossings(grey, found.grid_px + [max(u0, 0), max(v0, 0)])
+    return None if found is None else replace(found, grid_px=found.grid_px + [max(u0, 0), max(v0, 0)])
 
 
 def _solve(

@@ -14,6 +14,8 @@ _REACH = 0.42
 _MAX_SAMPLES_PER_SIDE = 25
 _STEPS = 12
 _MIN_SIGMA_PX = 0.25
+# Fits that gain no more than this share of their cost in a step are done: corners rest to 1e-3 px.
+_SETTLED = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +121,12 @@ def _fit(values: Array, a: Array, b: Array, height_px: Array) -> tuple[Array, Ar
         new_residuals, new_J = _model(candidate, values, a, b)
         new_cost = np.sum(new_residuals**2, axis=1)
         is_better = new_cost < cost
+        is_settled = np.all(np.abs(cost - new_cost) <= _SETTLED * cost)
         p[is_better], cost[is_better] = candidate[is_better], new_cost[is_better]
         residuals[is_better], J[is_better] = new_residuals[is_better], new_J[is_better]
         damping = np.where(is_better, damping * 0.2, damping * 5.0)
+        if is_settled:
+            break
     return p, residuals
 
 

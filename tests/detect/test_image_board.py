@@ -177,6 +177,24 @@ def test_the_region_of_the_last_picture_gives_the_same_corners() -> None:
     assert np.abs(tracked.corners_px - whole.corners_px).max() < 0.03
 
 
+@pytest.mark.parametrize("board", [SYMMETRIC, ASYMMETRIC], ids=["symmetric", "asymmetric"])
+@pytest.mark.parametrize("n_squares", [0.0, 0.2, 0.6, 1.0, 1.4, 2.0])
+@pytest.mark.parametrize("direction", [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
+def test_a_board_that_is_followed_is_found_as_if_it_were_not(
+    board: Board, n_squares: float, direction: tuple[float, float]
+) -> None:
+    T = looking(10, 80, 5, (0.1, 0, 2.2))
+    first = found(draw(board, WIDE, T), board, WIDE)
+    shift = n_squares * board.square_m * np.array(direction)
+    T_moved = T.copy()
+    T_moved[:3, 3] += T[:3, :2] @ shift
+    moved = picture(draw(board, WIDE, T_moved, noise=1.0))
+    whole = find_image_board(moved, board, WIDE)
+    followed = find_image_board(moved, board, WIDE, region=region_around(first, moved), last=first)
+    assert isinstance(followed, ImageBoard) and isinstance(whole, ImageBoard)
+    assert np.abs(followed.corners_px - whole.corners_px).max() < 0.03
+
+
 def test_a_board_that_left_the_region_is_found_in_the_whole_picture() -> None:
     pixels = draw(SYMMETRIC, WIDE, looking(25, 80, 40, (0.5, 0, 2.2)))
     result = find_image_board(picture(pixels), SYMMETRIC, WIDE, region=(0, 0, 200, 200))
