@@ -43,24 +43,23 @@ _VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-def bench_paper(n_seeds: int, folder: Path, methods: Sequence[str] = (), only: str = "") -> None:
+def bench_paper(n_seeds: int, folder: Path, anew: Sequence[str] = (), only: str = "") -> None:
     """Run the experiments, print tables and draw figures.
 
     Args:
         n_seeds: simulated sets.
-        folder: detections and results are kept in it, figures are written to it.
-        methods: to run; all by default. Of others, what was kept of simulated sets is shown.
+        folder: detections and results of simulated sets are kept in it, figures are written to it.
+        anew: methods that have changed since their results were kept.
         only: "simulated" for simulated sets only, else recorded sets whose name contains this.
     """
-    wanted = list(methods) or list(METHODS)
     if only in ("", "simulated"):
-        _bench_simulated(n_seeds, folder, wanted)
+        _bench_simulated(n_seeds, folder, anew)
     if only != "simulated" and os.environ.get("LCE_RIG_DATA"):
-        _bench_recorded(open_recordings(folder, only), folder, wanted)
+        _bench_recorded(open_recordings(folder, only), folder, anew or list(METHODS))
 
 
-def _bench_simulated(n_seeds: int, folder: Path, methods: Sequence[str]) -> None:
-    runs = simulated_runs(folder, n_seeds, methods)
+def _bench_simulated(n_seeds: int, folder: Path, anew: Sequence[str]) -> None:
+    runs = simulated_runs(folder, n_seeds, list(METHODS), anew)
     normals_deg = _normals_deg(folder, n_seeds)
     _print_noise(runs, normals_deg)
     _print_frames(runs)

@@ -46,26 +46,30 @@ class Run:
     paper_mge_mm: float
 
 
-def simulated_runs(folder: Path, n_seeds: int, methods: Sequence[str]) -> list[Run]:
-    """Run methods at all levels, and at the middle level on fewer captures.
+def simulated_runs(folder: Path, n_seeds: int, methods: Sequence[str], anew: Sequence[str]) -> list[Run]:
+    """Run methods at all levels, and at the middle level on fewer captures; what is kept is not run again.
 
     Args:
         folder: detections and results are kept in it.
         n_seeds: sets.
-        methods: to run now; of others, what an earlier run kept is returned too.
+        methods: to run.
+        anew: those of them that have changed since their results were kept.
     """
     path = folder / "simulated.csv"
-    runs = [run for run in read_runs(path) if run.method not in methods and run.seed < n_seeds]
+    runs = [run for run in read_runs(path) if run.method not in anew]
     for seed in range(n_seeds):
+        missing = [name for name in methods if (name, seed) not in {(run.method, run.seed) for run in runs}]
+        if not missing:
+            continue
         seen = paper_set(folder / "sets", seed)
         for level in LEVELS:
             counts = FRAME_COUNTS if level == MIDDLE_LEVEL else (N_CAPTURES,)
-            for method in methods:
+            for method in missing:
                 options = CalibrateOptions(method=method, n_draws=0)
                 runs += [measure(seen, method, level, seed, n, options) for n in counts]
         print(f"set {seed + 1} of {n_seeds} done", file=sys.stderr, flush=True)
         write_runs(path, runs)
-    return runs
+    return [run for run in runs if run.seed < n_seeds]
 
 
 def measure(
