@@ -73,7 +73,11 @@ def test_its_board_is_seen_by_both_sensors(everything: tuple[Lines, float]) -> N
 
 def test_its_clocks_are_compared(everything: tuple[Lines, float]) -> None:
     lines, _ = everything
-    assert {"lidar.drift_ppm", "lidar.offset_ms", "sync.drift_ppm"} <= set(lines["rig", "clocks"].values)
+    if lines["lidar", "PPS"].severity == "green":  # a LiDAR that sends too late is not believed
+        values = lines["rig", "clocks"].values
+        assert {"lidar.drift_ppm", "lidar.offset_ms", "sync.drift_ppm"} <= set(values)
+        assert abs(values["lidar.offset_ms"]) <= 100
+    assert lines["sync", "clock"].figure.startswith("the board's own, to the computer's by ")
     assert lines["rig", "sync"].severity in ("green", "yellow")
 
 

@@ -161,9 +161,10 @@ def _by_arrivals(exam: Examination, seen: Observation) -> ClockModel | None:
     if stream == "scans" and not seen.status.figures.get("is_device_time"):
         return None
     stamps, arrivals = seen.times(stream)
-    if len(stamps) < 2 or (np.diff(stamps) <= 0).any():
-        return None
-    return fit_arrivals(stamps, arrivals, "arrivals")
+    # A LiDAR's first scans may be stamped by arrival yet, until its position packets have come.
+    steps_back = np.flatnonzero(np.diff(stamps) <= 0)
+    first = int(steps_back[-1]) + 1 if len(steps_back) else 0
+    return fit_arrivals(stamps[first:], arrivals[first:], "arrivals")
 
 
 def _offset_ms(seen: Observation, model: ClockModel) -> float | None:

@@ -59,6 +59,14 @@ def test_the_drift_and_offset_of_every_stream_are_measured_against_the_computer(
     assert line.values["sync.drift_ppm"] == pytest.approx(40)
 
 
+def test_first_scans_that_were_stamped_by_arrival_do_not_count() -> None:
+    seen = lidar(figures=LOCKED)
+    late = [(stamp_ns + S, host_ns) for stamp_ns, host_ns in seen.stamps["scans"][:3]]
+    seen.stamps["scans"] = late + seen.stamps["scans"][3:]
+    line = check_offsets(examination(seen))
+    assert line is not None and abs(line.values["lidar.drift_ppm"]) < 1
+
+
 def test_a_clock_that_is_being_set_is_told() -> None:
     stepped = camera()
     stepped.stamps["frames"] = [
