@@ -24,22 +24,29 @@ _FLAGS = (
 
 
 class Browser:
-    """A headless browser whose profile is an empty folder; closed at the end of its `with` block."""
+    """A headless browser; closed at the end of its `with` block.
+
+    Each page has a context of its own, in memory: what one keeps, no other sees, and no slow disk delays it.
+    """
 
     def __init__(self, executable: str, folder: Path) -> None:
+        """Start it with an empty folder as its profile."""
         self._folder = folder
         command = [executable, *_FLAGS, f"--user-data-dir={folder}", "about:blank"]
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        self._address = f"http://127.0.0.1:{self._port()}"
-        self._pages: list[Page] = []
+        port, path = self._address()
+        self._url = f"ws://127.0.0.1:{port}"
+        self._contexts: list[tuple[str, Page]] = []
         self._loop = asyncio.new_event_loop()
         self._http = self._loop.run_until_complete(_http())
+        self._line = Line(self._loop, self._connect(path))
 
     def open(self, url: str, width: int = 1280, height: int = 720, first: str = "") -> "Page":
         """Open a page; `first` is run before its own scripts."""
-        target = self._loop.run_until_complete(self._new_target())
-        page = Page(self._loop, self._loop.run_until_complete(self._connect(target["webSocketDebuggerUrl"])))
-        self._pages.append(page)
+        context = self._line.call("Target.createBrowserContext")["browserContextId"]
+        target = self._line.call("Target.createTarget", url="about:blank", browserContextId=context)
+        page = Page(self._loop, self._connect(f"/devtools/page/{target['targetId']}"))
+        self._contexts.append((context, page))
         for domain in ("Page", "Runtime", "Log", "Network"):
             page.call(f"{domain}.enable")
         page.resize(width, height)
@@ -51,10 +58,10 @@ class Browser:
 
     def close_pages(self) -> None:
         """Close all pages; the browser stays."""
-        for page in self._pages:
-            page.call("Page.close")
-            self._loop.run_until_complete(page.socket.close())
-        self._pages.clear()
+        for context, page in self._contexts:
+            page.close()
+            self._line.call("Target.disposeBrowserContext", browserContextId=context)
+        self._contexts.clear()
 
     def __enter__(self) -> "Browser":
         return self
@@ -62,6 +69,7 @@ class Browser:
     def __exit__(self, *_: object) -> None:
         try:
             self.close_pages()
+            self._line.close()
             self._loop.run_until_complete(self._http.close())
             self._loop.close()
         finally:
@@ -75,26 +83,52 @@ class Browser:
             self._process.kill()
             self._process.wait()
 
-    def _port(self) -> int:
+    def _address(self) -> tuple[int, str]:
         written = self._folder / "DevToolsActivePort"
         deadline = time.monotonic() + _START_S
         while time.monotonic() < deadline and self._process.poll() is None:
             lines = written.read_text().splitlines() if written.exists() else []
             if len(lines) == 2:
-                return int(lines[0])
+                return int(lines[0]), lines[1]
             time.sleep(0.05)
         self._end()
         raise RuntimeError("the browser did not start")
 
-    async def _new_target(self) -> Any:
-        async with self._http.put(f"{self._address}/json/new?about:blank") as answer:
-            return await answer.json()
-
-    async def _connect(self, url: str) -> aiohttp.ClientWebSocketResponse:
-        return await self._http.ws_connect(url, max_msg_size=0)
+    def _connect(self, path: str) -> aiohttp.ClientWebSocketResponse:
+        return self._loop.run_until_complete(_connect(self._http, self._url + path))
 
 
-class Page:
+class Line:
+    """A connection that takes commands."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, socket: aiohttp.ClientWebSocketResponse) -> None:
+        self._loop = loop
+        self._socket = socket
+        self._numbers = itertools.count(1)
+
+    def call(self, method: str, **params: Any) -> Any:
+        """Call a method of the protocol."""
+        return self._loop.run_until_complete(asyncio.wait_for(self._call(method, params), _ANSWER_S))
+
+    def close(self) -> None:
+        self._loop.run_until_complete(self._socket.close())
+
+    async def _call(self, method: str, params: dict[str, Any]) -> Any:
+        number = next(self._numbers)
+        await self._socket.send_str(json.dumps({"id": number, "method": method, "params": params}))
+        while True:
+            message = json.loads((await self._socket.receive()).data)
+            if message.get("id") == number:
+                if "error" in message:
+                    raise AssertionError(f"{method}: {message['error']}")
+                return message["result"]
+            self._note(message.get("method"), message.get("params", {}))
+
+    def _note(self, event: str | None, params: dict[str, Any]) -> None:
+        """Take what came unasked."""
+
+
+class Page(Line):
     """One open page.
 
     Attributes:
@@ -103,15 +137,9 @@ class Page:
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, socket: aiohttp.ClientWebSocketResponse) -> None:
+        super().__init__(loop, socket)
         self.complaints: list[str] = []
         self.requested: list[str] = []
-        self.socket = socket
-        self._loop = loop
-        self._numbers = itertools.count(1)
-
-    def call(self, method: str, **params: Any) -> Any:
-        """Call a method of the protocol."""
-        return self._loop.run_until_complete(asyncio.wait_for(self._call(method, params), _ANSWER_S))
 
     def resize(self, width: int, height: int) -> None:
         self.call(
@@ -130,6 +158,10 @@ class Page:
         if "exceptionDetails" in answer:
             raise AssertionError(answer["exceptionDetails"])
         return answer["result"].get("value")
+
+    def _describe(self, expression: str) -> str:
+        where = self.evaluate("`${location.href}, ${document.readyState}`")
+        return f"not true: {expression}; {where}; loaded {self.requested}; {self.complaints}"
 
     def text(self, element: str) -> str:
         """Give the text of the element with this id."""
@@ -159,17 +191,6 @@ class Page:
         picture: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         return np.asarray(picture, np.uint8)
 
-    async def _call(self, method: str, params: dict[str, Any]) -> Any:
-        number = next(self._numbers)
-        await self.socket.send_str(json.dumps({"id": number, "method": method, "params": params}))
-        while True:
-            message = json.loads((await self.socket.receive()).data)
-            if message.get("id") == number:
-                if "error" in message:
-                    raise AssertionError(f"{method}: {message['error']}")
-                return message["result"]
-            self._note(message.get("method"), message.get("params", {}))
-
     def _note(self, event: str | None, params: dict[str, Any]) -> None:
         if event == "Runtime.exceptionThrown":
             self.complaints.append(str(params["exceptionDetails"]))
@@ -183,3 +204,7 @@ class Page:
 
 async def _http() -> aiohttp.ClientSession:
     return aiohttp.ClientSession()
+
+
+async def _connect(http: aiohttp.ClientSession, url: str) -> aiohttp.ClientWebSocketResponse:
+    return await http.ws_connect(url, max_msg_size=0)

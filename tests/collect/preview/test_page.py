@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lce_rig.collect.live.state import Cue, Drawing, StreamState
+from lce_rig.collect.live.state import Drawing, StreamState
 from lce_rig.collect.preview import Preview
 
 from .browser import Browser, Page
@@ -139,9 +139,11 @@ def test_outlines_break_off_where_the_lens_sees_no_further(preview: Preview, bro
 
 def test_an_arrow_leads_to_the_place_until_the_board_is_there(preview: Preview, browser: Browser) -> None:
     page = browser.open(preview.urls[0])
-    shown(preview, page, "document.querySelector('#arrow .head') !== null")
-    tip = page.evaluate("document.querySelector('#arrow .head').getAttribute('d')").partition("L")[0]
-    assert np.allclose([float(each) for each in tip[1:].split()], WANTED_PX[:-1].mean(axis=0))
+    tip = "document.querySelector('#arrow .head')?.getAttribute('d').split('L')[0]"
+    # From (150, 130) towards (480, 180), whose outline begins at x = 400.
+    shown(preview, page, f"{tip}?.startsWith('M400 167.8')")
+    near = Drawing("cam", picture(), PRESENT_PX, PRESENT_PX + [40.0, 0.0])
+    shown(preview, page, f"{tip} === 'M190 130'", drawing=near)
     there = Drawing("cam", picture(), PRESENT_PX, PRESENT_PX + 2, is_there=True)
     shown(preview, page, "document.querySelector('#outlines.there') !== null", drawing=there)
     assert page.evaluate("document.querySelectorAll('#arrow path').length") == 0
@@ -190,67 +192,22 @@ def test_what_sensors_say_is_text_and_not_markup(preview: Preview, browser: Brow
     assert not page.complaints
 
 
-def test_sounds_are_played_once_each_after_a_tap(preview: Preview, browser: Browser) -> None:
-    counting = """
-      window.tones = [];
-      const make = AudioContext.prototype.createOscillator;
-      AudioContext.prototype.createOscillator = function () {
-        const made = make.call(this);
-        const start = made.start;
-        made.start = function (when) { window.tones.push(made.frequency.value); start.call(made, when); };
-        return made;
-      };
-    """
-    page = browser.open(preview.urls[0], first=counting)
-    shown(preview, page, has_text("count", "7"))
-    shown(preview, page, has_text("count", "8"), n_captures=8, cues=(Cue(3, "enough"),))
-    assert page.evaluate("window.tones") == []
-    page.tap("sound")
-    page.wait_until("document.getElementById('sound').getAttribute('aria-pressed') === 'true'")
-    page.wait_until("window.tones.length === 1")
-    cues = (Cue(3, "enough"), Cue(4, "captured"), Cue(5, "refused"))
-    for k in range(3):
-        shown(preview, page, has_text("count", str(9 + k)), n_captures=9 + k, cues=cues)
-    assert page.evaluate("window.tones") == [1000, 880, 1320, 220, 185]
-    shown(preview, page, has_text("count", "12"), n_captures=12, cues=(*cues, Cue(6, "lost")))
-    assert page.evaluate("window.tones.length") == 8
-    page.tap("sound")
-    shown(preview, page, has_text("count", "13"), n_captures=13, cues=(Cue(7, "tick"),))
-    assert page.evaluate("window.tones.length") == 8
-    assert not page.complaints
+def test_before_the_first_state_it_waits(preview: Preview, browser: Browser) -> None:
+    page = browser.open(preview.urls[0])
+    page.wait_until(has_text("headline", "waiting for the collection"))
+    assert page.text("phase") == "connected"
 
 
-def test_the_voice_reads_settled_instructions_once_and_is_quiet_while_the_board_is_held(
-    preview: Preview, browser: Browser
-) -> None:
-    # Headless browsers have no voices: this one remembers what it is told to say.
-    listening = """
-      window.said = [];
-      const voice = {
-        speaking: false, getVoices: () => [{ lang: 'en-GB', localService: true }],
-        addEventListener() {}, cancel() {}, speak: (words) => window.said.push(words.text),
-      };
-      Object.defineProperty(window, 'speechSynthesis', { value: voice });
-      window.SpeechSynthesisUtterance = class { constructor(text) { this.text = text; } };
-    """
-    page = browser.open(preview.urls[0], first=listening)
+def test_phones_that_may_switch_their_screen_off_are_warned_of(preview: Preview, browser: Browser) -> None:
+    page = browser.open(preview.urls[0], 360, 640)
     page.wait_until(OPEN)
-
-    def stand(headline: str, phase: str, duration_s: float) -> None:
-        end_s = time.monotonic() + duration_s
-        while time.monotonic() < end_s:
-            preview.publish(state(headline=headline, phase=phase, drawing=None))
-            time.sleep(0.1)
-
-    stand("raise it 20 cm", "moving", 1.0)
-    assert page.evaluate("window.said") == []
-    page.tap("speech")
-    for distance in range(8):
-        stand(f"0.{9 - distance} m closer", "moving", 0.1)
-    stand("one step left", "moving", 2.0)
-    stand("hold still", "holding", 1.2)
-    page.wait_until(has_text("headline", "hold still"))
-    assert page.evaluate("window.said") == ["one step left"]
+    assert page.evaluate("document.getElementById('hint').hidden")
+    # On a plain link to another computer browsers hide the means to keep the screen on.
+    page.call("Page.addScriptToEvaluateOnNewDocument", source="delete Navigator.prototype.wakeLock")
+    page.call("Emulation.setTouchEmulationEnabled", enabled=True)
+    page.evaluate("window.isOld = true")
+    page.call("Page.reload")
+    page.wait_until(f"!window.isOld && {OPEN} && !document.getElementById('hint').hidden")
     assert not page.complaints
 
 

@@ -1,14 +1,14 @@
 // Ties the line to the rig to what is on the screen.
 
 import { connect } from "./connection.js";
-import { fitHeadline, showPanels } from "./panels.js";
+import { fitHeadline, showPanels, showWaiting } from "./panels.js";
 import { play, playCues, setSound, setSpeech, speak } from "./sounds.js";
 import { setMirrored, showDrawing, showHold } from "./stage.js";
 
 const STALE_S = 3;
 const byId = (id) => document.getElementById(id);
 
-let phase = "starting";
+let phase = null;
 let isAfterGap = false;
 let wasOpen = false;
 
@@ -29,6 +29,7 @@ connect(
     document.body.dataset.connection = isOpen ? "open" : isOver ? "over" : "lost";
     if (isRefused) setBanner("This link is no longer valid. Open the one that the rig shows now.");
     else setBanner(isOpen || isOver ? "" : "Connection to the rig lost. Trying again …");
+    if (isOpen && phase === null) showWaiting();
     if (!isOpen) {
       isAfterGap = true;
       showHold(null);
@@ -69,11 +70,29 @@ if ("speechSynthesis" in window) {
   offer();
 }
 
-toggle("mirror", localStorage.getItem("mirror") !== "no", (on) => {
-  localStorage.setItem("mirror", on ? "yes" : "no");
+// Browsers that keep nothing of a page refuse their storage.
+function remembered(name) {
+  try {
+    return localStorage.getItem(name);
+  } catch {
+    return null;
+  }
+}
+
+function remember(name, value) {
+  try {
+    localStorage.setItem(name, value);
+  } catch {
+    // chosen anew next time
+  }
+}
+
+const isMirrored = remembered("mirror") !== "no";
+toggle("mirror", isMirrored, (on) => {
+  remember("mirror", on ? "yes" : "no");
   setMirrored(on);
 });
-setMirrored(localStorage.getItem("mirror") !== "no");
+setMirrored(isMirrored);
 
 if (document.fullscreenEnabled) {
   const button = byId("fullscreen");
@@ -88,6 +107,8 @@ if (document.fullscreenEnabled) {
 }
 
 // Browsers let only pages from this computer, or encrypted ones, keep the screen on.
+byId("hint").hidden = "wakeLock" in navigator || !matchMedia("(pointer: coarse)").matches;
+
 async function keepScreenOn() {
   if (document.hidden || !("wakeLock" in navigator)) return;
   try {

@@ -38,6 +38,12 @@ export function showPanels(state) {
   setList("log", [...state.log].reverse());
 }
 
+/** Show that the line is open, and nothing has come yet. */
+export function showWaiting() {
+  setText("phase", "connected");
+  showHeadline("waiting for the collection");
+}
+
 /** Make the headline as large as its place allows. */
 export function fitHeadline() {
   const box = byId("headline");
@@ -97,7 +103,7 @@ function showSigma(id, sigma, target, unit) {
 }
 
 function fillBar(bar, share) {
-  bar.classList.toggle("full", share >= 1);
+  bar.classList.toggle("full", share >= 0.995);
   bar.querySelector("em").style.transform = `scaleX(${Math.min(Math.max(share, 0), 1)})`;
 }
 

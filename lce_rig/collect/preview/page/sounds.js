@@ -16,6 +16,7 @@ const QUIET_PHASES = new Set(["holding", "saving"]);
 let context = null;
 let isOn = false;
 let lastCue = null;
+let busyUntil = 0;
 let speaks = false;
 let spoken = "";
 let settling = { words: "", since: 0 };
@@ -23,8 +24,8 @@ let settling = { words: "", since: 0 };
 /** Turn sounds on or off; must be called from a tap. */
 export async function setSound(on) {
   isOn = on;
-  context ??= new AudioContext();
   if (!on) return;
+  context ??= new AudioContext();
   await context.resume();
   play("tick");
 }
@@ -52,10 +53,10 @@ export function playCues(cues, isAfterGap) {
 export function play(sound) {
   const tones = TONES[sound];
   if (!isOn || tones === undefined || context.state !== "running") return;
-  const begin = Math.max(context.currentTime + 0.02, play.until ?? 0);
+  const begin = Math.max(context.currentTime + 0.02, busyUntil);
   for (const [frequency, after, length] of tones) tone(frequency, begin + after, length, HARSH.has(sound));
   const [, after, length] = tones[tones.length - 1];
-  play.until = begin + after + length + 0.05;
+  busyUntil = begin + after + length + 0.05;
 }
 
 /** Read a headline aloud once it has settled; one is finished before the next begins. */

@@ -75,16 +75,18 @@ function toPath(points) {
   return lines;
 }
 
+// From the middle of the board to the border of its place, which stays visible; to its middle where both overlap.
 function drawArrow(drawing) {
   const from = centre(drawing?.present_px);
-  const to = centre(drawing?.wanted_px);
+  const middle = centre(drawing?.wanted_px);
   const parts = [];
-  if (from !== null && to !== null && !drawing.is_there) {
-    const [dx, dy] = [to[0] - from[0], to[1] - from[1]];
-    const length = Math.hypot(dx, dy);
-    const head = 0.035 * drawing.width_px;
+  if (from !== null && middle !== null && !drawing.is_there) {
+    const head = 0.03 * drawing.width_px;
+    const border = crossing(from, middle, drawing.wanted_px);
+    const to = border !== null && distance(from, border) > 0.5 * distance(from, middle) ? border : middle;
+    const length = distance(from, to);
     if (length > 1.5 * head) {
-      const [ux, uy] = [dx / length, dy / length];
+      const [ux, uy] = [(to[0] - from[0]) / length, (to[1] - from[1]) / length];
       const neck = [to[0] - head * ux, to[1] - head * uy];
       const shaft = `M${from[0]} ${from[1]}L${neck[0]} ${neck[1]}`;
       const side = 0.6 * head;
@@ -93,6 +95,27 @@ function drawArrow(drawing) {
     }
   }
   byId("arrow").replaceChildren(...parts);
+}
+
+// Where the way from a point to an outline's middle first meets the outline; null where it does not.
+function crossing(from, middle, points) {
+  const way = [middle[0] - from[0], middle[1] - from[1]];
+  let first = 1;
+  for (let k = 1; k < points.length; k += 1) {
+    const [a, b] = [points[k - 1], points[k]];
+    if (a === null || b === null) continue;
+    const edge = [b[0] - a[0], b[1] - a[1]];
+    const cross = way[0] * edge[1] - way[1] * edge[0];
+    const gap = [a[0] - from[0], a[1] - from[1]];
+    const along = (gap[0] * edge[1] - gap[1] * edge[0]) / cross;
+    const across = (gap[0] * way[1] - gap[1] * way[0]) / cross;
+    if (along > 0 && along < first && across >= 0 && across <= 1) first = along;
+  }
+  return first < 1 ? [from[0] + first * way[0], from[1] + first * way[1]] : null;
+}
+
+function distance(a, b) {
+  return Math.hypot(a[0] - b[0], a[1] - b[1]);
 }
 
 function centre(points) {
