@@ -7,6 +7,7 @@
     scripts/bench.py intrinsics  stale intrinsics: how often they are found
     scripts/bench.py guidance    a person who follows the guidance against random placements
     scripts/bench.py paper       the experiments of the LCE-Calib paper: tables and figures, every method
+    scripts/bench.py faults      sessions with faults: how many wrong results pass
     scripts/bench.py speed       detection, Algorithm 1, the command line
 
 Detections are made anew, but for those that `paper` keeps in its folder; random choices are seeded. Run it
@@ -18,7 +19,16 @@ from importlib import import_module
 from pathlib import Path
 
 # Part -> module, and how many simulated sessions it takes by default.
-PARTS = {"real": 0, "simulated": 20, "events": 10, "intrinsics": 20, "guidance": 20, "paper": 20, "speed": 0}
+PARTS = {
+    "real": 0,
+    "simulated": 20,
+    "events": 10,
+    "intrinsics": 20,
+    "guidance": 20,
+    "paper": 20,
+    "faults": 100,
+    "speed": 0,
+}
 
 
 def main() -> None:
