@@ -76,8 +76,8 @@ def start(path: Path, *arguments: str, **options: object) -> "subprocess.Popen[s
 
 def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(tmp_path: Path) -> None:
     path = tmp_path / "session"
-    process = start(path, "--plain", "--frames", "2", "--timeout", "90", "--hold", "0.3")
-    _, said = process.communicate(timeout=120)
+    process = start(path, "--plain", "--frames", "2", "--timeout", "240", "--hold", "0.3")
+    _, said = process.communicate(timeout=300)
     assert process.returncode == 0, said
     session = Session.open(path)
     assert len(session.captures) == 2
