@@ -8,7 +8,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.detect.event_board import find_in_reconstruction
-from lce_rig.detect.image_board import find_image_board, region_around
+from lce_rig.detect.image_board import NOT_SEEN_AT_ONCE, find_image_board, region_around
 from lce_rig.detect.lidar_board import find_lidar_boards
 from lce_rig.detect.lidar_track import track_lidar_board
 from lce_rig.rig import Rig
@@ -53,15 +53,18 @@ class BoardWatcher:
     Attributes:
         rig: the profile.
         search_interval_s: how often a whole picture is searched while no board is in sight.
+        thorough_interval_s: how often such a search is thorough, which takes most of a second; 0 for always.
         counts: frames in which it was not found, by sensor.
     """
 
     rig: Rig
     search_interval_s: float
+    thorough_interval_s: float = 0.0
     counts: Counter[str] = field(default_factory=Counter)
     _seen: dict[ImageKey, ImageBoard] = field(default_factory=dict)
     _candidates: dict[str, list[LidarBoard]] = field(default_factory=dict)
     _searched_ns: dict[ImageKey | str, int] = field(default_factory=dict)
+    _thorough_ns: dict[ImageKey | str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._board: Board = self.rig.board.to_board()
@@ -102,7 +105,12 @@ class BoardWatcher:
         if camera.channels[image.channel].kind == "events":
             found = find_in_reconstruction(image, self._board, intrinsics, self.rig.quality, region)
         else:
-            found = find_image_board(image, self._board, intrinsics, region=region, last=last)
+            is_thorough = self._is_thorough_due(key, time_ns, was_seen=last is not None)
+            found = find_image_board(
+                image, self._board, intrinsics, region=region, last=last, is_thorough=is_thorough
+            )
+            if found is NOT_SEEN_AT_ONCE:
+                return None
         if isinstance(found, ImageBoard):
             self._seen[key] = found
         return found
@@ -120,8 +128,20 @@ class BoardWatcher:
         return search
 
     def _is_search_due(self, key: ImageKey | str, time_ns: int) -> bool:
-        last_ns = self._searched_ns.get(key)
-        if last_ns is not None and 0 <= time_ns - last_ns < self.search_interval_s * 1e9:
+        return _is_due(self._searched_ns, key, time_ns, self.search_interval_s)
+
+    def _is_thorough_due(self, key: ImageKey, time_ns: int, *, was_seen: bool) -> bool:
+        """Tell whether it is time for a thorough search; a board just lost is soon seen again without."""
+        if was_seen and self.thorough_interval_s > 0:
+            self._thorough_ns[key] = time_ns
             return False
-        self._searched_ns[key] = time_ns
-        return True
+        return _is_due(self._thorough_ns, key, time_ns, self.thorough_interval_s)
+
+
+def _is_due(last_ns: dict[ImageKey | str, int], key: ImageKey | str, time_ns: int, interval_s: float) -> bool:
+    """Tell whether an interval has gone by since something was done last, and note that it is done now."""
+    before_ns = last_ns.get(key)
+    if before_ns is not None and 0 <= time_ns - before_ns < interval_s * 1e9:
+        return False
+    last_ns[key] = time_ns
+    return True

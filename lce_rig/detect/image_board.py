@@ -23,6 +23,8 @@ from lce_rig.detect.image_saddle import Crossings, fit_crossings
 from lce_rig.solvers.pnp import PlanarPose, solve_planar_pose
 
 Region = tuple[int, int, int, int]
+NOT_SEEN_AT_ONCE = Refusal("image", "no board at first sight", "search the picture thoroughly")
+"""Of a search that was not thorough."""
 
 # The alternative pose is as good as the first where the difference of the costs could be noise (3 sigma).
 _AMBIGUOUS_CHI2 = 9.0
@@ -49,6 +51,7 @@ def find_image_board(
     min_contrast: float = 12.0,
     min_sharpness: float = 1.5,
     is_from_events: bool = False,
+    is_thorough: bool = True,
 ) -> ImageBoard | Refusal:
     """Find the board's inner corners in one picture and T_cam_board in both its minima.
 
@@ -67,12 +70,20 @@ def find_image_board(
         min_contrast: refuse where black and white differ by fewer grey values.
         min_sharpness: refuse where fewer edge widths fit into a square.
         is_from_events: whether the picture was made from events: what is to be done is another thing.
+        is_thorough: whether a board that is not found at once is searched for at other scales, and its
+            absence explained, which takes most of a second.
 
     Raises:
         ProfileError: the intrinsics belong to pictures of another size.
     """
     grey = crop_to_intrinsics(image, intrinsics)
-    crossings = _follow(grey, board, last) or _find_in_region(grey, board, region) or find_grid(grey, board)
+    crossings = (
+        _follow(grey, board, last)
+        or _find_in_region(grey, board, region, is_thorough=is_thorough)
+        or find_grid(grey, board, is_thorough=is_thorough)
+    )
+    if crossings is None and not is_thorough:
+        return NOT_SEEN_AT_ONCE
     if crossings is None or np.mean(crossings.is_fitted) < _MIN_FITTED:
         return explain_absence(grey, board, is_from_events)
     quality = grid_quality(grey, crossings)
@@ -172,14 +183,16 @@ def _follow(grey: NDArray[np.uint8], board: Board, last: ImageBoard | None) -> C
     return crossings if is_in_order and outer_contrast >= _MIN_OUTER_CONTRAST and not goes_on else None
 
 
-def _find_in_region(grey: NDArray[np.uint8], board: Board, region: Region | None) -> Crossings | None:
+def _find_in_region(
+    grey: NDArray[np.uint8], board: Board, region: Region | None, *, is_thorough: bool
+) -> Crossings | None:
     if region is None:
         return None
     u0, v0, u1, v1 = region
     part = grey[max(v0, 0) : v1, max(u0, 0) : u1]
     if min(part.shape) < 16:
         return None
-    found = find_grid(np.ascontiguousarray(part), board)
+    found = find_grid(np.ascontiguousarray(part), board, is_thorough=is_thorough)
     return None if found is None else replace(found, grid_px=found.grid_px + [max(u0, 0), max(v0, 0)])
 
 

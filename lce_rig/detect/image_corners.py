@@ -23,12 +23,13 @@ _SB_THOROUGH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
 
-def find_grid(grey: Grey, board: Board) -> Crossings | None:
+def find_grid(grey: Grey, board: Board, *, is_thorough: bool = True) -> Crossings | None:
     """Find the inner corners, cheapest attempt first, and fit them to sub-pixel accuracy.
 
     Args:
         grey: (H, W).
         board: tells the number of inner corners.
+        is_thorough: whether to go on after the first attempt, which takes a tenth of the time of all.
 
     Returns:
         The crossings, `grid_px` in the order of `Board.corners()`; None where no attempt finds that many.
@@ -38,6 +39,8 @@ def find_grid(grey: Grey, board: Board) -> Crossings | None:
         seen = seen.swapaxes(0, 1)
     if seen is not None and seen.shape[:2] == (board.rows, board.cols):
         attempts: Iterator[Array | None] = iter([seen.reshape(-1, 2)])
+    elif not is_thorough:
+        return None
     else:
         n_seen = 0 if seen is None else seen.shape[0] * seen.shape[1]
         is_other_seen = n_seen >= _OTHER_BOARD * board.rows * board.cols

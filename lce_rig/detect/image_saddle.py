@@ -107,14 +107,14 @@ def _fit(values: Array, a: Array, b: Array, height_px: Array) -> tuple[Array, Ar
     residuals, J = _model(p, values, a, b)
     cost = np.sum(residuals**2, axis=1)
     for _ in range(_STEPS):
-        H = np.swapaxes(J, 1, 2) @ J
+        H = J @ np.swapaxes(J, 1, 2)
         diagonal = np.einsum("kii->ki", H)
         damped = (
             H
             + np.eye(8)
             * (damping[:, None] * diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-12)[:, None, :]
         )
-        step = -np.linalg.solve(damped, np.swapaxes(J, 1, 2) @ residuals[..., None])[..., 0]
+        step = -np.linalg.solve(damped, J @ residuals[..., None])[..., 0]
         candidate = p + step
         candidate[:, :4] = np.clip(candidate[:, :4], -1.0, 1.0)
         candidate[:, 6:8] = np.clip(candidate[:, 6:8], lowest, 0.0)
@@ -131,24 +131,20 @@ def _fit(values: Array, a: Array, b: Array, height_px: Array) -> tuple[Array, Ar
 
 
 def _model(p: Array, values: Array, a: Array, b: Array) -> tuple[Array, Array]:
-    """Evaluate the model's residuals (K, n) and their derivatives (K, n, 8)."""
+    """Evaluate the model's residuals (K, n) and their derivatives (K, 8, n)."""
     a0, b0, alpha, beta, m, c, log_s1, log_s2 = (column[:, None] for column in p.T)
-    f1 = (a - a0) - alpha * (b - b0)
-    f2 = (b - b0) - beta * (a - a0)
+    from_a, from_b = a - a0, b - b0
+    f1, f2 = from_a - alpha * from_b, from_b - beta * from_a
     k1, k2 = 0.85 * np.exp(-log_s1), 0.85 * np.exp(-log_s2)
     g1, g2 = np.tanh(k1 * f1), np.tanh(k2 * f2)
-    d1, d2 = c * (1 - g1**2) * g2 * k1, c * (1 - g2**2) * g1 * k2
-    J = np.stack(
-        [
-            -d1 + d2 * beta,
-            d1 * alpha - d2,
-            -d1 * (b - b0),
-            -d2 * (a - a0),
-            np.ones_like(g1),
-            g1 * g2,
-            -d1 * f1,
-            -d2 * f2,
-        ],
-        axis=-1,
-    )
-    return m + c * g1 * g2 - values, J
+    d1, d2 = c * k1 * (1 - g1**2) * g2, c * k2 * (1 - g2**2) * g1
+    J = np.empty((len(p), 8, values.shape[1]))
+    J[:, 0] = d2 * beta - d1
+    J[:, 1] = d1 * alpha - d2
+    J[:, 2] = -d1 * from_b
+    J[:, 3] = -d2 * from_a
+    J[:, 4] = 1.0
+    J[:, 5] = g1 * g2
+    J[:, 6] = -d1 * f1
+    J[:, 7] = -d2 * f2
+    return m + c * J[:, 5] - values, J

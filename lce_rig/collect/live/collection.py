@@ -33,6 +33,8 @@ Key = Literal["stop", "capture", "next"]
 
 #: How long a board stands still before it is captured, beyond the first half second.
 HOLD_S = 1.5
+#: How often a picture without a board is searched thoroughly, during which nothing is said.
+THOROUGH_S = 3.0
 _WAIT_S = 0.1
 _NOVEL_M, _NOVEL_DEG = 0.15, 10.0
 
@@ -166,7 +168,7 @@ class _Loop:
         self._show = show
         self._recorder = recorder
         self._began_s = time.monotonic()
-        self._watcher = BoardWatcher(self._rig, options.search_interval_s)
+        self._watcher = BoardWatcher(self._rig, options.search_interval_s, THOROUGH_S)
         self._gate: LiveGate | None = None
         self._n_captures = len(session.captures)
         names = [capture.name for capture in session.captures]
