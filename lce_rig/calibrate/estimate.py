@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from lce_rig.calibrate.expansion import Expansion
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Certificate, Metrics, Observation, Refusal
 
@@ -47,6 +48,8 @@ class CalibrationEstimate:
         weak_direction: the least certain motion in words, with its standard deviation.
         diagnostics: further figures by name.
         method: that found it, as `CalibrateOptions.method`.
+        expansion: the method's own cost about its result, capture by capture and in the extrinsic alone; None
+            of methods that give none.
     """
 
     T_cam_lidar: Array
@@ -61,3 +64,4 @@ class CalibrationEstimate:
     weak_direction: str
     diagnostics: Mapping[str, float]
     method: str = "paper"
+    expansion: Expansion | None = None

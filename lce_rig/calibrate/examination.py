@@ -66,9 +66,16 @@ def examine(
     if len(expansion.groups) < _MIN_PLACEMENTS:
         return Examination(estimate, "", (), None, None, intrinsics)
     settled = expansion.settled()
-    widened, remark = widen(estimate, resample(settled), rig.verdict)
+    # A cost made anew scatters as it does itself: a claim is held against the scatter of its own method.
+    widened, remark = widen(estimate, resample(estimate.expansion or settled), rig.verdict)
     control = run_control(
-        observations, board, estimate.T_cam_lidar, widened.cov, settled, rig.verdict.control_sigmas
+        observations,
+        board,
+        estimate.T_cam_lidar,
+        widened.cov,
+        settled,
+        rig.calibration,
+        rig.verdict.control_sigmas,
     )
     nuisances = estimate_nuisances(expansion)
     return Examination(widened, remark, contrast_halves(settled), control, nuisances, intrinsics)

@@ -1,11 +1,13 @@
 """The joint estimate as a method of calibration: Algorithm 1 finds the place, the likelihood the optimum."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from lce_rig.calibrate.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.expansion import Expansion
 from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.refine import JointEstimate, refine
@@ -46,19 +48,33 @@ def calibrate_by_likelihood(
     used = [start.observations[name] for name in start.used]
     priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=options.edge_shift_sigma_m)
     joint = refine([used], board, [start.T_cam_lidar], priors, Levels(laser_m=options.laser_bias_sigma_m))
-    cov, inflation = inflate(joint, group_placements(used))
+    placement = group_placements(used)
+    cov, inflation = inflate(joint, placement)
     figures = _figures(joint, start.T_cam_lidar) | {"covariance_inflation": inflation}
-    return report_estimate(
+    features = [extract_features(observation, board, options) for observation in used]
+    estimate = report_estimate(
         joint.T_cam_lidar[0],
         cov,
         used,
-        [extract_features(observation, board, options) for observation in used],
+        features,
         board,
         certificate=start.certificate,
         held_out_m=np.array([residual.held_out_m for residual in start.residuals]),
         refused=start.refused,
         diagnostics={**start.diagnostics, **figures},
     )
+    # Constant errors are held where they are: the first six unknowns alone.
+    expansion = Expansion(
+        joint.T_cam_lidar[0],
+        joint.system.gradients[:, :6],
+        joint.system.hessians[:, :6, :6],
+        np.zeros((6, 6)),
+        placement,
+        np.array([f.centre for f in features]),
+        joint.levels.depth_m,
+        joint.levels.edge_m,
+    )
+    return replace(estimate, expansion=expansion)
 
 
 def _figures(joint: JointEstimate, T_start: Array) -> dict[str, float]:

@@ -8,6 +8,7 @@ edge: s + d lies anywhere between 0 and D, hence
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -33,13 +34,28 @@ class EdgeRows:
     rows: Array
     step_m: Array
 
+    @cached_property
+    def products(self) -> Array:
+        """Products of each row with itself (M, 10, 10)."""
+        return np.asarray(self.rows[:, :, None] * self.rows[:, None, :])
+
     def variance(self, tau_m: float) -> Array:
         """Variance (M,) of (1) in m^2."""
         return np.asarray(self.step_m**2 / 12 + tau_m**2)
 
 
-def edge_rows(scans: StackedScans, T_lidar_board: Array, board: Board) -> EdgeRows:
-    """Linearise (1) at board poses (F, 4, 4), with d = 0."""
+def edge_rows(
+    scans: StackedScans, T_lidar_board: Array, board: Board, lens: Array, shift_m: float
+) -> EdgeRows:
+    """Linearise (1).
+
+    Args:
+        scans: ring ends.
+        T_lidar_board: (F, 4, 4) board poses.
+        board: its size.
+        lens: (2,) theta.
+        shift_m: d.
+    """
     T = T_lidar_board[scans.end_capture]
     R, t, n = T[:, :3, :3], T[:, :3, 3], T[:, :3, 2]
     h = np.sum(n * t, axis=1)
@@ -61,7 +77,7 @@ def edge_rows(scans: StackedScans, T_lidar_board: Array, board: Board) -> EdgeRo
     rows[:, 3:6] = -np.cross(sideways, here)
     rows[:, 6:-2] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
     rows[:, -2] = 1
-    rows[:, -1] = inside_m - step_m / 2
+    rows[:, -1] = inside_m + rows[:, 6:-2] @ lens + shift_m - step_m / 2
     return EdgeRows(scans.end_capture, rows, step_m)
 
 
@@ -78,7 +94,6 @@ def edge_system(edges: EdgeRows, weights: Array, n_captures: int) -> Array:
     """Sum products of rows, weighted (M,), by capture: (F, 10, 10)."""
     system = np.zeros((n_captures, _SIZE, _SIZE))
     if len(edges.rows):
-        products = weights[:, None, None] * edges.rows[:, :, None] * edges.rows[:, None, :]
         first = np.flatnonzero(np.diff(edges.capture, prepend=-1))
-        system[edges.capture[first]] = np.add.reduceat(products, first, axis=0)
+        system[edges.capture[first]] = np.add.reduceat(weights[:, None, None] * edges.products, first, axis=0)
     return system

@@ -12,12 +12,14 @@ from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, NO_LASER_M, Levels, P
 from lce_rig.calibrate.likelihood.system import Terms, assemble
 from lce_rig.core.geometry import Array
 
-_STEP, _MAX_ROUNDS = 1e-3, 15
+_STEP = 1e-3
 # Levels lie within these factors of what is usual, e^-4.6 and e^3.
 _BELOW, _ABOVE = -4.6, 3.0
 
 
-def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, end_weights: Array) -> Levels:
+def fit_levels(
+    terms: Terms, start: Levels, usual: Levels, priors: Priors, end_weights: Array, n_rounds: int
+) -> Levels:
     """Find the levels that minimise -2 ln p(data | levels) - 2 ln p(levels).
 
     Args:
@@ -26,6 +28,7 @@ def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, end_w
         usual: middle of what is believed of them.
         priors: of the constants.
         end_weights: (M,) robust weights of the ring ends.
+        n_rounds: of the search, at most.
     """
     middle = usual.to_logs()
     free = np.arange(len(middle)) if usual.laser_m > NO_LASER_M else np.arange(len(middle) - 1)
@@ -35,7 +38,7 @@ def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, end_w
         return assemble(terms, _levels(logs, usual), priors, end_weights).minus_2_log_evidence + unlikely
 
     bounds = [(middle[i] + _BELOW, middle[i] + _ABOVE) for i in free]
-    options = {"maxiter": _MAX_ROUNDS, "eps": _STEP, "ftol": 1e-6}
+    options = {"maxiter": n_rounds, "eps": _STEP, "ftol": 1e-6}
     found = minimize(cost, start.to_logs()[free], method="L-BFGS-B", bounds=bounds, options=options)
     return _levels(found.x, usual)
 

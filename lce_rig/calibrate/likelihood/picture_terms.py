@@ -61,7 +61,7 @@ def stack_pictures(capture: Indices, images: Sequence[ImageBoard], n_repeats: Ar
     return Pictures(capture, T, cov, shapes * n_repeats[:, None, None, None])
 
 
-def picture_rows(pictures: Pictures, T_cam_lidar: Array, T_lidar_board: Array) -> Array:
+def picture_rows(pictures: Pictures, T_cam_lidar: Array, T_lidar_board: Array, scale: float) -> Array:
     """Linearise the tangent from T_cam_board to T_cam_lidar T_lidar_board.
 
     Returns:
@@ -77,4 +77,5 @@ def picture_rows(pictures: Pictures, T_cam_lidar: Array, T_lidar_board: Array) -
     rows[:, :3, 6:9] = rows[:, 3:, 9:12] = R
     rows[:, :3, 12] = -pictures.T_cam_board[:, :3, 3]
     rows[:, :, 13] = difference(T_cam_lidar @ Y, pictures.T_cam_board)
+    rows[:, :3, 13] += scale * rows[:, :3, 12]
     return rows

@@ -8,7 +8,7 @@ laser and displaced by f theta (the lens, `scans`),
 With m = n / h the range r = 1 / (m . u) depends on three numbers a capture, and dr = -(r^2 u) . dm. All
 that an estimate needs of the returns of a ring in a capture are therefore the sums of products of
 
-    v = [r^2 u; 1; -n . f / (n . u); r - rho]
+    v = [r^2 u; 1; -n . f / (n . u); residual of (1)]
 
 (7 x 7), however many there are.
 """
@@ -36,8 +36,15 @@ class RangeSums:
     by_pose: Array
 
 
-def sum_ranges(scans: StackedScans, T_lidar_board: Array) -> RangeSums:
-    """Sum what the returns say at board poses (F, 4, 4)."""
+def sum_ranges(scans: StackedScans, T_lidar_board: Array, offset_m: Array, lens: Array) -> RangeSums:
+    """Sum what the returns say.
+
+    Args:
+        scans: rays.
+        T_lidar_board: (F, 4, 4) board poses.
+        offset_m: (L,) of each ring.
+        lens: (2,) theta.
+    """
     n, t = T_lidar_board[:, :3, 2], T_lidar_board[:, :3, 3]
     h = np.sum(n * t, axis=1)
     k = scans.capture
@@ -46,7 +53,7 @@ def sum_ranges(scans: StackedScans, T_lidar_board: Array) -> RangeSums:
     v = np.ones((len(r), _SIZE))
     v[:, :_ONE] = r[:, None] ** 2 * scans.rays
     v[:, _ONE + 1 : -1] = -np.einsum("ni,nij->nj", n[k], scans.fields) / cosine[:, None]
-    v[:, -1] = r - scans.range_m
+    v[:, -1] = r + v[:, _ONE + 1 : -1] @ lens + offset_m[scans.ring] - scans.range_m
     sums = np.zeros((scans.n_captures * len(scans.rings), _SIZE, _SIZE))
     first = np.flatnonzero(np.diff(scans.group, prepend=-1))
     sums[scans.group[first]] = np.add.reduceat(v[:, :, None] * v[:, None, :], first, axis=0)

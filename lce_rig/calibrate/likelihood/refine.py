@@ -16,13 +16,15 @@ from lce_rig.calibrate.likelihood.scans import N_FIELDS, lens_fields, stack_scan
 from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, System, Terms, assemble, linearise
 from lce_rig.calibrate.placements import group_placements
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array, invert
+from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import Observation
 from lce_rig.solvers.covariance import symmetric_inverse
 
 # Freedoms of Student's distribution of ring ends.
 _FREEDOMS = 5.0
-_LEVEL_ROUNDS, _STEPS = 3, 3
+_STEPS = 3
+# Rounds of the search for noise levels, after each of which all is linearised anew.
+_LEVEL_ROUNDS = (12, 4, 4)
 _SETTLED = 1e-7
 
 
@@ -87,7 +89,7 @@ def refine(
         np.zeros(PER_CAMERA * len(cameras) + len(scans.rings) + N_FIELDS + 1),
     )
     now = levels or usual
-    for round_ in range(_LEVEL_ROUNDS + 1):
+    for n_rounds in (*_LEVEL_ROUNDS, 0):
         for _ in range(_STEPS):
             terms = linearise(scans, pictures, board, state)
             z, y = assemble(terms, now, priors, end_weights(terms, now)).step()
@@ -95,8 +97,8 @@ def refine(
             if np.abs(z).max() < _SETTLED:
                 break
         terms = linearise(scans, pictures, board, state)
-        if levels is None and round_ < _LEVEL_ROUNDS:
-            now = fit_levels(terms, now, usual, priors, end_weights(terms, now))
+        if levels is None and n_rounds:
+            now = fit_levels(terms, now, usual, priors, end_weights(terms, now), n_rounds)
     return _summarise(state, assemble(terms, now, priors, end_weights(terms, now)), now)
 
 
@@ -109,31 +111,45 @@ def _pictures(observations: Sequence[Observation], order: dict[str, int]) -> Pic
 
 def end_weights(terms: Terms, levels: Levels) -> Array:
     """Compute (nu + 1) / (nu + (e / sigma)^2) for the ring ends (M,)."""
-    squares = terms.edge_residuals_m() ** 2 / terms.edges.variance(levels.edge_m)
+    squares = terms.edges.rows[:, -1] ** 2 / terms.edges.variance(levels.edge_m)
     return np.asarray((_FREEDOMS + 1) / (_FREEDOMS + squares))
 
 
+def to_extrinsic(T_cam_lidar: Array, camera: int, n_unknowns: int) -> Array:
+    """Differentiate a camera's extrinsic, as it is reported, by the unknowns z.
+
+    Straight ahead of the camera a lens beside the axis is a shift of the whole LiDAR: that goes to the
+    extrinsic, which is to be used with points as the driver gives them.
+
+    Args:
+        T_cam_lidar: (4, 4) for points whose displacement is taken off.
+        camera: its number.
+        n_unknowns: G.
+
+    Returns:
+        (6, G).
+    """
+    J = np.zeros((6, n_unknowns))
+    J[:, PER_CAMERA * camera : PER_CAMERA * camera + 6] = np.eye(6)
+    # The third row of R is the camera's line of sight in frame lidar.
+    J[:3, -N_FIELDS - 1] = T_cam_lidar[:3, :3] @ lens_fields(T_cam_lidar[2:3, :3])[0, :, 0]
+    return J
+
+
 def _summarise(state: State, system: System, levels: Levels) -> JointEstimate:
-    C = len(state.T_cam_lidar)
+    C, constants = len(state.T_cam_lidar), state.constants
     cov = symmetric_inverse(system.information)
-    rest = state.constants[PER_CAMERA * C :]
-    to_extrinsics, T_cam_lidar = np.zeros((C, 6, len(cov))), state.T_cam_lidar.copy()
-    for c, T in enumerate(state.T_cam_lidar):
-        # Straight ahead of the camera a lateral lens is a shift of the whole sensor: it goes to the
-        # extrinsic, which is to be used with points as the driver gives them.
-        ahead = T[:3, :3] @ lens_fields(T[2:3, :3])[0, :, 0]
-        to_extrinsics[c, :, PER_CAMERA * c : PER_CAMERA * c + 6] = np.eye(6)
-        to_extrinsics[c, :3, -N_FIELDS - 1] = ahead
-        T_cam_lidar[c, :3, 3] += ahead * rest[-N_FIELDS - 1]
+    J = np.stack([to_extrinsic(T, c, len(cov)) for c, T in enumerate(state.T_cam_lidar)])
+    rest = constants[PER_CAMERA * C :]
     return JointEstimate(
-        T_cam_lidar=T_cam_lidar,
+        T_cam_lidar=perturb(state.T_cam_lidar, J @ constants),
         T_lidar_board=state.T_lidar_board,
-        cov=to_extrinsics @ cov @ np.swapaxes(to_extrinsics, 1, 2),
-        to_extrinsics=to_extrinsics,
+        cov=J @ cov @ np.swapaxes(J, 1, 2),
+        to_extrinsics=J,
         offset_m=rest[: -N_FIELDS - 1],
         lens_m=rest[-N_FIELDS - 1 : -1],
         shift_m=float(rest[-1]),
-        scale=state.constants[PER_CAMERA * np.arange(C) + 6],
+        scale=constants[PER_CAMERA * np.arange(C) + 6],
         constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
         levels=levels,
         system=system,

@@ -51,7 +51,15 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """All residuals at one state, before they are weighted; linear in z, with the constants at zero."""
+    """All residuals at one state, before they are weighted.
+
+    Attributes:
+        ranges: of points.
+        edges: of ring ends.
+        pictures: of each camera.
+        picture_rows: linearised, of each camera.
+        constants: z of the state.
+    """
 
     ranges: RangeSums
     edges: EdgeRows
@@ -64,21 +72,20 @@ class Terms:
         """L."""
         return int(self.ranges.sums.shape[1])
 
-    def edge_residuals_m(self) -> Array:
-        """Residuals (M,) of the ring ends."""
-        rows = self.edges.rows
-        return np.asarray(rows[:, -1] + rows[:, 6:-1] @ self.constants[-N_FIELDS - 1 :])
-
 
 def linearise(scans: StackedScans, pictures: Sequence[Pictures], board: Board, state: State) -> Terms:
     """Linearise all terms."""
+    per_camera = state.constants[: PER_CAMERA * len(pictures)].reshape(-1, PER_CAMERA)
+    of_lidar = state.constants[PER_CAMERA * len(pictures) :]
+    offsets, lens, shift = np.split(of_lidar, [len(scans.rings), len(scans.rings) + N_FIELDS])
+    T_lidar_board = state.T_lidar_board
     return Terms(
-        sum_ranges(scans, state.T_lidar_board),
-        edge_rows(scans, state.T_lidar_board, board),
+        sum_ranges(scans, T_lidar_board, offsets, lens),
+        edge_rows(scans, T_lidar_board, board, lens, float(shift[0])),
         tuple(pictures),
         tuple(
-            picture_rows(own, T, state.T_lidar_board)
-            for own, T in zip(pictures, state.T_cam_lidar, strict=True)
+            picture_rows(own, T, T_lidar_board, float(constants[-1]))
+            for own, T, constants in zip(pictures, state.T_cam_lidar, per_camera, strict=True)
         ),
         state.constants,
     )
@@ -146,10 +153,7 @@ def assemble(terms: Terms, levels: Levels, priors: Priors, end_weights: Array) -
 
 
 def _eliminate(M: Array, terms: Terms, levels: Levels, priors: Priors, log_volume: float) -> System:
-    """Move the residuals to the constants' values and take the board poses out of M (F, 6 + G + 1, ...)."""
-    move = np.eye(M.shape[1])
-    move[6:-1, -1] = terms.constants
-    M = move.T @ M @ move
+    """Take the board poses out of M (F, 6 + G + 1, 6 + G + 1) and add the priors."""
     of_boards, rest = M[:, :6, :6], M[:, :6, 6:]
     steps = np.linalg.solve(of_boards, rest)
     reduced = M[:, 6:, 6:] - np.swapaxes(rest, 1, 2) @ steps

@@ -17,6 +17,7 @@ from lce_rig.core.geometry import difference, invert, perturb
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 STEP = 1e-6
+NO_LENS = np.zeros(2)
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +51,15 @@ def ranges_to(scans, T_lidar_board):
 def test_derivatives_by_a_boards_pose_are_those_of_differences(scans, T_lidar_board, axis):
     tangent = STEP * np.eye(6)[axis]
     ahead, behind = perturb(T_lidar_board, tangent), perturb(T_lidar_board, -tangent)
-    by_pose = sum_ranges(scans, T_lidar_board).by_pose[scans.capture]
+    by_pose = sum_ranges(scans, T_lidar_board, np.zeros(len(scans.rings)), NO_LENS).by_pose[scans.capture]
     r = ranges_to(scans, T_lidar_board)
     expected = (ranges_to(scans, ahead) - ranges_to(scans, behind)) / (2 * STEP)
     assert np.allclose(r**2 * np.sum(scans.rays * by_pose[:, :, axis], axis=1), expected, atol=1e-6)
-    rows = edge_rows(scans, T_lidar_board, BOARD)
-    inside = [(e.rows[:, -1] + e.step_m / 2) for e in (edge_rows(scans, T, BOARD) for T in (ahead, behind))]
+    rows = edge_rows(scans, T_lidar_board, BOARD, NO_LENS, 0.0)
+    inside = [
+        (e.rows[:, -1] + e.step_m / 2)
+        for e in (edge_rows(scans, T, BOARD, NO_LENS, 0.0) for T in (ahead, behind))
+    ]
     assert np.allclose(rows.rows[:, axis], (inside[0] - inside[1]) / (2 * STEP), atol=1e-6)
 
 
@@ -74,20 +78,20 @@ def test_a_displaced_lens_moves_ranges_and_ends_as_its_derivatives_say(
         moved.append(replace(observation.lidar, points=points, ring=own.rings[own.ring], edge_points=ends))
     there = stack_scans(moved)
     gap = there.range_m - ranges_to(there, T_lidar_board) - (scans.range_m - ranges_to(scans, T_lidar_board))
-    sums = sum_ranges(scans, T_lidar_board).sums
+    sums = sum_ranges(scans, T_lidar_board, np.zeros(len(scans.rings)), NO_LENS).sums
     assert sums.shape[2] == 7
     # Displacement along the normal over the ray's slope: what a range along the old ray would have to read.
     n = T_lidar_board[scans.capture, :3, 2]
     by_lens = -np.einsum("ni,ni->n", n, scans.fields[:, :, lens]) / np.sum(n * scans.rays, axis=1)
     assert np.allclose(-gap, theta * by_lens, atol=2e-5)
-    before, after = (edge_rows(s, T_lidar_board, BOARD).rows[:, -1] for s in (scans, there))
-    expected = theta * edge_rows(scans, T_lidar_board, BOARD).rows[:, 6 + lens]
+    before, after = (edge_rows(s, T_lidar_board, BOARD, NO_LENS, 0.0).rows[:, -1] for s in (scans, there))
+    expected = theta * edge_rows(scans, T_lidar_board, BOARD, NO_LENS, 0.0).rows[:, 6 + lens]
     # Points were moved, not rays: their rays meet the plane elsewhere, by less than a hundredth of the shift.
     assert np.allclose(after - before, expected, atol=4e-5)
 
 
 def test_derivatives_of_pictures_are_those_of_differences(pictures, T_lidar_board):
-    rows = picture_rows(pictures, T_FORWARD, T_lidar_board)
+    rows = picture_rows(pictures, T_FORWARD, T_lidar_board, 0.0)
     for axis in range(6):
         tangent = STEP * np.eye(6)[axis]
         by_camera = [
@@ -101,7 +105,7 @@ def test_derivatives_of_pictures_are_those_of_differences(pictures, T_lidar_boar
 
 
 def test_errors_shared_by_a_rings_returns_are_weighed_by_their_covariance(scans, T_lidar_board):
-    ranges = sum_ranges(scans, T_lidar_board)
+    ranges = sum_ranges(scans, T_lidar_board, np.zeros(len(scans.rings)), NO_LENS)
     weighted, log_volume = weigh_ranges(ranges, 0.01, 0.004)
     ring = scans.ring[np.searchsorted(scans.capture, 1)]
     mine = (scans.capture == 1) & (scans.ring == ring)
