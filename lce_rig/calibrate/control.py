@@ -1,7 +1,7 @@
 """A control that must fail: an extrinsic known to be bad has to fit captures worse that were left out.
 
-Where it does not, the captures cannot tell the result from one that is several of its standard deviations
-away: then either the result is not the best one, or its uncertainty is larger than it says.
+Where it does not, the captures cannot tell the result from one that is several of its standard deviations,
+and as much as the target, away: the result is not the best one, or it is less certain than it says.
 """
 
 from collections.abc import Sequence
@@ -17,6 +17,7 @@ from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, perturb, transform
 from lce_rig.core.results import Observation
+from lce_rig.rig import CalibrationSettings
 
 # A gain in the wrong direction that is this many of its standard errors sure is no chance.
 _SURE = 2.0
@@ -43,6 +44,7 @@ def run_control(
     T_cam_lidar: Array,
     cov: Array,
     expansion: Expansion,
+    target: CalibrationSettings,
     n_sigmas: float,
 ) -> Control:
     """Move an extrinsic both ways along the axes of its covariance, and judge it on captures left out.
@@ -55,12 +57,18 @@ def run_control(
         T_cam_lidar: (4, 4) the result.
         cov: (6, 6) as it claims.
         expansion: of these captures, settled.
-        n_sigmas: by how many standard deviations it is moved.
+        target: the result is moved by no less than this, in rotation or in translation.
+        n_sigmas: by how many standard deviations it is moved otherwise.
     """
     lever_m = float(np.sqrt(np.mean(np.sum(expansion.centres**2, axis=1))))
     scale = np.r_[np.ones(3), np.full(3, lever_m)]
     values, vectors = np.linalg.eigh(cov * np.outer(scale, scale))
     steps = n_sigmas * (np.sqrt(np.maximum(values, 0)) * vectors).T / scale
+    sizes = np.maximum(
+        np.degrees(np.linalg.norm(steps[:, 3:], axis=1)) / target.target_sigma_deg,
+        np.linalg.norm(steps[:, :3], axis=1) / target.target_sigma_m,
+    )
+    steps /= np.minimum(sizes, 1.0)[:, None]
     moves = np.concatenate([steps, -steps])
     left_out = expansion.solve(1 - expansion.groups)[:, :6][expansion.placement]
     own = perturb(T_cam_lidar, left_out)
@@ -89,7 +97,7 @@ def _costs(seen: Observation, board: Board, T: Array, expansion: Expansion) -> A
     return np.asarray(by_plane + np.sum(own**2, axis=1) / expansion.end_sigma_m**2)
 
 
-def doubt_control(control: Control, n_sigmas: float) -> list[Doubt]:
+def doubt_control(control: Control) -> list[Doubt]:
     """Doubt a result that captures left out do not tell from a bad one."""
     worst = int(np.argmin(control.worse / control.worse_sigma))
     if control.worse[worst] > 0:
@@ -97,8 +105,5 @@ def doubt_control(control: Control, n_sigmas: float) -> list[Doubt]:
     move = control.moves[worst]
     verdict: Verdict = "fail" if control.worse[worst] < -_SURE * control.worse_sigma[worst] else "marginal"
     figures = f"{np.degrees(np.linalg.norm(move[3:])):.2f} deg and {1000 * np.linalg.norm(move[:3]):.0f} mm"
-    text = (
-        f"moved by {figures} ({n_sigmas:g} of its standard deviations, {name_direction(move)}) the result "
-        "fits captures left out as well or better"
-    )
+    text = f"moved by {figures} ({name_direction(move)}) the result fits captures left out as well or better"
     return [Doubt(verdict, f"{text}: collect more captures; if it stays, measure the board anew")]

@@ -59,7 +59,7 @@ def judge(
         *_motion(result, estimate, rig.verdict.max_plane_misfit_m),
         *_channels(result, rig),
         *_residuals(estimate, rig),
-        *_control(examination, rig),
+        *_control(examination),
         *_refusals(estimate),
         *_detected(estimate, n_captures, rig.quality.min_detected_fraction),
         *_placements(estimate, rig.quality.min_captures),
@@ -84,10 +84,8 @@ def _shared(examination: Examination, rig: Rig, lidar: str) -> list[Doubt]:
     return doubt_nuisances(examination.nuisances, rig.board.to_board(), rig.lidars[lidar], rig.verdict)
 
 
-def _control(examination: Examination, rig: Rig) -> list[Doubt]:
-    if examination.control is None:
-        return []
-    return doubt_control(examination.control, rig.verdict.control_sigmas)
+def _control(examination: Examination) -> list[Doubt]:
+    return [] if examination.control is None else doubt_control(examination.control)
 
 
 def _certificate(estimate: CalibrationEstimate) -> list[Doubt]:

@@ -91,8 +91,8 @@ class VerdictSettings(Settings):
         max_contrast: the same between near and far, left and right, upper and lower boards, whose differences
             all but cancel in the whole.
         least_chance: such a difference counts where chance makes it this rarely.
-        control_sigmas: how many standard deviations the result is moved for the control; captures that
-            were left out must then fit worse.
+        control_sigmas: how many standard deviations the result is moved for the control, and no less than
+            the target; captures that were left out must then fit worse.
         max_spread_ratio: where resampled captures spread the result by more than this many claimed standard
             deviations, the claim is widened.
     """

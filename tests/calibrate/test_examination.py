@@ -138,11 +138,22 @@ def test_moving_a_sound_result_makes_left_out_captures_worse_and_moving_a_bad_on
     estimate = calibrated(20, 6)
     observations = [estimate.observations[name] for name in estimate.used]
     settled = expanded(observations, estimate.T_cam_lidar).settled()
-    good = run_control(observations, BOARD, estimate.T_cam_lidar, estimate.cov, settled, 3.0)
-    assert doubt_control(good, 3.0) == []
+    good = run_control(observations, BOARD, estimate.T_cam_lidar, estimate.cov, settled, TARGET, 3.0)
+    assert doubt_control(good) == []
     bad = perturb(estimate.T_cam_lidar, good.moves[-1])
-    doubts = doubt_control(run_control(observations, BOARD, bad, estimate.cov, settled, 3.0), 3.0)
+    doubts = doubt_control(run_control(observations, BOARD, bad, estimate.cov, settled, TARGET, 3.0))
     assert [doubt.verdict for doubt in doubts] == ["fail"]
+
+
+def test_the_control_moves_a_result_by_no_less_than_the_target():
+    observations = observed(12, 6)
+    settled = expanded(observations).settled()
+    moves = run_control(observations, BOARD, T_NEAR, 1e-10 * np.eye(6), settled, TARGET, 3.0).moves
+    sizes_deg, sizes_m = (
+        np.degrees(np.linalg.norm(moves[:, 3:], axis=1)),
+        np.linalg.norm(moves[:, :3], axis=1),
+    )
+    assert np.maximum(sizes_deg / 0.2, sizes_m / 0.01) == pytest.approx(np.ones(12))
 
 
 def test_a_claim_that_captures_contradict_is_widened_with_the_reason():
