@@ -113,4 +113,8 @@ class Preview:
         self._is_ready.set()
         await self._stop.wait()
         await self._server.say_goodbye()
+        # What a stuck page has not taken by now would keep its connection, and this thread, open.
+        for each in [] if runner.server is None else runner.server.connections:
+            if each.transport is not None:
+                each.transport.abort()
         await runner.cleanup()

@@ -1,6 +1,7 @@
 """The web application: the page's files, and the connection that feeds it."""
 
 import asyncio
+import contextlib
 import logging
 from importlib import resources
 
@@ -71,10 +72,10 @@ class Server:
             if all(viewer.is_up_to_date() for viewer in self._viewers):
                 break
             await asyncio.sleep(_GOODBYE_S / 10)
-        closing = [
-            socket.close(code=1001, message=b"the collection has ended") for socket in self._viewers.values()
-        ]
-        await asyncio.wait_for(asyncio.gather(*closing, return_exceptions=True), None)
+        # Closing waits until a page has taken what was sent, and a stuck one never does.
+        closing = [each.close(code=1001, message=b"closed") for each in self._viewers.values()]
+        with contextlib.suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(asyncio.gather(*closing, return_exceptions=True), _GOODBYE_S)
         self.encoder.close()
 
     async def _file(self, request: web.Request) -> web.Response:

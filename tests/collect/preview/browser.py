@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _START_S = 30.0
-_ANSWER_S = 20.0
+_ANSWER_S = 60.0
 _FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--mute-audio",
     "--hide-scrollbars", "--disable-background-networking", "--disable-component-update", "--disable-sync",
@@ -167,7 +167,7 @@ class Page(Line):
         """Give the text of the element with this id."""
         return str(self.evaluate(f"document.getElementById({element!r})?.innerText ?? ''"))
 
-    def wait_until(self, expression: str, timeout_s: float = 20.0) -> None:
+    def wait_until(self, expression: str, timeout_s: float = 40.0) -> None:
         """Wait until an expression is true."""
         deadline = time.monotonic() + timeout_s
         while not self.evaluate(expression):

@@ -239,6 +239,26 @@ def test_closing_does_not_wait_for_pages_that_are_stuck() -> None:
         assert time.monotonic() - began_s < 5
 
 
+def test_closing_does_not_wait_for_pages_whose_line_is_full() -> None:
+    preview = Preview(port=0)
+    port = int(preview.start().rstrip("/").rpartition(":")[2])
+    noise = np.random.default_rng(1).integers(0, 255, (3000, 960, 3), np.uint8)
+    with socket.socket() as full:
+        full.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        full.connect(("127.0.0.1", port))
+        full.sendall(
+            f"GET /live HTTP/1.1\r\nHost: localhost:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+        )
+        for n in (1, 2):
+            preview.publish(state(drawing=Drawing("cam", noise.copy())))
+            while preview.n_pictures < n:
+                time.sleep(0.02)
+        preview.close()
+        # Its thread has ended too, and left no connection behind.
+        assert not [thread for thread in threading.enumerate() if thread.name.startswith("preview")]
+
+
 def test_silence_of_the_collection_is_told(preview: Preview) -> None:
     with Watcher(preview.urls[0]) as watcher:
         watcher.watch()
