@@ -8,6 +8,8 @@
     scripts/bench.py guidance    a person who follows the guidance against random placements
     scripts/bench.py paper       the experiments of the LCE-Calib paper: tables and figures, every method
     scripts/bench.py faults      sessions with faults: how many wrong results pass
+    scripts/bench.py live        live collection under load, over real transports, for --seconds
+    scripts/bench.py uncertainty  the joint estimate: errors against their bound, truth of its claim
     scripts/bench.py speed       detection, Algorithm 1, the command line
 
 Detections are made anew, but for those that `paper` keeps in its folder; random choices are seeded. Run it
@@ -27,6 +29,8 @@ PARTS = {
     "guidance": 20,
     "paper": 20,
     "faults": 100,
+    "uncertainty": 100,
+    "live": 0,
     "speed": 0,
 }
 
@@ -43,9 +47,11 @@ def main() -> None:
         "--only", default="", help="recorded sets whose name contains this; of `paper` also: simulated"
     )
     parser.add_argument(
-        "-o", "--output", type=Path, default=Path("build/paper"), help="folder of `paper` (build/paper)"
+        "-o", "--output", type=Path, default=Path("build/paper"), help="folder of `paper`, and of what `uncertainty` keeps"
     )
+    parser.add_argument("--captures", type=int, default=30, help="of each session of `uncertainty` (30)")
     parser.add_argument("--methods", default="", help="methods that `paper` runs anew (default all)")
+    parser.add_argument("--seconds", type=float, default=60, help="that `live` takes (default 60)")
     arguments = parser.parse_args()
     bench = getattr(import_module(f"benchmarks.{arguments.part}"), f"bench_{arguments.part}")
     if arguments.part == "real":
@@ -53,6 +59,10 @@ def main() -> None:
     elif arguments.part == "paper":
         methods = arguments.methods.split(",") if arguments.methods else ()
         bench(arguments.seeds or PARTS["paper"], arguments.output, methods, arguments.only)
+    elif arguments.part == "uncertainty":
+        bench(arguments.seeds or PARTS["uncertainty"], arguments.output, arguments.only, arguments.captures)
+    elif arguments.part == "live":
+        bench(arguments.seconds)
     elif arguments.part == "speed":
         bench()
     else:

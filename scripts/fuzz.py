@@ -3,6 +3,7 @@
 
     scripts/fuzz.py vlp16 --n 1000000     data and position packets of a VLP-16
     scripts/fuzz.py serial --n 1000000    lines of sync boards, all dialects
+    scripts/fuzz.py kills --n 200         `lce-rig collect`, killed while it captures
 
 Exits with 1 where anything wrong was believed, or the process grew by more than 32 MB.
 """
@@ -30,7 +31,18 @@ def fuzz_serial(n: int, seed: int) -> Any:
     return fuzz_lines(n, seed)
 
 
-TARGETS: dict[str, Callable[[int, int], Any]] = {"vlp16": fuzz_vlp16, "serial": fuzz_serial}
+def fuzz_kill(n: int, seed: int) -> Any:
+    """Kill a live collection."""
+    from fuzzing.kills import fuzz_kills
+
+    return fuzz_kills(n, seed)
+
+
+TARGETS: dict[str, Callable[[int, int], Any]] = {
+    "vlp16": fuzz_vlp16,
+    "serial": fuzz_serial,
+    "kills": fuzz_kill,
+}
 """Target by name; its report has `n_wrong` and `grown_bytes`."""
 
 

@@ -53,14 +53,14 @@ class BoardWatcher:
     Attributes:
         rig: the profile.
         search_interval_s: how often a whole picture is searched while no board is in sight.
-        thorough_interval_s: how often such a search is thorough, which takes most of a second; 0 for always.
         counts: frames in which it was not found, by sensor.
+        thorough_interval_s: how often such a search is thorough, which takes most of a second; 0 for always.
     """
 
     rig: Rig
     search_interval_s: float
-    thorough_interval_s: float = 0.0
     counts: Counter[str] = field(default_factory=Counter)
+    thorough_interval_s: float = 0.0
     _seen: dict[ImageKey, ImageBoard] = field(default_factory=dict)
     _candidates: dict[str, list[LidarBoard]] = field(default_factory=dict)
     _searched_ns: dict[ImageKey | str, int] = field(default_factory=dict)

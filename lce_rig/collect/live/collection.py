@@ -168,11 +168,12 @@ class _Loop:
         self._show = show
         self._recorder = recorder
         self._began_s = time.monotonic()
-        self._watcher = BoardWatcher(self._rig, options.search_interval_s, THOROUGH_S)
+        self._watcher = BoardWatcher(self._rig, options.search_interval_s, thorough_interval_s=THOROUGH_S)
         self._gate: LiveGate | None = None
         self._n_captures = len(session.captures)
         names = [capture.name for capture in session.captures]
         self._next_number = int(names[-1]) + 1 if names else 0
+        self._n_asked = 0
         self._monitor = Monitor(session, options.n_wanted, pumps, clock)
         self._last: Sighting | None = None
 
@@ -243,6 +244,9 @@ class _Loop:
         sighting = moment.sighting
         if guide.key not in sighting.images or guide.lidar not in sighting.lidars:
             return narration
+        n_wanted, n_waiting = self._options.n_wanted, self._n_asked - len(self.report.captured)
+        if n_wanted is not None and self._n_captures + n_waiting >= n_wanted:
+            return narration  # A slow disk still writes the last ones.
         refusal = guide.adds_nothing(sighting.images[guide.key].T_cam_board)
         if refusal is None:
             self._capture(moment)
@@ -263,6 +267,7 @@ class _Loop:
         self._keeper.keep(Task(moment, frame.images, gate.events_of(moment), meta, time.monotonic()))
         name = f"{self._next_number:06d}"
         self._next_number += 1
+        self._n_asked += 1
         for guide in self._guides:
             if guide.key in sighting.images and guide.lidar in sighting.lidars:
                 guide.add(name, sighting.images[guide.key].T_cam_board)

@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from types import TracebackType
 
 from lce_rig.core.errors import SourceError
@@ -30,6 +31,7 @@ class Pumps:
         self._queue: Mailbox[tuple[str, LiveSample]] = Mailbox(_N_SLOTS)
         self._lost: dict[str, tuple[SourceError, float]] = {}
         self._n_reopened = 0
+        self._n_before: dict[str, tuple[int, int]] = {}
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -89,8 +91,14 @@ class Pumps:
             return dict(self._lost)
 
     def statuses(self) -> dict[str, SourceStatus]:
-        """Ask every sensor how it does."""
-        return {name: source.status() for name, source in self.sources.items()}
+        """Ask every sensor how it does; what it lost before it was opened again counts."""
+        statuses = {name: source.status() for name, source in self.sources.items()}
+        for name, (n_lost, n_dropped) in tuple(self._n_before.items()):
+            status = statuses[name]
+            statuses[name] = replace(
+                status, n_lost=status.n_lost + n_lost, n_dropped=status.n_dropped + n_dropped
+            )
+        return statuses
 
     def _run(self, source: LiveSource) -> None:
         while not self._stop.is_set():
@@ -119,6 +127,7 @@ class Pumps:
     def _reopen(self, source: LiveSource) -> bool:
         """Open a source again; False where collection ends before that."""
         source.__exit__(None, None, None)
+        before, status = self._n_before.get(source.sensor, (0, 0)), source.status()
         while not self._stop.wait(self._reopen_every_s):
             try:
                 source.__enter__()
@@ -126,6 +135,7 @@ class Pumps:
                 with self._lock:
                     self._lost[source.sensor] = error, self._lost[source.sensor][1]
                 continue
+            self._n_before[source.sensor] = before[0] + status.n_lost, before[1] + status.n_dropped
             if self._stop.is_set():
                 source.__exit__(None, None, None)
                 return False

@@ -1,0 +1,98 @@
+"""`lce-rig collect` in a process of its own, watched by what it says and what it writes."""
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+
+from lce_rig.session import Session
+from wire.rig import ENVIRONMENT
+
+_MAIN = "from lce_rig.cli.main import main; main()"
+
+
+class Collecting:
+    """A running `lce-rig collect --plain`; it is killed where the `with` block ends before it does.
+
+    Attributes:
+        session: the folder it fills.
+    """
+
+    def __init__(self, profile: Path, session: Path, *options: str, prelude: str = "") -> None:
+        """Prepare.
+
+        Args:
+            profile: of the rig.
+            session: new or not.
+            options: of the command line.
+            prelude: Python that its process runs first, to make its computer worse.
+        """
+        self.session = session
+        self._log = session.with_name(f"{session.name}.{time.monotonic_ns()}.log")
+        words = ["collect", "--rig", str(profile), str(session), "--plain", *options]
+        self._command = [sys.executable, "-c", f"{prelude}\n{_MAIN}", *words]
+
+    def __enter__(self) -> "Collecting":
+        with self._log.open("w") as log:
+            self._process = subprocess.Popen(
+                self._command, stdin=subprocess.DEVNULL, stderr=log, stdout=log, env=ENVIRONMENT
+            )
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._process.kill()
+        self._process.wait()
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid
+
+    @property
+    def said(self) -> str:
+        """What it has written to the terminal so far."""
+        return self._log.read_text(errors="replace")
+
+    @property
+    def n_captures(self) -> int:
+        """Captures that are listed in the session."""
+        marker = self.session / "session.json"
+        return len(Session.open(self.session).captures) if marker.exists() else 0
+
+    def wait_for(self, text: str, within_s: float = 60.0, times: int = 1) -> None:
+        """Wait until it has said something so often.
+
+        Raises:
+            AssertionError: it has ended, or did not in time.
+        """
+        self._wait(lambda: self.said.count(text) >= times, f"{text!r} was not said", within_s)
+
+    def wait_for_captures(self, n: int, within_s: float = 60.0) -> None:
+        """Wait until the session holds so many.
+
+        Raises:
+            AssertionError: it has ended, or did not in time.
+        """
+        self._wait(lambda: self.n_captures >= n, f"there are not {n} captures", within_s)
+
+    def wait(self, within_s: float = 60.0) -> int:
+        """Wait for its end, and give its exit code."""
+        return self._process.wait(within_s)
+
+    def end(self, number: signal.Signals = signal.SIGTERM) -> int:
+        """Send it a signal, and give its exit code."""
+        self._process.send_signal(number)
+        return self.wait()
+
+    def _wait(self, is_so: Callable[[], bool], otherwise: str, within_s: float) -> None:
+        deadline_s = time.monotonic() + within_s
+        while not is_so():
+            code = self._process.poll()
+            assert code is None or is_so(), f"{otherwise}; it ended with {code}:\n{self.said}"
+            assert time.monotonic() < deadline_s, f"{otherwise} in {within_s} s:\n{self.said}"
+            time.sleep(0.02)

@@ -1,0 +1,133 @@
+"""What the senders show: packets and pictures of a board held still at several places, simulated once."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lce_rig import pipeline
+from lce_rig.core import velodyne
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.results import Refusal
+from lce_rig.rig import Rig
+from lce_rig.simulate import SimulationOptions
+from lce_rig.simulate.live_scene import LiveScene
+from lce_rig.simulate.stage import PLACEMENT
+from lce_rig.simulate.vlp16_packets import STREAMED_VLP16, Vlp16Packets
+from wire.timing import PACKETS_PER_LOOP, SCANS_PER_LOOP
+
+_T0_NS = 1_700_000_000_000_000_000
+_N_PICTURES = 4
+# Scans begin half a step behind the seam at the sensor's back.
+_CUT = velodyne.AZIMUTH_STEPS / 2 + 20
+
+
+@dataclass(frozen=True)
+class Reel:
+    """A folder with packets.bin, CAMERA.bin for each camera, and reel.json with these figures.
+
+    Attributes:
+        folder: where they are.
+        n_placements: of the board.
+        n_pictures: of each placement and camera, alike but for their noise.
+        picture_bytes: of each picture as it is sent, by camera.
+    """
+
+    folder: str
+    n_placements: int
+    n_pictures: int
+    picture_bytes: dict[str, int]
+
+    @classmethod
+    def load(cls, folder: Path) -> "Reel":
+        """Read the figures of a reel."""
+        return cls(**json.loads((folder / "reel.json").read_text()))
+
+    def packets(self, placement: int) -> list[bytes]:
+        """Read the payloads of the data packets of a placement, one loop; their times are to be set."""
+        n_bytes = PACKETS_PER_LOOP * velodyne.DATA_BYTES
+        data = (Path(self.folder) / "packets.bin").read_bytes()[placement * n_bytes :][:n_bytes]
+        return [data[k : k + velodyne.DATA_BYTES] for k in range(0, n_bytes, velodyne.DATA_BYTES)]
+
+    def pictures(self, camera: str, placement: int) -> list[bytes]:
+        """Read the pictures of a placement as they are sent."""
+        n_bytes = self.picture_bytes[camera]
+        data = (Path(self.folder) / f"{camera}.bin").read_bytes()
+        first = placement * self.n_pictures
+        return [data[k * n_bytes : (k + 1) * n_bytes] for k in range(first, first + self.n_pictures)]
+
+
+def make_reel(folder: Path, rig: Rig, n_placements: int, seed: int = 0) -> Reel:
+    """Simulate a reel.
+
+    Args:
+        folder: a new one.
+        rig: with one VLP-16; cameras with frames send UYVY where their driver names it, else PGM.
+        n_placements: places of the board that all sensors find it at.
+        seed: of truth, room, placements and noise.
+    """
+    folder.mkdir(parents=True)
+    scene = LiveScene(rig, seed, replace(SimulationOptions.for_rig(rig.name), carrier="person"))
+    scene.stage = replace(scene.stage, models=dict.fromkeys(rig.lidars, STREAMED_VLP16))
+    sender = Vlp16Packets()
+    n_bytes: dict[str, int] = {}
+    packets = bytearray()
+    for index, (scans, images) in enumerate(_placements(scene, rig, n_placements)):
+        for k, scan in enumerate(scans):
+            stamp_ns = _T0_NS + (SCANS_PER_LOOP * index + k) * STREAMED_VLP16.period_ns
+            sent = sender.feed(replace(scan, stamp_ns=stamp_ns))
+            packets += b"".join(p.payload for p in sent if p.port == velodyne.DATA_PORT)
+        for image in images:
+            data = _encode(image, rig)
+            n_bytes[image.sensor] = len(data)
+            with (folder / f"{image.sensor}.bin").open("ab") as file:
+                file.write(data)
+    (folder / "packets.bin").write_bytes(_turn_evenly(packets))
+    reel = Reel(str(folder), n_placements, _N_PICTURES, n_bytes)
+    (folder / "reel.json").write_text(json.dumps(asdict(reel)))
+    return reel
+
+
+def _turn_evenly(packets: bytearray) -> bytes:
+    """Give all loops the same azimuths: a rotor goes on evenly, whatever is shown next.
+
+    Each simulated placement begins anywhere within a step, by which it is turned here; 0.2 deg at most.
+    """
+    fields = np.frombuffer(packets, velodyne.DATA_PACKET).copy()
+    fields = fields.reshape(-1, PACKETS_PER_LOOP)
+    n_blocks = PACKETS_PER_LOOP * velodyne.N_BLOCKS
+    turned = SCANS_PER_LOOP * velodyne.AZIMUTH_STEPS * np.arange(n_blocks) / n_blocks
+    azimuth = np.rint(_CUT + turned).astype(np.int64) % velodyne.AZIMUTH_STEPS
+    fields["blocks"]["azimuth"] = azimuth.reshape(PACKETS_PER_LOOP, velodyne.N_BLOCKS)
+    return fields.tobytes()
+
+
+def _placements(scene: LiveScene, rig: Rig, n: int) -> Iterator[tuple[list[Scan], list[Image]]]:
+    """Measure the board at places where every sensor finds it."""
+    index = n_found = 0
+    while n_found < n:
+        scene.hold(scene.stage.place(index, scene.stage.rng(index, PLACEMENT)))
+        index += 1
+        taken = [list(scene.take(_T0_NS)) for _ in range(_N_PICTURES)]
+        scans = [sample for turn in taken[:SCANS_PER_LOOP] for sample in turn if isinstance(sample, Scan)]
+        images = [sample for turn in taken for sample in turn if isinstance(sample, Image)]
+        found = [pipeline.detect_image(rig, image) for image in images]
+        seen = [pipeline.detect_scan(rig, scan) for scan in scans]
+        if not any(isinstance(each, Refusal) for each in [*found, *seen]):
+            n_found += 1
+            yield scans, images
+
+
+def _encode(image: Image, rig: Rig) -> bytes:
+    height, width = image.pixels.shape[:2]
+    if rig.cameras[image.sensor].driver.pixel_format != "UYVY":
+        grey = image.grey
+        return b"P5\n%d %d\n255\n" % (width, height) + grey.tobytes()
+    y, cr, cb = cv2.split(cv2.cvtColor(image.pixels, cv2.COLOR_BGR2YCrCb))
+    uyvy = np.empty((height, width, 2), np.uint8)
+    uyvy[:, :, 1] = y
+    uyvy[:, 0::2, 0], uyvy[:, 1::2, 0] = cb[:, 0::2], cr[:, 0::2]
+    return uyvy.tobytes()

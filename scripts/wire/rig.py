@@ -1,0 +1,157 @@
+"""Profiles of rigs whose sensors are senders on this computer, and the senders while they run."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from lce_rig.rig import Rig, dump_rig, load_rig
+from wire.reel import Reel
+
+_SCRIPTS = Path(__file__).parents[1]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{_SCRIPTS}:{_SCRIPTS.parent}", "OMP_NUM_THREADS": "1"}
+"""For processes of these senders and of lce-rig."""
+
+
+def small_rig(*, is_guided: bool = True) -> Rig:
+    """Build a rig of a VLP-16 and the camera `cam` of 346x260 px.
+
+    Args:
+        is_guided: whether captures that add nothing are refused; else every board that stands still counts.
+    """
+    rles = load_rig("rles")
+    davis = rles.cameras["davis"]
+    cam = davis.model_copy(update={"model": "wire", "channels": {"frames": davis.channels["frames"]}})
+    nominal = rles.nominal_extrinsics[0].model_copy(update={"camera": "cam"})
+    quality = rles.quality if is_guided else rles.quality.model_copy(update={"min_captures": 10_000})
+    return rles.model_copy(
+        update={
+            "name": "wire",
+            "cameras": {"cam": cam},
+            "nominal_extrinsics": (nominal,) if is_guided else (),
+            "quality": quality,
+        }
+    )
+
+
+def free_ports() -> tuple[int, int]:
+    """Find two UDP ports that nobody uses."""
+    kind = socket.AF_INET, socket.SOCK_DGRAM
+    with socket.socket(*kind) as data, socket.socket(*kind) as position:
+        data.bind(("", 0))
+        position.bind(("", 0))
+        return data.getsockname()[1], position.getsockname()[1]
+
+
+class WireRig:
+    """A rig whose VLP-16 sends while the `with` block lasts; its cameras send when they are read.
+
+    Attributes:
+        rig: the profile, with the ports and commands by which its sensors are reached.
+        profile: its file.
+        sent: data packets, after `stop`.
+    """
+
+    def __init__(self, folder: Path, rig: Rig, reel: Reel, loops_per_hold: int, **camera: Any) -> None:
+        """Prepare.
+
+        Args:
+            folder: for its files.
+            rig: as a reel was made of it.
+            reel: what is shown.
+            loops_per_hold: how many times 0.3 s the board stands at each place.
+            **camera: further options of send_pictures.py.
+        """
+        self._folder, self._reel, self._loops = folder, reel, loops_per_hold
+        self._ports = free_ports()
+        self._camera = {"rate": 30, "unplug": folder / "unplugged", **camera}
+        self.rig = self._reachable(rig)
+        self.profile = folder / "wire.yaml"
+        self.profile.write_text(dump_rig(self.rig))
+        self.sent: dict[str, int] = {}
+
+    def __enter__(self) -> "WireRig":
+        """Start the VLP-16; it sends when somebody listens."""
+        ports = ["--port", str(self._ports[0]), "--position-port", str(self._ports[1])]
+        command = [sys.executable, "-m", "wire.send_packets", self._reel.folder, "--loops", str(self._loops)]
+        self._sensor = subprocess.Popen(
+            command + ports, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT
+        )
+        assert self._sensor.stdout is not None
+        assert self._sensor.stdout.readline() == "ready\n"
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the VLP-16."""
+        self._sensor.kill()
+        self._sensor.communicate()
+
+    @property
+    def pid(self) -> int:
+        """Of the VLP-16."""
+        return self._sensor.pid
+
+    def tell(self, order: str) -> None:
+        """Tell the VLP-16 something; see send_packets.py."""
+        assert self._sensor.stdin is not None
+        self._sensor.stdin.write(order + "\n")
+        self._sensor.stdin.flush()
+
+    def stop(self) -> dict[str, int]:
+        """Let the VLP-16 fall silent for good, and give the numbers of packets `sent` and `withheld`."""
+        self.tell("stop")
+        assert self._sensor.stdout is not None
+        self.sent = json.loads(self._sensor.stdout.readline())
+        return self.sent
+
+    def unplug(self) -> None:
+        """Take the cameras away."""
+        self._camera["unplug"].touch()
+
+    def plug_in(self) -> None:
+        """Bring the cameras back."""
+        self._camera["unplug"].unlink()
+
+    def _reachable(self, rig: Rig) -> Rig:
+        lidars = {
+            name: lidar.model_copy(
+                update={
+                    "driver": lidar.driver.model_copy(
+                        update={
+                            "port": self._ports[0],
+                            "address": "127.0.0.1",
+                            "controls": {"position_port": self._ports[1]},
+                        }
+                    )
+                }
+            )
+            for name, lidar in rig.lidars.items()
+        }
+        cameras = {
+            name: camera.model_copy(
+                update={
+                    "driver": camera.driver.model_copy(
+                        update={
+                            "type": "command",
+                            "device": None,
+                            "controls": {},
+                            "command": self._command(name),
+                        }
+                    )
+                }
+            )
+            for name, camera in rig.cameras.items()
+        }
+        return rig.model_copy(update={"lidars": lidars, "cameras": cameras})
+
+    def _command(self, camera: str) -> tuple[str, ...]:
+        options = [text for key, value in self._camera.items() for text in (f"--{key}", str(value))]
+        interpreter = ("env", f"PYTHONPATH={ENVIRONMENT['PYTHONPATH']}", sys.executable)
+        where = (self._reel.folder, camera, "--loops", str(self._loops))
+        return (*interpreter, "-m", "wire.send_pictures", *where, *options)

@@ -1,0 +1,110 @@
+"""What a rig on the wire has sent, held against what a session keeps of it."""
+
+import json
+import re
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from wire.reel import Reel
+from wire.timing import LOOP_NS, PACKET_NS, placement_at
+
+from lce_rig.core import velodyne
+from lce_rig.core.data import Scan
+from lce_rig.rig import LidarSettings
+from lce_rig.session import Capture, Session
+from lce_rig.sources.velodyne_stream import Vlp16Stream
+from tests.collect.live.conftest import LOOPS_PER_HOLD
+
+
+@dataclass(frozen=True, eq=False)
+class Sent:
+    """Pictures (N, H, W) and scans of each placement, as they leave the senders."""
+
+    pictures: list[NDArray[np.uint8]]
+    scans: list[list[Scan]]
+
+
+def read_sent(reel: Reel, lidar: LidarSettings) -> Sent:
+    """Decode a reel without any transport."""
+    pictures = [
+        np.stack([_read_pgm(data) for data in reel.pictures("cam", k)]) for k in range(reel.n_placements)
+    ]
+    return Sent(pictures, [_decode(reel.packets(k), lidar) for k in range(reel.n_placements)])
+
+
+def check_whole(session: Path) -> list[Capture]:
+    """Read every file of every listed capture, and make sure that the journal lists no other."""
+    opened = Session.open(session)
+    captures = opened.captures
+    for capture in captures:
+        capture.check()
+        assert capture.image_keys and capture.lidars
+    names = [entry["capture"] for entry in opened.read_journal() if entry["event"] == "captured"]
+    assert set(names) <= {capture.name for capture in captures}
+    return captures
+
+
+def check_sent(capture: Capture, sent: Sent) -> int:
+    """Make sure that a capture is bit for bit what was sent of one placement, and give that."""
+    scan, image = capture.scan("lidar"), capture.image("cam", "frames")
+    shown = [k for k, pictures in enumerate(sent.pictures) if (pictures == image.pixels).all((1, 2)).any()]
+    seen = [k for k, scans in enumerate(sent.scans) if any(_are_alike(scan, each) for each in scans)]
+    assert len(shown) == 1 and shown == seen
+    return shown[0]
+
+
+def check_stamps(capture: Capture, placement: int, n_placements: int) -> None:
+    """Make sure that a capture's stamps lie where its placement was shown."""
+    stamp_ns, image = capture.scan("lidar").stamp_ns, capture.image("cam", "frames")
+    assert stamp_ns is not None and image.stamp_ns is not None
+    assert placement_at(stamp_ns, LOOPS_PER_HOLD, n_placements) == placement
+    # Scans begin with a loop, or a revolution or two later; the counter shows whole microseconds.
+    late_ns = stamp_ns % (LOOP_NS // 3)
+    assert min(late_ns, LOOP_NS // 3 - late_ns) < 2_000
+    (pair,) = capture.meta["pairs"]
+    assert abs(pair["difference_s"]) < 0.05
+
+
+def captured_names(said: str) -> list[str]:
+    """List the captures that were said to be safe."""
+    return re.findall(r"captured (\d{6}) \(", said)
+
+
+def errors(said: str) -> list[str]:
+    """List the errors that were printed."""
+    return [line for line in said.splitlines() if line.startswith("error:")]
+
+
+def journal_of(session: Path) -> list[dict[str, Any]]:
+    """Read how each run ended."""
+    lines = (session / "journal.jsonl").read_text().splitlines()
+    return [entry for entry in map(json.loads, lines) if entry["event"] == "collected live"]
+
+
+def _read_pgm(data: bytes) -> NDArray[np.uint8]:
+    magic, width, height, most = data[:20].split()[:4]
+    assert (magic, most) == (b"P5", b"255")
+    return np.frombuffer(data[-int(width) * int(height) :], np.uint8).reshape(int(height), int(width))
+
+
+def _decode(packets: list[bytes], lidar: LidarSettings) -> list[Scan]:
+    """Decode a loop of three revolutions, with its beginning behind it to close the last."""
+    stream, scans = Vlp16Stream("lidar", lidar), []
+    for k, packet in enumerate([*packets, *packets]):
+        us = (k * PACKET_NS // 1000) % velodyne.HOUR_US
+        timed = packet[:1200] + struct.pack("<I", us) + packet[1204:]
+        scan = stream.push_data(timed, 10**18 + k * PACKET_NS)
+        if scan is not None:
+            scans.append(scan)
+    assert len(scans) >= 3
+    return scans
+
+
+def _are_alike(a: Scan, b: Scan) -> bool:
+    return a.points.shape == b.points.shape and bool(
+        (a.points == b.points).all() and (a.ring == b.ring).all()
+    )

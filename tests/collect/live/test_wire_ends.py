@@ -1,0 +1,71 @@
+"""How a live collection ends: politely, by signals, or by force; and that its recordings can be read."""
+
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from wire.collecting import Collecting
+from wire.rig import ENVIRONMENT, WireRig
+
+from tests.collect.live.sent import captured_names, check_whole, errors
+
+Start = Callable[..., WireRig]
+
+
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [(signal.SIGTERM, 0), (signal.SIGINT, 130), pytest.param(signal.SIGHUP, 0, marks=pytest.mark.slow)],
+    ids=["SIGTERM", "SIGINT", "SIGHUP"],
+)
+def test_signals_end_a_collection_cleanly(
+    wire: Start, tmp_path: Path, number: signal.Signals, code: int
+) -> None:
+    with Collecting(wire().profile, tmp_path / "session", "--hold", "0") as collecting:
+        collecting.wait_for_captures(1)
+        assert collecting.end(number) == code
+    assert errors(collecting.said) == [] and "Traceback" not in collecting.said
+    assert "ended: stopped" in collecting.said
+    names = [capture.name for capture in check_whole(tmp_path / "session")]
+    assert f"{len(names)} captures ({len(names)} new)" in collecting.said
+    assert set(captured_names(collecting.said)) <= set(names)
+
+
+def test_a_collection_that_is_killed_loses_no_capture(wire: Start, tmp_path: Path) -> None:
+    rig, session, said = wire(), tmp_path / "session", list[str]()
+    chance = random.Random(0)
+    for turn in range(5):
+        with Collecting(rig.profile, session, "--hold", "0") as collecting:
+            collecting.wait_for("moving" if turn else "captured 000000")
+            time.sleep(chance.uniform(0, 2))
+            collecting.end(signal.SIGKILL)
+        said += captured_names(collecting.said)
+        assert set(said) <= {capture.name for capture in check_whole(session)}
+        assert len(said) == len(set(said))
+
+
+def test_what_is_recorded_beside_a_collection_can_be_collected_from(wire: Start, tmp_path: Path) -> None:
+    rig, record = wire(), tmp_path / "recording"
+    live, later = tmp_path / "live", tmp_path / "later"
+    with Collecting(rig.profile, live, "--hold", "0", "--record", str(record)) as collecting:
+        collecting.wait_for_captures(2)
+        assert collecting.end() == 0
+    assert "samples recorded" in collecting.said
+    parts = ["--from", str(record / "recording.bag"), "--from", str(record / "lidar.pcap")]
+    words = ["collect", "--rig", str(rig.profile), str(later), *parts]
+    code = "from lce_rig.cli.main import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], env=ENVIRONMENT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    # Live, on this rig, every board that stands still is captured; of a recording a place counts once.
+    seen = {(capture.scan("lidar").stamp_ns or 0) // 1_000 for capture in check_whole(live)}
+    stored = check_whole(later)
+    assert 1 <= len(stored) <= 4
+    for capture in stored:
+        stamp_us = (capture.scan("lidar").stamp_ns or 0) // 1_000
+        assert min(seen) - 5_000_000 < stamp_us < max(seen) + 5_000_000

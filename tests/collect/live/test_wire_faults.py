@@ -1,0 +1,195 @@
+"""Sensors, clocks and disks that fail while `lce-rig collect` runs: it goes on where it can."""
+
+import os
+import re
+import resource
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from wire.collecting import Collecting
+from wire.reel import Reel
+from wire.rig import WireRig
+
+from lce_rig.collect.live.collection import LiveOptions, collect_live
+from lce_rig.collect.live.state import LiveState
+from lce_rig.session import Session
+from lce_rig.sources.live.opening import open_live
+from tests.collect.live.sent import check_sent, check_stamps, check_whole, errors, journal_of, read_sent
+
+Start = Callable[..., WireRig]
+# A host whose clock somebody sets by SET_S once a file is there: every reading of the time, the kernel's
+# stamps of arrivals left out, which no process can set.
+SET_CLOCK = """
+import os, time
+from lce_rig.sources.live import vlp16_socket
+vlp16_socket._SO_TIMESTAMPNS = -1
+real_ns = time.time_ns
+time.time_ns = lambda: real_ns() + ({set_ns} if os.path.exists({file!r}) else 0)
+"""
+
+
+def test_a_camera_that_is_unplugged_is_waited_for_and_taken_again(wire: Start, tmp_path: Path) -> None:
+    rig = wire()
+    with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
+        collecting.wait_for_captures(1)
+        rig.unplug()
+        collecting.wait_for("cam is lost: camera 'cam': its command ended with exit code 1")
+        n_before = collecting.n_captures
+        time.sleep(1.5)
+        rig.plug_in()
+        collecting.wait_for("cam is back")
+        collecting.wait_for_captures(n_before + 1)
+        assert collecting.end() == 0
+    check_whole(tmp_path / "session")
+
+
+def test_a_lidar_that_falls_silent_for_a_while_is_taken_again(
+    wire: Start, reel: Reel, tmp_path: Path
+) -> None:
+    rig = wire()
+    with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
+        collecting.wait_for_captures(1)
+        rig.tell("loss 0.3")
+        time.sleep(1.0)
+        rig.tell("loss 0")
+        time.sleep(0.2)
+        rig.tell("pause 5")
+        collecting.wait_for("lidar is lost: lidar: data packets")
+        n_before = collecting.n_captures
+        collecting.wait_for("lidar is back")
+        collecting.wait_for_captures(n_before + 1)
+        assert collecting.end() == 0
+    # What was lost before it was opened again is not forgotten.
+    assert journal_of(tmp_path / "session")[0]["lost"]["lidar"] >= rig.stop()["withheld"] > 50
+    sent = read_sent(reel, rig.rig.lidars["lidar"])
+    for capture in check_whole(tmp_path / "session"):
+        check_stamps(capture, check_sent(capture, sent), reel.n_placements)
+
+
+def test_a_lidar_that_is_gone_for_good_ends_the_collection_and_spares_the_captures(
+    wire: Start, tmp_path: Path
+) -> None:
+    rig = wire()
+    with Session.create(tmp_path / "session", rig.rig) as session:
+
+        def show(state: LiveState) -> None:
+            if state.n_captures == 1:
+                rig.tell("pause 1000")
+
+        options = LiveOptions(timeout_s=90.0, hold_s=0.0, lost_s=1.0)
+        report = collect_live(session, open_live(rig.rig), options, show)
+    assert report.ending == "lost" and report.error is not None
+    assert report.error.exit_code == 5 and report.error.what.startswith("lidar: ")
+    assert len(check_whole(tmp_path / "session")) >= 1
+
+
+@pytest.mark.slow
+def test_a_lidar_that_is_gone_for_a_minute_is_an_error_of_the_command(wire: Start, tmp_path: Path) -> None:
+    rig = wire()
+    with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
+        collecting.wait_for_captures(1)
+        rig.tell("pause 1000")
+        assert collecting.wait(180) == 5
+    assert len(errors(collecting.said)) == 1 and "lidar: " in errors(collecting.said)[0]
+    assert "ended: a sensor was lost" in collecting.said
+    check_whole(tmp_path / "session")
+
+
+def test_losses_of_the_network_are_counted_and_shown_and_collection_goes_on(
+    wire: Start, tmp_path: Path
+) -> None:
+    rig = wire()
+    with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
+        collecting.wait_for_captures(1)
+        rig.tell("loss 0.3")
+        collecting.wait_for("% of the packets were lost on the way: check cable and switch")
+        time.sleep(2.0)
+        rig.tell("loss 0")
+        n_before = collecting.n_captures
+        collecting.wait_for_captures(n_before + 1)
+        assert collecting.end() == 0
+    n_withheld = rig.stop()["withheld"]
+    found = re.search(r"lost on the way: .*lidar (\d+)", collecting.said)
+    assert n_withheld > 300 and found is not None
+    # A busy computer may lose some itself.
+    assert n_withheld <= int(found[1]) < 1.2 * n_withheld
+    assert journal_of(tmp_path / "session")[0]["lost"]["lidar"] == int(found[1])
+    check_whole(tmp_path / "session")
+
+
+def test_a_lidar_whose_counter_jumps_as_its_pulses_end_goes_on_by_arrival(
+    wire: Start, reel: Reel, tmp_path: Path
+) -> None:
+    rig = wire()
+    with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
+        collecting.wait_for_captures(1)
+        rig.tell("clock absent 721000000")
+        collecting.wait_for("lidar: scans are stamped with this computer's clock, by arrival: PPS is absent")
+        n_before = collecting.n_captures
+        collecting.wait_for_captures(n_before + 2)
+        assert collecting.end() == 0
+    sent = read_sent(reel, rig.rig.lidars["lidar"])
+    for capture in check_whole(tmp_path / "session")[-2:]:
+        check_sent(capture, sent)
+        stamp_ns, host_ns = capture.scan("lidar").stamp_ns, capture.scan("lidar").host_ns
+        assert stamp_ns is not None and host_ns is not None
+        assert abs(host_ns - stamp_ns) < 10**9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("set_s", [-3600, 3600], ids=["back", "forward"])
+def test_a_computer_whose_clock_is_set_goes_on(wire: Start, reel: Reel, tmp_path: Path, set_s: int) -> None:
+    rig, file = wire(), tmp_path / "set"
+    prelude = SET_CLOCK.format(set_ns=set_s * 10**9, file=str(file))
+    with Collecting(rig.profile, tmp_path / "session", "--hold", "0", prelude=prelude) as collecting:
+        collecting.wait_for_captures(1)
+        file.touch()
+        n_before = collecting.n_captures
+        collecting.wait_for_captures(n_before + 2)
+        assert collecting.end() == 0
+    sent = read_sent(reel, rig.rig.lidars["lidar"])
+    for capture in check_whole(tmp_path / "session"):
+        check_sent(capture, sent)
+
+
+def test_a_full_disk_is_one_clear_error_and_spares_the_captures(wire: Start, tmp_path: Path) -> None:
+    rig, session = wire(), tmp_path / "session"
+    with Collecting(rig.profile, session, "--hold", "0") as collecting:
+        collecting.wait_for_captures(2)
+        # From now on no file of that process grows beyond 100 kB.
+        resource.prlimit(collecting.pid, resource.RLIMIT_FSIZE, (100_000, 100_000))
+        assert collecting.wait() == 4
+    assert len(errors(collecting.said)) == 1 and "cannot be written" in errors(collecting.said)[0]
+    assert "Make room or choose another disk" in collecting.said and "Traceback" not in collecting.said
+    n_safe = len(check_whole(session))
+    assert n_safe >= 2
+    with Collecting(rig.profile, session, "--hold", "0", "--frames", str(n_safe + 1)) as again:
+        assert again.wait() == 0
+    assert len(check_whole(session)) == n_safe + 1
+
+
+def test_guidance_goes_on_while_a_slow_disk_takes_a_capture(
+    wire: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = wire()
+    flush, begun_s, states_s = os.fsync, [], []
+
+    def flush_slowly(descriptor: int) -> None:
+        begun_s.append(time.monotonic())
+        time.sleep(0.5)
+        flush(descriptor)
+
+    with Session.create(tmp_path / "session", rig.rig) as session:
+        monkeypatch.setattr(os, "fsync", flush_slowly)
+        options = LiveOptions(n_wanted=1, timeout_s=90.0, hold_s=0.0)
+        report = collect_live(
+            session, open_live(rig.rig), options, lambda _state: states_s.append(time.monotonic())
+        )
+        monkeypatch.undo()
+    assert report.ending == "frames" and report.latencies_s[0] > 2.0
+    during_s = [at_s for at_s in states_s if begun_s[0] < at_s < begun_s[0] + 2.0]
+    assert len(during_s) >= 4
+    # Boards that were held still meanwhile are more than were wanted.
+    assert len(check_whole(tmp_path / "session")) == 1
