@@ -94,7 +94,7 @@ class UdpPort:
             OSError: the network failed.
         """
         if self._batch is None:
-            found = []
+            found: list[Datagram] = []
             while len(found) < N_AT_ONCE and (datagram := self.receive()) is not None:
                 found.append(datagram)
             return found
