@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 _START_S = 30.0
 _ANSWER_S = 60.0
 _FLAGS = (
-    "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--mute-audio",
+    "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-audio-output",
     "--hide-scrollbars", "--disable-background-networking", "--disable-component-update", "--disable-sync",
     "--disable-dev-shm-usage", "--remote-debugging-port=0", "--remote-allow-origins=*",
 )  # fmt: skip
@@ -171,9 +171,7 @@ class Page(Line):
         """Wait until an expression is true."""
         deadline = time.monotonic() + timeout_s
         while not self.evaluate(expression):
-            assert time.monotonic() < deadline, (
-                f"not true within {timeout_s} s: {expression}; {self.complaints}"
-            )
+            assert time.monotonic() < deadline, self._describe(expression)
             time.sleep(0.03)
 
     def tap(self, element: str) -> None:
