@@ -63,13 +63,15 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
     hold_s = HOLD_S if given.hold is None else given.hold
     options = LiveOptions(given.frames, given.timeout, hold_s, goes_on=given.keep_going)
     with ExitStack() as stack:
+        # The page first: an address that cannot be served is said before anything is made or started.
+        listeners, links = _open_preview(stack, given)
         session = stack.enter_context(Session.resume(path, rig))
         n_before = len(session.captures)
         recorder = stack.enter_context(_recorder(given, rig))
-        sources, listeners = _open_rig(stack, rig, path, given)
-        listeners += _open_preview(stack, given)
+        sources, watchers = _open_rig(stack, rig, path, given)
+        listeners += watchers
         asked = stack.enter_context(controls())
-        with open_view(is_plain=given.plain, has_keys=asked.is_interactive) as view:
+        with open_view(is_plain=given.plain, has_keys=asked.is_interactive, links=links) as view:
             listeners.append(view.show)
 
             def tell(state: "LiveState") -> None:
@@ -103,17 +105,19 @@ def _open_rig(
     return simulated.sources, [simulated.watch]
 
 
-def _open_preview(stack: ExitStack, given: LiveArguments) -> "list[Callable[[LiveState], None]]":
-    """Serve the page where it is wanted, and say where."""
+def _open_preview(
+    stack: ExitStack, given: LiveArguments
+) -> "tuple[list[Callable[[LiveState], None]], tuple[str, ...]]":
+    """Serve the page where it is wanted, say where, and give its links."""
     if given.preview is None:
-        return []
+        return [], ()
     from lce_rig.collect.preview import Preview, parse_address
 
     host, port = parse_address(given.preview)
     preview = stack.enter_context(Preview(host, port))
     for url in preview.urls:
         show.note(f"preview: {url}")
-    return [preview.publish]
+    return [preview.publish], preview.urls
 
 
 @contextmanager

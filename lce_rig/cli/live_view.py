@@ -37,8 +37,14 @@ class View(Protocol):
 
 
 @contextmanager
-def open_view(*, is_plain: bool, has_keys: bool) -> Iterator[View]:
-    """Open a screen where stderr is a terminal, else, or where wanted, plain lines."""
+def open_view(*, is_plain: bool, has_keys: bool, links: tuple[str, ...] = ()) -> Iterator[View]:
+    """Open a screen where stderr is a terminal, else, or where wanted, plain lines.
+
+    Args:
+        is_plain: lines are wanted.
+        has_keys: whether keys can be pressed.
+        links: of the page, the likeliest first; a screen covers what was printed before it.
+    """
     if is_plain or not sys.stderr.isatty():
         yield PlainView()
         return
@@ -47,7 +53,7 @@ def open_view(*, is_plain: bool, has_keys: bool) -> Iterator[View]:
 
     console = Console(stderr=True, highlight=False)
     with Live(console=console, screen=True, auto_refresh=False) as live:
-        yield ScreenView(live, console, has_keys=has_keys)
+        yield ScreenView(live, console, has_keys=has_keys, links=links)
 
 
 class PlainView:
@@ -82,10 +88,11 @@ class PlainView:
 class ScreenView:
     """One screen, drawn anew with every state."""
 
-    def __init__(self, live: Any, console: Any, *, has_keys: bool) -> None:
+    def __init__(self, live: Any, console: Any, *, has_keys: bool, links: tuple[str, ...] = ()) -> None:
         self._live = live
         self._console = console
         self._has_keys = has_keys
+        self._links = links
         self._n_cued = 0
 
     def show(self, state: LiveState) -> None:
@@ -95,11 +102,11 @@ class ScreenView:
                 for _ in range(_BELLS[cue.sound]):
                     self._console.bell()
         self._n_cued = state.cues[-1].number if state.cues else 0
-        self._live.update(render(state, has_keys=self._has_keys), refresh=True)
+        self._live.update(render(state, has_keys=self._has_keys, links=self._links), refresh=True)
 
 
-def render(state: LiveState, *, has_keys: bool = True) -> Any:
-    """Lay a state out for a terminal of 80x24."""
+def render(state: LiveState, *, has_keys: bool = True, links: tuple[str, ...] = ()) -> Any:
+    """Lay a state out for a terminal of 80x24; of the page's links the likeliest is shown."""
     from rich.columns import Columns
     from rich.console import Group
     from rich.padding import Padding
@@ -127,7 +134,10 @@ def render(state: LiveState, *, has_keys: bool = True) -> Any:
         Text(f"! {note}", style="yellow", no_wrap=True, overflow="ellipsis")
         for note in state.notes[:_NOTE_LINES]
     ]
-    parts += [Text(line, style="dim", no_wrap=True, overflow="ellipsis") for line in state.log[-_LOG_LINES:]]
+    n_lines = _LOG_LINES - len(links[:1])
+    parts += [Text(line, style="dim", no_wrap=True, overflow="ellipsis") for line in state.log[-n_lines:]]
+    # A link that is cut is none: it wraps where it is too long.
+    parts += [Text(f"page: {link}", overflow="fold") for link in links[:1]]
     if has_keys:
         parts.append(Text(HELP, style="bold dim"))
     return Group(*parts)

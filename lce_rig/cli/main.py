@@ -17,7 +17,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "rigs": ("lce_rig.cli.rigs", "List, show, check and derive rig profiles."),
     "doctor": ("lce_rig.cli.doctor", "Look at this computer and the sensors: fit to collect?"),
     "simulate": ("lce_rig.cli.simulate", "Make a session of a simulated rig, with exact truth."),
-    "collect": ("lce_rig.cli.collect", "Build a session from recordings."),
+    "collect": ("lce_rig.cli.collect", "Build a session, live and guided, or from recordings."),
     "reconstruct": ("lce_rig.cli.reconstruct", "Turn the events of a recording into pictures."),
     "check": ("lce_rig.cli.check", "Show what was detected in each capture, and why not."),
     "calibrate": ("lce_rig.cli.calibrate", "Estimate the extrinsics of a session."),

@@ -4,6 +4,7 @@ import json
 import os
 import pty
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -59,6 +60,18 @@ def test_simulated_and_real_captures_are_not_mixed(lce_rig, tmp_path: Path) -> N
     assert result.code == 4 and "real" in result.err
 
 
+def test_a_page_that_cannot_be_served_is_said_before_anything_is_made(lce_rig, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        used = f"127.0.0.1:{taken.getsockname()[1]}"
+        for address, said in ((used, "in use"), ("99999", "no port")):
+            path, record = tmp_path / "session", tmp_path / "record"
+            result = lce_rig(
+                "collect", "--rig", "rles", path, "--simulated", "--preview", address, "--record", record
+            )
+            assert result.code == 2 and said in result.err
+            assert "starting" not in result.err and not path.exists() and not record.exists()
+
+
 def start(path: Path, *arguments: str, **options: object) -> "subprocess.Popen[str]":
     command = [
         sys.executable,
@@ -95,7 +108,7 @@ def test_a_signal_ends_the_screen_and_leaves_the_terminal_as_it_was(tmp_path: Pa
     os.close(theirs)
     assert process.stderr is not None
     try:
-        deadline_s = time.monotonic() + 60
+        deadline_s = time.monotonic() + 150
         while not (tmp_path / "session/truth.json").exists():
             assert time.monotonic() < deadline_s and process.poll() is None
             time.sleep(0.1)
@@ -107,3 +120,14 @@ def test_a_signal_ends_the_screen_and_leaves_the_terminal_as_it_was(tmp_path: Pa
         os.close(ours)
     assert process.returncode == 130, said
     assert "captures (" in said and "Traceback" not in said
+
+
+def test_ctrl_c_and_a_kill_while_the_simulated_rig_starts_end_it_without_a_trace(tmp_path: Path) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        process = start(tmp_path / number.name, "--plain", start_new_session=True)
+        assert process.stderr is not None
+        assert "starting" in process.stderr.readline()
+        time.sleep(0.5)
+        os.killpg(process.pid, number)  # as a terminal does: to the simulation, too
+        _, said = process.communicate(timeout=60)  # until the simulation has closed its end, too
+        assert process.returncode in (130, -number) and "Traceback" not in said

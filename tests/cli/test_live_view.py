@@ -42,9 +42,9 @@ STATE = LiveState(
 )
 
 
-def drawn(state: LiveState) -> list[str]:
+def drawn(state: LiveState, links: tuple[str, ...] = ()) -> list[str]:
     console = Console(width=80, height=24, file=io.StringIO(), force_terminal=False)
-    console.print(render(state))
+    console.print(render(state, links=links))
     out = console.file
     assert isinstance(out, io.StringIO)
     return out.getvalue().rstrip("\n").split("\n")
@@ -58,6 +58,14 @@ def test_everything_fits_into_80_by_24() -> None:
     for wanted in ("HOLD STILL", "1.2 s", "7 of 15", "come 0.8 m closer", "3 lost", "1.20M/s", "+-0.12 deg"):
         assert wanted in text
     assert "captured 000006" in text and "boards must stand still" in text and "q stop" in text
+
+
+def test_the_page_s_link_stays_on_the_screen_which_covers_what_was_printed_before() -> None:
+    link = "http://192.168.100.200:8765/?token=q3Zk9Xw0aB4_q3Zk9Xw0aB4_"
+    log = ("01:01 the first", *STATE.log)
+    lines = drawn(replace(STATE, streams=STREAMS[:2], log=log), (link, "http://10.0.0.1:8765/"))
+    assert len(lines) <= 24 and any(link in line for line in lines)
+    assert "q stop" in lines[-1] and "10.0.0.1" not in "".join(lines)
 
 
 def test_a_state_without_pictures_guidance_or_figures_is_shown_all_the_same() -> None:

@@ -6,9 +6,11 @@ fast as that goes.
 """
 
 import multiprocessing
+import signal
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from types import TracebackType
 
@@ -141,7 +143,7 @@ class SimulatedRig:
         self._connection, theirs = context.Pipe()
         arguments = theirs, self._rig, self._seed, self._person, dict(self._views)
         self._process = context.Process(target=_simulate, args=arguments, name="simulated rig", daemon=True)
-        self._process.start()
+        _start_without_interrupts(self._process)
         theirs.close()
         try:
             if not self._connection.poll(START_S):
@@ -193,6 +195,17 @@ class SimulatedRig:
             self._by_sensor[sample.sensor].put(sample)
 
 
+def _start_without_interrupts(process: multiprocessing.process.BaseProcess) -> None:
+    """Start a process that Ctrl-C does not reach: a terminal sends it to both, and ours ends the other."""
+    # Starting the tracker would let interrupts through again.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _view(rig: Rig, camera: str) -> View:
     """Look through a camera as the drawing has it: people do not know the true extrinsic."""
     lidar = next(iter(rig.lidars))
@@ -211,10 +224,15 @@ def _simulate(connection: Connection, rig: Rig, seed: int, person: Person, views
         scene = LiveScene(rig, seed, SimulationOptions.for_rig(rig.name))
         camera = next(iter(views))
         scene.hold(scene.stage.T_world_sensor[camera] @ build_pose(views[camera], _START))
+        answer: LceRigError | str = "running"
     except LceRigError as error:
-        connection.send(error)
+        answer = error
+    try:
+        connection.send(answer)
+    except OSError:
+        return  # Whoever started this was ended meanwhile.
+    if isinstance(answer, LceRigError):
         return
-    connection.send("running")
     walker = _Walker(scene, person, views)
     period_ns = max(model.period_ns for model in scene.stage.models.values())
     due_ns = time.time_ns()
