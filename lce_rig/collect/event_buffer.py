@@ -1,5 +1,6 @@
 """The last seconds of every event camera's stream, and the stretch of it that belongs to a scan."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,11 +91,21 @@ class EventBuffer:
         for camera, packets in sorted(self._packets.items()):
             offset_ns = self._offset_ns[camera]
             own_ns = start_ns - offset_ns, end_ns - offset_ns
-            parts = tuple(part for packet in packets if len(part := packet.between(*own_ns)))
+            parts = tuple(_parts_between(packets, *own_ns))
             if parts:
                 missing_ns = max(0, self._first_ns[camera] - own_ns[0])
                 cuts.append(EventCut(camera, parts, *own_ns, offset_ns, missing_ns))
         return tuple(cuts)
+
+
+def _parts_between(packets: list[Events], start_ns: int, end_ns: int) -> Iterator[Events]:
+    """Cut packets in order of time; most lie wholly within or without, which their ends tell."""
+    for packet in packets:
+        first_ns, last_ns = packet.t_ns[0], packet.t_ns[-1]
+        if start_ns <= first_ns and last_ns < end_ns:
+            yield packet
+        elif first_ns < end_ns and last_ns >= start_ns and len(part := packet.between(start_ns, end_ns)):
+            yield part
 
 
 def join_events(parts: list[Events] | tuple[Events, ...]) -> Events:

@@ -37,7 +37,9 @@ class Crossings:
     noise: float
 
 
-def fit_crossings(grey: NDArray[np.uint8], grid_px: Array) -> Crossings:
+def fit_crossings(
+    grey: NDArray[np.uint8], grid_px: Array, most_samples: int = _MAX_SAMPLES_PER_SIDE
+) -> Crossings:
     """Fit I(a, b) = m + c g(f1 / s1) g(f2 / s2) around every corner at once, by Levenberg-Marquardt.
 
     (a, b) are coordinates along the sides of the squares at the corner; f1 = (a - a0) - alpha (b - b0) and
@@ -50,13 +52,14 @@ def fit_crossings(grey: NDArray[np.uint8], grid_px: Array) -> Crossings:
     Args:
         grey: (H, W).
         grid_px: (rows, cols, 2) corners to within a third of a square.
+        most_samples: per side of a patch; of fewer a fit is faster and noisier.
     """
     e1, e2 = _sides(grid_px)
     area = np.abs(e1[..., 0] * e2[..., 1] - e1[..., 1] * e2[..., 0])
     # Width of a square across its edges: what one unit of a and of b is in px.
     height_px = np.stack([area / np.linalg.norm(e2, axis=-1), area / np.linalg.norm(e1, axis=-1)], axis=-1)
     longest_px = float(np.median(np.maximum(np.linalg.norm(e1, axis=-1), np.linalg.norm(e2, axis=-1))))
-    n = int(np.clip(2 * round(_REACH * longest_px) + 1, 7, _MAX_SAMPLES_PER_SIDE))
+    n = int(np.clip(2 * round(_REACH * longest_px) + 1, 7, most_samples))
     axis = np.linspace(-_REACH, _REACH, n)
     b, a = (grid.ravel() for grid in np.meshgrid(axis, axis, indexing="ij"))
     pixels = grid_px[..., None, :] + a[:, None] * e1[..., None, :] + b[:, None] * e2[..., None, :]

@@ -73,7 +73,11 @@ def bench_live(duration_s: float) -> None:
     with tempfile.TemporaryDirectory() as folder:
         rig = load_of_sensors()
         reel = make_reel(Path(folder) / "reel", rig, N_PLACEMENTS)
-        print_load(run_load(Path(folder), rig, reel, duration_s))
+        for has_frames in (False, True):
+            print(f"\nframes of the DAVIS346: {'25 Hz' if has_frames else 'off'}\n")
+            part = Path(folder) / f"frames {has_frames}"
+            part.mkdir()
+            print_load(run_load(part, rig, reel, duration_s, has_frames=has_frames))
 
 
 def load_of_sensors() -> Rig:
@@ -89,7 +93,7 @@ def load_of_sensors() -> Rig:
     )
 
 
-def run_load(folder: Path, rig: Rig, reel: Reel, duration_s: float) -> Load:
+def run_load(folder: Path, rig: Rig, reel: Reel, duration_s: float, *, has_frames: bool) -> Load:
     """Start the senders, and collect in a process of its own."""
     camera_report = folder / "camera.json"
     with WireRig(folder, rig, reel, LOOPS_PER_HOLD, report=camera_report) as wire:
@@ -97,7 +101,7 @@ def run_load(folder: Path, rig: Rig, reel: Reel, duration_s: float) -> Load:
         ours, theirs = context.Pipe()
         cpu_s = _cpu_s(wire.pid)
         process = context.Process(
-            target=_collect, args=(theirs, wire.rig, folder / "session", reel, duration_s)
+            target=_collect, args=(theirs, wire.rig, folder / "session", reel, duration_s, has_frames)
         )
         process.start()
         assert ours.recv() == "time is over"
@@ -165,8 +169,10 @@ def measure_settled_s(session: Session) -> list[float]:
     return found
 
 
-def _collect(parent: Connection, rig: Rig, path: Path, reel: Reel, duration_s: float) -> None:
-    davis = _Davis(reel, "davis")
+def _collect(
+    parent: Connection, rig: Rig, path: Path, reel: Reel, duration_s: float, has_frames: bool
+) -> None:
+    davis = _Davis(reel, "davis", has_frames)
     sources: Sequence[LiveSource] = [
         DavisSource("davis", rig.cameras["davis"], lambda *_: OpenedCamera(davis, "made here"))
         if source.sensor == "davis"
@@ -196,8 +202,10 @@ class _Davis:
     writer takes more than half a core for itself, however little is sent.
     """
 
-    def __init__(self, reel: Reel, camera: str) -> None:
+    def __init__(self, reel: Reel, camera: str, has_frames: bool) -> None:
         import dv_processing
+
+        self._has_frames = has_frames
 
         self._dv: Any = dv_processing
         self._batch = self._frame = time.time_ns() // 1000 // _BATCH_US
@@ -226,7 +234,7 @@ class _Davis:
     def getNextFrame(self) -> Any:
         """Give the picture of the next 40 ms, once it is exposed."""
         start_us = self._frame * _BATCH_US
-        if time.time_ns() // 1000 < start_us + _EXPOSURE_US:
+        if not self._has_frames or time.time_ns() // 1000 < start_us + _EXPOSURE_US:
             return None
         self._frame += _FRAME_EVERY
         shown = placement_at(1000 * start_us, LOOPS_PER_HOLD, self._n_placements)
