@@ -50,7 +50,7 @@ def main() -> None:
         "-o", "--output", type=Path, default=Path("build/paper"), help="folder of `paper`, and of what `uncertainty` keeps"
     )
     parser.add_argument("--captures", type=int, default=30, help="of each session of `uncertainty` (30)")
-    parser.add_argument("--methods", default="", help="methods that `paper` runs anew (default all)")
+    parser.add_argument("--methods", default="", help="methods `paper` runs anew (default: what is not kept)")
     parser.add_argument("--seconds", type=float, default=60, help="that `live` takes (default 60)")
     arguments = parser.parse_args()
     bench = getattr(import_module(f"benchmarks.{arguments.part}"), f"bench_{arguments.part}")
