@@ -47,15 +47,21 @@ def main() -> None:
         "--only", default="", help="recorded sets whose name contains this; of `paper` also: simulated"
     )
     parser.add_argument(
-        "-o", "--output", type=Path, default=Path("build/paper"), help="folder of `paper`, and of what `uncertainty` keeps"
+        "-o",
+        "--output",
+        type=Path,
+        default=Path("build/paper"),
+        help="folder of `paper`, and of what `uncertainty` keeps",
     )
     parser.add_argument("--captures", type=int, default=30, help="of each session of `uncertainty` (30)")
-    parser.add_argument("--methods", default="", help="methods `paper` runs anew (default: what is not kept)")
+    parser.add_argument(
+        "--methods", default="", help="those `paper` runs anew (default: what is not kept); that of `real`"
+    )
     parser.add_argument("--seconds", type=float, default=60, help="that `live` takes (default 60)")
     arguments = parser.parse_args()
     bench = getattr(import_module(f"benchmarks.{arguments.part}"), f"bench_{arguments.part}")
     if arguments.part == "real":
-        bench(arguments.splits, arguments.only)
+        bench(arguments.splits, arguments.only, arguments.methods or "paper")
     elif arguments.part == "paper":
         methods = arguments.methods.split(",") if arguments.methods else ()
         bench(arguments.seeds or PARTS["paper"], arguments.output, methods, arguments.only)

@@ -10,13 +10,14 @@ from benchmarks.recordings import SETS, RecordedSet, detect
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
+from lce_rig.calibrate.options import Method
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.results import ImageBoard
 from lce_rig.pipeline import Detections
 from lce_rig.rig import Rig
 
 
-def bench_real(n_splits: int, only: str) -> None:
+def bench_real(n_splits: int, only: str, method: Method) -> None:
     """Tabulate every recorded set that is there, each channel alone and all together."""
     head = (
         "set, captures, picture, LiDAR, used, EGT deg, EGT mm, split deg, split mm, MGE mm, claimed deg / mm"
@@ -30,7 +31,7 @@ def bench_real(n_splits: int, only: str) -> None:
                 recorded.collect(session)
                 rig, detections = detect(session)
             for channels in _choices(recorded):
-                print_row(*_row(recorded, rig, detections, channels, n_splits))
+                print_row(*_row(recorded, rig, detections, channels, n_splits, method))
             if len(recorded.folders) > 1:
                 clocks += _clock_rows(recorded, rig, detections)
     if clocks:
@@ -47,14 +48,19 @@ def _choices(recorded: RecordedSet) -> list[tuple[str, ...]]:
 
 
 def _row(
-    recorded: RecordedSet, rig: Rig, detections: Detections, channels: tuple[str, ...], n_splits: int
+    recorded: RecordedSet,
+    rig: Rig,
+    detections: Detections,
+    channels: tuple[str, ...],
+    n_splits: int,
+    method: Method,
 ) -> tuple[object, ...]:
     pairs = [pair for pair in detections.pairs if pair.channel in channels]
     seen = [detections.of(pair, name) for pair in pairs for name in detections.captures(pair)]
-    options = CalibrateOptions()
+    options = CalibrateOptions(method=method)
     calibration, _ = pipeline.calibrate(rig, detections, options, channels=channels)[0][0]
     deg, mm = compare(calibration.T_cam_lidar, recorded.reference())
-    split_deg, split_mm = _split_halves(rig, detections, channels, n_splits)
+    split_deg, split_mm = _split_halves(rig, detections, channels, n_splits, method)
     return (
         recorded.name if len(recorded.folders) == 1 else f"{recorded.name} {' + '.join(channels)}",
         len(seen),
@@ -72,7 +78,7 @@ def _row(
 
 
 def _split_halves(
-    rig: Rig, detections: Detections, channels: tuple[str, ...], n_splits: int
+    rig: Rig, detections: Detections, channels: tuple[str, ...], n_splits: int, method: Method
 ) -> tuple[float, float]:
     """Calibrate random halves of the scans apart and give the rms of their differences, deg and mm."""
     rng = np.random.default_rng(0)
@@ -89,7 +95,7 @@ def _split_halves(
                 pipeline.calibrate(
                     rig,
                     _only(detections, {n for n, key in prints.items() if key in half}),
-                    CalibrateOptions(n_draws=0),
+                    CalibrateOptions(n_draws=0, method=method),
                     channels=channels,
                 )[0][0][0].T_cam_lidar
                 for half in halves

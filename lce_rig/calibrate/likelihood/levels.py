@@ -11,7 +11,7 @@ from lce_rig.core.geometry import Array
 class Levels:
     """Standard deviations of errors that differ from one measurement to the next; estimated.
 
-    The defaults are what is usual; how far from that they may well lie stands in `LOG_SIGMA`.
+    The defaults are what recordings show; how far from that they may well lie stands in `LOG_SIGMA`.
 
     Attributes:
         range_m: noise of a single range.
@@ -22,13 +22,13 @@ class Levels:
         laser_m: of the lasers' range offsets about their mean.
     """
 
-    range_m: float = 0.010
+    range_m: float = 0.008
     ring_m: float = 0.002
-    edge_m: float = 0.003
-    tilt_rad: float = 1e-3
+    edge_m: float = 0.002
+    tilt_rad: float = 3.5e-3
     spin_rad: float = 5e-4
-    depth_m: float = 0.002
-    across_m: float = 0.001
+    depth_m: float = 0.004
+    across_m: float = 0.0013
     laser_m: float = 0.008
 
     @property
@@ -47,7 +47,7 @@ class Levels:
 
 
 # One deviation of the logarithm of each level, a priori; the lasers' spread is the profile's to state.
-LOG_SIGMA = np.array([1.0, 1.0, 1.0, 1.5, 1.5, 1.5, 1.5, 0.5])
+LOG_SIGMA = np.array([0.7, 0.7, 0.7, 0.7, 0.7, 0.7, 0.7, 0.3])
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,9 @@ class Priors:
 
     offset_m: float = 0.005
     shift_m: float = 0.015
-    lateral_m: float = 0.03
+    lateral_m: float = 0.02
     vertical_m: float = 0.04
-    scale: float = 0.001
+    scale: float = 0.0005
 
 
 # Offsets of lasers that the profile says have none.
