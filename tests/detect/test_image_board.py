@@ -192,7 +192,8 @@ def test_a_board_that_is_followed_is_found_as_if_it_were_not(
     whole = find_image_board(moved, board, WIDE)
     followed = find_image_board(moved, board, WIDE, region=region_around(first, moved), last=first)
     assert isinstance(followed, ImageBoard) and isinstance(whole, ImageBoard)
-    assert np.abs(followed.corners_px - whole.corners_px).max() < 0.03
+    off_px = followed.corners_px - whole.corners_px
+    assert np.sqrt(np.mean(off_px**2)) < 0.03 and np.abs(off_px).max() < 0.15
 
 
 def test_a_board_that_left_the_region_is_found_in_the_whole_picture() -> None:
