@@ -106,6 +106,8 @@ class Monitor:
         self._was_enough = is_enough
         phase, headline, detail = self._phase(is_enough=is_enough, has_ended=has_ended)
         rig, guidance = self._session.rig, self._guide.guidance if self._guide else None
+        # Before the first capture there is nothing but wide priors.
+        guidance = guidance if guidance is not None and guidance.n_captures else None
         return LiveState(
             rig=rig.name,
             session=str(self._session.path),
