@@ -48,6 +48,7 @@ def test_a_collection_that_is_killed_loses_no_capture(wire: Start, tmp_path: Pat
         assert len(said) == len(set(said))
 
 
+@pytest.mark.slow
 def test_what_is_recorded_beside_a_collection_can_be_collected_from(wire: Start, tmp_path: Path) -> None:
     rig, record = wire(), tmp_path / "recording"
     live, later = tmp_path / "live", tmp_path / "later"

@@ -119,6 +119,7 @@ def test_losses_of_the_network_are_counted_and_shown_and_collection_goes_on(
     check_whole(tmp_path / "session")
 
 
+@pytest.mark.slow
 def test_a_lidar_whose_counter_jumps_as_its_pulses_end_goes_on_by_arrival(
     wire: Start, reel: Reel, tmp_path: Path
 ) -> None:
