@@ -6,6 +6,7 @@ captures/.new-000012/, its files are flushed, the folder is renamed and its pare
 not at all, whenever the power goes.
 """
 
+import errno
 import json
 import re
 import shutil
@@ -289,7 +290,11 @@ def _take_lock(path: Path) -> WriterLock:
 
 def _not_writable(path: Path, error: OSError, n_safe: int | None = None) -> SessionError:
     safe = "" if n_safe is None else f" The {n_safe} captures before it are safe."
-    hint = (
-        f"Make room or choose another disk and run the same command again: it goes on where it stopped.{safe}"
-    )
+    if isinstance(error, (FileExistsError, NotADirectoryError)):
+        hint = "There is a file of that name: choose another folder."
+    elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        hint = "Choose a folder that you may write to, or see to its permissions."
+    else:
+        hint = "Make room or choose another disk and run the same command again: it goes on where it stopped."
+    hint += safe
     return SessionError(f"{path} cannot be written: {error.strerror or error}", hint)
