@@ -134,6 +134,14 @@ def run(arguments: list[str]) -> int:
         return EXIT_BUG
 
 
+def _open_closed_streams() -> None:
+    """Stand /dev/null in for standard streams that were closed (`lce-rig collect <&-`), as services start."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115, PTH123
+
+
 def main() -> None:
     """Entry point of the installed command."""
+    _open_closed_streams()
     sys.exit(run(sys.argv[1:]))

@@ -36,9 +36,9 @@ def read_reference(path: Path) -> Reference:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise SessionError(f"{path}: cannot be read: {error.strerror}") from error
+        raise SessionError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise SessionError(f"{path}: is not JSON: {error}") from error
+        raise SessionError(f"{path} is not JSON: {error}") from error
     if not isinstance(document, dict):
         raise SessionError(f"{path}: holds no T_cam_lidar")
     pairs = document.get("pairs")

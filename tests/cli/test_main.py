@@ -67,3 +67,12 @@ def test_every_method_of_calibration_can_be_chosen():
 
     (option,) = [parameter for parameter in calibrate.params if parameter.name == "method"]
     assert list(option.type.choices) == list(METHODS)
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_standard_streams_are_no_bug(closed, tmp_path):
+    missing = f'collect --rig rles "{tmp_path}/none" --from "{tmp_path}/no"'
+    line = f'exec "{sys.executable}" -m lce_rig {missing} {closed}'
+    assert subprocess.run(["sh", "-c", line], check=False).returncode == 5
+    line = f'exec "{sys.executable}" -m lce_rig rigs {closed}'
+    assert subprocess.run(["sh", "-c", line], check=False, capture_output=True).returncode == 0
