@@ -81,13 +81,14 @@ def _split_halves(
     rig: Rig, detections: Detections, channels: tuple[str, ...], n_splits: int, method: Method
 ) -> tuple[float, float]:
     """Calibrate random halves of the scans apart and give the rms of their differences, deg and mm."""
-    # Half of a small set has fewer captures than a result would be given for.
-    rig = rig.model_copy(update={"quality": rig.quality.model_copy(update={"min_captures": 3})})
     rng = np.random.default_rng(0)
     ((_lidar, scans),) = detections.lidars.items()
     # Captures may hold copies of one scan: they go into the same half.
     prints = {n: found[0].points.tobytes() if isinstance(found, list) else n for n, found in scans.items()}
     keys = sorted(set(prints.values()), key=lambda key: min(n for n, own in prints.items() if own == key))
+    # Half of a small set has fewer captures than a result would be given for.
+    fewest = max(3, min(rig.quality.min_captures, len(keys) // 2))
+    rig = rig.model_copy(update={"quality": rig.quality.model_copy(update={"min_captures": fewest})})
     differences = []
     for _ in range(n_splits):
         order = rng.permutation(len(keys))
