@@ -265,11 +265,16 @@ def _difference(
     for _ in range(_N_SHARES):
         mine = set(rng.permutation(len(mover.scans))[: len(mover.scans) // 2].tolist())
         names = {mover.scans[k].capture for k in mine}
-        halves = [
-            calibrate_observations([o for o in own if (o.capture in names) == is_first], board, fast)
-            for own, is_first in zip(seen, (True, False), strict=True)
-        ]
+        try:
+            halves = [
+                calibrate_observations([o for o in own if (o.capture in names) == is_first], board, fast)
+                for own, is_first in zip(seen, (True, False), strict=True)
+            ]
+        except NotEnoughDataError:
+            continue  # These shares of few scans leave a direction open; others may not.
         apart = difference(halves[0].T_cam_lidar, halves[1].T_cam_lidar)
         cov = halves[0].cov + halves[1].cov
         ways.append((float(apart @ np.linalg.solve(cov, apart)), apart, cov))
-    return sorted(ways, key=lambda way: way[0])[_N_SHARES // 2][1:]
+    if not ways:
+        return None, None
+    return sorted(ways, key=lambda way: way[0])[len(ways) // 2][1:]
