@@ -13,16 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.still_sessions import scan_held_board, with_small_pictures
 from lce_rig import pipeline
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
 from lce_rig.detect.detection import LidarDetection, from_arrays, to_arrays
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
-from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.placements import can_be_held, count_rings, seen_share
-from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import PLACEMENT, Stage, set_stage, truth_extrinsics
-from lce_rig.simulate.takes import take_scan
 
 N_CAPTURES, N_PARALLEL = 15, 12
 # Plates as a profile may have them wrong: what is added to the true width and height, m.
@@ -34,9 +32,6 @@ WRONG_PLATES_M = {
 # A further stream of random numbers; the simulation itself uses the lower ones.
 _PARALLEL = 90
 _N_PLACES = 4000
-# The camera's picture of the room is not needed: the smaller it is, the sooner it is done.
-_SHRINK = 16
-_STAMP_NS = 1_700_000_000_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +77,7 @@ def with_plate(rig: Rig, added_m: tuple[float, float]) -> Rig:
 
 def _simulate(rig: Rig, seed: int) -> SimulatedScans:
     options = SimulationOptions.for_rig(rig.name)
-    stage = set_stage(_with_small_pictures(rig), seed, options)
+    stage = set_stage(with_small_pictures(rig), seed, options)
     truth = truth_extrinsics(rig, seed, options)[next(iter(rig.cameras)), next(iter(rig.lidars))]
     poses: dict[str, Array] = {}
     scans: dict[str, LidarDetection] = {}
@@ -91,7 +86,7 @@ def _simulate(rig: Rig, seed: int) -> SimulatedScans:
         name = f"{index:06d}"
         rng = stage.rng(index, PLACEMENT)
         T_world_board = stage.place(index, rng)
-        scan = _scan(stage, T_world_board, rng, index)
+        scan = scan_held_board(stage, T_world_board, rng, index)
         poses[name] = invert(stage.views[0].T_world_cam) @ T_world_board
         scans[name] = pipeline.detect_scan(rig, scan)
         for kind, added_m in WRONG_PLATES_M.items():
@@ -102,27 +97,10 @@ def _simulate(rig: Rig, seed: int) -> SimulatedScans:
     for index, T_world_board in enumerate(_nearly_parallel(stage, rng)):
         name = f"{index:06d}"
         parallel_poses[name] = invert(stage.views[0].T_world_cam) @ T_world_board
-        parallel_scans[name] = pipeline.detect_scan(rig, _scan(stage, T_world_board, rng, 1000 + index))
-    return SimulatedScans(seed, truth, poses, scans, resized, parallel_poses, parallel_scans)
-
-
-def _with_small_pictures(rig: Rig) -> Rig:
-    cameras = {}
-    for name, camera in rig.cameras.items():
-        lens = camera.intrinsics
-        scaled = {key: getattr(lens, key) / _SHRINK for key in ("fx_px", "fy_px", "cx_px", "cy_px")}
-        size = tuple(round(length / _SHRINK) for length in camera.resolution_px)
-        cameras[name] = camera.model_copy(
-            update={"resolution_px": size, "intrinsics": lens.model_copy(update=scaled)}
+        parallel_scans[name] = pipeline.detect_scan(
+            rig, scan_held_board(stage, T_world_board, rng, 1000 + index)
         )
-    return rig.model_copy(update={"cameras": cameras})
-
-
-def _scan(stage: Stage, T_world_board: Array, rng: np.random.Generator, index: int) -> Any:
-    carrier = build_carrier(stage.options.carrier, stage.board, T_world_board, rng)
-    reflectivity = stage.options.print_reflectivity
-    scene = Scene(stage.room.raycaster, carrier, stage.board, T_world_board, reflectivity)
-    return take_scan(stage, stage.views[0].lidar, scene, _STAMP_NS + index * 4_000_000_000, (index,))
+    return SimulatedScans(seed, truth, poses, scans, resized, parallel_poses, parallel_scans)
 
 
 def _nearly_parallel(stage: Stage, rng: np.random.Generator) -> Iterator[Array]:

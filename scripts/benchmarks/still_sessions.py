@@ -12,6 +12,7 @@ import numpy as np
 
 from lce_rig import pipeline
 from lce_rig.calibrate import CaptureCandidates
+from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import from_arrays, to_arrays
@@ -19,7 +20,7 @@ from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.scene import Scene
-from lce_rig.simulate.stage import PLACEMENT, set_stage, truth_extrinsics
+from lce_rig.simulate.stage import PLACEMENT, Stage, set_stage, truth_extrinsics
 from lce_rig.simulate.takes import take_scan
 from lce_rig.solvers.pnp import solve_planar_pose
 
@@ -103,7 +104,7 @@ def draw_corners(
 
 
 def _simulate(rig: Rig, seed: int, options: SimulationOptions, n_captures: int) -> dict[str, Any]:
-    stage = set_stage(_with_small_pictures(rig), seed, options)
+    stage = set_stage(with_small_pictures(rig), seed, options)
     view = stage.views[0]
     arrays: dict[str, Any] = {
         "truth": truth_extrinsics(rig, seed, options)[next(iter(rig.cameras)), next(iter(rig.lidars))]
@@ -111,11 +112,7 @@ def _simulate(rig: Rig, seed: int, options: SimulationOptions, n_captures: int) 
     for index in range(n_captures):
         rng = stage.rng(index, PLACEMENT)
         T_world_board = stage.place(index, rng)
-        carrier = build_carrier(stage.options.carrier, stage.board, T_world_board, rng)
-        scene = Scene(
-            stage.room.raycaster, carrier, stage.board, T_world_board, stage.options.print_reflectivity
-        )
-        scan = take_scan(stage, view.lidar, scene, _STAMP_NS + index * 4_000_000_000, (index,))
+        scan = scan_held_board(stage, T_world_board, rng, index)
         name = f"{index:06d}"
         arrays[f"pose/{name}"] = invert(view.T_world_cam) @ T_world_board
         found = to_arrays(pipeline.detect_scan(rig, scan))
@@ -123,7 +120,16 @@ def _simulate(rig: Rig, seed: int, options: SimulationOptions, n_captures: int) 
     return arrays
 
 
-def _with_small_pictures(rig: Rig) -> Rig:
+def scan_held_board(stage: Stage, T_world_board: Array, rng: np.random.Generator, index: int) -> Scan:
+    """Scan a board that is held still at (4, 4); rng decides what its carrier looks like."""
+    carrier = build_carrier(stage.options.carrier, stage.board, T_world_board, rng)
+    reflectivity = stage.options.print_reflectivity
+    scene = Scene(stage.room.raycaster, carrier, stage.board, T_world_board, reflectivity)
+    return take_scan(stage, stage.views[0].lidar, scene, _STAMP_NS + index * 4_000_000_000, (index,))
+
+
+def with_small_pictures(rig: Rig) -> Rig:
+    """Shrink a rig's pictures, for sessions that render none."""
     cameras = {}
     for name, camera in rig.cameras.items():
         lens = camera.intrinsics
