@@ -190,7 +190,7 @@ class _Loop:
         self._gate: LiveGate | None = None
         self._n_captures = len(session.captures)
         names = [capture.name for capture in session.captures]
-        self._next_number = int(names[-1]) + 1 if names else 0
+        self._first_number = int(names[-1]) + 1 if names else 0
         self._n_asked = 0
         self._monitor = Monitor(session, options.n_wanted, pumps, clock)
         self._last: Sighting | None = None
@@ -244,15 +244,13 @@ class _Loop:
         gate = self._find_gate()
         moments = gate.take(sighting)
         guide = self._active_guide(sighting)
-        now_s = time.monotonic()
-        if guide.key not in sighting.images or guide.lidar not in sighting.lidars:
-            present = sighting.images[guide.key].T_cam_board if guide.key in sighting.images else None
-            guide.plan(present, now_s)
-            narration = narrate_unseen(sighting, guide, self._monitor.reasons)
-        else:
-            present = sighting.images[guide.key].T_cam_board
-            guide.plan(present, now_s)
+        board = sighting.images.get(guide.key)
+        present = None if board is None else board.T_cam_board
+        guide.plan(present, time.monotonic())
+        if present is not None and guide.sees(sighting):
             narration = gate.narrate(guide, present)
+        else:
+            narration = narrate_unseen(sighting, guide, self._monitor.reasons)
         for moment in moments:
             narration = self._decide(moment, guide, narration)
         self._monitor.narrate(narration, guide, present)
@@ -260,7 +258,7 @@ class _Loop:
     def _decide(self, moment: Moment, guide: Guide, narration: Narration) -> Narration:
         """Capture a moment, unless it adds nothing."""
         sighting = moment.sighting
-        if guide.key not in sighting.images or guide.lidar not in sighting.lidars:
+        if not guide.sees(sighting):
             return narration
         n_wanted, n_waiting = self._options.n_wanted, self._n_asked - len(self.report.captured)
         if n_wanted is not None and self._n_captures + n_waiting >= n_wanted:
@@ -283,11 +281,10 @@ class _Loop:
             "still_boards_only": verdict.requires_still_boards,
         }
         self._keeper.keep(Task(moment, frame.images, gate.events_of(moment), meta, time.monotonic()))
-        name = f"{self._next_number:06d}"
-        self._next_number += 1
+        name = f"{self._first_number + self._n_asked:06d}"
         self._n_asked += 1
         for guide in self._guides:
-            if guide.key in sighting.images and guide.lidar in sighting.lidars:
+            if guide.sees(sighting):
                 guide.add(name, sighting.images[guide.key].T_cam_board)
 
     def _obey(self, key: Key | None) -> None:
@@ -296,7 +293,7 @@ class _Loop:
             guide.give_up()
             self._monitor.log("another placement was asked for")
         if key == "capture" and guide is not None and self._last is not None:
-            if guide.key in self._last.images and guide.lidar in self._last.lidars:
+            if guide.sees(self._last):
                 self._capture(Moment(self._last, {"by_hand": 1.0}))
             else:
                 self._monitor.cue("refused", "not captured: not every sensor sees the board")

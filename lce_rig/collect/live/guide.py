@@ -17,7 +17,7 @@ from lce_rig.collect.guidance import (
     model_sensors,
     outline_px,
 )
-from lce_rig.collect.watching import ImageKey
+from lce_rig.collect.watching import ImageKey, Sighting
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
@@ -92,6 +92,10 @@ class Guide:
     def wanted(self) -> Array | None:
         """Where the board should go, T_cam_board (4, 4); None where nothing new can be reached."""
         return None if self.guidance is None else self.guidance.T_cam_board
+
+    def sees(self, sighting: Sighting) -> bool:
+        """Tell whether both of its sensors see the board in a sighting."""
+        return self.key in sighting.images and self.lidar in sighting.lidars
 
     def add(self, name: str, T_cam_board: Array) -> None:
         """Take a capture into account; the next placement is chosen by `plan`."""

@@ -15,10 +15,10 @@ from lce_rig.collect.guidance import Planner
 from lce_rig.collect.live.guide import Guide, Learned
 from lce_rig.collect.novelty import board_figures
 from lce_rig.collect.stored_events import StoredEvents
-from lce_rig.collect.watching import ImageKey, Moment
+from lce_rig.collect.watching import ImageKey, Moment, Sighting
 from lce_rig.core.data import Image
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError
-from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.core.results import ImageBoard
 from lce_rig.session import Session
 
 
@@ -165,15 +165,14 @@ class Keeper:
             return SessionError(f"{self._session.path} cannot be written: {error!r}", "Please report it.")
         with self._changed:
             self._kept.append(Kept(name, sighting.images, time.monotonic() - task.asked_s))
-        self._gather(name, sighting.images, sighting.lidars)
+        self._gather(name, sighting)
         return None
 
-    def _gather(
-        self, name: str, images: Mapping[ImageKey, ImageBoard], lidars: Mapping[str, Sequence[LidarBoard]]
-    ) -> None:
+    def _gather(self, name: str, sighting: Sighting) -> None:
         for k, guide in enumerate(self._guides):
-            if guide.key in images and guide.lidar in lidars:
-                self._candidates[k].append(CaptureCandidates(name, images[guide.key], lidars[guide.lidar]))
+            if guide.sees(sighting):
+                image, scans = sighting.images[guide.key], sighting.lidars[guide.lidar]
+                self._candidates[k].append(CaptureCandidates(name, image, scans))
 
     def _teach(self) -> None:
         """Calibrate what each guide's sensors have shown in this run, and let it know."""

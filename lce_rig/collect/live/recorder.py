@@ -88,10 +88,7 @@ class SampleRecorder:
         return found
 
     def _run(self) -> None:
-        while not self._queue.is_ended:
-            sample = self._queue.take(_WAIT_S)
-            if sample is None:
-                continue
+        for sample in self._queue.items(_WAIT_S):
             with self._lock:
                 self._n_waiting_bytes -= _size_bytes(sample)
             if self._failure is not None:

@@ -20,10 +20,11 @@ from lce_rig.collect.guidance import HeldPose, Person, View, build_pose, model_s
 from lce_rig.collect.live.state import LiveState
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError, ProfileError, SourceError
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, invert
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
+from lce_rig.simulate.stage import channel_of
 from lce_rig.sources.live.base import LiveSource, Mailbox, SourceStatus
 from lce_rig.sources.live.reading import RateMeter
 
@@ -65,12 +66,7 @@ class SimulatedSource:
 
     def samples(self) -> Iterator[Image | Scan]:
         """Yield samples as they come, until the source is closed."""
-        mailbox = self._mailbox
-        while not mailbox.is_ended:
-            sample = mailbox.take(_WAIT_S)
-            if sample is not None:
-                yield sample
-        mailbox.take(0)
+        yield from self._mailbox.items(_WAIT_S)
 
     def status(self) -> SourceStatus:
         """Say how the sensor does."""
@@ -111,11 +107,7 @@ class SimulatedRig:
         self._rig = rig
         self._seed = seed
         self._person = person or Person()
-        framed = [
-            name
-            for name, each in rig.cameras.items()
-            if any(c.kind == "frames" for c in each.channels.values())
-        ]
+        framed = [name for name in rig.cameras if channel_of(rig, name, "frames")]
         if not framed:
             raise ProfileError(
                 f"rig {rig.name!r} has no camera with frames; events are not simulated in real time",
@@ -262,7 +254,7 @@ class _Walker:
     def hear(self, camera: str, wanted: Array) -> None:
         """Set out for a placement T_cam_board (4, 4)."""
         view, T_world_cam = self._views[camera], self._scene.stage.T_world_sensor[camera]
-        present = np.linalg.inv(T_world_cam) @ self._scene.T_world_board
+        present = invert(T_world_cam) @ self._scene.T_world_board
         for _ in range(_TRIES):
             reached = T_world_cam @ self._person.follow(view, present, wanted, self._rng)
             if self._scene.can_be_held(camera, reached):

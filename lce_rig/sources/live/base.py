@@ -139,6 +139,18 @@ class Mailbox(Generic[T]):
                 raise self._error
             return None
 
+    def items(self, wait_s: float) -> Iterator[T]:
+        """Yield items as they come until the queue has ended, looking every `wait_s`.
+
+        Raises:
+            SourceError: the reader failed, and all that it read before has been yielded.
+        """
+        while not self.is_ended:
+            item = self.take(wait_s)
+            if item is not None:
+                yield item
+        self.take(0)
+
     @property
     def is_ended(self) -> bool:
         """Whether the queue was closed and everything taken."""

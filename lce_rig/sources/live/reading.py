@@ -96,12 +96,7 @@ class ReaderThread:
         Raises:
             SourceError: why it ended, unless it was stopped.
         """
-        mailbox = self._mailbox
-        while not mailbox.is_ended:
-            sample = mailbox.take(_TAKE_S)
-            if sample is not None:
-                yield sample
-        mailbox.take(0)
+        yield from self._mailbox.items(_TAKE_S)
 
     @property
     def n_samples(self) -> int:

@@ -124,11 +124,7 @@ class Vlp16Source:
         Raises:
             SourceError: no packets came for `silence_s`; the hint says what to check.
         """
-        while not self._mailbox.is_ended:
-            scan = self._mailbox.take(_WAIT_S)
-            if scan is not None:
-                yield scan
-        self._mailbox.take(0)
+        yield from self._mailbox.items(_WAIT_S)
 
     def status(self) -> SourceStatus:
         """Say how the sensor does; may be called from any thread."""
