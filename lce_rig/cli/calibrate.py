@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
+from lce_rig.cli.options import event_image_option, session_argument, split_names
 from lce_rig.cli.uncertainty import uncertainty_lines
 from lce_rig.core.results import Calibration
 from lce_rig.detect.detection import Pair
@@ -16,7 +17,7 @@ _COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 
 
 @click.command()
-@click.argument("session", type=click.Path(path_type=Path), default="session")
+@session_argument
 @click.option(
     "--reference",
     type=click.Path(path_type=Path),
@@ -25,14 +26,11 @@ _COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 )
 @click.option(
     "--channels",
+    callback=split_names,
     metavar="NAME[,NAME]",
     help="Channels to use, such as frames or events [default: all; together they give one extrinsic].",
 )
-@click.option(
-    "--event-image",
-    type=click.Choice(["network", "map"]),
-    help="How events become pictures: by network, or sums of polarities [default: the profile's, network].",
-)
+@event_image_option
 @click.option(
     "--method",
     type=click.Choice(["ml", "paper", "zhou", "corners"]),
@@ -93,7 +91,7 @@ _COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 def calibrate(
     session: Path,
     reference: Path | None,
-    channels: str | None,
+    channels: list[str] | None,
     event_image: Any,
     as_json: bool,
     force: bool,
@@ -122,10 +120,9 @@ def calibrate(
     pipeline.remove_results(opened)
     with show.progress_bar("detecting") as progress:
         detections = pipeline.detect(opened, event_image=event_image, progress=progress)
-    wanted = None if channels is None else [name.strip() for name in channels.split(",")]
     with show.progress_bar("calibrating") as progress:
         results, troubles = pipeline.calibrate(
-            opened.rig, detections, options, channels=wanted, reference=truth, progress=progress
+            opened.rig, detections, options, channels=channels, reference=truth, progress=progress
         )
     for trouble in troubles:
         show.warn(str(trouble))

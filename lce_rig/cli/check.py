@@ -9,14 +9,14 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import event_image_option
+from lce_rig.cli.options import event_image_option, json_option, session_argument
 from lce_rig.core.results import Refusal
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 
 
 @click.command()
-@click.argument("session", type=click.Path(path_type=Path), default="session")
-@click.option("--json", "as_json", is_flag=True, help="Print every figure as JSON.")
+@session_argument
+@json_option
 @click.option("--debug-images", is_flag=True, help="Write one picture a capture into SESSION/debug/.")
 @event_image_option
 def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange
+from lce_rig.cli.options import FiniteRange, json_option, rig_option
 
 if TYPE_CHECKING:
     from lce_rig.collect.health import Check
@@ -24,8 +24,8 @@ _FILE_WIDTH = 160
 
 
 @click.command()
-@click.option("--rig", "rig_name", required=True, metavar="NAME|FILE", help="Rig profile: a name or a file.")
-@click.option("--json", "as_json", is_flag=True, help="Print every figure as JSON.")
+@rig_option
+@json_option
 @click.option(
     "--duration",
     type=FiniteRange(1, 3600),

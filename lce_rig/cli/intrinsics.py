@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lce_rig.cli import show
+from lce_rig.cli.options import session_argument, split_names
 
 if TYPE_CHECKING:
     from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
@@ -15,10 +16,11 @@ _MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")
 
 
 @click.command()
-@click.argument("session", type=click.Path(path_type=Path), default="session")
+@session_argument
 @click.option("--camera", "cameras", multiple=True, metavar="NAME", help="Only this camera; may be repeated.")
 @click.option(
     "--channels",
+    callback=split_names,
     metavar="NAME[,NAME]",
     help="Channels to use together, as they share the lens [default: those of frames].",
 )
@@ -37,7 +39,7 @@ _MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")
 def intrinsics(
     session: Path,
     cameras: tuple[str, ...],
-    channels: str | None,
+    channels: list[str] | None,
     model: str | None,
     save_profile: Path | None,
     as_json: bool,
@@ -60,8 +62,7 @@ def intrinsics(
         raise UsageError(f"there is no camera {unknown[0]!r}; there is {', '.join(opened.rig.cameras)}")
     if save_profile is not None and save_profile.exists():
         raise UsageError(f"{save_profile} exists already", "Name another file: nothing is written over.")
-    wanted = [] if channels is None else [name.strip() for name in channels.split(",")]
-    measured, troubles = [], []
+    wanted, measured, troubles = channels or [], [], []
     for camera in cameras or tuple(opened.rig.cameras):
         try:
             with show.progress_bar(f"looking through {camera}") as progress:

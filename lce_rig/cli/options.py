@@ -1,6 +1,7 @@
 """Kinds of option values that several verbs share."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import click
@@ -17,8 +18,23 @@ class FiniteRange(click.FloatRange):
         return number
 
 
+def split_names(_ctx: click.Context, _param: click.Parameter, value: str | None) -> list[str] | None:
+    """Take names separated by commas apart, as an option's callback."""
+    return None if value is None else [name.strip() for name in value.split(",")]
+
+
+session_argument = click.argument("session", type=click.Path(path_type=Path), default="session")
+
+rig_option = click.option(
+    "--rig", "rig_name", required=True, metavar="NAME|FILE", help="Rig profile: a shipped name or a file."
+)
+
+json_option = click.option("--json", "as_json", is_flag=True, help="Print every figure as JSON.")
+
+EVENT_IMAGES = click.Choice(["network", "map"])
+
 event_image_option = click.option(
     "--event-image",
-    type=click.Choice(["network", "map"]),
-    help="How pictures are made from raw events; by default as the profile says, which is the network.",
+    type=EVENT_IMAGES,
+    help="How events become pictures: by network, or sums of polarities [default: the profile's, network].",
 )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange
+from lce_rig.cli.options import EVENT_IMAGES, FiniteRange
 
 if TYPE_CHECKING:
     from lce_rig.core.data import Events
@@ -50,7 +50,7 @@ _WARM_UP_NS = 1_500_000_000
 @click.option("--window-events", type=click.IntRange(1), metavar="N", help="Windows of so many events.")
 @click.option(
     "--event-image",
-    type=click.Choice(["network", "map"]),
+    type=EVENT_IMAGES,
     default="network",
     show_default=True,
     help="Recurrent network, or sums of polarities, the alternative that the paper rejects.",

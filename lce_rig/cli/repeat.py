@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lce_rig.cli import show
+from lce_rig.cli.options import json_option
 
 if TYPE_CHECKING:
     from lce_rig.calibrate.repeatability import Repeatability
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("sessions", nargs=-1, type=click.Path(path_type=Path), metavar="SESSION...")
-@click.option("--json", "as_json", is_flag=True, help="Print every figure as JSON.")
+@json_option
 def repeat(sessions: tuple[Path, ...], as_json: bool) -> None:
     """Compare the calibrations of two or more independent SESSIONs of one rig.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange
+from lce_rig.cli.options import FiniteRange, rig_option
 
 if TYPE_CHECKING:
     from lce_rig.rig import Rig
@@ -20,9 +20,7 @@ _CAPTURES, _DURATION_S = 30, 20.0
 
 
 @click.command()
-@click.option(
-    "--rig", "rig_name", required=True, metavar="NAME|FILE", help="Rig profile: a shipped name or a file."
-)
+@rig_option
 @click.argument("session", type=click.Path(path_type=Path), required=False)
 @click.option("--captures", type=click.IntRange(1, 10_000), help=f"Board placements [default: {_CAPTURES}].")
 @click.option(

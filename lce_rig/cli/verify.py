@@ -6,11 +6,11 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import event_image_option
+from lce_rig.cli.options import event_image_option, json_option, session_argument
 
 
 @click.command()
-@click.argument("session", type=click.Path(path_type=Path), default="session")
+@session_argument
 @click.option(
     "--result",
     type=click.Path(path_type=Path),
@@ -20,7 +20,7 @@ from lce_rig.cli.options import event_image_option
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the pictures go."
 )
-@click.option("--json", "as_json", is_flag=True, help="Print the residuals as JSON.")
+@json_option
 @event_image_option
 def verify(session: Path, result: Path | None, output: Path | None, as_json: bool, event_image: Any) -> None:
     """Draw the LiDAR of each capture of SESSION (default: session/) into its picture, print residuals.

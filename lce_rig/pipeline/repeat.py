@@ -10,7 +10,7 @@ import numpy as np
 
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.calibrate.repeatability import Repeatability, compare_calibrations
-from lce_rig.core.errors import SessionError, UsageError
+from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.results import Calibration
 from lce_rig.export.result import read_result
 from lce_rig.pipeline.calibration import CALIBRATION, calibrate
@@ -55,6 +55,7 @@ def repeat(paths: Sequence[Path], *, progress: Progress = silent) -> Repeat:
         UsageError: fewer than two sessions, or one given twice.
         SessionError: sessions of different rigs, a result of another rig, captures in two sessions, or no
             camera and LiDAR in two of them.
+        NotEnoughDataError: a session holds too few captures to be calibrated; it is named.
     """
     if len(paths) < 2:
         raise UsageError("one session alone has nothing to agree with", "Name two sessions or more.")
@@ -63,23 +64,31 @@ def repeat(paths: Sequence[Path], *, progress: Progress = silent) -> Repeat:
     _require_one_rig(sessions)
     _require_independent(sessions)
     results: dict[str, list[Calibration]] = {}
-    calibrated = []
+    calibrated: list[str] = []
+    troubles: list[str] = []
     for done, (name, session) in enumerate(sessions.items(), start=1):
-        if not (session.path / CALIBRATION / "result.json").exists():
+        if (session.path / CALIBRATION / "result.json").exists():
+            results[name] = _read_calibrations(session)
+        else:
+            results[name], own_troubles = _calibrate(name, session)
             calibrated.append(name)
-        results[name] = _calibrations(session)
+            troubles += own_troubles
         progress(done, len(sessions))
     rig = next(iter(sessions.values())).rig.name
     comparisons, lonely = _comparisons(results)
     if not comparisons:
-        raise SessionError("no camera and LiDAR are calibrated in two of the sessions")
+        raise SessionError(
+            "no camera and LiDAR are calibrated in two of the sessions",
+            "\n".join(_calibrated_sensors(name, own) for name, own in results.items()),
+        )
     failed = [
         f"{name} ({c.camera} and {c.lidar})"
         for name, own in results.items()
         for c in own
         if c.verdict == "fail"
     ]
-    return Repeat(rig, comparisons, tuple(calibrated), (*_board_remarks(sessions), *lonely), tuple(failed))
+    remarks = (*_board_remarks(sessions), *troubles, *lonely)
+    return Repeat(rig, comparisons, tuple(calibrated), remarks, tuple(failed))
 
 
 def _require_different(paths: Sequence[Path]) -> None:
@@ -144,11 +153,26 @@ def _board_remarks(sessions: dict[str, Session]) -> list[str]:
     ]
 
 
-def _calibrations(session: Session) -> list[Calibration]:
+def _calibrate(name: str, session: Session) -> tuple[list[Calibration], list[str]]:
+    """Calibrate a session; and say which of its sensors could not be, and why.
+
+    Raises:
+        NotEnoughDataError: none of them could; the session is named.
+    """
+    try:
+        results, troubles = calibrate(session.rig, detect(session), CalibrateOptions())
+    except NotEnoughDataError as error:
+        raise NotEnoughDataError(f"{name}: {error.what}", error.hint) from None
+    return [calibration for calibration, _ in results], [f"{name}: {trouble}" for trouble in troubles]
+
+
+def _calibrated_sensors(name: str, calibrations: Sequence[Calibration]) -> str:
+    sensors = ", ".join(f"{c.camera} and {c.lidar}" for c in calibrations)
+    return f"{name}: {sensors or 'its result holds no sensors'}"
+
+
+def _read_calibrations(session: Session) -> list[Calibration]:
     path = session.path / CALIBRATION / "result.json"
-    if not path.exists():
-        results, _ = calibrate(session.rig, detect(session), CalibrateOptions())
-        return [calibration for calibration, _ in results]
     saved = read_result(path)
     if saved.rig != session.rig.name:
         raise SessionError(

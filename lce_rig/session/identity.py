@@ -26,13 +26,18 @@ def check_marker(path: Path) -> None:
     Raises:
         SessionError: it is none, or damaged, or made by a newer version.
     """
+    if path.is_file():
+        hint = "Name the session's folder; `lce-rig collect --from FILE` makes one of a recording."
+        raise SessionError(f"{path} is a file, a session is a folder", hint)
     try:
         marker = json.loads((path / MARKER).read_text(encoding="utf-8"))
         version = int(marker["format_version"])
     except FileNotFoundError:
         hint = "Make one with `lce-rig collect` or `lce-rig simulate`."
         raise SessionError(f"{path} is no session: it has no {MARKER}", hint) from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except OSError as error:
+        raise SessionError(f"{path / MARKER} cannot be read: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError) as error:
         raise SessionError(f"{path / MARKER} cannot be read: {error}") from None
     if version > FORMAT_VERSION:
         raise SessionError(f"{path} was made by a newer lce-rig (format {version})", "Update lce-rig.")

@@ -55,6 +55,16 @@ def test_a_folder_that_is_no_session_exits_with_4(lce_rig, tmp_path, verb):
     assert str(tmp_path) in outcome.err
 
 
+@pytest.mark.parametrize("verb", ["check", "calibrate", "verify", "intrinsics", "repeat"])
+def test_a_file_in_place_of_a_session_is_said_to_be_one(lce_rig, tmp_path, verb):
+    file = tmp_path / "recording.bag"
+    file.write_bytes(b"#ROSBAG V2.0")
+    outcome = lce_rig(verb, file, *([tmp_path] if verb == "repeat" else []))
+    assert outcome.code == 4
+    assert f"error: {file} is a file, a session is a folder" in outcome.err
+    assert "Errno" not in outcome.err
+
+
 def test_the_module_runs_like_the_command():
     words = [sys.executable, "-m", "lce_rig", "--version"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)

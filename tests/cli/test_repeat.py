@@ -119,6 +119,21 @@ def test_sensors_of_one_session_only_leave_nothing_to_compare(lce_rig, made):
     outcome = lce_rig("repeat", made("monday", [0] * 6), made("rear", [0] * 6, lidar="rear"))
     assert outcome.code == 4
     assert "no camera and LiDAR are calibrated in two of the sessions" in outcome.err
+    assert "monday: davis and lidar\n  rear: davis and rear\n" in outcome.err
+
+
+def test_a_session_that_cannot_be_calibrated_is_named(lce_rig, made, tmp_path):
+    a = made("monday", [0] * 6)
+    with Session.create(tmp_path / "empty", load_rig("rles")):
+        pass
+    outcome = lce_rig("repeat", a, tmp_path / "empty")
+    assert outcome.code == 6
+    assert "error: empty: the session holds no capture with a picture and a scan" in outcome.err
+    uncalibrated = made("unfinished", [0] * 6)
+    shutil.rmtree(uncalibrated / "calibration")
+    outcome = lce_rig("repeat", a, uncalibrated)
+    assert outcome.code == 6
+    assert "error: unfinished: " in outcome.err
 
 
 def test_a_damaged_result_names_its_file(lce_rig, made):
