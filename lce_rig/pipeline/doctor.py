@@ -144,7 +144,7 @@ def _sight_in_picture(rig: Rig, image: Image) -> Sight:
 
 def _sight_in_events(rig: Rig, seen: Observation) -> Sight:
     camera = rig.cameras[seen.sensor]
-    channel = next((name for name, each in camera.channels.items() if each.kind == "events"), "events")
+    channel = camera.first_channel("events") or "events"
     events = join_events(list(seen.events))
     try:
         reconstructor = reconstructor_for(

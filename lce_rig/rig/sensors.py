@@ -230,6 +230,10 @@ class CameraSettings(Settings):
         channels = {name: channel.located(folder) for name, channel in self.channels.items()}
         return self.model_copy(update={"channels": channels})
 
+    def first_channel(self, kind: Literal["frames", "events"]) -> str | None:
+        """Name the first channel of a kind; None where there is none."""
+        return next((name for name, channel in self.channels.items() if channel.kind == kind), None)
+
     def to_intrinsics(self) -> Intrinsics:
         """Build the camera model as the algorithms know it."""
         given = self.intrinsics

@@ -45,10 +45,9 @@ def event_channel(rig: Rig, camera: str) -> str:
     Raises:
         SessionError: the rig has no such camera, or the camera no such channel.
     """
-    channels = rig.cameras[camera].channels if camera in rig.cameras else {}
-    for name, channel in channels.items():
-        if channel.kind == "events":
-            return name
+    channel = rig.cameras[camera].first_channel("events") if camera in rig.cameras else None
+    if channel is not None:
+        return channel
     raise SessionError(
         f"rig {rig.name!r} has no camera {camera!r} with events",
         f"Give it a channel of `kind: events` in the profile, under cameras.{camera}.channels.",

@@ -13,7 +13,7 @@ from lce_rig.simulate.lidar import Sweep, measure_sweep, sweep_scene
 from lce_rig.simulate.options import SimulationOptions
 from lce_rig.simulate.placements import can_be_held, count_rings
 from lce_rig.simulate.scene import Scene
-from lce_rig.simulate.stage import CARRIER, OF_SESSION, channel_of, set_stage
+from lce_rig.simulate.stage import CARRIER, OF_SESSION, set_stage
 
 _NOISE_STREAM = 102
 
@@ -76,7 +76,8 @@ class LiveScene:
         if camera not in self._radiance:
             self._radiance[camera] = render_radiance(self._render(), stage.backdrops[camera])
         pixels = expose(self._radiance[camera], stage.options.camera, self._noise)
-        return Image(camera, channel_of(stage.rig, camera, "frames") or "frames", stamp_ns, pixels, stamp_ns)
+        channel = stage.rig.cameras[camera].first_channel("frames") or "frames"
+        return Image(camera, channel, stamp_ns, pixels, stamp_ns)
 
     def _take_scan(self, lidar: str, stamp_ns: int) -> Scan:
         stage, settings = self.stage, self.stage.rig.lidars[lidar]

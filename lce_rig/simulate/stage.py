@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -61,7 +62,7 @@ class Stage:
     @property
     def framed(self) -> list[str]:
         """The cameras that take pictures, in the profile's order."""
-        return [name for name in self.backdrops if channel_of(self.rig, name, "frames")]
+        return [name for name in self.backdrops if self.rig.cameras[name].first_channel("frames")]
 
     def rng(self, *stream: int) -> np.random.Generator:
         """Begin a stream of random numbers of this session or of one of its captures."""
@@ -132,7 +133,7 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
     pixels = {
         name: draw_pixels(lenses[name], options.events, np.random.default_rng([seed, OF_SESSION, PIXELS, k]))
         for k, name in enumerate(cameras)
-        if options.motion == "moving" and channel_of(rig, name, "events")
+        if options.motion == "moving" and rig.cameras[name].first_channel("events")
     }
     views = [
         View(camera, lenses[camera], T_world_sensor[camera], lidar, models[lidar], T_world_sensor[lidar])
@@ -144,15 +145,13 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
     return Stage(rig, seed, options, board, room, T_world_sensor, backdrops, models, bias, pixels, views)
 
 
-def channel_of(rig: Rig, camera: str, kind: str) -> str | None:
-    """Find the camera's first channel of a kind, "frames" or "events"."""
-    channels = rig.cameras[camera].channels
-    return next((name for name, channel in channels.items() if channel.kind == kind), None)
-
-
 def _simulated_cameras(rig: Rig, options: SimulationOptions) -> list[str]:
-    kinds = ("frames", "events") if options.motion == "moving" else ("frames",)
-    cameras = [name for name in rig.cameras if any(channel_of(rig, name, kind) for kind in kinds)]
+    kinds: tuple[Literal["frames", "events"], ...] = ("frames",)
+    if options.motion == "moving":
+        kinds = ("frames", "events")
+    cameras = [
+        name for name, camera in rig.cameras.items() if any(camera.first_channel(kind) for kind in kinds)
+    ]
     if not cameras:
         hint = "Of a board held still, only frames can be simulated: events need motion."
         raise ProfileError(f"rig {rig.name}: no camera has a channel of kind {' or '.join(kinds)}", hint)

@@ -14,7 +14,7 @@ from lce_rig.simulate.event_camera import EventCamera
 from lce_rig.simulate.lidar import simulate_scan
 from lce_rig.simulate.motion import Trajectory
 from lce_rig.simulate.scene import Scene
-from lce_rig.simulate.stage import EVENTS, IMAGE, SCAN, Stage, channel_of
+from lce_rig.simulate.stage import EVENTS, IMAGE, SCAN, Stage
 from lce_rig.simulate.subframes import MovingView, speed_px_s
 
 # While the shutter is open the board is drawn at moments that lie this far apart in the picture at most.
@@ -127,7 +127,7 @@ class MovingBoard:
 def _develop(stage: Stage, camera: str, radiance: Array, exposed_ns: int, stream: Stream) -> Image:
     rng = stage.rng(*_numbered(stream, IMAGE, list(stage.backdrops).index(camera)))
     stamp_ns = exposed_ns + round(1e9 * stage.options.frame_offset_s)
-    channel = channel_of(stage.rig, camera, "frames") or "frames"
+    channel = stage.rig.cameras[camera].first_channel("frames") or "frames"
     return Image(camera, channel, stamp_ns, expose(radiance, stage.options.camera, rng), stamp_ns)
 
 

@@ -87,8 +87,7 @@ class EventCameraFile:
         first = None if frames is None else frames.first()
         if frames is None or first is None:
             return None
-        channels = self._rig.cameras[self._camera].channels
-        channel = next((name for name, settings in channels.items() if settings.kind == "frames"), None)
+        channel = self._rig.cameras[self._camera].first_channel("frames")
         if channel is None:
             self.notes.append(
                 f"{self.path.name}: frames left out; {self._camera} has no channel of kind frames"

@@ -8,8 +8,7 @@ from lce_rig.sources.base import Sample, Stream
 
 def event_channel(rig: Rig, camera: str) -> str | None:
     """Name a camera's channel of kind events; None where it has none."""
-    channels = rig.cameras[camera].channels if camera in rig.cameras else {}
-    return next((name for name, channel in channels.items() if channel.kind == "events"), None)
+    return rig.cameras[camera].first_channel("events") if camera in rig.cameras else None
 
 
 def stamp_of(sample: Sample) -> int | None:

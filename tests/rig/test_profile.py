@@ -53,6 +53,16 @@ def test_nominal_pose_puts_the_lidars_forward_axis_before_the_camera() -> None:
     np.testing.assert_allclose(entry.to_matrix()[:3, 3], [0.126, -0.065, -0.080])
 
 
+def test_the_first_channel_of_a_kind_is_found_or_there_is_none() -> None:
+    davis = load_rig("rles").cameras["davis"]
+    assert (davis.first_channel("frames"), davis.first_channel("events")) == ("frames", "events")
+    second = dict(davis.channels, cleaned=davis.channels["frames"])
+    assert davis.model_copy(update={"channels": second}).first_channel("frames") == "frames"
+    backwards = dict(reversed(second.items()))
+    assert davis.model_copy(update={"channels": backwards}).first_channel("frames") == "cleaned"
+    assert load_rig("rlfs").cameras["cam"].first_channel("events") is None
+
+
 def test_only_the_ideal_lidar_has_ranges_without_systematic_error() -> None:
     for name in ("rlfs", "rles", "sss"):
         lidar = load_rig(name).lidars["lidar"]

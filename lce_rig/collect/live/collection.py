@@ -148,10 +148,10 @@ def _swift_turns() -> Iterator[None]:
 
 def make_guides(rig: Rig) -> list[Guide]:
     """Make a guide for every camera with every LiDAR: by its frames where it has any."""
-    keys: list[ImageKey] = []
-    for name, camera in rig.cameras.items():
-        framed = [channel for channel, given in camera.channels.items() if given.kind == "frames"]
-        keys.append((name, (framed or list(camera.channels))[0]))
+    keys: list[ImageKey] = [
+        (name, camera.first_channel("frames") or next(iter(camera.channels)))
+        for name, camera in rig.cameras.items()
+    ]
     return [Guide(rig, key, lidar) for key in keys for lidar in rig.lidars]
 
 

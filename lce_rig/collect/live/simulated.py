@@ -24,7 +24,6 @@ from lce_rig.core.geometry import Array, invert
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
-from lce_rig.simulate.stage import channel_of
 from lce_rig.sources.live.base import LiveSource, Mailbox, SourceStatus
 from lce_rig.sources.live.reading import RateMeter
 
@@ -107,7 +106,7 @@ class SimulatedRig:
         self._rig = rig
         self._seed = seed
         self._person = person or Person()
-        framed = [name for name in rig.cameras if channel_of(rig, name, "frames")]
+        framed = [name for name, camera in rig.cameras.items() if camera.first_channel("frames")]
         if not framed:
             raise ProfileError(
                 f"rig {rig.name!r} has no camera with frames; events are not simulated in real time",

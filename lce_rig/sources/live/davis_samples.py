@@ -34,7 +34,7 @@ class DavisSamples:
         self.n_events = self.n_frames = self.n_pulses = self.n_frames_lost = self.n_resets = 0
         self._sensor = sensor
         self._size = settings.resolution_px
-        self._channel = next((n for n, c in settings.channels.items() if c.kind == "frames"), "frames")
+        self._channel = settings.first_channel("frames") or "frames"
         interval_us = settings.driver.controls.get("frame_interval_us", 0)
         self._interval_us = float(interval_us) if isinstance(interval_us, int | float) else 0.0
         self._last_frame_us: int | None = None

@@ -46,7 +46,7 @@ class ImagePipeSource:
     def __init__(self, sensor: str, settings: CameraSettings, silence_s: float = 10.0) -> None:
         self.sensor = sensor
         self._settings = settings
-        self._channel = next((n for n, c in settings.channels.items() if c.kind == "frames"), "frames")
+        self._channel = settings.first_channel("frames") or "frames"
         self._who = f"camera {sensor!r}"
         hint = f"Run its command in a shell: does it write pictures? {' '.join(settings.driver.command)}"
         self._reader = ReaderThread(self._who, self._read, _N_SLOTS, silence_s, hint)

@@ -41,7 +41,7 @@ class V4l2Source:
     def __init__(self, sensor: str, settings: CameraSettings, silence_s: float = 5.0) -> None:
         self.sensor = sensor
         self._settings = settings
-        self._channel = next((n for n, c in settings.channels.items() if c.kind == "frames"), "frames")
+        self._channel = settings.first_channel("frames") or "frames"
         self._clock = StampClock(settings.driver.frame_timing.clock)
         self._reader = ReaderThread(f"camera {sensor!r}", self._read, _N_SLOTS, silence_s, _SILENT_HINT)
         self._stack = ExitStack()
