@@ -28,9 +28,9 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     multiple=True,
     type=click.Path(path_type=Path),
     metavar="PATH",
-    help="Read a recording: a folder with img/ and pcd/, a ROS 1 or ROS 2 bag, an mcap or pcap file, or an "
-    "event camera's file (AEDAT4, Prophesee RAW, HDF5); may be repeated, also for several recorders of one "
-    "moment.",
+    help="Read a recording: a folder with img/ and pcd/, what --record kept, a ROS 1 or ROS 2 bag, an mcap "
+    "or pcap file, or an event camera's file (AEDAT4, Prophesee RAW, HDF5); may be repeated, also for several "
+    "recorders of one moment.",
 )
 @click.option(
     "--pair",
@@ -117,13 +117,13 @@ def collect(
     from lce_rig.core.errors import NotEnoughDataError
     from lce_rig.rig import load_rig
     from lce_rig.session import Session
-    from lce_rig.sources import open_recording
+    from lce_rig.sources import open_recordings
     from lce_rig.sources.base import PairedRecording, SourceOptions
 
     rig = load_rig(rig_name)
     require_kind(session, None)
-    options = SourceOptions(camera, channel, lidar, pair, pair_tolerance, topics, is_part=len(paths) > 1)
-    recordings = [open_recording(path, rig, options) for path in paths]
+    options = SourceOptions(camera, channel, lidar, pair, pair_tolerance, topics)
+    recordings = open_recordings(paths, rig, options)
     with Session.resume(session, rig) as writer, show.progress_bar("collecting") as progress:
         report = fill(
             writer,

@@ -1,11 +1,14 @@
 """Recordings and sensors behind one door: `open_recording` finds the reader for a path."""
 
+from collections.abc import Iterable
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.sources.base import Recording, SourceOptions
+from lce_rig.sources.recorded_folder import list_parts
 
 RECORDINGS = {
     "folder": "lce_rig.sources.folder:FolderRecording",
@@ -42,6 +45,35 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
     module, name = RECORDINGS[kind].split(":")
     recording: Recording = getattr(import_module(module), name)(path, rig, options or SourceOptions())
     return recording
+
+
+def open_recordings(paths: Iterable[Path], rig: Rig, options: SourceOptions | None = None) -> list[Recording]:
+    """Open what lies at several paths; a folder that several recorders filled gives each of their files.
+
+    Raises:
+        SourceError: as `open_recording`; of a folder's files only where none of them can be read.
+    """
+    paths, options = list(paths), options or SourceOptions()
+    options = replace(options, is_part=options.is_part or len(paths) > 1)
+    recordings: list[Recording] = []
+    for path in paths:
+        recordings += _open_parts(list_parts(path, rig, options), rig)
+    return recordings
+
+
+def _open_parts(parts: list[tuple[Path, SourceOptions]], rig: Rig) -> list[Recording]:
+    """Open the recordings of one folder; a file that a killed recorder left empty is passed over."""
+    opened: list[Recording] = []
+    failures: list[SourceError] = []
+    for path, options in parts:
+        try:
+            opened.append(open_recording(path, rig, options))
+        except SourceError as error:
+            failures.append(error)
+    if not opened:
+        raise failures[0]
+    opened[0].notes.extend(f"left out: {error.what}" for error in failures)
+    return opened
 
 
 def _kind(path: Path) -> str:

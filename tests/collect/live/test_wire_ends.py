@@ -10,9 +10,18 @@ from pathlib import Path
 
 import pytest
 from wire.collecting import Collecting
+from wire.reel import Reel
 from wire.rig import ENVIRONMENT, WireRig
+from wire.timing import placement_at
 
-from tests.collect.live.sent import captured_names, check_whole, errors
+from tests.collect.live.conftest import LOOPS_PER_HOLD
+from tests.collect.live.sent import (
+    captured_names,
+    check_sent,
+    check_whole,
+    errors,
+    read_sent,
+)
 
 Start = Callable[..., WireRig]
 
@@ -49,15 +58,16 @@ def test_a_collection_that_is_killed_loses_no_capture(wire: Start, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_what_is_recorded_beside_a_collection_can_be_collected_from(wire: Start, tmp_path: Path) -> None:
+def test_what_is_recorded_beside_a_collection_can_be_collected_from(
+    wire: Start, reel: Reel, tmp_path: Path
+) -> None:
     rig, record = wire(), tmp_path / "recording"
     live, later = tmp_path / "live", tmp_path / "later"
     with Collecting(rig.profile, live, "--hold", "0", "--record", str(record)) as collecting:
         collecting.wait_for_captures(2)
         assert collecting.end() == 0
     assert "samples recorded" in collecting.said
-    parts = ["--from", str(record / "recording.bag"), "--from", str(record / "lidar.pcap")]
-    words = ["collect", "--rig", str(rig.profile), str(later), *parts]
+    words = ["collect", "--rig", str(rig.profile), str(later), "--from", str(record)]
     code = "from lce_rig.cli.main import main; main()"
     done = subprocess.run(
         [sys.executable, "-c", code, *words], env=ENVIRONMENT, capture_output=True, text=True, check=False
@@ -65,8 +75,11 @@ def test_what_is_recorded_beside_a_collection_can_be_collected_from(wire: Start,
     assert done.returncode == 0, done.stderr
     # Live, on this rig, every board that stands still is captured; of a recording a place counts once.
     seen = {(capture.scan("lidar").stamp_ns or 0) // 1_000 for capture in check_whole(live)}
-    stored = check_whole(later)
+    stored, sent = check_whole(later), read_sent(reel, rig.rig.lidars["lidar"])
     assert 1 <= len(stored) <= 4
     for capture in stored:
-        stamp_us = (capture.scan("lidar").stamp_ns or 0) // 1_000
+        stamp_ns = capture.scan("lidar").stamp_ns or 0
+        shown = placement_at(stamp_ns, LOOPS_PER_HOLD, reel.n_placements)
+        assert check_sent(capture, sent) == shown, "pictures and packets are of one moment"
+        stamp_us = stamp_ns // 1_000
         assert min(seen) - 5_000_000 < stamp_us < max(seen) + 5_000_000
