@@ -93,6 +93,18 @@ def _report(error: LceRigError) -> int:
     return error.exit_code
 
 
+def _comes_of_interrupt(error: BaseException | None) -> bool:
+    """Tell whether Ctrl-C caused an error, as where it stops the import of a compiled module (open3d)."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__
+    return error is not None
+
+
+def _interrupted() -> int:
+    click.echo("interrupted; what was written so far is whole", err=True)
+    return EXIT_INTERRUPTED
+
+
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit code.
 
@@ -104,6 +116,8 @@ def run(arguments: list[str]) -> int:
         result: Any = cli.main(args=arguments, prog_name="lce-rig", standalone_mode=False)
         return result if isinstance(result, int) else 0
     except LceRigError as error:
+        if _comes_of_interrupt(error):
+            return _interrupted()
         if show_traceback:
             traceback.print_exc()
         return _report(error)
@@ -111,8 +125,7 @@ def run(arguments: list[str]) -> int:
         error.show()
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
-        click.echo("interrupted; what was written so far is whole", err=True)
-        return EXIT_INTERRUPTED
+        return _interrupted()
     except BrokenPipeError:
         # The reader of our output went away (`lce-rig check | head`): nobody is left to report to.
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
@@ -128,7 +141,9 @@ def run(arguments: list[str]) -> int:
             traceback.print_exc()
         click.secho(f"error: {error}", fg="red", err=True)
         return LceRigError.exit_code
-    except Exception:
+    except Exception as error:
+        if _comes_of_interrupt(error):
+            return _interrupted()
         traceback.print_exc()
         click.secho("this is a bug in lce-rig: please report it with these lines", fg="red", err=True)
         return EXIT_BUG

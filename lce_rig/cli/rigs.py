@@ -219,8 +219,14 @@ def _write_new(path: Path, text: str) -> None:
     from lce_rig.core.errors import ProfileError
 
     try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
+        file = path.open("x", encoding="utf-8")
+        try:
+            with file:
+                file.write(text)
+        except BaseException:
+            # A part of a profile on a full disk would be in the way of the next try.
+            path.unlink(missing_ok=True)
+            raise
     except FileExistsError as error:
         raise ProfileError(
             f"{path}: exists already", "choose another file with -o, or remove it first"

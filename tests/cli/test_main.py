@@ -71,6 +71,26 @@ def test_the_module_runs_like_the_command():
     assert done.stdout == f"lce-rig {__version__}\n"
 
 
+def test_ctrl_c_while_a_compiled_module_is_imported_is_an_interrupt_and_no_bug(tmp_path):
+    # A signal that comes while open3d's library is loaded is dealt with in its initialisation.
+    script = """
+import signal, sys
+from lce_rig.cli.main import run
+
+def press_ctrl_c_soon(event, arguments):
+    if event == "import" and arguments[0] == "open3d.pybind":
+        signal.setitimer(signal.ITIMER_REAL, 1e-3)
+
+signal.signal(signal.SIGALRM, signal.default_int_handler)
+sys.addaudithook(press_ctrl_c_soon)
+sys.exit(run(["simulate", "--rig", "rles", sys.argv[1], "--captures", "1"]))
+"""
+    words = [sys.executable, "-c", script, tmp_path / "session"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 130
+    assert done.stderr.strip() == "interrupted; what was written so far is whole"
+
+
 def test_every_method_of_calibration_can_be_chosen():
     from lce_rig.calibrate.calibrate import METHODS
     from lce_rig.cli.calibrate import calibrate

@@ -1,6 +1,7 @@
 """`lce-rig rigs` as a user runs it."""
 
 import json
+import resource
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,19 @@ def test_new_writes_a_profile_and_never_over_another(
     assert run(["rigs", "new", "mine"]) == 3
     assert "exists already" in capsys.readouterr().err
     assert Path("mine.yaml").read_bytes() == before
+
+
+def test_a_full_disk_leaves_no_part_of_a_profile(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+    try:
+        assert run(["rigs", "new", "mine", "-o", str(path)]) == 3
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "cannot be written" in capsys.readouterr().err
+    assert not path.exists()
+    assert run(["rigs", "new", "mine", "-o", str(path)]) == 0
 
 
 @pytest.mark.parametrize(
