@@ -1,6 +1,9 @@
 """The scene a ray meets: meshes that stand still, meshes that move with the board, and the board itself."""
 
-from collections.abc import Sequence
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -57,7 +60,8 @@ class Raycaster:
 
     @cached_property
     def _engine(self) -> Any:
-        import open3d as o3d
+        with _without_interrupt():
+            import open3d as o3d
 
         engine = o3d.t.geometry.RaycastingScene(nthreads=1)
         for surface in self.surfaces:
@@ -103,6 +107,23 @@ class Raycaster:
         rays = self._rays(origins, targets - origins)
         blocked = self._engine.test_occlusions(rays, tnear=1e-3, tfar=0.999, nthreads=1)
         return np.asarray(blocked.numpy(), dtype=np.bool_)
+
+
+@contextmanager
+def _without_interrupt() -> Iterator[None]:
+    """Let Ctrl-C wait: Open3D, stopped in its initialisation, ends the process by an exit code of its own."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield
+        return
+    pressed = []
+    signal.signal(signal.SIGINT, lambda *arguments: pressed.append(arguments))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        before(*pressed[0])
 
 
 def _nothing(n: int) -> Hits:

@@ -2,11 +2,12 @@
 
 import subprocess
 import sys
+from importlib import resources
 
 import pytest
 
 from lce_rig import __version__
-from lce_rig.cli.main import COMMANDS
+from lce_rig.cli.main import COMMANDS, run
 
 
 def test_help_lists_every_verb_and_every_exit_code(lce_rig):
@@ -71,22 +72,38 @@ def test_the_module_runs_like_the_command():
     assert done.stdout == f"lce-rig {__version__}\n"
 
 
-def test_ctrl_c_while_a_compiled_module_is_imported_is_an_interrupt_and_no_bug(tmp_path):
-    # A signal that comes while open3d's library is loaded is dealt with in its initialisation.
-    script = """
+# Press Ctrl-C so long after the library of a module began to load, then run a command line.
+INTERRUPTED = """
 import signal, sys
 from lce_rig.cli.main import run
 
-def press_ctrl_c_soon(event, arguments):
-    if event == "import" and arguments[0] == "open3d.pybind":
-        signal.setitimer(signal.ITIMER_REAL, 1e-3)
+module, after_s, *words = sys.argv[1:]
 
-signal.signal(signal.SIGALRM, signal.default_int_handler)
-sys.addaudithook(press_ctrl_c_soon)
-sys.exit(run(["simulate", "--rig", "rles", sys.argv[1], "--captures", "1"]))
+def press_ctrl_c(event, arguments):
+    if event == "import" and arguments[0] == module and arguments[1]:
+        signal.setitimer(signal.ITIMER_REAL, float(after_s))
+
+signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+sys.addaudithook(press_ctrl_c)
+sys.exit(run(words))
 """
-    words = [sys.executable, "-c", script, tmp_path / "session"]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+
+
+def test_ctrl_c_while_open3d_is_imported_is_an_interrupt_and_no_bug(tmp_path):
+    # Stopped in its initialisation, it would complain of lost memory and end the process with 1.
+    words = ["open3d.pybind", "0.2", "simulate", "--rig", "rles", tmp_path / "session", "--captures", "1"]
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED, *words], capture_output=True, text=True)
+    assert done.returncode == 130
+    assert done.stderr.strip() == "interrupted; what was written so far is whole"
+
+
+def test_ctrl_c_while_onnxruntime_is_imported_is_not_taken_for_a_missing_package(tmp_path):
+    network = resources.files("lce_rig") / "models" / "reconstruction.onnx"
+    setting = f"cameras.davis.channels.events.reconstruction.model={network}"
+    profile = tmp_path / "mine.yaml"
+    assert run(["rigs", "new", "mine", "--from", "rles", "--set", setting, "-o", str(profile)]) == 0
+    words = ["onnxruntime.capi.onnxruntime_pybind11_state", "0.01", "rigs", "check", profile]
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED, *words], capture_output=True, text=True)
     assert done.returncode == 130
     assert done.stderr.strip() == "interrupted; what was written so far is whole"
 
