@@ -29,8 +29,8 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     type=click.Path(path_type=Path),
     metavar="PATH",
     help="Read a recording: a folder with img/ and pcd/, what --record kept, a ROS 1 or ROS 2 bag, an mcap "
-    "or pcap file, or an event camera's file (AEDAT4, Prophesee RAW, HDF5); may be repeated, also for several "
-    "recorders of one moment.",
+    "or pcap file, or an event camera's file (AEDAT4, Prophesee RAW, HDF5); may be repeated, also for "
+    "several recorders of one moment.",
 )
 @click.option(
     "--pair",

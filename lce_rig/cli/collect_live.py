@@ -16,6 +16,7 @@ from lce_rig.cli.simulate import TRUTH, require_kind, write_truth
 if TYPE_CHECKING:
     from lce_rig.collect.live.collection import LiveReport
     from lce_rig.collect.live.recorder import SampleRecorder
+    from lce_rig.collect.live.simulated import SimulatedRig
     from lce_rig.collect.live.state import LiveState
     from lce_rig.rig import Rig
     from lce_rig.sources.live.base import LiveSource
@@ -68,8 +69,8 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
         session = stack.enter_context(Session.resume(path, rig))
         n_before = len(session.captures)
         recorder = stack.enter_context(_recorder(given, rig))
-        sources, watchers = _open_rig(stack, rig, path, given)
-        listeners += watchers
+        sources, simulated = _open_rig(stack, rig, path, given)
+        listeners += [simulated.watch] if simulated else []
         asked = stack.enter_context(controls())
         with open_view(is_plain=given.plain, has_keys=asked.is_interactive, links=links) as view:
             listeners.append(view.show)
@@ -84,17 +85,17 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
                 n_captures = len(session.captures)
                 saved = f"{path}: {n_captures} captures ({n_captures - n_before} new)"
                 stack.callback(show.note, saved)
-    _tell(report, n_captures, asked)
+    _tell(report, n_captures, asked, simulated)
 
 
 def _open_rig(
     stack: ExitStack, rig: "Rig", path: Path, given: LiveArguments
-) -> "tuple[list[LiveSource], list[Callable[[LiveState], None]]]":
+) -> "tuple[list[LiveSource], SimulatedRig | None]":
     """Build the sources: attached ones, or simulated ones, whose truth goes into the session's folder."""
     if not given.simulated:
         from lce_rig.sources.live.opening import open_live
 
-        return open_live(rig, given.record), []
+        return open_live(rig, given.record), None
     from lce_rig.collect.live.simulated import SimulatedRig
     from lce_rig.simulate import SimulationOptions, rig_truth
 
@@ -102,7 +103,7 @@ def _open_rig(
     show.note("starting the simulated rig ...")
     simulated = stack.enter_context(SimulatedRig(rig, seed))
     write_truth(path / TRUTH, rig_truth(rig, seed, SimulationOptions.for_rig(rig.name)))
-    return simulated.sources, [simulated.watch]
+    return simulated.sources, simulated
 
 
 def _open_preview(
@@ -136,7 +137,7 @@ def _recorder(given: LiveArguments, rig: "Rig") -> "Iterator[SampleRecorder | No
     show.note(f"{given.record}: {recorder.n_written} samples recorded")
 
 
-def _tell(report: "LiveReport", n_captures: int, asked: Controls) -> None:
+def _tell(report: "LiveReport", n_captures: int, asked: Controls, simulated: "SimulatedRig | None") -> None:
     """Say how it went.
 
     Raises:
@@ -150,13 +151,21 @@ def _tell(report: "LiveReport", n_captures: int, asked: Controls) -> None:
     lost = {name: n for name, n in report.n_lost.items() if n}
     if lost:
         show.note("lost on the way: " + ", ".join(f"{name} {n}" for name, n in sorted(lost.items())))
+    if simulated is not None and simulated.pace.problem():
+        show.warn(f"the rig was {simulated.pace.problem()}")
     show.note(f"ended: {_ENDINGS[report.ending]}")
     if report.error is not None:
         raise report.error
     if asked.signal == signal.SIGINT:
         raise click.exceptions.Exit(130)
     if n_captures == 0:
-        raise NotEnoughDataError(
-            "nothing was captured",
-            "The board must be seen by every sensor at once; `lce-rig doctor` says what is in the way.",
-        )
+        raise NotEnoughDataError("nothing was captured", _remedy(simulated))
+
+
+def _remedy(simulated: "SimulatedRig | None") -> str:
+    """Say what to do where nothing was captured."""
+    if simulated is None:
+        return "The board must be seen by every sensor at once; `lce-rig doctor` says what is in the way."
+    if simulated.pace.problem():
+        return "This computer is too busy, or too slow: end other programs, or take `lce-rig simulate`."
+    return "The simulated person needs longer: a longer --timeout."

@@ -20,6 +20,9 @@ _EVERY_S = 0.5
 _N_CUES, _N_LOG = 8, 40
 _TICK_S = 0.5
 _ENOUGH = "enough: you may stop"
+_WAIT = "waiting for the sensors"
+# Without a frame for so long, what was seen before says nothing about the board any more.
+_STALE_S = 2.0
 
 
 class Monitor:
@@ -42,17 +45,18 @@ class Monitor:
         self._n_cues = 0
         self._log: deque[str] = deque(maxlen=_N_LOG)
         self._n_logged = 0
-        self._narration = Narration("starting", "waiting for the sensors")
+        self._narration = Narration("starting", _WAIT)
         self._guide: Guide | None = None
         self._drawing: Drawing | None = None
         self._sighting: Sighting | None = None
+        self._seen_s = 0.0
         self._ticks_left: int | None = None
         self._lost: frozenset[str] = frozenset()
         self._was_enough = False
 
     def see(self, sighting: Sighting) -> None:
         """Take a sighting, and remember why streams do not show the board."""
-        self._sighting = sighting
+        self._sighting, self._seen_s = sighting, time.monotonic()
         for key, why in sighting.unseen.items():
             self.reasons[stream_name(key)] = why
         self.reasons.update(sighting.unscanned)
@@ -141,6 +145,9 @@ class Monitor:
             return "lost", f"{name} is lost", "" if error is None else f"{error[0].what} {error[0].hint}"
         if is_enough:
             return "enough", _ENOUGH, said.headline
+        if self._is_stale():
+            waited_s = time.monotonic() - self._seen_s
+            return "searching", _WAIT, f"no picture with a scan of its time for {waited_s:.0f} s"
         return said.phase, said.headline, said.detail
 
     def _tick(self, narration: Narration) -> None:
@@ -165,6 +172,10 @@ class Monitor:
             self.log(f"{name} is back")
         self._lost = frozenset(lost)
 
+    def _is_stale(self) -> bool:
+        """Tell whether what was seen last is no longer what is there."""
+        return self._sighting is not None and time.monotonic() - self._seen_s > _STALE_S
+
     def _streams(self) -> tuple[StreamState, ...]:
         """List every stream: channels of cameras, LiDARs, then what else there is."""
         rig, streams = self._session.rig, []
@@ -184,7 +195,7 @@ class Monitor:
     def _camera_stream(
         self, camera: str, channel: str, is_framed: bool, rate_hz: float, status: SourceStatus
     ) -> StreamState:
-        name, sighting = f"{camera}.{channel}", self._sighting
+        name, sighting = f"{camera}.{channel}", None if self._is_stale() else self._sighting
         n_lost = status.n_lost + status.n_dropped
         pictures = {(i.sensor, i.channel) for i in sighting.frame.images} if sighting else set()
         if sighting is None or (camera, channel) not in pictures:
@@ -197,7 +208,7 @@ class Monitor:
         return StreamState(name, rate_hz, n_lost, True, self._trouble(camera), image_figures(board))
 
     def _lidar_stream(self, lidar: str, status: SourceStatus) -> StreamState:
-        sighting, n_lost = self._sighting, status.n_lost + status.n_dropped
+        sighting, n_lost = None if self._is_stale() else self._sighting, status.n_lost + status.n_dropped
         if sighting is None or not sighting.images:
             return StreamState(lidar, status.rate_hz, n_lost, None, self._trouble(lidar))
         boards = sighting.lidars.get(lidar)
@@ -216,8 +227,11 @@ class Monitor:
         verdict = self._clock.verdict()
         notes = [str(verdict)] if verdict.requires_still_boards else []
         notes += self._clock.problems()
+        named: dict[str, list[str]] = {}
         for name, status in self._statuses.items():
-            notes += [f"{name}: {problem}" for problem in status.problems]
+            for problem in status.problems:
+                named.setdefault(problem, []).append(name)
+        notes += [f"{', '.join(names)}: {problem}" for problem, names in named.items()]
         if self._guide is not None and self._guide.problem:
             notes.append(self._guide.problem)
         return tuple(notes)

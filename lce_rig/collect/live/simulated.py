@@ -17,6 +17,7 @@ from types import TracebackType
 import numpy as np
 
 from lce_rig.collect.guidance import HeldPose, Person, View, build_pose, model_sensors
+from lce_rig.collect.live.simulated_pace import SimulatedPace
 from lce_rig.collect.live.state import LiveState
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError, ProfileError, SourceError
@@ -41,8 +42,9 @@ _WAIT_S, _N_SLOTS = 0.2, 32
 class SimulatedSource:
     """One simulated sensor; see `LiveSource`."""
 
-    def __init__(self, sensor: str) -> None:
+    def __init__(self, sensor: str, pace: SimulatedPace | None = None) -> None:
         self.sensor = sensor
+        self._pace = pace
         self._mailbox: Mailbox[Image | Scan] = Mailbox(_N_SLOTS)
         self._failure: SourceError | None = None
         self._rate = RateMeter()
@@ -69,9 +71,15 @@ class SimulatedSource:
 
     def status(self) -> SourceStatus:
         """Say how the sensor does."""
-        box = self._mailbox
+        box, problem = self._mailbox, self._pace.problem() if self._pace else ""
         return SourceStatus(
-            self.sensor, box.n_put, box.n_dropped, 0, self._rate.rate_hz, "simulated", device="simulated"
+            self.sensor,
+            box.n_put,
+            box.n_dropped,
+            rate_hz=self._rate.rate_hz,
+            clock="simulated",
+            problems=(problem,) if problem else (),
+            device="simulated",
         )
 
     def put(self, sample: Image | Scan) -> None:
@@ -90,6 +98,7 @@ class SimulatedRig:
 
     Attributes:
         sources: of its sensors: frames and scans. Events cannot be simulated in real time.
+        pace: how much slower than real time it runs.
     """
 
     def __init__(self, rig: Rig, seed: int, person: Person | None = None) -> None:
@@ -112,7 +121,9 @@ class SimulatedRig:
                 f"rig {rig.name!r} has no camera with frames; events are not simulated in real time",
                 "Simulate a recording instead: lce-rig simulate --recording FOLDER.",
             )
-        self._by_sensor = {name: SimulatedSource(name) for name in [*framed, *rig.lidars]}
+        self.pace = SimulatedPace(1 / min(lidar.rate_hz for lidar in rig.lidars.values()))
+        self._by_sensor = {name: SimulatedSource(name, self.pace) for name in [*framed, *rig.lidars]}
+        self._counted = next(iter(rig.lidars))
         self._views = {name: _view(rig, name) for name in framed}
         self._sent_s = -1e9
         self._last: tuple[int, bytes] | None = None
@@ -145,6 +156,7 @@ class SimulatedRig:
         if isinstance(answer, LceRigError):
             self._process.join()
             raise answer
+        self.pace.begin()
         self._reader = threading.Thread(target=self._read, name="read simulated rig", daemon=True)
         self._reader.start()
         return self
@@ -184,6 +196,8 @@ class SimulatedRig:
                     source.fail(SourceError("the simulated rig has ended", "Start again."))
                 return
             self._by_sensor[sample.sensor].put(sample)
+            if sample.sensor == self._counted:
+                self.pace.turn()
 
 
 def _start_without_interrupts(process: multiprocessing.process.BaseProcess) -> None:

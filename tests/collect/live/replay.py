@@ -59,6 +59,10 @@ class Show:
             due_s += 0.1
             self._stop.wait(max(0.0, due_s - time.monotonic()))
 
+    def pause(self) -> None:
+        """Send nothing more."""
+        self._stop.set()
+
     def send(self, k: int, stamp_ns: int) -> None:
         """Send a placement's picture and scan."""
         capture = self._captures[k]

@@ -84,6 +84,25 @@ def test_keys_capture_at_once_ask_for_another_place_and_stop(tmp_path: Path) -> 
     assert len({each.tobytes() for each in wanted}) >= 2
 
 
+def test_what_was_seen_before_the_sensors_fell_silent_is_not_shown_as_seen_now(tmp_path: Path) -> None:
+    show, states = Show(placements()[:1], each_s=100.0), list[LiveState]()
+
+    def watch(state: LiveState) -> None:
+        states.append(state)
+        if all(stream.sees_board for stream in state.streams[:1]):
+            show.pause()
+
+    def key() -> Key | None:
+        return "stop" if states and "no picture" in states[-1].detail else None
+
+    with show.running(), Session.create(tmp_path / "session", rig()) as session:
+        collect_live(session, show.sources, replace(QUICK, hold_s=20.0), watch, key)
+    told = next(state for state in states if "no picture" in state.detail)
+    assert told.phase == "searching" and "waiting" in told.headline
+    assert any(stream.sees_board for state in states for stream in state.streams)
+    assert [stream.sees_board for stream in told.streams] == [None] * len(told.streams)
+
+
 def test_a_sensor_that_is_gone_for_good_ends_the_collection_with_what_was_saved(tmp_path: Path) -> None:
     states: list[LiveState] = []
     show = Show(placements(), each_s=2.0)
