@@ -1,5 +1,6 @@
 """The board in a picture: corners, both poses and figures, or why there is none."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -101,8 +102,21 @@ def find_image_board(
     if solved is None or solved.reprojection_px > max_reprojection_px:
         return _misfit(solved, quality, intrinsics, max_reprojection_px)
     quality |= {"n_corners": float(crossings.is_fitted.sum()), "corner_rms_px": solved.reprojection_px}
+    return board_from_pose(crossings.grid_px.reshape(-1, 2), solved, quality)
+
+
+def board_from_pose(
+    corners_px: Array, solved: PlanarPose, quality: Mapping[str, float] | None = None
+) -> ImageBoard:
+    """Put together what a picture shows of the board, once its pose is solved for.
+
+    Args:
+        corners_px: (rows * cols, 2) in the order of `Board.corners()`.
+        solved: both poses that they admit.
+        quality: figures of the picture; those of the pose are added.
+    """
     return ImageBoard(
-        corners_px=crossings.grid_px.reshape(-1, 2),
+        corners_px=corners_px,
         T_cam_board=solved.T_cam_board,
         cov=solved.cov,
         T_cam_board_alternative=solved.T_cam_board_alternative,
@@ -110,7 +124,7 @@ def find_image_board(
         is_ambiguous=solved.chi2_gap < _AMBIGUOUS_CHI2,
         reprojection_px=solved.reprojection_px,
         sigma_px=solved.sigma_px,
-        quality=quality | _pose_quality(solved.T_cam_board),
+        quality={**(quality or {}), **_pose_quality(solved.T_cam_board)},
     )
 
 

@@ -10,8 +10,9 @@ from benchmarks.intrinsics import imperfect_corners
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, exp_so3, fit_plane, invert, perturb, pose, transform
-from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.core.results import LidarBoard, Refusal
 from lce_rig.detect.detection import ImageDetection, LidarDetection
+from lce_rig.detect.image_board import board_from_pose
 from lce_rig.rig import Rig
 from lce_rig.solvers.pnp import solve_planar_pose
 
@@ -63,18 +64,7 @@ class _Photographer:
         solved = solve_planar_pose(pixels, self.rig.board.to_board().corners(), _lens(self.rig))
         if solved is None or solved.reprojection_px > self.rig.quality.max_reprojection_px:
             return Refusal("image", "corners fit no board", "check the intrinsics")
-        distance_m = float(np.linalg.norm(solved.T_cam_board[:3, 3]))
-        return ImageBoard(
-            pixels,
-            solved.T_cam_board,
-            solved.cov,
-            solved.T_cam_board_alternative,
-            solved.chi2_gap,
-            solved.chi2_gap < 9,
-            solved.reprojection_px,
-            solved.sigma_px,
-            {"distance_m": distance_m},
-        )
+        return board_from_pose(pixels, solved)
 
 
 def _lens(rig: Rig) -> Intrinsics:

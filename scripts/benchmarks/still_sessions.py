@@ -16,6 +16,7 @@ from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import from_arrays, to_arrays
+from lce_rig.detect.image_board import board_from_pose
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.carriers import build_carrier
@@ -89,18 +90,7 @@ def draw_corners(
     pixels, _ = lens.project(transform(T_cam_board, corners))
     pixels = pixels + sigma_px * rng.standard_normal(pixels.shape)
     solved = solve_planar_pose(pixels, corners, lens)
-    if solved is None:
-        return None
-    return ImageBoard(
-        corners_px=pixels,
-        T_cam_board=solved.T_cam_board,
-        cov=solved.cov,
-        T_cam_board_alternative=solved.T_cam_board_alternative,
-        chi2_gap=solved.chi2_gap,
-        is_ambiguous=solved.chi2_gap < 9,
-        reprojection_px=solved.reprojection_px,
-        sigma_px=solved.sigma_px,
-    )
+    return None if solved is None else board_from_pose(pixels, solved)
 
 
 def _simulate(rig: Rig, seed: int, options: SimulationOptions, n_captures: int) -> dict[str, Any]:

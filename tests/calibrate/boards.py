@@ -9,6 +9,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import exp_so3, fit_plane, invert, pose, project_to_so3, transform
 from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.detect.image_board import board_from_pose
 from lce_rig.solvers.pnp import solve_planar_pose
 
 BOARD = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)
@@ -85,18 +86,7 @@ def photograph(
         return None
     pixels = pixels + scenario.corner_sigma_px * rng.standard_normal(pixels.shape)
     solved = solve_planar_pose(pixels, board.corners(), CAMERA)
-    if solved is None:
-        return None
-    return ImageBoard(
-        corners_px=pixels,
-        T_cam_board=solved.T_cam_board,
-        cov=solved.cov,
-        T_cam_board_alternative=solved.T_cam_board_alternative,
-        chi2_gap=solved.chi2_gap,
-        is_ambiguous=solved.chi2_gap < 9,
-        reprojection_px=solved.reprojection_px,
-        sigma_px=solved.sigma_px,
-    )
+    return None if solved is None else board_from_pose(pixels, solved)
 
 
 def scan_board(
