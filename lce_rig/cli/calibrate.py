@@ -133,7 +133,8 @@ def calibrate(
     if as_json:
         from lce_rig.export.result import to_json_dict
 
-        show.print_json(to_json_dict(opened.rig.name, calibrations))
+        inputs = pipeline.inputs_sha256(opened, calibrations)
+        show.print_json(to_json_dict(opened.rig.name, calibrations, inputs))
     else:
         for calibration, estimate in results:
             show.print_lines(_lines(calibration, estimate.held_out_m, estimate.weak_direction))

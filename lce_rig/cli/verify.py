@@ -34,7 +34,7 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
     from lce_rig.cli.calibrate import exit_by_verdict
     from lce_rig.core.errors import ResultRefusedError, SessionError
     from lce_rig.export.result import read_result
-    from lce_rig.pipeline.calibration import CALIBRATION
+    from lce_rig.pipeline.result_files import CALIBRATION
     from lce_rig.session import Session
 
     opened = Session.open(session)

@@ -1,7 +1,7 @@
 """result.json: the result of a calibration for machines; the same result gives the same bytes."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,23 +20,44 @@ FORMAT_VERSION = 1
 
 @dataclass(frozen=True)
 class SavedResult:
-    """A result file's content."""
+    """A result file's content.
+
+    Attributes:
+        rig: its name.
+        made_by: the program and its version.
+        calibrations: one for each camera and LiDAR.
+        inputs_sha256: SHA-256 of the session's files that the result was made from, by their path in it.
+    """
 
     rig: str
     made_by: str
     calibrations: tuple[Calibration, ...]
+    inputs_sha256: Mapping[str, str]
 
 
-def to_json_dict(rig_name: str, calibrations: Sequence[Calibration]) -> dict[str, Any]:
+def to_json_dict(
+    rig_name: str, calibrations: Sequence[Calibration], inputs_sha256: Mapping[str, str] | None = None
+) -> dict[str, Any]:
     """Build the content of result.json from plain types, keys in a fixed order.
 
     Figures that could not be computed are null.
+
+    Args:
+        rig_name: of the profile.
+        calibrations: one for each camera and LiDAR.
+        inputs_sha256: SHA-256 of the session's files behind the result, by their path in it.
 
     Raises:
         ResultRefusedError: a pose or covariance is not finite.
     """
     pairs = [_pair(calibration) for calibration in calibrations]
-    return {"format_version": FORMAT_VERSION, "rig": rig_name, "made_by": MADE_BY, "pairs": pairs}
+    return {
+        "format_version": FORMAT_VERSION,
+        "rig": rig_name,
+        "made_by": MADE_BY,
+        "inputs_sha256": dict(sorted((inputs_sha256 or {}).items())),
+        "pairs": pairs,
+    }
 
 
 def _pair(calibration: Calibration) -> dict[str, Any]:
@@ -100,9 +121,11 @@ def _figure(value: float | None) -> float | None:
     return None if value is None or not np.isfinite(value) else float(value)
 
 
-def result_text(rig_name: str, calibrations: Sequence[Calibration]) -> str:
+def result_text(
+    rig_name: str, calibrations: Sequence[Calibration], inputs_sha256: Mapping[str, str] | None = None
+) -> str:
     """Write the content of result.json: deterministic, floats to the last digit, a matrix row a line."""
-    return _layout(to_json_dict(rig_name, calibrations), "") + "\n"
+    return _layout(to_json_dict(rig_name, calibrations, inputs_sha256), "") + "\n"
 
 
 def _layout(value: Any, indent: str) -> str:
@@ -119,14 +142,19 @@ def _layout(value: Any, indent: str) -> str:
     return json.dumps(value, ensure_ascii=False, allow_nan=False)
 
 
-def write_result(path: Path, rig_name: str, calibrations: Sequence[Calibration]) -> None:
+def write_result(
+    path: Path,
+    rig_name: str,
+    calibrations: Sequence[Calibration],
+    inputs_sha256: Mapping[str, str] | None = None,
+) -> None:
     """Write result.json, whole or not at all.
 
     Raises:
         ResultRefusedError: a pose or covariance is not finite.
         SessionError: the file cannot be written.
     """
-    write_atomically(path, result_text(rig_name, calibrations))
+    write_atomically(path, result_text(rig_name, calibrations, inputs_sha256))
 
 
 def read_result(path: Path) -> SavedResult:
@@ -158,7 +186,8 @@ def read_result(path: Path) -> SavedResult:
         key = ".".join(str(part) for part in first["loc"])
         what = f"{path}: {key + ': ' if key else ''}{first['msg'].removeprefix('Value error, ')}"
         raise SessionError(what, "run `lce-rig calibrate SESSION` again") from error
-    return SavedResult(record.rig, record.made_by, tuple(_calibration(pair) for pair in record.pairs))
+    calibrations = tuple(_calibration(pair) for pair in record.pairs)
+    return SavedResult(record.rig, record.made_by, calibrations, record.inputs_sha256)
 
 
 def _refuse_constant(name: str) -> float:

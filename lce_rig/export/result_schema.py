@@ -113,6 +113,7 @@ class ResultRecord(_Record):
     format_version: Literal[1]
     rig: str
     made_by: str
+    inputs_sha256: dict[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = Field(default_factory=dict)
     pairs: list[PairRecord]
 
     @model_validator(mode="after")

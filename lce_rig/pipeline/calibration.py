@@ -1,10 +1,8 @@
-"""Estimate, judge and write the extrinsic of every camera with every LiDAR of a session."""
+"""Estimate and judge the extrinsic of every camera with every LiDAR of a session."""
 
-import shutil
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -29,9 +27,6 @@ from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.pipeline.progress import Progress, silent
 from lce_rig.rig import Rig
-from lce_rig.session import Session
-
-CALIBRATION, OVERLAYS = "calibration", "overlays"
 
 
 def calibrate(
@@ -260,34 +255,3 @@ def _still_refused(estimate: CalibrationEstimate, refused: dict[str, Refusal]) -
     for name, why in estimate.refused.items():
         every |= dict.fromkeys(_single([name]), why)
     return {name: every[name] for name in sorted(every) if name not in used}
-
-
-def write_results(session: Session, calibrations: list[Calibration], *, force: bool) -> list[Path]:
-    """Write result.json and, unless a verdict forbids it, every export beside it.
-
-    Returns:
-        The files written, result.json first.
-    """
-    from lce_rig.export import remove_exports, write_exports
-    from lce_rig.export.result import write_result
-
-    folder = session.path / CALIBRATION
-    folder.mkdir(exist_ok=True)
-    result = folder / "result.json"
-    write_result(result, session.rig.name, calibrations)
-    usable = [c for c in calibrations if force or c.verdict != "fail"]
-    if not usable:
-        remove_exports(folder)
-        return [result]
-    return [result, *write_exports(usable, session.rig, folder, is_forced=force)]
-
-
-def remove_results(session: Session) -> None:
-    """Remove the result, exports and pictures of an earlier run: they must not pass for this one's."""
-    from lce_rig.export import remove_exports
-
-    folder = session.path / CALIBRATION
-    if folder.is_dir():
-        remove_exports(folder)
-        (folder / "result.json").unlink(missing_ok=True)
-        shutil.rmtree(folder / OVERLAYS, ignore_errors=True)

@@ -13,9 +13,10 @@ from lce_rig.calibrate.repeatability import Repeatability, compare_calibrations
 from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.results import Calibration
 from lce_rig.export.result import read_result
-from lce_rig.pipeline.calibration import CALIBRATION, calibrate
+from lce_rig.pipeline.calibration import calibrate
 from lce_rig.pipeline.detection import detect
 from lce_rig.pipeline.progress import Progress, silent
+from lce_rig.pipeline.result_files import CALIBRATION
 from lce_rig.session import Session
 from lce_rig.session.identity import differing_keys
 

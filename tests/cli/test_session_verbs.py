@@ -1,6 +1,7 @@
 """check, calibrate and verify on a simulated session, as a user types them."""
 
 import json
+import subprocess
 
 import numpy as np
 
@@ -41,6 +42,20 @@ def test_the_same_session_gives_the_same_bytes(lce_rig, session):
     first = (session / "calibration" / "result.json").read_bytes()
     lce_rig("calibrate", session)
     assert (session / "calibration" / "result.json").read_bytes() == first
+
+
+def test_the_result_names_its_inputs_by_hashes_that_other_tools_check(lce_rig, session):
+    printed = json.loads(lce_rig("calibrate", session, "--json").out)
+    document = read(session / "calibration" / "result.json")
+    assert printed["inputs_sha256"] == document["inputs_sha256"]
+    used = {f"captures/{name}/meta.json" for name in document["pairs"][0]["captures_used"]}
+    assert set(document["inputs_sha256"]) == {"rig.yaml", *used}
+    lines = "".join(f"{digest}  {path}\n" for path, digest in document["inputs_sha256"].items())
+    check = ["sha256sum", "--check", "--quiet"]
+    assert subprocess.run(check, input=lines, text=True, cwd=session, check=False).returncode == 0
+    (session / sorted(used)[0]).write_text("{}")
+    done = subprocess.run(check, input=lines, text=True, cwd=session, check=False, capture_output=True)
+    assert done.returncode == 1
 
 
 def test_the_reference_never_enters_the_estimate(lce_rig, session):

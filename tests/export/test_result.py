@@ -37,7 +37,7 @@ def same(a: Calibration, b: Calibration) -> bool:
 
 def test_the_published_fields_are_there_in_order(make: Make) -> None:
     document = to_json_dict("rles", [make()])
-    assert list(document) == ["format_version", "rig", "made_by", "pairs"]
+    assert list(document) == ["format_version", "rig", "made_by", "inputs_sha256", "pairs"]
     assert (document["format_version"], document["rig"]) == (1, "rles")
     assert document["made_by"].startswith("lce-rig ")
     assert list(document["pairs"][0])[: len(FIELDS)] == FIELDS
@@ -52,6 +52,24 @@ def test_the_method_is_told_and_read_back(make: Make, tmp_path: Path) -> None:
     write_result(path, "rles", [make(method="other")])
     assert json.loads(path.read_text())["pairs"][0]["method"] == "other"
     assert read_result(path).calibrations[0].method == "other"
+
+
+def test_hashes_of_inputs_are_read_back_and_what_is_no_hash_is_refused(make: Make, tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    inputs = {"rig.yaml": "0f" * 32, "captures/000000/meta.json": "a1" * 32}
+    write_result(path, "rles", [make()], inputs)
+    assert read_result(path).inputs_sha256 == inputs
+    path.write_text(path.read_text().replace("0f" * 32, "0f"))
+    with pytest.raises(SessionError, match=r"inputs_sha256\.rig\.yaml"):
+        read_result(path)
+
+
+def test_a_result_of_an_earlier_version_holds_no_hashes(make: Make, tmp_path: Path) -> None:
+    document = to_json_dict("rles", [make()])
+    del document["inputs_sha256"]
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(document))
+    assert read_result(path).inputs_sha256 == {}
 
 
 def test_figures_that_do_not_exist_are_null(make: Make) -> None:
