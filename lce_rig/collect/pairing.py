@@ -71,7 +71,7 @@ class _Pairing:
     def __init__(self, rig: Rig, counts: PairingCounts) -> None:
         self._rig = rig
         self._counts = counts
-        self._waiting: deque[tuple[int, Scan]] = deque()
+        self._waiting: deque[tuple[int, int, Scan]] = deque()
         self._buffers: _Buffers = {}
         self._events = EventBuffer(rig)
         self._anchor: str | None = None
@@ -86,14 +86,16 @@ class _Pairing:
         if isinstance(sample, Events):
             self._events.add(sample)
         else:
-            time_ns += _half_sweep_ns(sample, self._rig) if isinstance(sample, Scan) else 0
-            self._take_frame_part(sample, time_ns)
+            # Told once a scan: samples come hundreds of times as often.
+            half_ns = _half_sweep_ns(sample, self._rig) if isinstance(sample, Scan) else 0
+            time_ns += half_ns
+            self._take_frame_part(sample, time_ns, half_ns)
         self._position_ns = max(self._position_ns, time_ns)
         self._events.forget_before(self._position_ns - _KEPT_NS)
 
     def due_frames(self) -> Iterator[Frame]:
         """Yield the frames that nothing more can come for."""
-        while self._waiting and self._is_due(*self._waiting[0]):
+        while self._waiting and self._is_due(*self._waiting[0][:2]):
             yield from self._frame(*self._waiting.popleft())
 
     def remaining_frames(self) -> Iterator[Frame]:
@@ -101,7 +103,7 @@ class _Pairing:
         while self._waiting:
             yield from self._frame(*self._waiting.popleft())
 
-    def _take_frame_part(self, sample: Image | Scan, time_ns: int) -> None:
+    def _take_frame_part(self, sample: Image | Scan, time_ns: int, half_ns: int) -> None:
         if time_ns < self._newest_ns - 2 * PATIENCE_NS:
             self._waiting.clear()
             self._buffers.clear()
@@ -110,19 +112,18 @@ class _Pairing:
         self._newest_ns = max(self._newest_ns, time_ns)
         if isinstance(sample, Scan) and sample.sensor == (self._anchor or sample.sensor):
             self._anchor = sample.sensor
-            self._waiting.append((time_ns, sample))
+            self._waiting.append((time_ns, half_ns, sample))
         else:
             key = (sample.sensor, sample.channel if isinstance(sample, Image) else "")
             self._buffers.setdefault(key, deque()).append((time_ns, sample))
 
-    def _is_due(self, time_ns: int, scan: Scan) -> bool:
+    def _is_due(self, time_ns: int, half_ns: int) -> bool:
         if self._position_ns > time_ns + PATIENCE_NS:
             return True
         have_passed = all(buffer and buffer[-1][0] >= time_ns for buffer in self._buffers.values())
-        last_firing_ns = time_ns + _half_sweep_ns(scan, self._rig)
-        return bool(self._buffers) and have_passed and self._events.has_passed(last_firing_ns + AFTER_NS)
+        return bool(self._buffers) and have_passed and self._events.has_passed(time_ns + half_ns + AFTER_NS)
 
-    def _frame(self, time_ns: int, scan: Scan) -> Iterator[Frame]:
+    def _frame(self, time_ns: int, half_ns: int, scan: Scan) -> Iterator[Frame]:
         images: list[Image] = []
         scans = [scan]
         nearest_ns: int | None = None
@@ -143,7 +144,6 @@ class _Pairing:
             else:
                 scans.append(sample)
         if images:
-            half_ns = _half_sweep_ns(scan, self._rig)
             events = self._events.cut(time_ns - half_ns - BEFORE_NS, time_ns + half_ns + AFTER_NS)
             yield Frame(time_ns, tuple(images), tuple(scans), events)
         else:

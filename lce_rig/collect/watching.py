@@ -55,14 +55,18 @@ class BoardWatcher:
         search_interval_s: how often a whole picture is searched while no board is in sight.
         counts: frames in which it was not found, by sensor.
         thorough_interval_s: how often such a search is thorough, which takes most of a second; 0 for always.
+        rescan_interval_s: how often a whole scan is searched while all candidates are followed; 0 for as
+            often as while one is lost.
     """
 
     rig: Rig
     search_interval_s: float
     counts: Counter[str] = field(default_factory=Counter)
     thorough_interval_s: float = 0.0
+    rescan_interval_s: float = 0.0
     _seen: dict[ImageKey, ImageBoard] = field(default_factory=dict)
     _candidates: dict[str, list[LidarBoard]] = field(default_factory=dict)
+    _n_candidates: dict[str, int] = field(default_factory=dict)
     _searched_ns: dict[ImageKey | str, int] = field(default_factory=dict)
     _thorough_ns: dict[ImageKey | str, int] = field(default_factory=dict)
 
@@ -90,6 +94,7 @@ class BoardWatcher:
             else:
                 lidars[scan.sensor] = candidates
         if not images:
+            self._n_candidates.clear()  # A board that comes back is searched for at once.
             self.counts["no board in any picture"] += 1
         elif not lidars:
             self.counts["no board in the scan"] += 1
@@ -116,15 +121,19 @@ class BoardWatcher:
         return found
 
     def _find_in_scan(self, scan: Scan, time_ns: int) -> list[LidarBoard] | Refusal:
-        tracked = (track_lidar_board(scan, self._board, old) for old in self._candidates.get(scan.sensor, []))
+        known = self._candidates.get(scan.sensor, [])
+        tracked = (track_lidar_board(scan, self._board, old) for old in known)
         found = [board for board in tracked if isinstance(board, LidarBoard)]
-        if not self._is_search_due(scan.sensor, time_ns) and found:
+        are_all_there = len(found) == self._n_candidates.get(scan.sensor)
+        interval_s = max(self.search_interval_s, self.rescan_interval_s if are_all_there else 0.0)
+        if not _is_due(self._searched_ns, scan.sensor, time_ns, interval_s) and found:
             self._candidates[scan.sensor] = found
             return found
         settings = self.rig.lidars[scan.sensor]
         reach_m = min(settings.max_range_m, self.rig.quality.max_distance_m)
         search = find_lidar_boards(scan, self._board, min_range_m=settings.min_range_m, max_range_m=reach_m)
         self._candidates[scan.sensor] = [] if isinstance(search, Refusal) else search
+        self._n_candidates[scan.sensor] = len(self._candidates[scan.sensor])
         return search
 
     def _is_search_due(self, key: ImageKey | str, time_ns: int) -> bool:

@@ -82,7 +82,7 @@ def find_image_board(
     grey = crop_to_intrinsics(image, intrinsics)
     crossings = (
         _follow(grey, board, last)
-        or _find_in_region(grey, board, region, is_thorough=is_thorough)
+        or _find_in_region(grey, board, region, last, is_thorough=is_thorough)
         or find_grid(grey, board, is_thorough=is_thorough)
     )
     if crossings is None and not is_thorough:
@@ -200,16 +200,28 @@ def _follow(grey: NDArray[np.uint8], board: Board, last: ImageBoard | None) -> C
 
 
 def _find_in_region(
-    grey: NDArray[np.uint8], board: Board, region: Region | None, *, is_thorough: bool
+    grey: NDArray[np.uint8],
+    board: Board,
+    region: Region | None,
+    last: ImageBoard | None,
+    *,
+    is_thorough: bool,
 ) -> Crossings | None:
+    """Search about where the board was; a quick search looks for squares of the size they had there only."""
     if region is None:
         return None
     u0, v0, u1, v1 = region
     part = grey[max(v0, 0) : v1, max(u0, 0) : u1]
     if min(part.shape) < 16:
         return None
-    found = find_grid(np.ascontiguousarray(part), board, is_thorough=is_thorough)
+    square_px = None if is_thorough or last is None else _square_px(last, board)
+    found = find_grid(np.ascontiguousarray(part), board, is_thorough=is_thorough, square_px=square_px)
     return None if found is None else replace(found, grid_px=found.grid_px + [max(u0, 0), max(v0, 0)])
+
+
+def _square_px(found: ImageBoard, board: Board) -> float:
+    grid_px = found.corners_px.reshape(board.rows, board.cols, 2)
+    return float(np.median(np.linalg.norm(np.diff(grid_px, axis=1), axis=-1)))
 
 
 def _solve(

@@ -17,28 +17,36 @@ Grey = NDArray[np.uint8]
 # squares of 10 to 60 px.
 _WIDE_PX = 700
 _SEARCH_PX = 640
+# Of squares of a known size, pictures are searched in which they are so large: time goes with area.
+_SQUARE_PX = 12.0
+_MOST_SCALE = 1.5
 # A grid of another size with this share of the wanted corners is another board, not a part of the board.
 _OTHER_BOARD = 0.6
 _SB_THOROUGH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
 
-def find_grid(grey: Grey, board: Board, *, is_thorough: bool = True) -> Crossings | None:
+def find_grid(
+    grey: Grey, board: Board, *, is_thorough: bool = True, square_px: float | None = None
+) -> Crossings | None:
     """Find the inner corners, cheapest attempt first, and fit them to sub-pixel accuracy.
 
     Args:
         grey: (H, W).
         board: tells the number of inner corners.
         is_thorough: whether to go on after the quick attempts, which take a tenth of the time of all.
+        square_px: about how large its squares are, where that is known: only such are looked for.
 
     Returns:
         The crossings, `grid_px` in the order of `Board.corners()`; None where no attempt finds that many.
     """
-    seen = seen_grid(grey)
+    seen = seen_grid(grey, None if square_px is None else min(_SQUARE_PX / square_px, _MOST_SCALE))
     if seen is not None and seen.shape[:2] == (board.cols, board.rows):
         seen = seen.swapaxes(0, 1)
     if seen is not None and seen.shape[:2] == (board.rows, board.cols):
         attempts: Iterator[Array | None] = iter([seen.reshape(-1, 2)])
+    elif square_px is not None:
+        return None
     else:
         n_seen = 0 if seen is None else seen.shape[0] * seen.shape[1]
         is_other_seen = n_seen >= _OTHER_BOARD * board.rows * board.cols
@@ -49,14 +57,19 @@ def find_grid(grey: Grey, board: Board, *, is_thorough: bool = True) -> Crossing
     return None
 
 
-def seen_grid(grey: Grey) -> Array | None:
+def seen_grid(grey: Grey, scale: float | None = None) -> Array | None:
     """Find a checkerboard of any size of at least 5x4 inner corners, in about 30 ms.
+
+    Args:
+        grey: (H, W).
+        scale: of the picture that is searched; None for what suits pictures of this width.
 
     Returns:
         (rows, cols, 2) px; which of the two is called rows means nothing. None where nothing is found.
     """
     width = grey.shape[1]
-    scale = _SEARCH_PX / width if width > _WIDE_PX else 1.5
+    if scale is None:
+        scale = _SEARCH_PX / width if width > _WIDE_PX else _MOST_SCALE
     level = level_contrast(_resize(grey, scale))
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     is_found, corners, meta = cv2.findChessboardCornersSBWithMeta(level, (5, 4), flags)

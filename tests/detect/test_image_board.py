@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -55,11 +56,12 @@ def draw(
     # Rays change smoothly: every fourth is exact, those between are interpolated linearly.
     gu, gv = np.arange(u0 - 1, u1 + 5, 4.0), np.arange(v0 - 1, v1 + 5, 4.0)
     coarse = camera.unproject(np.stack(np.meshgrid(gu, gv), axis=-1))
-    maps = np.meshgrid(((u - gu[0]) / 4), (v - gv[0]) / 4)
-    rays = np.stack([_interpolate(coarse[..., axis], *maps) for axis in range(3)], axis=-1)
     R, t = T_cam_board[:3, :3], T_cam_board[:3, 3]
-    on_plane = (rays * ((R[:, 2] @ t) / (rays @ R[:, 2]))[..., None] - t) @ R
-    x, y = on_plane[..., 0], on_plane[..., 1]
+    along_x, along_y, along_z = (
+        _interpolate(coarse @ axis, (u - gu[0]) / 4, (v - gv[0]) / 4) for axis in R.T
+    )
+    distance = (R[:, 2] @ t) / along_z
+    x, y = along_x * distance - R[:, 0] @ t, along_y * distance - R[:, 1] @ t
     column = np.floor((x - board.pattern_offset_m[0]) / board.square_m + (board.cols + 1) / 2)
     row = np.floor((board.rows + 1) / 2 - (y - board.pattern_offset_m[1]) / board.square_m)
     is_square = (column >= 0) & (column <= board.cols) & (row >= 0) & (row <= board.rows)
@@ -74,12 +76,12 @@ def draw(
 
 
 def _interpolate(table: Array, u: Array, v: Array) -> Array:
+    """Interpolate linearly at every column of u (U,) and row of v (V,): (V, U)."""
     # cv2.remap rounds its weights to 1/32; rays need more.
     i, j = np.floor(u).astype(int), np.floor(v).astype(int)
-    a, b = u - i, v - j
-    top = (1 - a) * table[j, i] + a * table[j, i + 1]
-    bottom = (1 - a) * table[j + 1, i] + a * table[j + 1, i + 1]
-    return np.asarray((1 - b) * top + b * bottom)
+    a, b = u - i, (v - j)[:, None]
+    rows = (1 - b) * table[j] + b * table[j + 1]
+    return np.asarray((1 - a) * rows[:, i] + a * rows[:, i + 1])
 
 
 def picture(pixels: NDArray[np.uint8], channel: str = "frames") -> Image:
@@ -100,6 +102,7 @@ def refused(pixels: NDArray[np.uint8], board: Board, camera: Intrinsics) -> Refu
     return result
 
 
+FOLLOWED_FROM = looking(10, 80, 5, (0.1, 0, 2.2))
 CASES = [
     pytest.param(ASYMMETRIC, DAVIS, looking(30, 20, 45, (0.05, 0.0, 1.6)), id="davis-near"),
     pytest.param(ASYMMETRIC, DAVIS, looking(35, -60, 130, (-0.2, 0.1, 3.0)), id="davis-far"),
@@ -177,23 +180,46 @@ def test_the_region_of_the_last_picture_gives_the_same_corners() -> None:
     assert np.abs(tracked.corners_px - whole.corners_px).max() < 0.03
 
 
+@cache
+def _first_of_following(board: Board) -> ImageBoard:
+    return found(draw(board, WIDE, FOLLOWED_FROM), board, WIDE)
+
+
 @pytest.mark.parametrize("board", [SYMMETRIC, ASYMMETRIC], ids=["symmetric", "asymmetric"])
 @pytest.mark.parametrize("n_squares", [0.0, 0.2, 0.6, 1.0, 1.4, 2.0])
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
 def test_a_board_that_is_followed_is_found_as_if_it_were_not(
     board: Board, n_squares: float, direction: tuple[float, float]
 ) -> None:
-    T = looking(10, 80, 5, (0.1, 0, 2.2))
-    first = found(draw(board, WIDE, T), board, WIDE)
+    first = _first_of_following(board)
     shift = n_squares * board.square_m * np.array(direction)
-    T_moved = T.copy()
-    T_moved[:3, 3] += T[:3, :2] @ shift
+    T_moved = FOLLOWED_FROM.copy()
+    T_moved[:3, 3] += FOLLOWED_FROM[:3, :2] @ shift
     moved = picture(draw(board, WIDE, T_moved, noise=1.0))
     whole = find_image_board(moved, board, WIDE)
     followed = find_image_board(moved, board, WIDE, region=region_around(first, moved), last=first)
     assert isinstance(followed, ImageBoard) and isinstance(whole, ImageBoard)
     off_px = followed.corners_px - whole.corners_px
     assert np.sqrt(np.mean(off_px**2)) < 0.03 and np.abs(off_px).max() < 0.15
+
+
+@pytest.mark.parametrize(
+    ("camera", "z_m"), [(WIDE, 1.2), (WIDE, 3.0), (DAVIS, 1.6)], ids=["near", "far", "small picture"]
+)
+@pytest.mark.parametrize(("turn_deg", "closer"), [(0, 1.0), (12, 0.9), (-12, 1.1)])
+def test_a_quick_search_finds_a_board_that_moved_on_and_turned_a_little(
+    camera: Intrinsics, z_m: float, turn_deg: float, closer: float
+) -> None:
+    first = found(draw(ASYMMETRIC, camera, looking(10, 80, 5, (0.0, 0, z_m))), ASYMMETRIC, camera)
+    shift_m = 1.5 * ASYMMETRIC.square_m
+    T_moved = looking(10, 80, 5 + turn_deg, (shift_m, shift_m, closer * z_m))
+    moved = picture(draw(ASYMMETRIC, camera, T_moved, noise=1.0))
+    whole = find_image_board(moved, ASYMMETRIC, camera)
+    quick = find_image_board(
+        moved, ASYMMETRIC, camera, region=region_around(first, moved), last=first, is_thorough=False
+    )
+    assert isinstance(quick, ImageBoard) and isinstance(whole, ImageBoard)
+    assert np.abs(quick.corners_px - whole.corners_px).max() < 0.15
 
 
 def test_a_board_that_left_the_region_is_found_in_the_whole_picture() -> None:

@@ -37,6 +37,8 @@ Key = Literal["stop", "capture", "next"]
 HOLD_S = 1.5
 #: How often a picture without a board is searched thoroughly, during which nothing is said.
 THOROUGH_S = 3.0
+#: How often a scan is searched for other things of the board's size while all that are known are followed.
+RESCAN_S = 1.0
 _WAIT_S = 0.1
 _TURN_S = 0.0005
 _NOVEL_M, _NOVEL_DEG = 0.15, 10.0
@@ -186,7 +188,9 @@ class _Loop:
         self._show = show
         self._recorder = recorder
         self._began_s = time.monotonic()
-        self._watcher = BoardWatcher(self._rig, options.search_interval_s, thorough_interval_s=THOROUGH_S)
+        self._watcher = BoardWatcher(
+            self._rig, options.search_interval_s, thorough_interval_s=THOROUGH_S, rescan_interval_s=RESCAN_S
+        )
         self._gate: LiveGate | None = None
         self._n_captures = len(session.captures)
         names = [capture.name for capture in session.captures]
