@@ -1,6 +1,9 @@
 """A small simulator of detected boards: a spinning LiDAR and a camera in front of one board per capture."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import islice
 
 import numpy as np
 
@@ -47,20 +50,35 @@ def simulate(
     board: Board = BOARD,
 ) -> list[CaptureCandidates]:
     """Simulate n captures in which both sensors see the board."""
-    scenario = scenario or Scenario()
+    made, source = _session(seed, scenario or Scenario(), T_cam_lidar.tobytes(), board)
+    made += islice(source, max(0, n - len(made)))
+    return made[:n]
+
+
+@lru_cache(maxsize=100)
+def _session(
+    seed: int, scenario: Scenario, T_cam_lidar: bytes, board: Board
+) -> tuple[list[CaptureCandidates], Iterator[CaptureCandidates]]:
+    """Keep what was simulated of a session, and what goes on with it: many tests ask for the same one."""
+    return [], _captures(seed, scenario, np.frombuffer(T_cam_lidar).reshape(4, 4), board)
+
+
+def _captures(
+    seed: int, scenario: Scenario, T_cam_lidar: np.ndarray, board: Board
+) -> Iterator[CaptureCandidates]:
     rng = np.random.default_rng(seed)
     # A generator of their own: the captures of a seed are otherwise the same with and without biases.
     laser_rng = np.random.default_rng([seed, 1])
     bias_m = scenario.laser_bias_sigma_m * laser_rng.standard_normal(16)
     bias_m += scenario.range_offset_m - bias_m.mean()
-    captures: list[CaptureCandidates] = []
-    while len(captures) < n:
+    n_seen = 0
+    while True:
         T_cam_board = random_pose(rng, scenario, board)
         lidar = scan_board(invert(T_cam_lidar) @ T_cam_board, rng, scenario, board, bias_m)
         image = photograph(T_cam_board, rng, scenario, board)
         if lidar is not None and image is not None:
-            captures.append(CaptureCandidates(f"{len(captures):06d}", image, [lidar]))
-    return captures
+            yield CaptureCandidates(f"{n_seen:06d}", image, [lidar])
+            n_seen += 1
 
 
 def random_pose(rng: np.random.Generator, scenario: Scenario, board: Board) -> np.ndarray:

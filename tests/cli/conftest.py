@@ -40,6 +40,23 @@ def simulated(tmp_path_factory) -> Path:
     return session
 
 
+@pytest.fixture(scope="session")
+def calibrated_once(simulated, tmp_path_factory) -> Path:
+    """The simulated session with its result; as `lce-rig calibrate` leaves it."""
+    copy = tmp_path_factory.mktemp("calibrated") / "session"
+    shutil.copytree(simulated, copy)
+    assert run(["calibrate", str(copy)]) == 0
+    return copy
+
+
+@pytest.fixture
+def calibrated(calibrated_once, tmp_path) -> Path:
+    """A copy of the calibrated session to write into."""
+    copy = tmp_path / "session"
+    shutil.copytree(calibrated_once, copy)
+    return copy
+
+
 @pytest.fixture
 def session(simulated, tmp_path) -> Path:
     """A copy of the simulated session to write into."""

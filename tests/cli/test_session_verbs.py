@@ -37,11 +37,10 @@ def test_calibrate_finds_the_simulated_truth_within_four_sigma(lce_rig, session)
     assert np.abs(T - truth).max() < 0.02
 
 
-def test_the_same_session_gives_the_same_bytes(lce_rig, session):
-    lce_rig("calibrate", session)
-    first = (session / "calibration" / "result.json").read_bytes()
-    lce_rig("calibrate", session)
-    assert (session / "calibration" / "result.json").read_bytes() == first
+def test_the_same_session_gives_the_same_bytes(lce_rig, calibrated):
+    first = (calibrated / "calibration" / "result.json").read_bytes()
+    lce_rig("calibrate", calibrated)
+    assert (calibrated / "calibration" / "result.json").read_bytes() == first
 
 
 def test_the_result_names_its_inputs_by_hashes_that_other_tools_check(lce_rig, session):
@@ -79,58 +78,55 @@ def test_a_reference_that_is_no_rigid_transform_exits_with_4(lce_rig, session, t
     assert "bad.json: T_cam_lidar" in outcome.err
 
 
-def test_every_export_stands_beside_the_result(lce_rig, session):
-    lce_rig("calibrate", session)
-    names = {path.name for path in (session / "calibration").iterdir()}
+def test_every_export_stands_beside_the_result(lce_rig, calibrated):
+    names = {path.name for path in (calibrated / "calibration").iterdir()}
     assert {"result.json", "extrinsics.yaml", "rles.urdf", "static_transforms.txt"} <= names
     assert any(name.startswith("camera_info") for name in names)
 
 
-def test_verify_draws_every_capture_and_one_sheet(lce_rig, session):
-    assert lce_rig("verify", session).code == 4, "nothing was calibrated yet"
-    lce_rig("calibrate", session)
-    outcome = lce_rig("verify", session)
+def test_verify_before_anything_was_calibrated_exits_with_4(lce_rig, session):
+    assert lce_rig("verify", session).code == 4
+
+
+def test_verify_draws_every_capture_and_one_sheet(lce_rig, calibrated):
+    outcome = lce_rig("verify", calibrated)
     assert outcome.code == 0
     assert "mean over captures" in outcome.out
-    pictures = sorted(path.name for path in (session / "calibration" / "overlays").iterdir())
+    pictures = sorted(path.name for path in (calibrated / "calibration" / "overlays").iterdir())
     assert pictures == [*(f"{k:06d}.png" for k in range(16)), "contact_sheet.png"]
 
 
-def test_verify_tells_a_wrong_extrinsic_by_its_residuals(lce_rig, session):
-    lce_rig("calibrate", session)
-    right = json.loads(lce_rig("verify", session, "--json").out)["pairs"][0]["metrics"]
-    path = session / "calibration" / "result.json"
+def test_verify_tells_a_wrong_extrinsic_by_its_residuals(lce_rig, calibrated):
+    right = json.loads(lce_rig("verify", calibrated, "--json").out)["pairs"][0]["metrics"]
+    path = calibrated / "calibration" / "result.json"
     result = read(path)
     result["pairs"][0]["T_cam_lidar"][0][3] += 0.05
     path.write_text(json.dumps(result))
-    wrong = json.loads(lce_rig("verify", session, "--json").out)["pairs"][0]["metrics"]
+    wrong = json.loads(lce_rig("verify", calibrated, "--json").out)["pairs"][0]["metrics"]
     assert wrong["mee_m"] > right["mee_m"] + 0.01
 
 
-def test_verify_refuses_an_extrinsic_that_the_captures_contradict(lce_rig, session):
-    lce_rig("calibrate", session)
-    path = session / "calibration" / "result.json"
+def test_verify_refuses_an_extrinsic_that_the_captures_contradict(lce_rig, calibrated):
+    path = calibrated / "calibration" / "result.json"
     result = read(path)
     result["pairs"][0]["T_cam_lidar"][2][3] += 0.12
     path.write_text(json.dumps(result))
-    outcome = lce_rig("verify", session)
+    outcome = lce_rig("verify", calibrated)
     assert outcome.code == 7
     assert "contradict the extrinsic of davis.frames and lidar" in outcome.err
     assert "limit 30 mm" in outcome.err
 
 
-def test_verify_refuses_the_result_of_another_rig(lce_rig, session):
-    lce_rig("calibrate", session)
-    path = session / "calibration" / "result.json"
+def test_verify_refuses_the_result_of_another_rig(lce_rig, calibrated):
+    path = calibrated / "calibration" / "result.json"
     path.write_text(json.dumps(read(path) | {"rig": "other"}))
-    assert lce_rig("verify", session).code == 4
+    assert lce_rig("verify", calibrated).code == 4
 
 
-def test_captures_of_another_session_never_count_as_used(lce_rig, session, tmp_path):
-    lce_rig("calibrate", session)
+def test_captures_of_another_session_never_count_as_used(lce_rig, calibrated, tmp_path):
     foreign = tmp_path / "deployed.json"
-    foreign.write_bytes((session / "calibration" / "result.json").read_bytes())
-    pair = json.loads(lce_rig("verify", session, "--result", foreign, "--json").out)["pairs"][0]
+    foreign.write_bytes((calibrated / "calibration" / "result.json").read_bytes())
+    pair = json.loads(lce_rig("verify", calibrated, "--result", foreign, "--json").out)["pairs"][0]
     assert not any(figures["was_used"] for figures in pair["captures"].values())
 
 
@@ -140,15 +136,14 @@ def test_nothing_to_fit_is_a_usage_error(lce_rig, session):
     assert "leave nothing to fit" in outcome.err
 
 
-def test_a_failed_calibration_leaves_no_earlier_result_behind(lce_rig, session):
+def test_a_failed_calibration_leaves_no_earlier_result_behind(lce_rig, calibrated):
     import shutil
 
-    lce_rig("calibrate", session)
-    lce_rig("verify", session)
+    lce_rig("verify", calibrated)
     for k in range(4, 16):
-        shutil.rmtree(session / "captures" / f"{k:06d}")
-    assert lce_rig("calibrate", session).code == 6
-    assert list((session / "calibration").iterdir()) == []
+        shutil.rmtree(calibrated / "captures" / f"{k:06d}")
+    assert lce_rig("calibrate", calibrated).code == 6
+    assert list((calibrated / "calibration").iterdir()) == []
 
 
 def test_a_capture_without_manifest_does_not_hinder_the_others(lce_rig, session):
