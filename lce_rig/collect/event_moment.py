@@ -98,7 +98,8 @@ def _judge_camera(
     motion = _follow(key, around)
     if motion is None:
         return None
-    (speed_mps, unsteady_m), events_px = motion, _events_on_board(key, sighting, cut, rig)
+    recent, stamp_ns = _events_before(key, sighting, cut, rig)
+    (speed_mps, unsteady_m), events_px = motion, _events_on_board(key, sighting, recent, stamp_ns, rig)
     limits, said = rig.quality, f"{events_px:.1f} events a pixel of it in a second"
     if speed_mps > limits.max_board_speed_mps:
         cause = f"the board moved at {speed_mps:.2f} m/s ({limits.max_board_speed_mps:g} allowed)"
@@ -110,8 +111,7 @@ def _judge_camera(
         action = f"{_MOVE}, rather than to and fro, and in better light"
         return Refusal("image", f"the board made few events at {speed_mps:.2f} m/s: {said}", action)
     if is_slow:
-        stamp_ns = sighting.frame.time_ns - cut.offset_ns
-        lamps = look_for_flicker(cut.between(stamp_ns - MEMORY_NS, stamp_ns))
+        lamps = look_for_flicker(recent)
         if lamps is not None:
             return lamps
     figures = {"speed_mps": speed_mps, "unsteady_m": unsteady_m, "events_px": events_px}
@@ -134,15 +134,20 @@ def _follow(key: ImageKey, around: Sequence[Sighting]) -> tuple[float, float] | 
     return float(np.linalg.norm(velocity)), float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
 
 
-def _events_on_board(key: ImageKey, sighting: Sighting, cut: EventCut, rig: Rig) -> float:
-    """Count the events a pixel of the board in the second before its picture."""
+def _events_before(key: ImageKey, sighting: Sighting, cut: EventCut, rig: Rig) -> tuple[Events, int]:
+    """Cut out the second of events before the board's picture; also give its time on their clock."""
     image = next(i for i in sighting.frame.images if (i.sensor, i.channel) == key)
     # Frames and events of one camera may have clocks, or delays, of their own.
     time_ns = rig_time_ns(image, rig)
     stamp_ns = (sighting.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
+    return cut.between(stamp_ns - MEMORY_NS, stamp_ns), stamp_ns
+
+
+def _events_on_board(key: ImageKey, sighting: Sighting, recent: Events, stamp_ns: int, rig: Rig) -> float:
+    """Count the events a pixel of the board in the second before its picture."""
     camera, board = rig.cameras[key[0]], sighting.images[key]
     outline = outline_px(board.T_cam_board, rig.board.to_board(), camera.to_intrinsics())
-    return event_figures(cut.between(stamp_ns - MEMORY_NS, stamp_ns), stamp_ns, outline)["events_px"]
+    return event_figures(recent, stamp_ns, outline)["events_px"]
 
 
 def _explain_unseen(sighting: Sighting, cuts: Mapping[str, EventCut], rig: Rig) -> Refusal | None:

@@ -7,29 +7,31 @@ import resource
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
-from datetime import datetime, timedelta
+from datetime import datetime
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from wire.davis import RandomDavis
 from wire.reel import Reel, make_reel
 from wire.rig import WireRig
-from wire.timing import LOOP_NS, placement_at
+from wire.sync_board import WireSyncBoard
+from wire.timing import LOOP_NS
 
 from benchmarks.tables import print_head, print_row
 from lce_rig.collect.live.collection import Key, LiveOptions, LiveReport, collect_live
 from lce_rig.collect.live.state import LiveState
 from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig, load_rig
+from lce_rig.rig.sync import SyncSettings
 from lce_rig.session import Session
 from lce_rig.sources.live.base import LiveSource, SourceStatus
 from lce_rig.sources.live.davis import DavisSource
 from lce_rig.sources.live.davis_device import OpenedCamera
 from lce_rig.sources.live.opening import open_live
 
-EVENTS_HZ = 2_000_000
 LOOPS_PER_HOLD = 10
 N_PLACEMENTS = 20
 HOLD_S = 0.5
@@ -37,7 +39,6 @@ HOLD_S = 0.5
 _STILL_S = 0.5 + HOLD_S
 _DRAIN_S = 1.0
 _MOVED_M = 0.05
-_SIZE, _BATCH_US, _FRAME_EVERY, _EXPOSURE_US = (346, 260), 10_000, 4, 4_000
 _CLOCK_HZ = os.sysconf("SC_CLK_TCK")
 
 
@@ -54,6 +55,8 @@ class Load:
         wall_s, cpu_s, sender_cpu_s: of the collector, and of the camera's process.
         peak_bytes: memory of the collector.
         sent: by the senders, by name.
+        tied_s: from the beginning until clocks were tied, and boards may move; None where never.
+        n_events: events in each capture.
     """
 
     report: LiveReport
@@ -66,6 +69,8 @@ class Load:
     sender_cpu_s: float = 0.0
     peak_bytes: int = 0
     sent: dict[str, dict[str, int]] = field(default_factory=dict)
+    tied_s: float | None = None
+    n_events: list[int] = field(default_factory=list)
 
 
 def bench_live(duration_s: float) -> None:
@@ -73,11 +78,13 @@ def bench_live(duration_s: float) -> None:
     with tempfile.TemporaryDirectory() as folder:
         rig = load_of_sensors()
         reel = make_reel(Path(folder) / "reel", rig, N_PLACEMENTS)
-        for has_frames in (False, True):
-            print(f"\nframes of the DAVIS346: {'25 Hz' if has_frames else 'off'}\n")
-            part = Path(folder) / f"frames {has_frames}"
+        for number, (has_frames, has_board) in enumerate(((False, False), (True, False), (True, True))):
+            frames, board = "25 Hz" if has_frames else "off", "attached" if has_board else "none"
+            print(f"\nframes of the DAVIS346: {frames}; sync board: {board}; load {os.getloadavg()[0]:.1f}\n")
+            part = Path(folder) / str(number)
             part.mkdir()
-            print_load(run_load(part, rig, reel, duration_s, has_frames=has_frames))
+            print_load(run_load(part, rig, reel, duration_s, has_frames=has_frames, has_board=has_board))
+            print(f"\nload {os.getloadavg()[0]:.1f}")
 
 
 def load_of_sensors() -> Rig:
@@ -93,10 +100,16 @@ def load_of_sensors() -> Rig:
     )
 
 
-def run_load(folder: Path, rig: Rig, reel: Reel, duration_s: float, *, has_frames: bool) -> Load:
+def run_load(
+    folder: Path, rig: Rig, reel: Reel, duration_s: float, *, has_frames: bool, has_board: bool = False
+) -> Load:
     """Start the senders, and collect in a process of its own."""
     camera_report = folder / "camera.json"
-    with WireRig(folder, rig, reel, LOOPS_PER_HOLD, report=camera_report) as wire:
+    with ExitStack() as stack:
+        if has_board:
+            sync = SyncSettings(device=stack.enter_context(WireSyncBoard()).path)
+            rig = rig.model_copy(update={"sync": sync})
+        wire = stack.enter_context(WireRig(folder, rig, reel, LOOPS_PER_HOLD, report=camera_report))
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         cpu_s = _cpu_s(wire.pid)
@@ -120,6 +133,7 @@ class _Watch:
     def __init__(self, parent: Connection, duration_s: float) -> None:
         self.shown_ns: list[int] = []
         self.changes_s: list[float] = []
+        self.tied_s: float | None = None
         self._parent, self._ends_s = parent, time.monotonic() + duration_s
         self._has_told = False
         self._drawing: object = None
@@ -129,6 +143,9 @@ class _Watch:
     def show(self, state: LiveState) -> None:
         """Note when a frame was shown, and when the first that shows the board at another place."""
         now_ns, drawing = time.time_ns(), state.drawing
+        if self.tied_s is None and drawing is not None:
+            must_stand = any("must stand still" in note for note in state.notes)
+            self.tied_s = None if must_stand else state.elapsed_s
         if drawing is None or drawing is self._drawing:
             return
         self._drawing = drawing
@@ -172,7 +189,7 @@ def measure_settled_s(session: Session) -> list[float]:
 def _collect(
     parent: Connection, rig: Rig, path: Path, reel: Reel, duration_s: float, has_frames: bool
 ) -> None:
-    davis = _Davis(reel, "davis", has_frames)
+    davis = RandomDavis(reel, "davis", LOOPS_PER_HOLD, has_frames=has_frames)
     sources: Sequence[LiveSource] = [
         DavisSource("davis", rig.cameras["davis"], lambda *_: OpenedCamera(davis, "made here"))
         if source.sensor == "davis"
@@ -187,78 +204,17 @@ def _collect(
         )
         statuses = {source.sensor: source.status() for source in sources}
         load = Load(report, statuses, watch.shown_ns, watch.changes_s, measure_settled_s(session))
+        load.tied_s = watch.tied_s
+        load.n_events = [
+            sum(len(capture.events(camera)) for camera in capture.event_cameras)
+            for capture in session.captures
+        ]
         load.sent["davis"] = {"events": davis.n_events, "frames": davis.n_frames}
         load.wall_s, load.cpu_s = time.monotonic() - began_s, time.process_time() - cpu_s
     load.peak_bytes = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     load.sender_cpu_s = children.ru_utime + children.ru_stime
     parent.send(load)
-
-
-class _Davis:
-    """A camera of dv-processing that makes random events, and shows a reel's pictures, in real time.
-
-    It runs in the collector's process, as the threads of an attached camera do; dv-processing's own network
-    writer takes more than half a core for itself, however little is sent.
-    """
-
-    def __init__(self, reel: Reel, camera: str, has_frames: bool) -> None:
-        import dv_processing
-
-        self._has_frames = has_frames
-
-        self._dv: Any = dv_processing
-        self._batch = self._frame = time.time_ns() // 1000 // _BATCH_US
-        self._n_placements = reel.n_placements
-        self._frames = [
-            [_read_frame(data) for data in reel.pictures(camera, placement)]
-            for placement in range(reel.n_placements)
-        ]
-        self.n_events = self.n_frames = 0
-
-    def getNextEventBatch(self) -> Any:
-        """Give the events of the next 10 ms, once they are over."""
-        start_us = self._batch * _BATCH_US
-        if time.time_ns() // 1000 < start_us + _BATCH_US:
-            return None
-        self._batch += 1
-        n, seed, span = (
-            round(EVENTS_HZ * _BATCH_US * 1e-6),
-            self._batch % 1000,
-            timedelta(microseconds=_BATCH_US),
-        )
-        events = self._dv.data.generate.uniformEventsWithinTimeRange(start_us, span, _SIZE, n, seed)
-        self.n_events += events.size()
-        return events
-
-    def getNextFrame(self) -> Any:
-        """Give the picture of the next 40 ms, once it is exposed."""
-        start_us = self._frame * _BATCH_US
-        if not self._has_frames or time.time_ns() // 1000 < start_us + _EXPOSURE_US:
-            return None
-        self._frame += _FRAME_EVERY
-        shown = placement_at(1000 * start_us, LOOPS_PER_HOLD, self._n_placements)
-        image = self._frames[shown][self.n_frames % len(self._frames[shown])]
-        self.n_frames += 1
-        return self._dv.Frame(start_us, _EXPOSURE_US, 0, 0, image, self._dv.FrameSource.SENSOR)
-
-    def isEventStreamAvailable(self) -> bool:
-        """It has events."""
-        return True
-
-    isFrameStreamAvailable = isRunning = isEventStreamAvailable
-
-    def isTriggerStreamAvailable(self) -> bool:
-        """It sees no pulses, and does not move."""
-        return False
-
-    isImuStreamAvailable = isTriggerStreamAvailable
-
-
-def _read_frame(data: bytes) -> Any:
-    """Take the pixels out of a PGM file."""
-    n_pixels = _SIZE[0] * _SIZE[1]
-    return np.frombuffer(data[-n_pixels:], np.uint8).reshape(_SIZE[::-1])
 
 
 def _cpu_s(pid: int) -> float:
@@ -289,11 +245,16 @@ def print_load(load: Load) -> None:
     print_row("guidance updates a second", f"{len(gaps_s) / gaps_s.sum():.1f}")
     print_row("longest time without one", f"{gaps_s.max():.2f} s")
     print_row("a moved board is shown after, median / worst", _pair(load.changes_s))
-    print_row("captures", len(load.report.captured))
+    print_row("clocks tied after", "never" if load.tied_s is None else f"{load.tied_s:.1f} s")
+    print_row("captures, those with events", f"{len(load.n_events)}, {sum(n > 0 for n in load.n_events)}")
+    if any(load.n_events):
+        print_row(
+            "events in each of these, median", f"{np.median([n for n in load.n_events if n]) / 1e6:.2f} M"
+        )
     print_row("decision to safe on disk, median / worst", _pair(latencies_s))
-    print_row(
-        "end of the hold to safe on disk, median / worst", _pair([s - _STILL_S for s in load.settled_s])
-    )
+    if load.tied_s is None:
+        settled_s = [s - _STILL_S for s in load.settled_s]
+        print_row("end of the hold to safe on disk, median / worst", _pair(settled_s))
     print_row("collector, share of a core", f"{load.cpu_s / load.wall_s:.2f}")
     print_row("senders, share of a core", f"{load.sender_cpu_s / load.wall_s:.2f}")
     print_row("collector, peak memory", f"{load.peak_bytes / 1e6:.0f} MB")
