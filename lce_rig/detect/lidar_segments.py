@@ -167,7 +167,9 @@ def _azimuth_step(turn: Floats) -> float:
     if len(forward) == 0:
         return 0.0
     middle = float(np.median(forward[:: 1 + len(forward) // 1000]))
-    return float(np.mean(forward[np.abs(forward - middle) < 0.3 * middle], dtype=np.float64))
+    common = forward[np.abs(forward - middle) < 0.3 * middle]
+    # Of a few returns, such as are left about where a board was, two steps may have nothing in common.
+    return float(np.mean(common, dtype=np.float64)) if len(common) else middle
 
 
 def _range_noise(turn: Floats, range_m: Floats, ring: NDArray[np.int16]) -> float:

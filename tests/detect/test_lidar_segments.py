@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scans import board_plate, cast, place, room
 
+from lce_rig.core.data import Scan
 from lce_rig.detect.lidar_segments import cut_segments, order_scan
 
 
@@ -17,6 +18,13 @@ def test_azimuth_step_is_read_off_the_scan(step_deg):
     assert order_scan(cast(room(9.0), step_deg=step_deg), 0.4).step_rad == pytest.approx(
         np.radians(step_deg), rel=2e-3
     )
+
+
+def test_a_few_returns_whose_steps_have_nothing_in_common_still_have_a_step():
+    azimuth = np.radians([0.0, 0.2, 2.4])
+    points = 3.0 * np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(3)], axis=1).astype(np.float32)
+    scan = Scan("lidar", 0, points, np.ones(3, np.float32), np.zeros(3, np.int16))
+    assert np.radians(0.2) < order_scan(scan, 0.4).step_rad < np.radians(2.2)
 
 
 def test_rings_are_ordered_by_azimuth_and_begin_at_a_break():
