@@ -13,8 +13,6 @@ from lce_rig.cli.uncertainty import uncertainty_lines
 from lce_rig.core.results import Calibration
 from lce_rig.detect.detection import Pair
 
-_COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
-
 
 @click.command()
 @session_argument
@@ -163,7 +161,7 @@ def _left_out(held_out_m: float) -> str:
 
 def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> list[str]:
     c = calibration
-    colour = _COLOURS[c.verdict]
+    colour = show.COLOURS[c.verdict]
     metrics = c.metrics
     lines = [
         f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/]",

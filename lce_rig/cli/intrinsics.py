@@ -11,7 +11,6 @@ from lce_rig.cli.options import session_argument, split_names
 if TYPE_CHECKING:
     from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
 
-_COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 _MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")
 
 
@@ -153,7 +152,7 @@ def _findings(measured: "MeasuredIntrinsics") -> list[str]:
         verdict = measured.check.verdict()
         lines.append(f"  {describe(measured.check)}")
         if verdict != "pass":
-            lines.append(f"  [{_COLOURS[verdict]}]{show.escape(explain(measured.check))}[/]")
+            lines.append(f"  [{show.COLOURS[verdict]}]{show.escape(explain(measured.check))}[/]")
     lines += [f"  [yellow]{show.escape(text)}[/]" for text in measured.weaknesses]
     for name, why in measured.refused.items():
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.cause}: {why.action}')}[/]")

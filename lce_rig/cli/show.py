@@ -9,6 +9,8 @@ from typing import Any
 import click
 
 Progress = Callable[[int, int], None]
+COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
+"""Of verdicts."""
 
 
 def note(text: str) -> None:
@@ -19,6 +21,11 @@ def note(text: str) -> None:
 def say(text: str) -> None:
     """Print a line of the result on stdout."""
     click.echo(text)
+
+
+def counted(n: int, noun: str) -> str:
+    """Say how many: "1 capture", "2 captures"."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def warn(text: str) -> None:
