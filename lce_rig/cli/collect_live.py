@@ -1,6 +1,7 @@
 """`lce-rig collect` without --from: attached sensors, or the simulated rig."""
 
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import click
 from lce_rig.cli import show
 from lce_rig.cli.keys import Controls, controls
 from lce_rig.cli.simulate import TRUTH, require_kind, write_truth
+from lce_rig.core.errors import LceRigError
 
 if TYPE_CHECKING:
     from lce_rig.collect.live.collection import LiveReport
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from lce_rig.collect.live.simulated import SimulatedRig
     from lce_rig.collect.live.state import LiveState
     from lce_rig.rig import Rig
+    from lce_rig.session import Session
     from lce_rig.sources.live.base import LiveSource
 
 _ENDINGS = {
@@ -55,7 +58,6 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
     from lce_rig.collect.live.collection import HOLD_S, LiveOptions, collect_live
     from lce_rig.core.errors import UsageError
     from lce_rig.rig import load_rig
-    from lce_rig.session import Session
 
     if given.seed is not None and not given.simulated:
         raise UsageError("--seed belongs to --simulated", "leave it out")
@@ -66,7 +68,7 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
     with ExitStack() as stack:
         # The page first: an address that cannot be served is said before anything is made or started.
         listeners, links = _open_preview(stack, given)
-        session = stack.enter_context(Session.resume(path, rig))
+        session = stack.enter_context(_session(path, rig))
         n_before = len(session.captures)
         recorder = stack.enter_context(_recorder(given, rig))
         sources, simulated = _open_rig(stack, rig, path, given)
@@ -74,8 +76,10 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
         asked = stack.enter_context(controls())
         with open_view(is_plain=given.plain, has_keys=asked.is_interactive, links=links) as view:
             listeners.append(view.show)
+            is_begun = threading.Event()
 
             def tell(state: "LiveState") -> None:
+                is_begun.set()
                 for listener in listeners:
                     listener(state)
 
@@ -83,9 +87,25 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
                 report = collect_live(session, sources, options, tell, asked, recorder)
             finally:
                 n_captures = len(session.captures)
-                saved = f"{path}: {n_captures} captures ({n_captures - n_before} new)"
-                stack.callback(show.note, saved)
+                if n_captures or is_begun.is_set():
+                    saved = f"{path}: {show.counted(n_captures, 'capture')} ({n_captures - n_before} new)"
+                    stack.callback(show.note, saved)
     _tell(report, n_captures, asked, simulated)
+
+
+@contextmanager
+def _session(path: Path, rig: "Rig") -> "Iterator[Session]":
+    """Continue or start a session; one that never held anything, as its rig does not answer, goes again."""
+    from lce_rig.session import Session, discard_if_empty
+
+    is_new = not path.exists()
+    try:
+        with Session.resume(path, rig) as session:
+            yield session
+    except LceRigError:
+        if is_new:
+            discard_if_empty(path)
+        raise
 
 
 def _open_rig(

@@ -87,7 +87,11 @@ def _print_screen(checks: "list[Check]") -> None:
         if not sys.stdout.isatty() or len(console.render_lines(_screen(checks))) <= room:
             break
         checks = _together(checks, group)
-    console.print(_screen(checks))
+    with console.capture() as capture:
+        console.print(_screen(checks))
+    # Rich fills wrapped lines up with blanks.
+    for line in capture.get().splitlines():
+        show.say(line.rstrip())
 
 
 def _together(checks: "list[Check]", group: str) -> "list[Check]":
@@ -119,7 +123,7 @@ def _screen(checks: "list[Check]") -> Any:
         row.add_row(_MARKS[check.severity], group, check.name, show.escape(check.figure))
         rows.append(row)
         rows += [
-            Padding(f"[cyan]-> {show.escape(line)}[/]", (0, 0, 0, _INDENT))
+            Padding(f"[cyan]-> {show.escape(line)}[/]", (0, 0, 0, _INDENT), expand=False)
             for line in check.remedy.splitlines()
         ]
         last = check.group

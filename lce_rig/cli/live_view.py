@@ -113,10 +113,11 @@ def render(state: LiveState, *, has_keys: bool = True, links: tuple[str, ...] = 
     from rich.text import Text
 
     wanted = f" of {state.n_wanted}" if state.n_wanted is not None else ""
+    shown = state.n_captures if state.n_wanted is None else state.n_wanted
     title = Text.assemble(
         (f"lce-rig {state.rig}", "bold"),
         f"  {_clock(state)}  ",
-        (f"{state.n_captures}{wanted} captures", "bold"),
+        (f"{state.n_captures}{wanted} {'capture' if shown == 1 else 'captures'}", "bold"),
         f"  {state.session}",
         no_wrap=True,
         overflow="ellipsis",

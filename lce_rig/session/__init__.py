@@ -1,7 +1,8 @@
 """Sessions on disk: captures that exist whole or not at all, a journal, a frozen profile and a cache."""
 
 from lce_rig.session.capture import Capture
+from lce_rig.session.discarding import discard_if_empty
 from lce_rig.session.session import Session
 from lce_rig.session.writing import content_hash
 
-__all__ = ["Capture", "Session", "content_hash"]
+__all__ = ["Capture", "Session", "content_hash", "discard_if_empty"]

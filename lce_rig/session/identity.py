@@ -1,6 +1,7 @@
 """What makes a folder a session, and whose session it is."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from lce_rig.core.errors import SessionError
 from lce_rig.rig import Rig, dump_rig
 
 FORMAT_VERSION = 1
+_MAY_DIFFER = re.compile(r"description|(lidars|cameras)\.[^.]+\.driver(\..*)?|sync\.(device|baud)").fullmatch
 MARKER = "session.json"
 
 
@@ -44,9 +46,12 @@ def check_marker(path: Path) -> None:
 
 
 def differing_keys(theirs: Rig, ours: Rig) -> list[str]:
-    """List the keys in which two profiles differ, with both values; the description may differ."""
+    """List the keys in which two profiles differ, with both values.
+
+    The description may differ, and how attached sensors are reached: a camera is /dev/video2 today.
+    """
     a, b = (_flatten(yaml.safe_load(dump_rig(rig))) for rig in (theirs, ours))
-    keys = sorted(key for key in a.keys() | b.keys() if a.get(key) != b.get(key) and key != "description")
+    keys = sorted(key for key in a.keys() | b.keys() if a.get(key) != b.get(key) and not _MAY_DIFFER(key))
     return [f"{key} {a.get(key, 'absent')} there, {b.get(key, 'absent')} here" for key in keys]
 
 

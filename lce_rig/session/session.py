@@ -128,6 +128,7 @@ class Session:
                 f"{path} is a session of rig {session.rig.name!r}, not of this rig {rig.name!r}: {shown}",
                 "Collect into another folder, or use the profile in the session (its rig.yaml).",
             )
+        session._adopt(rig)
         return session
 
     def __enter__(self) -> "Session":
@@ -141,6 +142,17 @@ class Session:
         if self._lock is not None:
             self._lock.release()
             self._lock = None
+
+    def _adopt(self, rig: Rig) -> None:
+        """Take over what may differ in the profile: how attached sensors are reached."""
+        if rig == self.rig:
+            return
+        try:
+            replace_file(self.path / PROFILE, dump_rig(rig).encode())
+        except OSError as error:
+            self.close()
+            raise _not_writable(self.path, error) from error
+        self.rig = rig
 
     @property
     def captures(self) -> list[Capture]:
@@ -289,7 +301,7 @@ def _take_lock(path: Path) -> WriterLock:
 
 
 def _not_writable(path: Path, error: OSError, n_safe: int | None = None) -> SessionError:
-    safe = "" if n_safe is None else f" The {n_safe} captures before it are safe."
+    safe = "" if not n_safe else f" The {n_safe} captures before it are safe."
     if isinstance(error, (FileExistsError, NotADirectoryError)):
         hint = "There is a file of that name: choose another folder."
     elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):

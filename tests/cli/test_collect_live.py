@@ -42,6 +42,7 @@ def test_a_rig_without_its_devices_says_what_to_check(lce_rig, tmp_path: Path) -
     result = lce_rig("collect", "--rig", "rlfs", tmp_path / "session", "--plain", "--timeout", "5")
     assert result.code == 5
     assert "lidar" in result.err and "doctor" in result.err
+    assert "captures" not in result.err and not (tmp_path / "session").exists(), "nothing had begun"
 
 
 def test_simulated_and_real_captures_are_not_mixed(lce_rig, tmp_path: Path) -> None:

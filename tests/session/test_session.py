@@ -11,7 +11,7 @@ import pytest
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError
 from lce_rig.rig import dump_rig, load_rig
-from lce_rig.session import Session
+from lce_rig.session import Session, discard_if_empty
 
 
 def test_a_capture_comes_back_exactly_as_it_was_given(tmp_path, rig, samples):
@@ -93,6 +93,30 @@ def test_a_session_of_another_rig_is_refused_with_the_keys_that_differ(tmp_path,
     with pytest.raises(SessionError, match=r"of rig 'rlfs', not of this rig 'rles'"):
         Session.resume(tmp_path / "s", load_rig("rles"))
     Session.resume(tmp_path / "s", rig).close()
+
+
+def test_a_session_goes_on_when_a_sensor_is_reached_otherwise(tmp_path, rig, samples):
+    with Session.resume(tmp_path / "s", rig) as session:
+        session.add_capture(*samples(0), {})
+    camera = rig.cameras["cam"]
+    elsewhere = camera.driver.model_copy(update={"device": "/dev/video7"})
+    moved = rig.model_copy(update={"cameras": {"cam": camera.model_copy(update={"driver": elsewhere})}})
+    with Session.resume(tmp_path / "s", moved) as session:
+        assert session.rig == moved and len(session.captures) == 1
+    assert Session.open(tmp_path / "s").rig.cameras["cam"].driver.device == "/dev/video7"
+
+
+def test_a_session_that_holds_nothing_can_be_discarded_and_no_other(tmp_path, rig, samples):
+    for name in ("empty", "captured", "noted"):
+        with Session.create(tmp_path / name, rig) as session:
+            if name == "captured":
+                session.add_capture(*samples(0), {})
+    (tmp_path / "noted" / "truth.json").write_text("{}")
+    assert discard_if_empty(tmp_path / "empty") and not (tmp_path / "empty").exists()
+    for name in ("captured", "noted", "never"):
+        assert not discard_if_empty(tmp_path / name)
+    assert len(Session.open(tmp_path / "captured").captures) == 1
+    assert Session.open(tmp_path / "noted").captures == []
 
 
 def test_only_one_writer_is_let_in_and_readers_always(tmp_path, rig, samples):

@@ -64,8 +64,9 @@ class ImagePipeSource:
         """
         command = self._settings.driver.command
         if not command:
-            hint = f"Set it to a list, program and arguments, such as: {_EXAMPLE}"
-            raise SourceError(f"{self._who}: driver.command is missing", hint)
+            line = "driver: {type: command, command: [PROGRAM, ARGUMENT, ...]}"
+            hint = f"Add to cameras.{self.sensor}: {line}\nAn example of a command: {_EXAMPLE}"
+            raise SourceError(f"{self.sensor}: the profile does not say how it is reached", hint)
         self._stream, self._begin, self._complaints, self._n_pictures = self._raw_stream(), b"", b"", 0
         with ExitStack() as stack:
             try:

@@ -111,8 +111,9 @@ class V4l2Source:
         driver = self._settings.driver
         if driver.device is None:
             found = ", ".join(video_devices()) or "none"
-            hint = f"Set it in the profile; video devices of this computer: {found}."
-            raise SourceError(f"camera {self.sensor!r}: driver.device is missing", hint)
+            line = "driver: {type: v4l2, device: /dev/video0}"
+            hint = f"Add to cameras.{self.sensor}: {line}\nVideo devices of this computer: {found}."
+            raise SourceError(f"{self.sensor}: the profile does not say how it is reached", hint)
         self._last_sequence = None
         self._device = VideoDevice(driver.device, self.sensor)
         stack.callback(self._device.close)

@@ -40,7 +40,8 @@ def test_signals_end_a_collection_cleanly(
     assert errors(collecting.said) == [] and "Traceback" not in collecting.said
     assert "ended: stopped" in collecting.said
     names = [capture.name for capture in check_whole(tmp_path / "session")]
-    assert f"{len(names)} captures ({len(names)} new)" in collecting.said
+    said = "1 capture" if len(names) == 1 else f"{len(names)} captures"
+    assert f"{said} ({len(names)} new)" in collecting.said
     assert set(captured_names(collecting.said)) <= set(names)
 
 

@@ -258,7 +258,7 @@ def test_a_program_that_is_not_there_is_named() -> None:
     with pytest.raises(SourceError, match="no-such-program cannot be started: No such file") as caught:
         ImagePipeSource("cam", camera("no-such-program")).__enter__()
     assert "installed" in caught.value.hint
-    with pytest.raises(SourceError, match=r"driver\.command is missing"):
+    with pytest.raises(SourceError, match="cam: the profile does not say how it is reached"):
         ImagePipeSource("cam", camera()).__enter__()
     with pytest.raises(SourceError, match="pixel_format 'H264' is not read here"):
         ImagePipeSource("cam", camera("true", pixel_format="H264")).__enter__()

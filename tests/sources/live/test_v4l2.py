@@ -41,8 +41,8 @@ def test_a_camera_that_is_not_there_is_named_with_what_to_check() -> None:
 
 def test_a_missing_device_setting_is_said() -> None:
     error = refusal(None)
-    assert error.what == "camera 'cam': driver.device is missing"
-    assert "video devices of this computer:" in error.hint
+    assert error.what == "cam: the profile does not say how it is reached"
+    assert "Video devices of this computer:" in error.hint
 
 
 def test_what_is_no_device_is_not_opened(tmp_path: Path) -> None:
