@@ -23,7 +23,10 @@ _STYLES: dict[Phase, str] = {
     "ended": "white on grey30",
 }
 _BELLS = {"captured": 1, "refused": 2, "enough": 3, "lost": 3, "tick": 0}
+_HEIGHT = 24
 _LOG_LINES, _NOTE_LINES, _DRAWING_SIZE = 3, 2, (40, 9)
+# Two lines of 80 characters, broken between words.
+_LONGEST_NOTE = 150
 _PLAIN_EVERY_S = 3.0
 _BARS = ("left_right", "up_down", "near_far", "tilt", "roll")
 
@@ -102,11 +105,15 @@ class ScreenView:
                 for _ in range(_BELLS[cue.sound]):
                     self._console.bell()
         self._n_cued = state.cues[-1].number if state.cues else 0
-        self._live.update(render(state, has_keys=self._has_keys, links=self._links), refresh=True)
+        height = self._console.height
+        screen = render(state, has_keys=self._has_keys, links=self._links, height=height)
+        self._live.update(screen, refresh=True)
 
 
-def render(state: LiveState, *, has_keys: bool = True, links: tuple[str, ...] = ()) -> Any:
-    """Lay a state out for a terminal of 80x24; of the page's links the likeliest is shown."""
+def render(
+    state: LiveState, *, has_keys: bool = True, links: tuple[str, ...] = (), height: int = _HEIGHT
+) -> Any:
+    """Lay a state out for a terminal of 80x24 or lower; of the page's links the likeliest is shown."""
     from rich.columns import Columns
     from rich.console import Group
     from rich.padding import Padding
@@ -125,17 +132,21 @@ def render(state: LiveState, *, has_keys: bool = True, links: tuple[str, ...] = 
     headline = state.headline.upper()
     if state.hold_s is not None:
         headline += f"   {state.hold_s:.1f} s"
-    banner = Padding(Text(headline, style="bold", justify="center"), (1, 2), style=_STYLES[state.phase])
+    n_lacking = max(_HEIGHT - height, 0)
+    edge = 0 if n_lacking else 1
+    banner = Padding(Text(headline, style="bold", justify="center"), (edge, 2), style=_STYLES[state.phase])
     detail = Text(state.detail or " ", overflow="ellipsis", no_wrap=True, style="italic")
     parts = [title, banner, detail, _stream_table(state.streams)]
-    drawing = _drawing(state)
+    drawing = _drawing(state, n_lacking)
     side = _progress(state)
     parts.append(Columns([side, drawing], padding=(0, 2)) if drawing is not None else side)
+    # A note that is alone may take the lines of all.
+    is_alone = len(state.notes) == 1 and not n_lacking
     parts += [
-        Text(f"! {note}", style="yellow", no_wrap=True, overflow="ellipsis")
+        Text(f"! {note}"[:_LONGEST_NOTE], style="yellow", no_wrap=not is_alone, overflow="ellipsis")
         for note in state.notes[:_NOTE_LINES]
     ]
-    n_lines = _LOG_LINES - len(links[:1])
+    n_lines = max(_LOG_LINES - len(links[:1]) - n_lacking // 4, 1)
     parts += [Text(line, style="dim", no_wrap=True, overflow="ellipsis") for line in state.log[-n_lines:]]
     # A link that is cut is none: it wraps where it is too long.
     parts += [Text(f"page: {link}", overflow="fold") for link in links[:1]]
@@ -196,7 +207,7 @@ def _progress(state: LiveState) -> Any:
     return lines
 
 
-def _drawing(state: LiveState) -> Any:
+def _drawing(state: LiveState, n_lacking: int) -> Any:
     """Draw where the board is (dotted) and where it should be, as small as it gets."""
     from rich.text import Text
 
@@ -204,7 +215,10 @@ def _drawing(state: LiveState) -> Any:
     if drawing is None:
         return None
     height, width = drawing.pixels.shape[:2]
-    rows = draw_outlines((width, height), drawing.wanted_px, drawing.present_px, _DRAWING_SIZE)
+    columns, lines = _DRAWING_SIZE
+    # No lower than the bars beside it, whose lines are taken anyway.
+    size = columns, max(lines - n_lacking, 7)
+    rows = draw_outlines((width, height), drawing.wanted_px, drawing.present_px, size)
     return Text("\n".join(rows), style="green" if drawing.is_there else "", no_wrap=True)
 
 

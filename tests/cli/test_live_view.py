@@ -42,9 +42,9 @@ STATE = LiveState(
 )
 
 
-def drawn(state: LiveState, links: tuple[str, ...] = ()) -> list[str]:
-    console = Console(width=80, height=24, file=io.StringIO(), force_terminal=False)
-    console.print(render(state, links=links))
+def drawn(state: LiveState, links: tuple[str, ...] = (), width: int = 80, height: int = 24) -> list[str]:
+    console = Console(width=width, height=height, file=io.StringIO(), force_terminal=False)
+    console.print(render(state, links=links, height=height))
     out = console.file
     assert isinstance(out, io.StringIO)
     return out.getvalue().rstrip("\n").split("\n")
@@ -68,6 +68,22 @@ def test_the_page_s_link_stays_on_the_screen_which_covers_what_was_printed_befor
     assert "q stop" in lines[-1] and "10.0.0.1" not in "".join(lines)
 
 
+def test_a_note_that_is_alone_is_told_to_its_end() -> None:
+    note = (
+        "boards must stand still: no sync board ties the cameras' clocks, whatever they are, to the LiDAR's"
+    )
+    lines = drawn(replace(STATE, notes=(note,)))
+    assert len(lines) <= 24 and "the LiDAR's" in "\n".join(lines) and "q stop" in lines[-1]
+    assert len(drawn(replace(STATE, notes=STATE.notes[:1]))) <= 24, "however long it is"
+
+
+def test_a_small_terminal_shows_the_keys_and_the_last_message_too() -> None:
+    lines = drawn(replace(STATE, streams=STREAMS[:3]), width=60, height=20)
+    assert len(lines) <= 20 and "q stop" in lines[-1]
+    assert any("not captured" in line for line in lines)
+    assert max(len(line) for line in lines) <= 60
+
+
 def test_a_state_without_pictures_guidance_or_figures_is_shown_all_the_same() -> None:
     bare = replace(
         STATE, drawing=None, coverage=None, sigma_deg=np.nan, sigma_mm=np.nan, hold_s=None, streams=()
@@ -85,6 +101,8 @@ def test_every_phase_has_a_look(phase: str) -> None:
 
 def test_the_bell_rings_once_for_each_cue() -> None:
     class Bells:
+        height = 24
+
         n = 0
 
         def bell(self) -> None:

@@ -182,7 +182,9 @@ class Monitor:
         for name, camera in rig.cameras.items():
             status = self._statuses.get(name, SourceStatus(name))
             for channel, given in camera.channels.items():
-                kind_hz = status.figures.get(f"{given.kind}_hz", status.rate_hz)
+                # Of two kinds of one camera only its source can tell the rates apart.
+                otherwise_hz = status.rate_hz if given.kind == "frames" else 0.0
+                kind_hz = status.figures.get(f"{given.kind}_hz", otherwise_hz)
                 streams.append(self._camera_stream(name, channel, given.kind == "frames", kind_hz, status))
         for name in rig.lidars:
             streams.append(self._lidar_stream(name, self._statuses.get(name, SourceStatus(name))))
