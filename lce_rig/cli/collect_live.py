@@ -75,7 +75,7 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
         listeners += [simulated.watch] if simulated else []
         asked = stack.enter_context(controls())
         with open_view(is_plain=given.plain, has_keys=asked.is_interactive, links=links) as view:
-            listeners.append(view.show)
+            listeners.append(_until_gone(view.show))
             is_begun = threading.Event()
 
             def tell(state: "LiveState") -> None:
@@ -91,6 +91,20 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
                     saved = f"{path}: {show.counted(n_captures, 'capture')} ({n_captures - n_before} new)"
                     stack.callback(show.note, saved)
     _tell(report, n_captures, asked, simulated)
+
+
+def _until_gone(show_state: "Callable[[LiveState], None]") -> "Callable[[LiveState], None]":
+    """Show states until the terminal is gone: what comes with its hangup is the end, in good order."""
+    is_gone = threading.Event()
+
+    def tell(state: "LiveState") -> None:
+        if not is_gone.is_set():
+            try:
+                show_state(state)
+            except OSError:
+                is_gone.set()
+
+    return tell
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Protocol
 
 import numpy as np
@@ -41,7 +41,7 @@ class View(Protocol):
 
 @contextmanager
 def open_view(*, is_plain: bool, has_keys: bool, links: tuple[str, ...] = ()) -> Iterator[View]:
-    """Open a screen where stderr is a terminal, else, or where wanted, plain lines.
+    """Open a screen where stderr is a terminal that can draw one, else, or where wanted, plain lines.
 
     Args:
         is_plain: lines are wanted.
@@ -55,8 +55,16 @@ def open_view(*, is_plain: bool, has_keys: bool, links: tuple[str, ...] = ()) ->
     from rich.live import Live
 
     console = Console(stderr=True, highlight=False)
-    with Live(console=console, screen=True, auto_refresh=False) as live:
+    if console.is_dumb_terminal:
+        yield PlainView()
+        return
+    live = Live(console=console, screen=True, auto_refresh=False)
+    live.start()
+    try:
         yield ScreenView(live, console, has_keys=has_keys, links=links)
+    finally:
+        with suppress(OSError):  # The terminal may be gone.
+            live.stop()
 
 
 class PlainView:

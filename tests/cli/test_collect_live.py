@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import select
 import signal
 import socket
 import subprocess
@@ -132,3 +133,29 @@ def test_ctrl_c_and_a_kill_while_the_simulated_rig_starts_end_it_without_a_trace
         os.killpg(process.pid, number)  # as a terminal does: to the simulation, too
         _, said = process.communicate(timeout=60)  # until the simulation has closed its end, too
         assert process.returncode in (130, -number) and "Traceback" not in said
+
+
+@pytest.mark.parametrize("term", ["xterm", pytest.param("dumb", marks=pytest.mark.slow)])
+def test_a_terminal_that_is_closed_ends_the_collection_in_good_order(tmp_path: Path, term: str) -> None:
+    ours, theirs = pty.openpty()
+    path = tmp_path / "session"
+    environment = {**os.environ, "TERM": term}
+    command = [sys.executable, "-m", "lce_rig", "collect", "--rig", "rles", str(path), "--simulated"]
+    process = subprocess.Popen(
+        command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment, start_new_session=True
+    )
+    os.close(theirs)
+    said, deadline_s = b"", time.monotonic() + 150
+    try:
+        while b"davis.frames" not in said and b"moving" not in said:
+            assert time.monotonic() < deadline_s and process.poll() is None, said
+            if select.select([ours], [], [], 0.5)[0]:
+                said += os.read(ours, 65536)
+        os.close(ours)
+        process.send_signal(signal.SIGHUP)  # as the kernel does where it is the controlling terminal
+        process.wait(timeout=60)
+    finally:
+        process.kill()
+    assert (b"\x1b[" in said) == (term == "xterm")
+    entries = [json.loads(line) for line in (path / "journal.jsonl").read_text().splitlines()]
+    assert entries[-1]["event"] == "collected live" and entries[-1]["ending"] == "stopped"
