@@ -72,6 +72,8 @@ class LidarBoard:
         edge_ring: (M,) int16.
         edge_side: (M,) int8, -1 where the board ends towards smaller azimuth, +1 towards larger
             (azimuth = atan2(y, x), counter-clockwise).
+        edge_behind_m: (M,) how far behind the board's plane the ring's next return beyond the edge lies;
+            inf where there is none. What stands close behind blends into the beam's return.
         azimuth_step_rad: angle between neighbouring firings of one ring.
         plane: (4,) as (n, d), n.p + d = 0, unit n towards the LiDAR (d > 0).
         sigma_m: rms distance of `points` from the plane.
@@ -87,6 +89,7 @@ class LidarBoard:
     edge_points: Array
     edge_ring: NDArray[np.int16]
     edge_side: NDArray[np.int8]
+    edge_behind_m: Array
     azimuth_step_rad: float
     plane: Array
     sigma_m: float

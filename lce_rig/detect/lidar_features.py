@@ -188,6 +188,7 @@ def build_board(
         edge_points=scan.points[edge].astype(np.float64),
         edge_ring=scan.ring[edge],
         edge_side=ends.side[order],
+        edge_behind_m=ends.behind_m[order],
         azimuth_step_rad=scan.step_rad,
         plane=view.plane,
         sigma_m=float(np.sqrt(np.mean(height**2))),

@@ -1,25 +1,30 @@
 """Is the claimed covariance true, and how near is the error to the Cramer-Rao bound of the same captures?"""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
-from lce_rig.calibrate import CalibrateOptions, calibrate
-from lce_rig.calibrate.likelihood.levels import Levels, Priors
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate
+from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, EdgeRows
+from lce_rig.calibrate.likelihood.end_density import density
+from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import stack_pictures
 from lce_rig.calibrate.likelihood.refine import to_extrinsic
 from lce_rig.calibrate.likelihood.scans import N_FIELDS, stack_scans
-from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, assemble, linearise
+from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, Terms, assemble, linearise
 from lce_rig.core.geometry import Array, difference, invert
 from lce_rig.rig import Rig, load_rig
-from lce_rig.simulate import SimulationOptions
+from lce_rig.simulate import LidarNoise, SimulationOptions
 
 CORNER_SIGMA_PX = 0.1
+# Something found in the scan that lies farther than this from the board is not it.
+_FOUND_M = 0.05
 _FREEDOMS = 6
 
 
@@ -101,6 +106,7 @@ def _sizes(cov: Array) -> tuple[float, float]:
 
 def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[Run]:
     rig = load_rig(case.rig)
+    board = rig.board.to_board()
     lidar = next(iter(rig.lidars.values()))
     options = CalibrateOptions(
         method="ml",
@@ -109,36 +115,75 @@ def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[R
         range_offset_sigma_m=lidar.range_offset_sigma_m,
     )
     own = folder / "".join(c if c.isalnum() else "-" for c in case.label)
-    for seed in range(n_seeds):
-        session = still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, own)
-        estimate = calibrate(session.candidates, rig.board.to_board(), options)
-        error = difference(estimate.T_cam_lidar, session.T_cam_lidar)
-        yield Run(error, estimate.cov, cramer_rao_bound(rig, session, options, case.options()))
+    sessions = [
+        still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, own) for seed in range(n_seeds)
+    ]
+    at_truth = [_at_truth(rig, session) for session in sessions]
+    levels = _true_levels(case.options().lidar_noise, *_fit_ends([terms.edges for terms in at_truth]))
+    priors = Priors(offset_m=options.range_offset_sigma_m, shift_m=options.edge_shift_sigma_m)
+    for session, terms in zip(sessions, at_truth, strict=True):
+        estimate = calibrate(session.candidates, board, options)
+        bound = cramer_rao_bound(terms, levels, priors, session.T_cam_lidar)
+        yield Run(difference(estimate.T_cam_lidar, session.T_cam_lidar), estimate.cov, bound)
 
 
-def cramer_rao_bound(
-    rig: Rig, session: StillSession, options: CalibrateOptions, simulated: SimulationOptions
-) -> Array:
+def cramer_rao_bound(terms: Terms, levels: Levels, priors: Priors, T_cam_lidar: Array) -> Array:
     """Compute the covariance (6, 6) below which no unbiased estimate gets from a session's captures.
 
     The inverse of the information of ranges, ring ends and corners at the true poses, with the noise that
-    the simulator has: ranges and lasers as its options say, ring ends anywhere within their step, corners
-    as drawn, and no pose error. Constant errors of the sensors are unknown, but for what the profile says
-    of them.
+    the simulator has. Constant errors of the sensors are unknown, but for what the profile says of them.
+
+    Args:
+        terms: at the truth.
+        levels: of the simulated noise.
+        priors: of the constant errors.
+        T_cam_lidar: (4, 4) the truth.
     """
-    names = [item.capture for item in session.candidates]
-    T_cam_board = np.array([session.T_cam_board[name] for name in names])
-    scans = stack_scans([item.lidar[0] for item in session.candidates])
-    images = [item.image for item in session.candidates]
-    pictures = stack_pictures(np.arange(len(names)), images, np.ones(len(names)))
-    n_constants = PER_CAMERA + len(scans.rings) + N_FIELDS + 1
-    T = session.T_cam_lidar
-    state = State(T[None], invert(T) @ T_cam_board, np.zeros(n_constants))
-    terms = linearise(scans, (pictures,), rig.board.to_board(), state)
-    tiny = 1e-6
-    noise = simulated.lidar_noise
-    levels = Levels(noise.range_sigma_m, tiny, tiny, tiny, tiny, tiny, tiny, noise.laser_sigma_m)
-    priors = Priors(offset_m=options.range_offset_sigma_m, shift_m=options.edge_shift_sigma_m)
-    information = assemble(terms, levels, priors, np.ones(len(scans.end_rays))).information
-    J = to_extrinsic(T, 0, n_constants)
+    information = assemble(terms, levels, priors).information
+    J = to_extrinsic(T_cam_lidar, 0, len(information))
     return np.asarray(J @ np.linalg.inv(information) @ J.T)
+
+
+def _true_levels(noise: LidarNoise, blur_rad: float, lost_share: float) -> Levels:
+    """Ranges and lasers as the simulator's options say, corners as drawn, and no pose error."""
+    none = 1e-6
+    return Levels(
+        noise.range_sigma_m, none, blur_rad, lost_share, none, none, none, none, noise.laser_sigma_m
+    )
+
+
+def _at_truth(rig: Rig, session: StillSession) -> Terms:
+    found = [item for item in session.candidates if is_board(session, item)]
+    scans = stack_scans([item.lidar[0] for item in found])
+    pictures = stack_pictures(np.arange(len(found)), [item.image for item in found], np.ones(len(found)))
+    T = session.T_cam_lidar
+    T_lidar_board = invert(T) @ np.array([session.T_cam_board[item.capture] for item in found])
+    constants = np.zeros(PER_CAMERA + len(scans.rings) + N_FIELDS + N_SHIFTS)
+    return linearise(scans, (pictures,), rig.board.to_board(), State(T[None], T_lidar_board, constants))
+
+
+def is_board(session: StillSession, item: CaptureCandidates) -> bool:
+    """Tell whether what was found in the scan lies where the board truly was."""
+    T = invert(session.T_cam_lidar) @ session.T_cam_board[item.capture]
+    return float(np.linalg.norm(item.lidar[0].points.mean(axis=0) - T[:3, 3])) < _FOUND_M
+
+
+def _fit_ends(edges: Sequence[EdgeRows]) -> tuple[float, float]:
+    """Find the blur and lost share under which ring ends at the true poses are most probable.
+
+    How far a ring end strays follows from ray-traced footprints, not from a number among the options. The
+    beam's width is free.
+    """
+    rows, step_m, range_m = (
+        np.concatenate([getattr(e, name) for e in edges]) for name in ("rows", "step_m", "range_m")
+    )
+
+    def cost(x: Array) -> float:
+        blur, lost_share = np.exp(x[2]) * range_m / step_m, float(np.exp(min(x[3], np.log(MOST_LOST))))
+        p, _ = density((rows[:, -1] + rows[:, -3:-1] @ x[:2]) / step_m, blur, lost_share)
+        return -float(np.sum(np.log(p)))
+
+    usual = Levels()
+    start = [-float(np.median(rows[:, -1])), 0.0, np.log(usual.edge_rad), np.log(usual.lost_share)]
+    blur_rad, lost_share = np.exp(minimize(cost, start, method="Nelder-Mead").x[2:])
+    return float(blur_rad), min(float(lost_share), MOST_LOST)

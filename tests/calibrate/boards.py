@@ -33,6 +33,7 @@ class Scenario:
     range_offset_m: float = 0.0
     corner_sigma_px: float = 0.1
     footprint_m: float = 0.0
+    end_sigma_m: float = 0.0
     lost_share: float = 0.0
     step_deg: float = 0.2
     tilt_deg: tuple[float, float] = (10.0, 45.0)
@@ -134,7 +135,12 @@ def scan_board(
     )
     ranges = (R[:, 2] @ centre) / (rays @ R[:, 2])
     on_board = (rays * ranges[..., None] - centre) @ R
-    half = np.array([board.width_m, board.height_m]) / 2 + scenario.footprint_m
+    # A beam so wide meets the board from that far beyond an edge, farther along a board seen obliquely.
+    wide = scenario.footprint_m * np.hypot(1, (rays @ R)[..., :2] / (rays @ R)[..., 2:])
+    half = np.array([board.width_m, board.height_m]) / 2 + wide
+    if scenario.end_sigma_m > 0:
+        jitter = scenario.end_sigma_m * rng.standard_normal((16, 2))
+        half = half + jitter[:, (azimuth[0] > middle).astype(int), None]
     is_hit = (ranges > 0) & np.all(np.abs(on_board[..., :2]) <= half, axis=-1)
     first, last = is_hit.argmax(axis=1), is_hit.shape[1] - 1 - is_hit[:, ::-1].argmax(axis=1)
     lost = rng.random((16, 2)) < scenario.lost_share
@@ -164,6 +170,7 @@ def scan_board(
         edge_points=np.concatenate([points[rings, first[rings]], points[rings, last[rings]]]),
         edge_ring=np.concatenate([rings, rings]).astype(np.int16),
         edge_side=np.repeat(np.array([-1, 1], dtype=np.int8), len(rings)),
+        edge_behind_m=np.full(2 * len(rings), np.inf),
         azimuth_step_rad=step,
         plane=plane,
         sigma_m=rms,

@@ -72,7 +72,7 @@ def calibrate_by_likelihood(
         placement,
         np.array([f.centre for f in features]),
         joint.levels.depth_m,
-        joint.levels.edge_m,
+        joint.end_sigma_m,
     )
     return replace(estimate, expansion=expansion)
 
@@ -82,8 +82,9 @@ def _figures(joint: JointEstimate, T_start: Array) -> dict[str, float]:
     offset_deg, offset_m = error_to_reference(joint.T_cam_lidar[0], T_start)
     levels = joint.levels
     return {
-        "edge_shift_m": joint.shift_m,
-        "edge_shift_sigma_m": float(joint.constants_sigma[-1]),
+        "edge_shift_m": float(joint.shifts_m[0]),
+        "edge_shift_sigma_m": float(joint.constants_sigma[-2]),
+        "edge_shift_backed_m": float(joint.shifts_m.sum()),
         "range_offset_m": float(np.mean(joint.offset_m)),
         "laser_spread_m": float(np.std(joint.offset_m)),
         "lens_lateral_m": float(joint.lens_m[0]),
@@ -91,7 +92,8 @@ def _figures(joint: JointEstimate, T_start: Array) -> dict[str, float]:
         "camera_scale": 1.0 + float(joint.scale[0]),
         "noise_range_m": levels.range_m,
         "noise_ring_m": levels.ring_m,
-        "noise_ring_end_m": levels.edge_m,
+        "noise_ring_end_mrad": 1e3 * levels.edge_rad,
+        "ring_ends_lost": levels.lost_share,
         "noise_tilt_deg": float(np.degrees(levels.tilt_rad)),
         "noise_spin_deg": float(np.degrees(levels.spin_rad)),
         "noise_depth_m": levels.depth_m,

@@ -1,10 +1,15 @@
 """Ring ends against the board's edges.
 
 A ring's last ray on the board meets its plane at a distance s inside an edge, the next ray a step D farther
-out along the edge's normal. The beam has a width, so that the board is lost where the ray is d outside the
-edge: s + d lies anywhere between 0 and D, hence
+out along the edge's normal. The beam has a width, so that the board is lost where the ray passes d beyond
+the edge, measured across the beam; along the board that is g d, more the more obliquely it is seen:
+s + g d lies anywhere between 0 and D. The error
 
-    s + d - D / 2 = noise,    sigma^2 = D^2 / 12 + tau^2                                                  (1)
+    e = s + g d - D / 2                                                                                  (1)
+
+in units of D has the density of `end_density`. Where something stands close behind the edge, its echo blends
+into those of beams that the board fills in part, and their ranges no longer lie on the board: there the board
+is lost sooner, at d + d'.
 """
 
 from dataclasses import dataclass
@@ -12,40 +17,48 @@ from functools import cached_property
 
 import numpy as np
 
+from lce_rig.calibrate.likelihood.end_density import density, information
 from lce_rig.calibrate.likelihood.scans import N_FIELDS, Indices, StackedScans
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 
-# Columns of a row: by board pose, by lens, by d, residual.
-_SIZE = 6 + N_FIELDS + 2
+N_SHIFTS = 2
+# Columns of a row: by board pose, by lens, by d and d', residual.
+_SIZE = 6 + N_FIELDS + N_SHIFTS + 1
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeRows:
-    """Equation (1) for M ring ends, linear in the tangent of T_lidar_board, the lens and d.
+    """Equation (1) for M ring ends, linear in the tangent of T_lidar_board, the lens, d and d'.
 
     Attributes:
         capture: (M,).
-        rows: (M, 10) by board pose (6), by lens (2), by d, residual in m.
+        rows: (M, 11) by board pose (6), by lens (2), by d, by d', e in m.
         step_m: (M,) D.
+        range_m: (M,) to the board.
     """
 
     capture: Indices
     rows: Array
     step_m: Array
+    range_m: Array
 
     @cached_property
     def products(self) -> Array:
-        """Products of each row with itself (M, 10, 10)."""
+        """Products of each row with itself (M, 11, 11)."""
         return np.asarray(self.rows[:, :, None] * self.rows[:, None, :])
 
-    def variance(self, tau_m: float) -> Array:
-        """Variance (M,) of (1) in m^2."""
-        return np.asarray(self.step_m**2 / 12 + tau_m**2)
+    def blur(self, tau_rad: float) -> Array:
+        """Blur (M,) of each interval's ends, in steps."""
+        return np.asarray(tau_rad * self.range_m / self.step_m)
+
+    def variance(self, tau_rad: float) -> Array:
+        """Variance (M,) of e in m^2, of the blurred interval alone."""
+        return np.asarray(self.step_m**2 / 12 + (tau_rad * self.range_m) ** 2)
 
 
 def edge_rows(
-    scans: StackedScans, T_lidar_board: Array, board: Board, lens: Array, shift_m: float
+    scans: StackedScans, T_lidar_board: Array, board: Board, lens: Array, shifts_m: Array
 ) -> EdgeRows:
     """Linearise (1).
 
@@ -54,7 +67,7 @@ def edge_rows(
         T_lidar_board: (F, 4, 4) board poses.
         board: its size.
         lens: (2,) theta.
-        shift_m: d.
+        shifts_m: (2,) d and d'.
     """
     T = T_lidar_board[scans.end_capture]
     R, t, n = T[:, :3, :3], T[:, :3, 3], T[:, :3, 2]
@@ -75,10 +88,11 @@ def edge_rows(
     rows = np.empty((len(M), _SIZE))
     rows[:, :3] = sideways
     rows[:, 3:6] = -np.cross(sideways, here)
-    rows[:, 6:-2] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
-    rows[:, -2] = 1
-    rows[:, -1] = inside_m + rows[:, 6:-2] @ lens + shift_m - step_m / 2
-    return EdgeRows(scans.end_capture, rows, step_m)
+    rows[:, 6 : 6 + N_FIELDS] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
+    rows[:, -3] = np.linalg.norm(sideways, axis=1)
+    rows[:, -2] = rows[:, -3] * scans.end_is_backed
+    rows[:, -1] = inside_m + rows[:, 6:-1] @ np.concatenate([lens, shifts_m]) - step_m / 2
+    return EdgeRows(scans.end_capture, rows, step_m, h / cosine)
 
 
 def nearest_edge(xy_m: Array, board: Board) -> Indices:
@@ -90,10 +104,21 @@ def nearest_edge(xy_m: Array, board: Board) -> Indices:
     return np.where(to_side < to_rail, side, rail).astype(np.intp)
 
 
-def edge_system(edges: EdgeRows, weights: Array, n_captures: int) -> Array:
-    """Sum products of rows, weighted (M,), by capture: (F, 10, 10)."""
+def edge_system(edges: EdgeRows, tau_rad: float, lost_share: float, n_captures: int) -> Array:
+    """Expand -2 ln p of the ring ends to second order, by capture: (F, 11, 11).
+
+    With J a row without its residual: J J^T times the information, J times the score in the last column, and
+    -2 ln p itself in the corner. The information is the mean over all ring ends of such a blur: that of a
+    single one is zero in the middle of its interval, and no Hessian to step by.
+    """
     system = np.zeros((n_captures, _SIZE, _SIZE))
     if len(edges.rows):
+        D, blur = edges.step_m, edges.blur(tau_rad)
+        p, slope = density(edges.rows[:, -1] / D, blur, lost_share)
+        weighted = edges.products * (information(blur, lost_share) / D**2)[:, None, None]
+        weighted[:, :-1, -1] = edges.rows[:, :-1] * (-slope / p / D)[:, None]
+        weighted[:, -1, :-1] = weighted[:, :-1, -1]
+        weighted[:, -1, -1] = -2 * np.log(p / D)
         first = np.flatnonzero(np.diff(edges.capture, prepend=-1))
-        system[edges.capture[first]] = np.add.reduceat(weights[:, None, None] * edges.products, first, axis=0)
+        system[edges.capture[first]] = np.add.reduceat(weighted, first, axis=0)
     return system

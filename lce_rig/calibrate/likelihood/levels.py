@@ -16,7 +16,8 @@ class Levels:
     Attributes:
         range_m: noise of a single range.
         ring_m: error that the returns of one ring in one capture share, beyond the laser's offset.
-        edge_m: tau, of a ring end beyond the width of its step.
+        edge_rad: blur of the ends of a ring end's interval, across the beam, by range (`edge_terms`).
+        lost_share: of ring ends whose last returns are missing; a share, not a deviation.
         tilt_rad, spin_rad: errors of a board's turn in a picture beyond corner noise.
         depth_m, across_m: errors of its place, along and across the line of sight.
         laser_m: of the lasers' range offsets about their mean.
@@ -24,7 +25,8 @@ class Levels:
 
     range_m: float = 0.008
     ring_m: float = 0.002
-    edge_m: float = 0.002
+    edge_rad: float = 0.0005
+    lost_share: float = 0.08
     tilt_rad: float = 3.5e-3
     spin_rad: float = 5e-4
     depth_m: float = 0.004
@@ -47,7 +49,9 @@ class Levels:
 
 
 # One deviation of the logarithm of each level, a priori; the lasers' spread is the profile's to state.
-LOG_SIGMA = np.array([0.7, 0.7, 0.7, 0.7, 0.7, 0.7, 0.7, 0.3])
+LOG_SIGMA = np.array([0.7, 0.7, 0.7, 1.0, 0.7, 0.7, 0.7, 0.7, 0.3])
+# Most ring ends are where the board ends, or there would be nothing to go by.
+MOST_LOST = 0.6
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,7 @@ class Priors:
     Attributes:
         offset_m: range offset common to all lasers.
         shift_m: edge shift d.
+        backed_m: its change d' where something stands close behind the edge.
         lateral_m: lens beside the LiDAR's axis, `scans`.
         vertical_m: its height, per rad of elevation.
         scale: of the camera's distances, by which squares or focal length are off.
@@ -64,6 +69,7 @@ class Priors:
 
     offset_m: float = 0.005
     shift_m: float = 0.015
+    backed_m: float = 0.01
     lateral_m: float = 0.02
     vertical_m: float = 0.04
     scale: float = 0.0005

@@ -5,21 +5,22 @@ small are not taken for small noise. The terms stay linearised: an evaluation is
 pass over points.
 """
 
+from dataclasses import fields
+
 import numpy as np
 from scipy.optimize import minimize
 
-from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, NO_LASER_M, Levels, Priors
+from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, Priors
 from lce_rig.calibrate.likelihood.system import Terms, assemble
 from lce_rig.core.geometry import Array
 
 _STEP = 1e-3
+_LOST = [field.name for field in fields(Levels)].index("lost_share")
 # Levels lie within these factors of what is usual, e^-4.6 and e^3.
 _BELOW, _ABOVE = -4.6, 3.0
 
 
-def fit_levels(
-    terms: Terms, start: Levels, usual: Levels, priors: Priors, end_weights: Array, n_rounds: int
-) -> Levels:
+def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, n_rounds: int) -> Levels:
     """Find the levels that minimise -2 ln p(data | levels) - 2 ln p(levels).
 
     Args:
@@ -27,7 +28,6 @@ def fit_levels(
         start: levels to start from.
         usual: middle of what is believed of them.
         priors: of the constants.
-        end_weights: (M,) robust weights of the ring ends.
         n_rounds: of the search, at most.
     """
     middle = usual.to_logs()
@@ -35,9 +35,11 @@ def fit_levels(
 
     def cost(logs: Array) -> float:
         unlikely = float(np.sum(((logs - middle[free]) / LOG_SIGMA[free]) ** 2))
-        return assemble(terms, _levels(logs, usual), priors, end_weights).minus_2_log_evidence + unlikely
+        return assemble(terms, _levels(logs, usual), priors).minus_2_log_evidence + unlikely
 
-    bounds = [(middle[i] + _BELOW, middle[i] + _ABOVE) for i in free]
+    highest = middle + _ABOVE
+    highest[_LOST] = np.log(MOST_LOST)
+    bounds = [(middle[i] + _BELOW, highest[i]) for i in free]
     options = {"maxiter": n_rounds, "eps": _STEP, "ftol": 1e-6}
     found = minimize(cost, start.to_logs()[free], method="L-BFGS-B", bounds=bounds, options=options)
     return _levels(found.x, usual)

@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS
 from lce_rig.calibrate.likelihood.levels import NO_LASER_M, Levels, Priors
 from lce_rig.calibrate.likelihood.levels_fit import fit_levels
 from lce_rig.calibrate.likelihood.picture_terms import Pictures, stack_pictures
-from lce_rig.calibrate.likelihood.scans import N_FIELDS, lens_fields, stack_scans
+from lce_rig.calibrate.likelihood.scans import N_FIELDS, StackedScans, lens_fields, stack_scans
 from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, System, Terms, assemble, linearise
 from lce_rig.calibrate.placements import group_placements
 from lce_rig.core.board import Board
@@ -20,12 +21,13 @@ from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import Observation
 from lce_rig.solvers.covariance import symmetric_inverse
 
-# Freedoms of Student's distribution of ring ends.
-_FREEDOMS = 5.0
 _STEPS = 3
 # Rounds of the search for noise levels, after each of which all is linearised anew.
 _LEVEL_ROUNDS = (12, 4, 4)
 _SETTLED = 1e-7
+# Blurs that ring ends are first given: as long as the edge shift is unknown, all of them may lie outside
+# their intervals, where a sharp density is flat.
+_BLURS_RAD = (4e-3, 1.5e-3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +41,11 @@ class JointEstimate:
         to_extrinsics: (C, 6, G) derivative of each extrinsic's tangent by the unknowns z of `system`.
         offset_m: (L,) by which ranges of each ring read too long.
         lens_m: (2,) lateral and vertical displacement of the LiDAR's lens, `scans`.
-        shift_m: edge shift.
+        shifts_m: (2,) edge shift, and its change where something stands close behind.
         scale: (C,) by how much of themselves each camera's distances are too short.
-        constants_sigma: (L + 3,) standard deviations of offsets, lens and edge shift.
+        constants_sigma: (L + 4,) standard deviations of offsets, lens and edge shifts.
         levels: of the noise.
+        end_sigma_m: standard deviation of ring ends from the edges, without those lost or astray.
         system: normal equations at the optimum.
     """
 
@@ -52,10 +55,11 @@ class JointEstimate:
     to_extrinsics: Array
     offset_m: Array
     lens_m: Array
-    shift_m: float
+    shifts_m: Array
     scale: Array
     constants_sigma: Array
     levels: Levels
+    end_sigma_m: float
     system: System
 
 
@@ -86,20 +90,39 @@ def refine(
     state = State(
         np.array(T_cam_lidar),
         np.array([invert(T) @ o.image.T_cam_board for o, T in (seen[name] for name in order)]),
-        np.zeros(PER_CAMERA * len(cameras) + len(scans.rings) + N_FIELDS + 1),
+        np.zeros(PER_CAMERA * len(cameras) + len(scans.rings) + N_FIELDS + N_SHIFTS),
     )
+    problem = _Problem(scans, pictures, board, priors)
     now = levels or usual
-    for n_rounds in (*_LEVEL_ROUNDS, 0):
+    for blur_rad in _BLURS_RAD:
+        state = problem.settle(state, replace(now, edge_rad=max(blur_rad, now.edge_rad)))
+    for n_rounds in _LEVEL_ROUNDS if levels is None else ():
+        state = problem.settle(state, now)
+        now = fit_levels(problem.linearise(state), now, usual, priors, n_rounds)
+    state = problem.settle(state, now)
+    return _summarise(state, problem.linearise(state), now, priors)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What stays the same while the unknowns are sought."""
+
+    scans: StackedScans
+    pictures: tuple[Pictures, ...]
+    board: Board
+    priors: Priors
+
+    def linearise(self, state: State) -> Terms:
+        return linearise(self.scans, self.pictures, self.board, state)
+
+    def settle(self, state: State, levels: Levels) -> State:
+        """Find the optimum at given levels."""
         for _ in range(_STEPS):
-            terms = linearise(scans, pictures, board, state)
-            z, y = assemble(terms, now, priors, end_weights(terms, now)).step()
+            z, y = assemble(self.linearise(state), levels, self.priors).step()
             state = state.moved(z, y)
             if np.abs(z).max() < _SETTLED:
                 break
-        terms = linearise(scans, pictures, board, state)
-        if levels is None and n_rounds:
-            now = fit_levels(terms, now, usual, priors, end_weights(terms, now), n_rounds)
-    return _summarise(state, assemble(terms, now, priors, end_weights(terms, now)), now)
+        return state
 
 
 def _pictures(observations: Sequence[Observation], order: dict[str, int]) -> Pictures:
@@ -107,12 +130,6 @@ def _pictures(observations: Sequence[Observation], order: dict[str, int]) -> Pic
     capture = np.array([order[o.capture] for o in observations], dtype=np.intp)
     n_repeats = np.bincount(placement)[placement].astype(np.float64)
     return stack_pictures(capture, [o.image for o in observations], n_repeats)
-
-
-def end_weights(terms: Terms, levels: Levels) -> Array:
-    """Compute (nu + 1) / (nu + (e / sigma)^2) for the ring ends (M,)."""
-    squares = terms.edges.rows[:, -1] ** 2 / terms.edges.variance(levels.edge_m)
-    return np.asarray((_FREEDOMS + 1) / (_FREEDOMS + squares))
 
 
 def to_extrinsic(T_cam_lidar: Array, camera: int, n_unknowns: int) -> Array:
@@ -132,11 +149,12 @@ def to_extrinsic(T_cam_lidar: Array, camera: int, n_unknowns: int) -> Array:
     J = np.zeros((6, n_unknowns))
     J[:, PER_CAMERA * camera : PER_CAMERA * camera + 6] = np.eye(6)
     # The third row of R is the camera's line of sight in frame lidar.
-    J[:3, -N_FIELDS - 1] = T_cam_lidar[:3, :3] @ lens_fields(T_cam_lidar[2:3, :3])[0, :, 0]
+    J[:3, -N_SHIFTS - N_FIELDS] = T_cam_lidar[:3, :3] @ lens_fields(T_cam_lidar[2:3, :3])[0, :, 0]
     return J
 
 
-def _summarise(state: State, system: System, levels: Levels) -> JointEstimate:
+def _summarise(state: State, terms: Terms, levels: Levels, priors: Priors) -> JointEstimate:
+    system = assemble(terms, levels, priors)
     C, constants = len(state.T_cam_lidar), state.constants
     cov = symmetric_inverse(system.information)
     J = np.stack([to_extrinsic(T, c, len(cov)) for c, T in enumerate(state.T_cam_lidar)])
@@ -146,11 +164,12 @@ def _summarise(state: State, system: System, levels: Levels) -> JointEstimate:
         T_lidar_board=state.T_lidar_board,
         cov=J @ cov @ np.swapaxes(J, 1, 2),
         to_extrinsics=J,
-        offset_m=rest[: -N_FIELDS - 1],
-        lens_m=rest[-N_FIELDS - 1 : -1],
-        shift_m=float(rest[-1]),
+        offset_m=rest[: -N_FIELDS - N_SHIFTS],
+        lens_m=rest[-N_FIELDS - N_SHIFTS : -N_SHIFTS],
+        shifts_m=rest[-N_SHIFTS:],
         scale=constants[PER_CAMERA * np.arange(C) + 6],
         constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
         levels=levels,
+        end_sigma_m=float(np.sqrt(np.mean(terms.edges.variance(levels.edge_rad)))),
         system=system,
     )

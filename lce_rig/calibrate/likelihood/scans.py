@@ -20,6 +20,8 @@ from lce_rig.core.results import LidarBoard
 
 Indices = NDArray[np.intp]
 N_FIELDS = 2
+# Echoes from surfaces nearer to each other than this blend into one.
+_BLENDS_M = 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +39,7 @@ class StackedScans:
         end_rays: (M, 3) unit vectors towards it.
         next_rays: (M, 3) unit vectors of the firing after it, which missed the board.
         end_fields: (M, 3, 2) as `fields`.
+        end_is_backed: (M,) whether something stands close behind the board's edge.
     """
 
     n_captures: int
@@ -50,6 +53,7 @@ class StackedScans:
     end_rays: Array
     next_rays: Array
     end_fields: Array
+    end_is_backed: NDArray[np.bool_]
 
     @property
     def group(self) -> Indices:
@@ -81,6 +85,7 @@ def stack_scans(boards: Sequence[LidarBoard]) -> StackedScans:
         end_rays=end_rays,
         next_rays=turn_about_z(end_rays, angle),
         end_fields=lens_fields(ends),
+        end_is_backed=np.concatenate([b.edge_behind_m for b in boards]) < _BLENDS_M,
     )
 
 

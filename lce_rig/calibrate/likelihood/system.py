@@ -3,7 +3,7 @@
 Unknowns are the tangent y_k (6) of each board's T_lidar_board, and z, which all captures share:
 
     z = [tangent of T_cam_lidar (6) and scale of each camera, range offset of each ring (L), lens (2),
-         edge shift]
+         edge shift, its change where something stands close behind]
 
 A board pose meets only the terms of its own capture: the matrix is an arrow head, and y_k is eliminated
 capture by capture (Schur complement).
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.calibrate.likelihood.edge_terms import EdgeRows, edge_rows, edge_system
+from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, EdgeRows, edge_rows, edge_system
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import Pictures, picture_rows
 from lce_rig.calibrate.likelihood.range_terms import RangeSums, range_system, sum_ranges, weigh_ranges
@@ -34,7 +34,7 @@ class State:
     Attributes:
         T_cam_lidar: (C, 4, 4).
         T_lidar_board: (F, 4, 4).
-        constants: (7 C + L + 3,) z, zero in the places of the tangents.
+        constants: (7 C + L + 4,) z, zero in the places of the tangents.
     """
 
     T_cam_lidar: Array
@@ -77,11 +77,11 @@ def linearise(scans: StackedScans, pictures: Sequence[Pictures], board: Board, s
     """Linearise all terms."""
     per_camera = state.constants[: PER_CAMERA * len(pictures)].reshape(-1, PER_CAMERA)
     of_lidar = state.constants[PER_CAMERA * len(pictures) :]
-    offsets, lens, shift = np.split(of_lidar, [len(scans.rings), len(scans.rings) + N_FIELDS])
+    offsets, lens, shifts = np.split(of_lidar, [len(scans.rings), len(scans.rings) + N_FIELDS])
     T_lidar_board = state.T_lidar_board
     return Terms(
         sum_ranges(scans, T_lidar_board, offsets, lens),
-        edge_rows(scans, T_lidar_board, board, lens, float(shift[0])),
+        edge_rows(scans, T_lidar_board, board, lens, shifts),
         tuple(pictures),
         tuple(
             picture_rows(own, T, T_lidar_board, float(constants[-1]))
@@ -122,26 +122,23 @@ class System:
         return z, -self.board_steps @ np.append(z, 1.0)
 
 
-def assemble(terms: Terms, levels: Levels, priors: Priors, end_weights: Array) -> System:
+def assemble(terms: Terms, levels: Levels, priors: Priors) -> System:
     """Weigh all terms and eliminate the board poses.
 
     Args:
         terms: of F captures.
         levels: of their noise.
         priors: of the constants.
-        end_weights: (M,) robust weights of the ring ends.
     """
     F, L, C = len(terms.ranges.sums), terms.n_rings, len(terms.pictures)
-    G = PER_CAMERA * C + L + N_FIELDS + 1
+    G = PER_CAMERA * C + L + N_FIELDS + N_SHIFTS
     M = np.zeros((F, 6 + G + 1, 6 + G + 1))
     weighted, log_volumes = weigh_ranges(terms.ranges, levels.range_m, levels.ring_m)
     log_volume = float(log_volumes.sum())
-    place = np.r_[0:6, 6 + PER_CAMERA * C : 6 + G - 1, 6 + G]
+    place = np.r_[0:6, 6 + PER_CAMERA * C : 6 + G - N_SHIFTS, 6 + G]
     M[:, place[:, None], place] += range_system(terms.ranges, weighted)
-    variance = terms.edges.variance(levels.edge_m)
-    place = np.r_[0:6, 6 + G - N_FIELDS - 1 : 6 + G + 1]
-    M[:, place[:, None], place] += edge_system(terms.edges, end_weights / variance, F)
-    log_volume += float(np.sum(np.log(variance)))
+    place = np.r_[0:6, 6 + G - N_FIELDS - N_SHIFTS : 6 + G + 1]
+    M[:, place[:, None], place] += edge_system(terms.edges, levels.edge_rad, levels.lost_share, F)
     for c, (pictures, rows) in enumerate(zip(terms.pictures, terms.picture_rows, strict=True)):
         cov = pictures.total_cov(levels.pose)
         products = np.swapaxes(rows, 1, 2) @ np.linalg.solve(cov, rows)
@@ -181,5 +178,5 @@ def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, float]:
     ring = np.arange(PER_CAMERA * C, PER_CAMERA * C + L)
     prior[ring[:, None], ring] = np.linalg.inv(cov)
     last = np.arange(PER_CAMERA * C + L, len(prior))
-    prior[last, last] = 1 / np.square([priors.lateral_m, priors.vertical_m, priors.shift_m])
+    prior[last, last] = 1 / np.square([priors.lateral_m, priors.vertical_m, priors.shift_m, priors.backed_m])
     return prior, float(np.linalg.slogdet(cov)[1])

@@ -1,0 +1,84 @@
+"""How a ring's last return on the board lies to the board's edge: the density, its score and information.
+
+In units of the step to the next ray, let x be the distance of the last return inside the edge, less half a
+step, beam width included. Without noise x is uniform in -1/2..1/2: the edge lies somewhere between the last
+ray that met the board and the first that did not. Three things blur that:
+
+    p(x) = (1 - a - b) core + a lost + b stray                                                           (1)
+
+core   the uniform interval, its ends blurred by t (print, width of the beam): what remains of the interval
+       tells more of the edge than a normal distribution of the same variance would;
+lost   the last returns on the board are missing (weak, or blended with whoever holds it): an exponential tail
+       inwards, of few ring ends where the board is on a stand, of a third where a person stands behind it;
+stray  anything else (the neighbouring ray met something just behind the board), Cauchy's distribution.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.special import ndtr
+
+from lce_rig.core.geometry import Array
+
+STRAY = 0.01
+"""Share b of (1), as in simulated and recorded captures; a is theirs to say."""
+_LOST_STEPS = 1.1
+# Blurs and lost shares that the table of informations spans; beyond, the density is normal or uniform.
+_BLURS = np.geomspace(0.01, 30.0, 60)
+_SHARES = np.array([0.001, 0.02, 0.05, 0.1, 0.2, 0.35, 0.6])
+_NARROWEST = 0.01
+
+
+def density(x: Array, blur: Array, lost_share: float) -> tuple[Array, Array]:
+    """Compute (1) and its derivative.
+
+    Args:
+        x: (M,) steps.
+        blur: (M,) t, steps.
+        lost_share: a.
+
+    Returns:
+        p and dp/dx, (M,) each.
+    """
+    t = np.maximum(blur, _NARROWEST)
+    low, high = (x + 0.5) / t, (x - 0.5) / t
+    core, core_slope = ndtr(low) - ndtr(high), (_normal(low) - _normal(high)) / t
+    # Normal noise of deviation t plus an exponential one; t is bounded, or the two exponents run away.
+    s = np.minimum(t, 2.0) / _LOST_STEPS
+    grown = np.exp(np.minimum(s**2 / 2 - x / _LOST_STEPS, 50.0)) / _LOST_STEPS
+    z = x / (s * _LOST_STEPS) - s
+    lost = grown * ndtr(z)
+    lost_slope = -lost / _LOST_STEPS + grown * _normal(z) / (s * _LOST_STEPS)
+    width = np.maximum(t, 1.0)
+    stray = 1 / (np.pi * width * (1 + (x / width) ** 2))
+    stray_slope = -2 * x * np.pi / width * stray**2
+    shares = (1 - lost_share - STRAY, lost_share, STRAY)
+    p, slope = (
+        sum(share * part for share, part in zip(shares, parts, strict=True))
+        for parts in ((core, lost, stray), (core_slope, lost_slope, stray_slope))
+    )
+    return np.asarray(p), np.asarray(slope)
+
+
+def information(blur: Array, lost_share: float) -> Array:
+    """Compute Fisher's information (M,) of the edge's place, the mean of (d ln p / dx)^2, per step^2."""
+    table = _log_informations()
+    row = float(np.interp(lost_share, _SHARES, np.arange(len(_SHARES))))
+    low = min(int(row), len(_SHARES) - 2)
+    between = table[low] + (row - low) * (table[low + 1] - table[low])
+    return np.asarray(np.exp(np.interp(np.log(np.maximum(blur, _NARROWEST)), np.log(_BLURS), between)))
+
+
+@lru_cache(maxsize=1)
+def _log_informations() -> Array:
+    """Tabulate ln of the information by lost share and blur."""
+    x = np.linspace(-1.0, 1.0, 2001)[:, None]
+    # Finest where the core rises and falls.
+    at = np.sign(x) * np.abs(x) ** 2 * (12.0 + 8.0 * _BLURS)
+    blurs = np.broadcast_to(_BLURS, at.shape)
+    both = (density(at, blurs, float(share)) for share in _SHARES)
+    return np.array([np.log(np.trapezoid(slope**2 / p, at, axis=0)) for p, slope in both])
+
+
+def _normal(z: Array) -> Array:
+    return np.asarray(np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi))
