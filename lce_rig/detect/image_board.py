@@ -1,6 +1,6 @@
 """The board in a picture: corners, both poses and figures, or why there is none."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -80,8 +80,9 @@ def find_image_board(
         ProfileError: the intrinsics belong to pictures of another size.
     """
     grey = crop_to_intrinsics(image, intrinsics)
+    followed = _follow(grey, board, last)
     crossings = (
-        _follow(grey, board, last)
+        followed
         or _find_in_region(grey, board, region, last, is_thorough=is_thorough)
         or find_grid(grey, board, is_thorough=is_thorough)
     )
@@ -98,7 +99,9 @@ def find_image_board(
     if problem is not None:
         return problem
 
-    solved, crossings = _solve(grey, crossings, board, intrinsics)
+    solved, crossings = _solve(
+        grey, crossings, board, intrinsics, _starts(None if followed is None else last)
+    )
     if solved is None or solved.reprojection_px > max_reprojection_px:
         return _misfit(solved, quality, intrinsics, max_reprojection_px)
     quality |= {"n_corners": float(crossings.is_fitted.sum()), "corner_rms_px": solved.reprojection_px}
@@ -219,13 +222,23 @@ def _find_in_region(
     return None if found is None else replace(found, grid_px=found.grid_px + [max(u0, 0), max(v0, 0)])
 
 
+def _starts(last: ImageBoard | None) -> list[Array]:
+    """List where a board that was followed has its poses, about: they jump no farther than it did."""
+    poses = [] if last is None else [last.T_cam_board, last.T_cam_board_alternative]
+    return [T_cam_board for T_cam_board in poses if T_cam_board is not None]
+
+
 def _square_px(found: ImageBoard, board: Board) -> float:
     grid_px = found.corners_px.reshape(board.rows, board.cols, 2)
     return float(np.median(np.linalg.norm(np.diff(grid_px, axis=1), axis=-1)))
 
 
 def _solve(
-    grey: NDArray[np.uint8], crossings: Crossings, board: Board, intrinsics: Intrinsics
+    grey: NDArray[np.uint8],
+    crossings: Crossings,
+    board: Board,
+    intrinsics: Intrinsics,
+    near: Sequence[Array] = (),
 ) -> tuple[PlanarPose | None, Crossings]:
     """Solve for the pose; corners far from the board's picture are looked for again where they should be.
 
@@ -233,7 +246,7 @@ def _solve(
     others put them; what cannot be fitted there takes that place and no longer counts in `n_corners`.
     """
     corners_board = board.corners()
-    solved = solve_planar_pose(crossings.grid_px.reshape(-1, 2), corners_board, intrinsics)
+    solved = solve_planar_pose(crossings.grid_px.reshape(-1, 2), corners_board, intrinsics, near)
     if solved is None:
         return None, crossings
     error_px = _errors(solved.T_cam_board, crossings, corners_board, intrinsics)

@@ -1,5 +1,6 @@
 """Pose of a planar board from its corners in one picture: both local minima, with covariance."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +42,9 @@ class PlanarPose:
     sigma_px: float
 
 
-def solve_planar_pose(corners_px: Array, corners_board: Array, intrinsics: Intrinsics) -> PlanarPose | None:
+def solve_planar_pose(
+    corners_px: Array, corners_board: Array, intrinsics: Intrinsics, starts: Sequence[Array] = ()
+) -> PlanarPose | None:
     """Find T_cam_board and the second local minimum of the reprojection error.
 
     A homography gives the first start. Mirroring the board's tilt in the line of sight gives the second:
@@ -52,6 +55,8 @@ def solve_planar_pose(corners_px: Array, corners_board: Array, intrinsics: Intri
         corners_px: (N, 2) measured, N >= 4.
         corners_board: (N, 3) with z = 0, frame board, m.
         intrinsics: the camera.
+        starts: T_cam_board (4, 4) near one minimum, or near both, where a picture shortly before gave them:
+            the homography is then not needed, and fewer steps are.
 
     Returns:
         The minima, or None where the corners admit no pose in front of the camera.
@@ -59,12 +64,13 @@ def solve_planar_pose(corners_px: Array, corners_board: Array, intrinsics: Intri
     References:
         T. Collins, A. Bartoli: Infinitesimal plane-based pose estimation. IJCV 109 (2014).
     """
-    start = _pose_from_homography(corners_board, intrinsics.unproject(corners_px))
+    start = starts[0] if starts else _pose_from_homography(corners_board, intrinsics.unproject(corners_px))
     if start is None:
         return None
     first = refine_pose(start, corners_px, corners_board, intrinsics)
     centre_board = corners_board.mean(axis=0)
-    second = refine_pose(mirror_tilt(first[0], centre_board), corners_px, corners_board, intrinsics)
+    other = starts[1] if len(starts) > 1 else mirror_tilt(first[0], centre_board)
+    second = refine_pose(other, corners_px, corners_board, intrinsics)
     # A poor homography may lead to neither minimum; mirroring the second one back shows whether it did.
     back = mirror_tilt(second[0], centre_board)
     if second[1] < first[1] and rotation_angle(back[:3, :3], first[0][:3, :3]) > 0.2:

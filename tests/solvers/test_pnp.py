@@ -110,6 +110,22 @@ def test_a_board_whose_minima_cannot_be_told_apart_has_a_small_gap_and_a_near_on
     assert near.chi2_gap > 1000.0
 
 
+@pytest.mark.parametrize("n_starts", [1, 2])
+@pytest.mark.parametrize("swapped", [False, True])
+def test_starts_of_a_picture_before_lead_to_the_same_minima(n_starts: int, swapped: bool) -> None:
+    before = solve(seen(looking(15, 40, 30, (0.1, 0.0, 4.5)), RADTAN, 0.1, 1), RADTAN)
+    corners = seen(looking(17, 44, 31, (0.12, 0.01, 4.55)), RADTAN, 0.1, 2)
+    alone = solve(corners, RADTAN)
+    assert before.T_cam_board_alternative is not None and alone.T_cam_board_alternative is not None
+    starts = [before.T_cam_board, before.T_cam_board_alternative]
+    starts = (starts[::-1] if swapped else starts)[:n_starts]
+    led = solve_planar_pose(corners, BOARD.corners(), RADTAN, starts)
+    assert led is not None and led.T_cam_board_alternative is not None
+    assert np.abs(led.T_cam_board - alone.T_cam_board).max() < 1e-6
+    assert np.abs(led.T_cam_board_alternative - alone.T_cam_board_alternative).max() < 1e-5
+    assert led.chi2_gap == pytest.approx(alone.chi2_gap, rel=1e-4)
+
+
 @given(tilt_deg=st.floats(1, 60), about_deg=st.floats(-180, 180), z=st.floats(0.5, 6.0))
 def test_mirroring_the_tilt_twice_changes_nothing_and_once_keeps_the_centre(
     tilt_deg: float, about_deg: float, z: float
