@@ -193,11 +193,13 @@ def _tell(report: "LiveReport", n_captures: int, asked: Controls, simulated: "Si
     if asked.signal == signal.SIGINT:
         raise click.exceptions.Exit(130)
     if n_captures == 0:
-        raise NotEnoughDataError("nothing was captured", _remedy(simulated))
+        raise NotEnoughDataError("nothing was captured", _remedy(report, simulated))
 
 
-def _remedy(simulated: "SimulatedRig | None") -> str:
+def _remedy(report: "LiveReport", simulated: "SimulatedRig | None") -> str:
     """Say what to do where nothing was captured."""
+    if report.lost:
+        return "\n".join(f"{name} is lost: {error.what}. {error.hint}" for name, error in report.lost.items())
     if simulated is None:
         return "The board must be seen by every sensor at once; `lce-rig doctor` says what is in the way."
     if simulated.pace.problem():

@@ -76,6 +76,7 @@ class LiveReport:
         n_frames: frames looked at.
         n_skipped: frames that came while one before was looked at.
         n_lost: what sensors lost or nobody took, by sensor.
+        lost: sensors that were lost when it ended, and why, by name.
         error: the sensor that is lost for good; None where none is.
         notes: what else was odd.
     """
@@ -86,6 +87,7 @@ class LiveReport:
     n_frames: int = 0
     n_skipped: int = 0
     n_lost: dict[str, int] = field(default_factory=dict)
+    lost: dict[str, SourceError] = field(default_factory=dict)
     error: SourceError | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -227,6 +229,7 @@ class _Loop:
         """Gather what was lost on the way, and write it into the session's journal."""
         report = self.report
         report.n_skipped = self._feed.n_skipped
+        report.lost = {name: error for name, (error, _) in self._pumps.lost().items()}
         for name, status in self._pumps.statuses().items():
             report.n_lost[name] = status.n_lost + status.n_dropped
         report.notes += self._keeper.notes() + self._clock.problems() + self._clock.account()

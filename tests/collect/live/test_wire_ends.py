@@ -14,6 +14,7 @@ from wire.reel import Reel
 from wire.rig import ENVIRONMENT, WireRig
 from wire.timing import placement_at
 
+from lce_rig.rig import dump_rig
 from tests.collect.live.conftest import LOOPS_PER_HOLD
 from tests.collect.live.sent import (
     captured_names,
@@ -84,3 +85,17 @@ def test_what_is_recorded_beside_a_collection_can_be_collected_from(
         assert check_sent(capture, sent) == shown, "pictures and packets are of one moment"
         stamp_us = stamp_ns // 1_000
         assert min(seen) - 5_000_000 < stamp_us < max(seen) + 5_000_000
+
+
+def test_a_camera_whose_command_writes_no_pictures_is_named_where_nothing_was_captured(
+    wire: Start, tmp_path: Path
+) -> None:
+    rig = wire()
+    command = ("sh", "-c", "while :; do echo this is no picture; sleep 0.1; done")
+    camera = rig.rig.cameras["cam"]
+    broken = camera.model_copy(update={"driver": camera.driver.model_copy(update={"command": command})})
+    rig.profile.write_text(dump_rig(rig.rig.model_copy(update={"cameras": {"cam": broken}})))
+    with Collecting(rig.profile, tmp_path / "session", "--timeout", "3") as collecting:
+        assert collecting.wait() == 6
+    said = collecting.said.partition("error: nothing was captured")[2]
+    assert "cam is lost" in said and "writes no Y4M" in said
