@@ -150,7 +150,7 @@ class Intrinsics:
                 slope[:, 0, 0], slope[:, 1, 1] = by_x / z, by_y / z
                 slope[:, 0, 1] = slope[:, 1, 0] = by_xy / z
                 slope[:, 0, 2], slope[:, 1, 2] = -(by_x * a + by_xy * b) / z, -(by_xy * a + by_y * b) / z
-        return slope * np.array([self.fx_px, self.fy_px])[:, None]
+        return np.asarray(slope * np.array([self.fx_px, self.fy_px])[:, None])
 
     def unproject(self, pixels: NDArray[Any]) -> Array:
         """Find the unit ray through each pixel, by Newton's method.
