@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from lce_rig.calibrate.blended_ends import blended_share, without_blended_ends
 from lce_rig.calibrate.draws import Draws, draw_subsets
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.features import CaptureFeatures, extract_features
@@ -49,6 +50,8 @@ def calibrate_by_algorithm_1(
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
+    share = blended_share(observations)
+    observations = without_blended_ends(observations)
     features = [extract_features(observation, board, options) for observation in observations]
     problem = Problem(features, board, _weights(options, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
     T_planes = solve_planes(features, problem)
@@ -77,7 +80,7 @@ def calibrate_by_algorithm_1(
         certificate=Certificate(bool(certificates.is_optimal[0]), float(certificates.relative_gap[0])),
         held_out_m=held_out,
         refused=outliers,
-        diagnostics=_diagnostics(problem, solution, covariances, draws),
+        diagnostics={**_diagnostics(problem, solution, covariances, draws), "ring_ends_blended": share},
     )
 
 

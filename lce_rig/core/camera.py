@@ -60,6 +60,11 @@ class Intrinsics:
             return np.asarray(r * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])))))
         return np.asarray(r * self._radial_scale(r * r))
 
+    def _radius_slope(self, angle: Array) -> Array:
+        """Differentiate the distorted radius by the angle (equidistant only)."""
+        k, s = self._coefficients(4) * [3, 5, 7, 9], angle * angle
+        return np.asarray(1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))))
+
     def _radial_scale(self, s: Array) -> Array:
         k1, k2, _, _, k3, k4, k5, k6 = self._coefficients(8)
         scale = (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6)))
@@ -77,6 +82,19 @@ class Intrinsics:
                 y * scale + p1 * (s + 2 * y * y) + 2 * p2 * x * y,
             ],
             axis=-1,
+        )
+
+    def _distortion_slope(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Differentiate `_distort`: d x' / dx, d x' / dy = d y' / dx, d y' / dy."""
+        k1, k2, p1, p2, k3, k4, k5, k6 = self._coefficients(8)
+        s = x * x + y * y
+        above, below = 1 + s * (k1 + s * (k2 + s * k3)), 1 + s * (k4 + s * (k5 + s * k6))
+        scale = above / below
+        growth = 2 * (k1 + s * (2 * k2 + 3 * s * k3) - scale * (k4 + s * (2 * k5 + 3 * s * k6))) / below
+        return (
+            scale + growth * x * x + 2 * p1 * y + 6 * p2 * x,
+            growth * x * y + 2 * p1 * x + 2 * p2 * y,
+            scale + growth * y * y + 6 * p1 * y + 2 * p2 * x,
         )
 
     def project(self, points_camera: NDArray[Any]) -> tuple[Array, NDArray[np.bool_]]:
@@ -105,6 +123,35 @@ class Intrinsics:
         pixels[~is_valid] = np.nan
         return pixels, is_valid
 
+    def differentiate(self, points_camera: Array) -> Array:
+        """Differentiate `project` by the point.
+
+        Args:
+            points_camera: (N, 3) m, frame camera optical, where `project` is valid.
+
+        Returns:
+            (N, 2, 3) px per m; without meaning where `project` is not valid.
+        """
+        x, y, z = np.moveaxis(np.asarray(points_camera, dtype=np.float64), -1, 0)
+        slope = np.empty((len(x), 2, 3))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if self.model == "equidistant":
+                rho = np.maximum(np.hypot(x, y), 1e-12)
+                angle, square = np.arctan2(rho, z), rho**2 + z**2
+                across, growth = self._distorted_radius(angle) / rho, self._radius_slope(angle) / square
+                ex, ey = x / rho, y / rho
+                along = growth * z - across
+                slope[:, 0, 0], slope[:, 1, 1] = across + along * ex * ex, across + along * ey * ey
+                slope[:, 0, 1] = slope[:, 1, 0] = along * ex * ey
+                slope[:, 0, 2], slope[:, 1, 2] = -growth * x, -growth * y
+            else:
+                a, b = x / z, y / z
+                by_x, by_xy, by_y = self._distortion_slope(a, b)
+                slope[:, 0, 0], slope[:, 1, 1] = by_x / z, by_y / z
+                slope[:, 0, 1] = slope[:, 1, 0] = by_xy / z
+                slope[:, 0, 2], slope[:, 1, 2] = -(by_x * a + by_xy * b) / z, -(by_xy * a + by_y * b) / z
+        return np.asarray(slope * np.array([self.fx_px, self.fy_px])[:, None])
+
     def unproject(self, pixels: NDArray[Any]) -> Array:
         """Find the unit ray through each pixel, by Newton's method.
 
@@ -120,10 +167,8 @@ class Intrinsics:
     def _unproject_equidistant(self, xy: Array) -> Array:
         radius = np.linalg.norm(xy, axis=-1)
         angle = np.minimum(radius, 0.9 * self.max_radius)
-        k = self._coefficients(4) * [3, 5, 7, 9]
         for _ in range(20):
-            s = angle * angle
-            slope = 1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])))
+            slope = self._radius_slope(angle)
             step = (self._distorted_radius(angle) - radius) / np.where(np.abs(slope) > 1e-3, slope, 1e-3)
             angle = np.clip(angle - step, 0.0, self.max_radius)
         angle = np.where(np.abs(self._distorted_radius(angle) - radius) < 1e-8, angle, np.nan)
@@ -132,17 +177,15 @@ class Intrinsics:
 
     def _unproject_radtan(self, xy: Array) -> Array:
         guess = xy.copy()
-        step = 1e-6
         for _ in range(20):
             error = self._distort(guess) - xy
             if np.all(np.abs(error) < 1e-13):
                 break
-            col_x = (self._distort(guess + [step, 0]) - self._distort(guess - [step, 0])) / (2 * step)
-            col_y = (self._distort(guess + [0, step]) - self._distort(guess - [0, step])) / (2 * step)
-            det = col_x[..., 0] * col_y[..., 1] - col_y[..., 0] * col_x[..., 1]
+            by_x, by_xy, by_y = self._distortion_slope(guess[..., 0], guess[..., 1])
+            det = by_x * by_y - by_xy * by_xy
             det = np.where(np.abs(det) > 1e-3, det, 1e-3)
-            dx = (col_y[..., 1] * error[..., 0] - col_y[..., 0] * error[..., 1]) / det
-            dy = (col_x[..., 0] * error[..., 1] - col_x[..., 1] * error[..., 0]) / det
+            dx = (by_y * error[..., 0] - by_xy * error[..., 1]) / det
+            dy = (by_x * error[..., 1] - by_xy * error[..., 0]) / det
             guess = guess - np.clip(np.stack([dx, dy], axis=-1), -0.5, 0.5)
         miss = np.linalg.norm(self._distort(guess) - xy, axis=-1)
         is_bad = (miss > 1e-8) | (np.linalg.norm(guess, axis=-1) >= self.max_radius)

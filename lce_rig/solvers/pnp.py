@@ -205,14 +205,11 @@ def _residuals_and_jacobian(
 ) -> tuple[Array, Array]:
     """Compute the residuals (2 N,) and their derivative (2 N, 6) by the tangent of T_cam_board.
 
-    The derivative of the camera model by the point is taken by central differences in one batched projection,
-    so that no camera model needs its own; that of the point by the tangent is [I, -(R p)^].
+    That of the point by the tangent is [I, -(R p)^].
     """
     turned = corners_board @ T_cam_board[:3, :3].T
     points = turned + T_cam_board[:3, 3]
-    h = 1e-6 * np.linalg.norm(points, axis=1)
-    offsets = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    pixels, _ = intrinsics.project(points + h[:, None] * offsets[:, None, :])
-    by_point = np.stack((pixels[1:4] - pixels[4:7]) / (2 * h[:, None]), axis=-1)
+    pixels, _ = intrinsics.project(points)
+    by_point = intrinsics.differentiate(points)
     by_tangent = np.concatenate([by_point, -by_point @ skew(turned)], axis=-1)
-    return (pixels[0] - corners_px).ravel(), by_tangent.reshape(-1, 6)
+    return (pixels - corners_px).ravel(), by_tangent.reshape(-1, 6)

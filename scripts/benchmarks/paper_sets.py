@@ -81,12 +81,11 @@ def paper_set(folder: Path, seed: int, n_captures: int = N_CAPTURES) -> PaperSet
     placements = []
     for index in range(n_captures):
         path = folder / f"seed{seed:03d}" / f"{index:06d}.npz"
-        kept = load(path)
-        if kept is None:
-            placements.append(maker.place(index))
-            store(path, *_flatten(placements[-1]))
-        else:
-            placements.append(_rebuild(kept))
+        placement = _read(path)
+        if placement is None:
+            placement = maker.place(index)
+            store(path, *_flatten(placement))
+        placements.append(placement)
     return PaperSet(placements, maker.T_cam_lidar)
 
 
@@ -124,6 +123,15 @@ def _flatten(placement: Placement) -> tuple[dict[str, Array], dict[str, list[flo
     parts = {"image": placement.image} | {f"scan{level}": scan for level, scan in placement.scans.items()}
     arrays = {f"{name}/{key}": a for name, part in parts.items() for key, a in to_arrays(part).items()}
     return arrays, {"normal": placement.normal.tolist()}
+
+
+def _read(path: Path) -> Placement | None:
+    """Read a placement; None where it was not kept, or by a detector that found less."""
+    kept = load(path)
+    try:
+        return None if kept is None else _rebuild(kept)
+    except ValueError:
+        return None
 
 
 def _rebuild(kept: Cached) -> Placement:

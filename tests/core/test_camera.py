@@ -71,3 +71,20 @@ def test_inside_means_within_the_picture_less_the_margin():
     pixels = np.array([[0.0, 0.0], [1279.0, 719.0], [1279.5, 3.0], [5.0, 5.0], [np.nan, 3.0]])
     assert PINHOLE.is_inside(pixels).tolist() == [True, True, False, True, False]
     assert PINHOLE.is_inside(pixels, margin_px=5).tolist() == [False, False, False, True, False]
+
+
+RATIONAL = Intrinsics(
+    900.0, 905.0, 640.0, 360.0, 1280, 720, "radtan", (0.3, -0.1, 1e-3, -5e-4, 0.02, 0.6, -0.05, 0.01)
+)
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, RADTAN, FISHEYE, RATIONAL])
+def test_its_derivative_is_that_of_differences(camera):
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-0.4, 0.4, (50, 2)), np.ones(50)]) * rng.uniform(1, 5, (50, 1))
+    points[0, :2] = 0.0
+    step = 1e-5 * np.eye(3)
+    differences = [(camera.project(points + h)[0] - camera.project(points - h)[0]) / 2e-5 for h in step]
+    np.testing.assert_allclose(
+        camera.differentiate(points), np.stack(differences, axis=-1), rtol=1e-5, atol=1e-4
+    )

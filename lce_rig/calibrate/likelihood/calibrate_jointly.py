@@ -45,7 +45,7 @@ def calibrate_by_likelihood(
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
     start = calibrate_by_algorithm_1(observations, board, options, progress)
-    used = [start.observations[name] for name in start.used]
+    used = [observation for observation in observations if observation.capture in start.used]
     priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=options.edge_shift_sigma_m)
     joint = refine([used], board, [start.T_cam_lidar], priors, Levels(laser_m=options.laser_bias_sigma_m))
     placement = group_placements(used)

@@ -15,13 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.blended_ends import is_blended
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard
 
 Indices = NDArray[np.intp]
 N_FIELDS = 2
-# Echoes from surfaces nearer to each other than this blend into one.
-_BLENDS_M = 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +84,7 @@ def stack_scans(boards: Sequence[LidarBoard]) -> StackedScans:
         end_rays=end_rays,
         next_rays=turn_about_z(end_rays, angle),
         end_fields=lens_fields(ends),
-        end_is_backed=np.concatenate([b.edge_behind_m for b in boards]) < _BLENDS_M,
+        end_is_backed=np.concatenate([is_blended(board) for board in boards]),
     )
 
 
