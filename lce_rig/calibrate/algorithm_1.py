@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lce_rig.calibrate.blended_ends import blended_share, without_blended_ends
+from lce_rig.calibrate.blended_ends import estimate_sooner, move_blended_ends
 from lce_rig.calibrate.draws import Draws, draw_subsets
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.features import CaptureFeatures, extract_features
@@ -50,12 +50,13 @@ def calibrate_by_algorithm_1(
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
-    share = blended_share(observations)
-    observations = without_blended_ends(observations)
     features = [extract_features(observation, board, options) for observation in observations]
     problem = Problem(features, board, _weights(options, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
     T_planes = solve_planes(features, problem)
     require_observable(features, problem, T_planes)
+    sooner_m = estimate_sooner(observations, features, T_planes, board)
+    observations = move_blended_ends(observations, features, T_planes, board, sooner_m)
+    features = [extract_features(observation, board, options) for observation in observations]
 
     outliers, sigmas = reject_outliers(features, problem, T_planes, options)
     features = [f for f in features if f.capture not in outliers]
@@ -80,7 +81,10 @@ def calibrate_by_algorithm_1(
         certificate=Certificate(bool(certificates.is_optimal[0]), float(certificates.relative_gap[0])),
         held_out_m=held_out,
         refused=outliers,
-        diagnostics={**_diagnostics(problem, solution, covariances, draws), "ring_ends_blended": share},
+        diagnostics={
+            **_diagnostics(problem, solution, covariances, draws),
+            "blended_ends_sooner_m": sooner_m,
+        },
     )
 
 

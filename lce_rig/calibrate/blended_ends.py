@@ -1,8 +1,8 @@
-"""Ring ends where something stands close behind the board, and what becomes of them.
+"""Ring ends where something stands close behind the board, and by how much the board seems to end sooner.
 
-There a beam that the board fills in part comes back as a blend of both surfaces, off the board's plane, and
-the board seems to end sooner: by 2 to 4 mm on recordings, by up to 10 mm in simulation with a person behind
-the board (docs/method.md). A few such ring ends among many do less harm than their loss would.
+A beam that the board fills in part comes back as a blend of both surfaces, off the board's plane, and is lost
+to the board: it ends sooner by 2 to 4 mm on recordings, by up to 10 mm in simulation with a person behind it
+(docs/method.md).
 """
 
 from collections.abc import Sequence
@@ -11,14 +11,21 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.expansion import FIRST_RING, SHIFT, end_rows, nearest_edge
+from lce_rig.calibrate.features import CaptureFeatures
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import LidarBoard, Observation
 
 BLENDS_M = 0.35
 """Echoes from surfaces nearer to each other than this blend into one."""
-# So large a share of all ring ends biases a result by more than the others' noise.
+# A smaller share of all ring ends does less harm than an uncertain correction.
 _HARMFUL_SHARE = 0.25
-# A capture that has fewer others keeps all it has.
-_MIN_ENDS = 4
+# What is believed before any ring end is seen: of the extrinsic, of the beam's width, of the change of it.
+_SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD, _SIGMA_SHIFT_M, _SIGMA_SOONER_M = 0.02, 0.01, 0.015, 0.006
+# Noise of a ring end, and beyond how many sigmas one counts less.
+_END_SIGMA_M, _HUBER = 0.003, 1.5
+_ROUNDS = 5
 
 
 def is_blended(lidar: LidarBoard) -> NDArray[np.bool_]:
@@ -26,26 +33,48 @@ def is_blended(lidar: LidarBoard) -> NDArray[np.bool_]:
     return np.asarray(lidar.edge_behind_m < BLENDS_M)
 
 
-def blended_share(observations: Sequence[Observation]) -> float:
-    """Compute the share of blended ring ends, 0 where there are no ring ends."""
+def estimate_sooner(
+    observations: Sequence[Observation], features: Sequence[CaptureFeatures], T_cam_lidar: Array, board: Board
+) -> float:
+    """Estimate by how much the board seems to end sooner at blended ring ends, m; 0 where they are few.
+
+    Robust least squares over all ring ends, with the extrinsic, the beam's width and the difference unknown.
+
+    Args:
+        observations: F captures.
+        features: of each.
+        T_cam_lidar: (4, 4) near the truth.
+        board: the board.
+    """
+    parts = [end_rows(f, T_cam_lidar, board, FIRST_RING) for f in features]
     blended = np.concatenate([is_blended(observation.lidar) for observation in observations])
-    return float(blended.mean()) if len(blended) else 0.0
+    if len(blended) == 0 or blended.mean() < _HARMFUL_SHARE:
+        return 0.0
+    inside = np.concatenate([r for r, _ in parts])
+    # Inside distance = - (change of the extrinsic) - beam's width + difference where blended.
+    A = np.column_stack([-np.concatenate([J[:, : SHIFT + 1] for _, J in parts]), blended])
+    sigmas = [_SIGMA_TRANSLATION_M] * 3 + [_SIGMA_ROTATION_RAD] * 3 + [_SIGMA_SHIFT_M, _SIGMA_SOONER_M]
+    prior, x = np.diag(np.square(_END_SIGMA_M / np.array(sigmas))), np.zeros(len(sigmas))
+    for _ in range(_ROUNDS):
+        scaled = np.abs(inside - A @ x) / (_HUBER * _END_SIGMA_M)
+        weights = 1 / np.maximum(scaled, 1.0)
+        x = np.linalg.solve(A.T @ (weights[:, None] * A) + prior, A.T @ (weights * inside))
+    return float(max(x[-1], 0.0))
 
 
-def without_blended_ends(observations: Sequence[Observation]) -> list[Observation]:
-    """Leave blended ring ends out where they are a harmful share of all."""
-    if blended_share(observations) < _HARMFUL_SHARE:
-        return list(observations)
-    return [_clean(observation) for observation in observations]
-
-
-def _clean(observation: Observation) -> Observation:
-    lidar = observation.lidar
-    keep = ~is_blended(lidar)
-    if np.count_nonzero(keep) < _MIN_ENDS:
-        return observation
-    ends = {
-        name: getattr(lidar, name)[keep]
-        for name in ("edge_points", "edge_ring", "edge_side", "edge_behind_m")
-    }
-    return replace(observation, lidar=replace(lidar, **ends))
+def move_blended_ends(
+    observations: Sequence[Observation],
+    features: Sequence[CaptureFeatures],
+    T_cam_lidar: Array,
+    board: Board,
+    sooner_m: float,
+) -> list[Observation]:
+    """Move blended ring ends outwards by what the board ends sooner there."""
+    moved = []
+    for observation, f in zip(observations, features, strict=True):
+        edge = nearest_edge(transform(f.T_board_cam @ T_cam_lidar, f.edge_points), board)
+        outwards = f.edge_normals[edge] @ T_cam_lidar[:3, :3]
+        shift = sooner_m * is_blended(observation.lidar)[:, None] * outwards
+        lidar = replace(observation.lidar, edge_points=observation.lidar.edge_points + shift)
+        moved.append(replace(observation, lidar=lidar))
+    return moved

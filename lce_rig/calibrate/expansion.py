@@ -122,7 +122,7 @@ def expand(
     planes = [
         _plane_rows(f, seen.lidar, rings, T_cam_lidar) for f, seen in zip(features, observations, strict=True)
     ]
-    ends = [_end_rows(f, T_cam_lidar, board, p) for f in features]
+    ends = [end_rows(f, T_cam_lidar, board, p) for f in features]
     plane_sigma_m = max(float(np.median([_distance(f, T_cam_lidar) for f in features])), _PLANE_FLOOR_M)
     beyond = np.concatenate([r for r, _ in ends])
     # Ring ends reach beyond the plate by the beam's width, which is no error.
@@ -169,7 +169,7 @@ def _plane_rows(
     return np.asarray((f.centre - turned - T[:3, 3]) @ f.normal), J
 
 
-def _end_rows(f: CaptureFeatures, T: Array, board: Board, p: int) -> tuple[Array, Array]:
+def end_rows(f: CaptureFeatures, T: Array, board: Board, p: int) -> tuple[Array, Array]:
     """Write m . ((1 - s) g + a - R q - t) + d for each ring end and its nearest edge: (M,) and (M, p)."""
     turned = f.edge_points @ T[:3, :3].T
     edge = nearest_edge(transform(f.T_board_cam @ T, f.edge_points), board)
