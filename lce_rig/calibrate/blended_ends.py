@@ -26,6 +26,8 @@ _SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD, _SIGMA_SHIFT_M, _SIGMA_SOONER_M = 0.0
 # Noise of a ring end, and beyond how many sigmas one counts less.
 _END_SIGMA_M, _HUBER = 0.003, 1.5
 _ROUNDS = 5
+# A difference counts from so many of its standard deviations on.
+_SURE = 3.0
 
 
 def is_blended(lidar: LidarBoard) -> NDArray[np.bool_]:
@@ -36,7 +38,9 @@ def is_blended(lidar: LidarBoard) -> NDArray[np.bool_]:
 def estimate_sooner(
     observations: Sequence[Observation], features: Sequence[CaptureFeatures], T_cam_lidar: Array, board: Board
 ) -> float:
-    """Estimate by how much the board seems to end sooner at blended ring ends, m; 0 where they are few.
+    """Estimate by how much the board seems to end sooner at blended ring ends, m.
+
+    0 where they are few, or the difference is not certain.
 
     Robust least squares over all ring ends, with the extrinsic, the beam's width and the difference unknown.
 
@@ -58,8 +62,10 @@ def estimate_sooner(
     for _ in range(_ROUNDS):
         scaled = np.abs(inside - A @ x) / (_HUBER * _END_SIGMA_M)
         weights = 1 / np.maximum(scaled, 1.0)
-        x = np.linalg.solve(A.T @ (weights[:, None] * A) + prior, A.T @ (weights * inside))
-    return float(max(x[-1], 0.0))
+        information = A.T @ (weights[:, None] * A) + prior
+        x = np.linalg.solve(information, A.T @ (weights * inside))
+    sigma_m = _END_SIGMA_M * float(np.sqrt(np.linalg.inv(information)[-1, -1]))
+    return float(x[-1]) if x[-1] > _SURE * sigma_m else 0.0
 
 
 def move_blended_ends(

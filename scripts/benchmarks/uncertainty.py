@@ -16,7 +16,7 @@ from lce_rig.calibrate.likelihood.end_density import density
 from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import stack_pictures
 from lce_rig.calibrate.likelihood.refine import to_extrinsic
-from lce_rig.calibrate.likelihood.scans import N_FIELDS, stack_scans
+from lce_rig.calibrate.likelihood.scans import N_FIELDS, interior, stack_scans
 from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, Terms, assemble, linearise
 from lce_rig.core.geometry import Array, difference, invert
 from lce_rig.rig import Rig, load_rig
@@ -119,7 +119,7 @@ def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[R
         still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, own) for seed in range(n_seeds)
     ]
     at_truth = [_at_truth(rig, session) for session in sessions]
-    levels = _true_levels(case.options().lidar_noise, *_fit_ends([terms.edges for terms in at_truth]))
+    levels = _true_levels(case.options().lidar_noise, [terms.edges for terms in at_truth])
     priors = Priors(offset_m=options.range_offset_sigma_m, shift_m=options.edge_shift_sigma_m)
     for session, terms in zip(sessions, at_truth, strict=True):
         estimate = calibrate(session.candidates, board, options)
@@ -144,22 +144,23 @@ def cramer_rao_bound(terms: Terms, levels: Levels, priors: Priors, T_cam_lidar: 
     return np.asarray(J @ np.linalg.inv(information) @ J.T)
 
 
-def _true_levels(noise: LidarNoise, blur_rad: float, lost_share: float) -> Levels:
-    """Ranges and lasers as the simulator's options say, corners as drawn, and no pose error."""
+def _true_levels(noise: LidarNoise, edges: Sequence[EdgeRows]) -> Levels:
+    """Ranges and lasers as the simulator's options say, ring ends as they are, no pose error."""
     none = 1e-6
-    return Levels(
-        noise.range_sigma_m, none, blur_rad, lost_share, none, none, none, none, noise.laser_sigma_m
-    )
+    without = Levels(ring_m=none, tilt_rad=none, spin_rad=none, depth_m=none, across_m=none)
+    lidar = replace(without, range_m=noise.range_sigma_m, laser_m=noise.laser_sigma_m)
+    return replace(lidar, **_fit_ends(edges))
 
 
 def _at_truth(rig: Rig, session: StillSession) -> Terms:
     found = [item for item in session.candidates if is_board(session, item)]
-    scans = stack_scans([item.lidar[0] for item in found])
+    board = rig.board.to_board()
+    scans = stack_scans([interior(item.lidar[0], board) for item in found])
     pictures = stack_pictures(np.arange(len(found)), [item.image for item in found], np.ones(len(found)))
     T = session.T_cam_lidar
     T_lidar_board = invert(T) @ np.array([session.T_cam_board[item.capture] for item in found])
     constants = np.zeros(PER_CAMERA + len(scans.rings) + N_FIELDS + N_SHIFTS)
-    return linearise(scans, (pictures,), rig.board.to_board(), State(T[None], T_lidar_board, constants))
+    return linearise(scans, (pictures,), board, State(T[None], T_lidar_board, constants))
 
 
 def is_board(session: StillSession, item: CaptureCandidates) -> bool:
@@ -168,8 +169,8 @@ def is_board(session: StillSession, item: CaptureCandidates) -> bool:
     return float(np.linalg.norm(item.lidar[0].points.mean(axis=0) - T[:3, 3])) < _FOUND_M
 
 
-def _fit_ends(edges: Sequence[EdgeRows]) -> tuple[float, float]:
-    """Find the blur and lost share under which ring ends at the true poses are most probable.
+def _fit_ends(edges: Sequence[EdgeRows]) -> dict[str, float]:
+    """Find the blurs and lost share under which ring ends at the true poses are most probable.
 
     How far a ring end strays follows from ray-traced footprints, not from a number among the options. The
     beam's width is free.
@@ -179,11 +180,13 @@ def _fit_ends(edges: Sequence[EdgeRows]) -> tuple[float, float]:
     )
 
     def cost(x: Array) -> float:
-        blur, lost_share = np.exp(x[2]) * range_m / step_m, float(np.exp(min(x[3], np.log(MOST_LOST))))
+        blur = np.exp(np.where(rows[:, -2] > 0, x[4], x[2])) * range_m / step_m
+        lost_share = float(np.exp(min(x[3], np.log(MOST_LOST))))
         p, _ = density((rows[:, -1] + rows[:, -3:-1] @ x[:2]) / step_m, blur, lost_share)
         return -float(np.sum(np.log(p)))
 
     usual = Levels()
-    start = [-float(np.median(rows[:, -1])), 0.0, np.log(usual.edge_rad), np.log(usual.lost_share)]
-    blur_rad, lost_share = np.exp(minimize(cost, start, method="Nelder-Mead").x[2:])
-    return float(blur_rad), min(float(lost_share), MOST_LOST)
+    names = ("edge_rad", "lost_share", "backed_rad")
+    start = [-float(np.median(rows[:, -1])), 0.0, *(np.log(getattr(usual, name)) for name in names)]
+    found = minimize(cost, start, method="Nelder-Mead", options={"maxiter": 2000}).x[2:]
+    return dict(zip(names, np.exp(np.minimum(found, [np.inf, np.log(MOST_LOST), np.inf])), strict=True))

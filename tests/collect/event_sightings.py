@@ -82,4 +82,6 @@ def plate() -> LidarBoard:
     """What a scan shows of it; only that there is something counts."""
     none = np.zeros((0, 3))
     ring, side = np.zeros(0, np.int16), np.zeros(0, np.int8)
-    return LidarBoard(none, ring, none, ring, side, 0.003, np.array([0, 0, 1.0, -3.0]), 0.01, np.eye(4))
+    return LidarBoard(
+        none, ring, none, ring, side, np.zeros(0), 0.003, np.array([0, 0, 1.0, -3.0]), 0.01, np.eye(4)
+    )

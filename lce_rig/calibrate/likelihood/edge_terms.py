@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from lce_rig.calibrate.likelihood.end_density import density, information
+from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.scans import N_FIELDS, Indices, StackedScans
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
@@ -48,13 +49,14 @@ class EdgeRows:
         """Products of each row with itself (M, 11, 11)."""
         return np.asarray(self.rows[:, :, None] * self.rows[:, None, :])
 
-    def blur(self, tau_rad: float) -> Array:
-        """Blur (M,) of each interval's ends, in steps."""
-        return np.asarray(tau_rad * self.range_m / self.step_m)
+    def blur_m(self, levels: Levels) -> Array:
+        """Blur (M,) of each interval's ends."""
+        is_backed = self.rows[:, -2] > 0
+        return np.asarray(np.where(is_backed, levels.backed_rad, levels.edge_rad) * self.range_m)
 
-    def variance(self, tau_rad: float) -> Array:
+    def variance(self, levels: Levels) -> Array:
         """Variance (M,) of e in m^2, of the blurred interval alone."""
-        return np.asarray(self.step_m**2 / 12 + (tau_rad * self.range_m) ** 2)
+        return np.asarray(self.step_m**2 / 12 + self.blur_m(levels) ** 2)
 
 
 def edge_rows(
@@ -104,7 +106,7 @@ def nearest_edge(xy_m: Array, board: Board) -> Indices:
     return np.where(to_side < to_rail, side, rail).astype(np.intp)
 
 
-def edge_system(edges: EdgeRows, tau_rad: float, lost_share: float, n_captures: int) -> Array:
+def edge_system(edges: EdgeRows, levels: Levels, n_captures: int) -> Array:
     """Expand -2 ln p of the ring ends to second order, by capture: (F, 11, 11).
 
     With J a row without its residual: J J^T times the information, J times the score in the last column, and
@@ -113,9 +115,9 @@ def edge_system(edges: EdgeRows, tau_rad: float, lost_share: float, n_captures: 
     """
     system = np.zeros((n_captures, _SIZE, _SIZE))
     if len(edges.rows):
-        D, blur = edges.step_m, edges.blur(tau_rad)
-        p, slope = density(edges.rows[:, -1] / D, blur, lost_share)
-        weighted = edges.products * (information(blur, lost_share) / D**2)[:, None, None]
+        D, blur = edges.step_m, edges.blur_m(levels) / edges.step_m
+        p, slope = density(edges.rows[:, -1] / D, blur, levels.lost_share)
+        weighted = edges.products * (information(blur, levels.lost_share) / D**2)[:, None, None]
         weighted[:, :-1, -1] = edges.rows[:, :-1] * (-slope / p / D)[:, None]
         weighted[:, -1, :-1] = weighted[:, :-1, -1]
         weighted[:, -1, -1] = -2 * np.log(p / D)

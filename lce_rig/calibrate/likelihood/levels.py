@@ -1,6 +1,6 @@
 """Sizes of the errors that the likelihood knows, and what is believed of them before any capture is seen."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ class Levels:
         range_m: noise of a single range.
         ring_m: error that the returns of one ring in one capture share, beyond the laser's offset.
         edge_rad: blur of the ends of a ring end's interval, across the beam, by range (`edge_terms`).
+        backed_rad: the same where something stands close behind.
         lost_share: of ring ends whose last returns are missing; a share, not a deviation.
         tilt_rad, spin_rad: errors of a board's turn in a picture beyond corner noise.
         depth_m, across_m: errors of its place, along and across the line of sight.
@@ -26,6 +27,7 @@ class Levels:
     range_m: float = 0.008
     ring_m: float = 0.002
     edge_rad: float = 0.0005
+    backed_rad: float = 0.001
     lost_share: float = 0.08
     tilt_rad: float = 3.5e-3
     spin_rad: float = 5e-4
@@ -38,6 +40,11 @@ class Levels:
         """Deviations of a picture's pose in the order of `Pictures.shapes`."""
         return np.array([self.tilt_rad, self.spin_rad, self.depth_m, self.across_m])
 
+    def blurred(self, blur_rad: float) -> "Levels":
+        """Blur ring ends by so much at least."""
+        edge_rad, backed_rad = max(self.edge_rad, blur_rad), max(self.backed_rad, blur_rad)
+        return replace(self, edge_rad=edge_rad, backed_rad=backed_rad)
+
     def to_logs(self) -> Array:
         """Take logs, in the order of the fields."""
         return np.log([getattr(self, field.name) for field in fields(self)])
@@ -49,7 +56,7 @@ class Levels:
 
 
 # One deviation of the logarithm of each level, a priori; the lasers' spread is the profile's to state.
-LOG_SIGMA = np.array([0.7, 0.7, 0.7, 1.0, 0.7, 0.7, 0.7, 0.7, 0.3])
+LOG_SIGMA = np.array([0.7, 0.7, 0.7, 1.0, 1.0, 0.7, 0.7, 0.7, 0.7, 0.3])
 # Most ring ends are where the board ends, or there would be nothing to go by.
 MOST_LOST = 0.6
 

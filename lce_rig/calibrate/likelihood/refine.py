@@ -13,7 +13,7 @@ from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS
 from lce_rig.calibrate.likelihood.levels import NO_LASER_M, Levels, Priors
 from lce_rig.calibrate.likelihood.levels_fit import fit_levels
 from lce_rig.calibrate.likelihood.picture_terms import Pictures, stack_pictures
-from lce_rig.calibrate.likelihood.scans import N_FIELDS, StackedScans, lens_fields, stack_scans
+from lce_rig.calibrate.likelihood.scans import N_FIELDS, StackedScans, interior, lens_fields, stack_scans
 from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, System, Terms, assemble, linearise
 from lce_rig.calibrate.placements import group_placements
 from lce_rig.core.board import Board
@@ -85,7 +85,7 @@ def refine(
     usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
     seen = {o.capture: (o, T) for own, T in zip(cameras, T_cam_lidar, strict=True) for o in own}
     order = {name: k for k, name in enumerate(sorted(seen))}
-    scans = stack_scans([seen[name][0].lidar for name in order])
+    scans = stack_scans([interior(seen[name][0].lidar, board) for name in order])
     pictures = tuple(_pictures(own, order) for own in cameras)
     state = State(
         np.array(T_cam_lidar),
@@ -95,7 +95,7 @@ def refine(
     problem = _Problem(scans, pictures, board, priors)
     now = levels or usual
     for blur_rad in _BLURS_RAD:
-        state = problem.settle(state, replace(now, edge_rad=max(blur_rad, now.edge_rad)))
+        state = problem.settle(state, now.blurred(blur_rad))
     for n_rounds in _LEVEL_ROUNDS if levels is None else ():
         state = problem.settle(state, now)
         now = fit_levels(problem.linearise(state), now, usual, priors, n_rounds)
@@ -170,6 +170,6 @@ def _summarise(state: State, terms: Terms, levels: Levels, priors: Priors) -> Jo
         scale=constants[PER_CAMERA * np.arange(C) + 6],
         constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
         levels=levels,
-        end_sigma_m=float(np.sqrt(np.mean(terms.edges.variance(levels.edge_rad)))),
+        end_sigma_m=float(np.sqrt(np.mean(terms.edges.variance(levels)))),
         system=system,
     )

@@ -10,17 +10,20 @@ instead of p.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.blended_ends import is_blended
+from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard
 
 Indices = NDArray[np.intp]
 N_FIELDS = 2
+# Half a beam's width, and what the outline found in the scan may be off by.
+_BORDER_M = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +61,17 @@ class StackedScans:
     def group(self) -> Indices:
         """Index (N,) of each return's pair of capture and ring, of F L in all; ascending."""
         return self.capture * len(self.rings) + self.ring
+
+
+def interior(lidar: LidarBoard, board: Board) -> LidarBoard:
+    """Leave out returns near the border: there the beam meets what is behind as well, and reads too long."""
+    T = lidar.T_lidar_board
+    xy = ((np.asarray(lidar.points, dtype=np.float64) - T[:3, 3]) @ T[:3, :3])[:, :2]
+    keep = np.all(np.abs(xy) < np.array([board.width_m, board.height_m]) / 2 - _BORDER_M, axis=1)
+    if np.count_nonzero(keep) < len(keep) / 2:
+        return lidar
+    offset_ns = None if lidar.offset_ns is None else lidar.offset_ns[keep]
+    return replace(lidar, points=lidar.points[keep], ring=lidar.ring[keep], offset_ns=offset_ns)
 
 
 def stack_scans(boards: Sequence[LidarBoard]) -> StackedScans:

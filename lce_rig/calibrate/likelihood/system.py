@@ -138,7 +138,7 @@ def assemble(terms: Terms, levels: Levels, priors: Priors) -> System:
     place = np.r_[0:6, 6 + PER_CAMERA * C : 6 + G - N_SHIFTS, 6 + G]
     M[:, place[:, None], place] += range_system(terms.ranges, weighted)
     place = np.r_[0:6, 6 + G - N_FIELDS - N_SHIFTS : 6 + G + 1]
-    M[:, place[:, None], place] += edge_system(terms.edges, levels.edge_rad, levels.lost_share, F)
+    M[:, place[:, None], place] += edge_system(terms.edges, levels, F)
     for c, (pictures, rows) in enumerate(zip(terms.pictures, terms.picture_rows, strict=True)):
         cov = pictures.total_cov(levels.pose)
         products = np.swapaxes(rows, 1, 2) @ np.linalg.solve(cov, rows)
