@@ -55,8 +55,9 @@ def calibrate_by_algorithm_1(
     T_planes = solve_planes(features, problem)
     require_observable(features, problem, T_planes)
     sooner_m = estimate_sooner(observations, features, T_planes, board)
-    observations = move_blended_ends(observations, features, T_planes, board, sooner_m)
-    features = [extract_features(observation, board, options) for observation in observations]
+    if sooner_m > 0:
+        observations = move_blended_ends(observations, features, T_planes, board, sooner_m)
+        features = [extract_features(observation, board, options) for observation in observations]
 
     outliers, sigmas = reject_outliers(features, problem, T_planes, options)
     features = [f for f in features if f.capture not in outliers]

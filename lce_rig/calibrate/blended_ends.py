@@ -50,10 +50,10 @@ def estimate_sooner(
         T_cam_lidar: (4, 4) near the truth.
         board: the board.
     """
-    parts = [end_rows(f, T_cam_lidar, board, FIRST_RING) for f in features]
     blended = np.concatenate([is_blended(observation.lidar) for observation in observations])
     if len(blended) == 0 or blended.mean() < _HARMFUL_SHARE:
         return 0.0
+    parts = [end_rows(f, T_cam_lidar, board, FIRST_RING) for f in features]
     inside = np.concatenate([r for r, _ in parts])
     # Inside distance = - (change of the extrinsic) - beam's width + difference where blended.
     A = np.column_stack([-np.concatenate([J[:, : SHIFT + 1] for _, J in parts]), blended])

@@ -205,7 +205,7 @@ def _residuals_and_jacobian(
 ) -> tuple[Array, Array]:
     """Compute the residuals (2 N,) and their derivative (2 N, 6) by the tangent of T_cam_board.
 
-    That of the point by the tangent is [I, -(R p)^].
+    The derivative of a point by the tangent is [I, -(R p)^].
     """
     turned = corners_board @ T_cam_board[:3, :3].T
     points = turned + T_cam_board[:3, 3]

@@ -24,9 +24,9 @@ STRAY = 0.01
 """Share b of (1), as in simulated and recorded captures; a is theirs to say."""
 _LOST_STEPS = 1.1
 # Blurs and lost shares that the table of informations spans; beyond, the density is normal or uniform.
-_BLURS = np.geomspace(0.01, 30.0, 60)
-_SHARES = np.array([0.001, 0.02, 0.05, 0.1, 0.2, 0.35, 0.6])
 _NARROWEST = 0.01
+_BLURS = np.geomspace(_NARROWEST, 30.0, 60)
+_SHARES = np.array([0.001, 0.02, 0.05, 0.1, 0.2, 0.35, 0.6])
 
 
 def density(x: Array, blur: Array, lost_share: float) -> tuple[Array, Array]:
