@@ -16,7 +16,6 @@ stray  anything else (the neighbouring ray met something just behind the board),
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import ndtr
 
 from lce_rig.core.geometry import Array
 
@@ -40,6 +39,8 @@ def density(x: Array, blur: Array, lost_share: float) -> tuple[Array, Array]:
     Returns:
         p and dp/dx, (M,) each.
     """
+    from scipy.special import ndtr
+
     t = np.maximum(blur, _NARROWEST)
     low, high = (x + 0.5) / t, (x - 0.5) / t
     core, core_slope = ndtr(low) - ndtr(high), (_normal(low) - _normal(high)) / t
