@@ -191,7 +191,9 @@ def build_board(
         edge_ring=scan.ring[edge],
         edge_side=ends.side[order],
         edge_behind_m=ends.behind_m[order],
-        edge_echo=_echo_shares(scan, source.intensity[scan.index].astype(np.float64), ends, view, border)[order],
+        edge_echo=_echo_shares(scan, source.intensity[scan.index].astype(np.float64), ends, view, border)[
+            order
+        ],
         azimuth_step_rad=scan.step_rad,
         plane=view.plane,
         sigma_m=float(np.sqrt(np.mean(height**2))),
@@ -201,20 +203,19 @@ def build_board(
     )
 
 
-def _echo_shares(
-    scan: OrderedScan, intensity: Array, ends: RingEnds, view: PlaneView, border: Indices
-) -> Array:
+def _echo_shares(scan: OrderedScan, source: Scan, ends: RingEnds, view: PlaneView, border: Indices) -> Array:
     """Compute the share (E,) of the power that comes from behind where a beam meets it and the board alike.
 
     Intensities are those of surfaces; what is received from them falls with the square of the range.
 
     Args:
         scan: all returns.
-        intensity: (N,) of them; zeros where the recording has none, which says that all surfaces are alike.
+        source: the scan they come from; where it has no intensities all surfaces count as alike.
         ends: ring ends.
         view: beams about the board.
         border: returns from near the board's outline.
     """
+    intensity = source.intensity[scan.index].astype(np.float64)
     end = view.member[ends.beam]
     of_board = float(np.median(intensity[border])) if len(border) else 0.0
     brightness = intensity[ends.beyond] / of_board if of_board > 0 else np.ones(len(end))
