@@ -3,7 +3,7 @@
 Unknowns are the tangent y_k (6) of each board's T_lidar_board, and z, which all captures share:
 
     z = [tangent of T_cam_lidar (6) and scale of each camera, range offset of each ring (L), lens (2),
-         edge shift, its change where something stands close behind]
+         shifts of ring ends (7)]
 
 A board pose meets only the terms of its own capture: the matrix is an arrow head, and y_k is eliminated
 capture by capture (Schur complement).
@@ -34,7 +34,7 @@ class State:
     Attributes:
         T_cam_lidar: (C, 4, 4).
         T_lidar_board: (F, 4, 4).
-        constants: (7 C + L + 4,) z, zero in the places of the tangents.
+        constants: (7 C + L + 9,) z, zero in the places of the tangents.
     """
 
     T_cam_lidar: Array
@@ -178,5 +178,5 @@ def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, float]:
     ring = np.arange(PER_CAMERA * C, PER_CAMERA * C + L)
     prior[ring[:, None], ring] = np.linalg.inv(cov)
     last = np.arange(PER_CAMERA * C + L, len(prior))
-    prior[last, last] = 1 / np.square([priors.lateral_m, priors.vertical_m, priors.shift_m, priors.backed_m])
+    prior[last, last] = np.concatenate([[priors.lateral_m, priors.vertical_m], priors.shifts]) ** -2.0
     return prior, float(np.linalg.slogdet(cov)[1])
