@@ -191,9 +191,7 @@ def build_board(
         edge_ring=scan.ring[edge],
         edge_side=ends.side[order],
         edge_behind_m=ends.behind_m[order],
-        edge_echo=_echo_shares(scan, source.intensity[scan.index].astype(np.float64), ends, view, border)[
-            order
-        ],
+        edge_echo=_echo_shares(scan, source, ends, view, border)[order],
         azimuth_step_rad=scan.step_rad,
         plane=view.plane,
         sigma_m=float(np.sqrt(np.mean(height**2))),
