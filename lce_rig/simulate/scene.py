@@ -1,9 +1,6 @@
 """The scene a ray meets: meshes that stand still, meshes that move with the board, and the board itself."""
 
-import signal
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,6 +10,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.interrupts import without_interrupt
 from lce_rig.simulate.materials import Material, albedo, checker
 from lce_rig.simulate.shapes import Mesh, rectangle
 
@@ -60,7 +58,7 @@ class Raycaster:
 
     @cached_property
     def _engine(self) -> Any:
-        with _without_interrupt():
+        with without_interrupt():
             import open3d as o3d
 
         engine = o3d.t.geometry.RaycastingScene(nthreads=1)
@@ -110,23 +108,6 @@ class Raycaster:
         rays = self._rays(origins, targets - origins)
         blocked = self._engine.test_occlusions(rays, tnear=1e-3, tfar=0.999, nthreads=1)
         return np.asarray(blocked.numpy(), dtype=np.bool_)
-
-
-@contextmanager
-def _without_interrupt() -> Iterator[None]:
-    """Let Ctrl-C wait: Open3D, stopped in its initialisation, ends the process by an exit code of its own."""
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
-        yield
-        return
-    pressed = []
-    signal.signal(signal.SIGINT, lambda *arguments: pressed.append(arguments))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if pressed:
-        before(*pressed[0])
 
 
 def _nothing(n: int) -> Hits:
