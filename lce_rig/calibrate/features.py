@@ -1,6 +1,7 @@
 """From a pair of detected boards to the points, planes and lines that are fitted to each other."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -71,7 +72,7 @@ def place_features(
     return replace(features, **_seen_at(T_cam_board, cov, board))
 
 
-def _seen_at(T_cam_board: Array, cov: Array, board: Board) -> dict[str, Array]:
+def _seen_at(T_cam_board: Array, cov: Array, board: Board) -> dict[str, Any]:
     """Compute the features of the camera's side, by the names of `CaptureFeatures`."""
     R = T_cam_board[:3, :3]
     anchors_board, normals_board = board.edges()
