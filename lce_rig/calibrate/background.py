@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from lce_rig.calibrate.expansion import FIRST_RING, SHIFT, end_rows, nearest_edge
 from lce_rig.calibrate.features import CaptureFeatures
+from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import LidarBoard, Observation
@@ -21,11 +21,11 @@ from lce_rig.solvers.covariance import jackknife_covariance
 
 BLENDS_M = 0.35
 """Echoes from surfaces nearer to each other than this blend into one."""
-# What is believed before any ring end is seen: of the extrinsic, of the beam's width, and of the shifts by
-# the background: by its share of the power, where it blends, and by its share where it blends.
-_SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD, _SIGMA_SHIFT_M = 0.02, 0.01, 0.015
-_SIGMAS_M = (0.015, 0.006, 0.015)
-_N_SHIFTS = len(_SIGMAS_M)
+BACKGROUND_SIGMAS_M = (0.015, 0.01, 0.015)
+"""What is believed of the shifts by the background, in the order of `describe_background`."""
+# What is believed of the extrinsic near which the shifts are sought.
+_SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD = 0.02, 0.01
+_N_SHIFTS = len(BACKGROUND_SIGMAS_M)
 # Noise of a ring end, and beyond how many sigmas one counts less.
 _END_SIGMA_M, _HUBER = 0.003, 1.5
 _ROUNDS = 5
@@ -66,8 +66,9 @@ def estimate_shifts(
     background = np.concatenate([describe_background(observation.lidar) for observation in observations])
     # Inside distance = - (change of the extrinsic) - beam's width - shifts.
     A = -np.column_stack([np.concatenate([J[:, : SHIFT + 1] for _, J in parts]), background])
-    sigmas = [_SIGMA_TRANSLATION_M] * 3 + [_SIGMA_ROTATION_RAD] * 3 + [_SIGMA_SHIFT_M, *_SIGMAS_M]
-    prior, x = np.diag(np.square(_END_SIGMA_M / np.array(sigmas))), np.zeros(len(sigmas))
+    extrinsic = np.repeat([_SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD], 3)
+    sigmas = np.concatenate([extrinsic, [EDGE_SHIFT_SIGMA_M], BACKGROUND_SIGMAS_M])
+    prior, x = np.diag(np.square(_END_SIGMA_M / sigmas)), np.zeros(len(sigmas))
     for _ in range(_ROUNDS):
         weights = 1 / np.maximum(np.abs(inside - A @ x) / (_HUBER * _END_SIGMA_M), 1.0)
         information = A.T @ (weights[:, None] * A) + prior
@@ -76,6 +77,8 @@ def estimate_shifts(
     gradients = np.add.reduceat(A * (weights * (A @ x - inside))[:, None], first, axis=0)
     hessians = np.add.reduceat(A[:, :, None] * (weights[:, None] * A)[:, None, :], first, axis=0)
     cov = jackknife_covariance(gradients, hessians, prior)[-_N_SHIFTS:, -_N_SHIFTS:]
+    from scipy.special import chdtri
+
     # A column that no ring end has is known to be zero.
     shifts, is_seen = x[-_N_SHIFTS:], np.any(background > 0, axis=0)
     chi2 = shifts[is_seen] @ np.linalg.solve(cov[np.ix_(is_seen, is_seen)], shifts[is_seen])
