@@ -56,7 +56,7 @@ def still_session(
         options: of the simulation; the folder must have been made with the same.
         n_captures: placements of the board.
         sigma_px: noise of each corner's coordinates.
-        folder: where detections are kept.
+        folder: where detections are kept; delete it when the simulation or the detectors change.
     """
     path = folder / f"{rig.name}-{n_captures}-{seed:04d}.npz"
     if not path.exists():

@@ -68,7 +68,7 @@ def bench_uncertainty(n_seeds: int, folder: Path, only: str = "", n_captures: in
 
     Args:
         n_seeds: sessions of each case.
-        folder: where detections are kept.
+        folder: where detections are kept; delete it when the simulation or the detectors change.
         only: cases whose label contains this.
         n_captures: of each session.
     """
