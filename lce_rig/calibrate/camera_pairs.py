@@ -24,9 +24,13 @@ from lce_rig.solvers.covariance import jackknife_covariance, symmetric_inverse
 
 # Fewer placements show no scatter.
 _MIN_PLACEMENTS = 4
+# Of fewer, the scatter has no shape that could be told: that of usual errors is taken.
+_MIN_JACKKNIFE = 10
 _STEPS = 20
 # Freedoms of the Student distribution that weighs single boards: one in some may be seen wrongly.
 _STUDENT = 5.0
+# Boards scatter for a reason where they do so by this many times what is usual.
+_MAX_SCATTER = 2.0
 # 99 % of the chi-squared distribution of six freedoms.
 _CHI2 = 16.81
 
@@ -37,10 +41,11 @@ class PicturePose:
 
     Attributes:
         T_second_first: (4, 4), p_second = R p_first + t.
-        cov: (6, 6) from the scatter between placements, tangent (translation m, rotation rad), axes of the
+        cov: (6, 6) of it, from the scatter between placements; tangent (translation m, rotation rad), axes of the
             second camera.
         captures: (F,) that both cameras used, as the first names them.
         board_rms_m: how far apart the two cameras put the middle of a board, rms.
+        scatter: of single boards about it, in standard deviations that poses in pictures usually have.
         expansion: of the cost about T_second_first, capture by capture.
     """
 
@@ -48,6 +53,7 @@ class PicturePose:
     cov: Array
     captures: tuple[str, ...]
     board_rms_m: float
+    scatter: float
     expansion: Expansion
 
 
@@ -130,15 +136,21 @@ def pose_from_pictures(shared: Sequence[tuple[Observation, Observation]]) -> Pic
     T, J = relative_pose(T_second, T_first)
     information = symmetric_inverse(relative_covariance(J, cov_second, cov_first))
     mean, weight = _robust_mean(T, information)
+    apart = difference(T, mean)
+    chi2 = float(np.einsum("ki,kij,kj->", apart, information, apart))
     hessians = weight[:, None, None] * information
-    gradients = -(hessians @ difference(T, mean)[..., None])[..., 0]
+    gradients = -(hessians @ apart[..., None])[..., 0]
     none, board_rms_m = np.zeros((6, 6)), _board_rms_m(shared, mean)
     expansion = Expansion(
         mean, gradients, hessians, none, placement, T_first[:, :3, 3], board_rms_m, board_rms_m
     )
+    scatter = float(np.sqrt(chi2 / (6 * (len(T) - 1))))
     pulls, stiffness = (np.tensordot(expansion.groups, each, axes=1) for each in (gradients, hessians))
-    cov = jackknife_covariance(pulls, stiffness, none)
-    return PicturePose(mean, cov, tuple(one.capture for one in firsts), board_rms_m, expansion)
+    if len(pulls) < _MIN_JACKKNIFE:
+        cov = max(scatter, 1.0) ** 2 * symmetric_inverse(stiffness.sum(axis=0))
+    else:
+        cov = jackknife_covariance(pulls, stiffness, none)
+    return PicturePose(mean, cov, tuple(one.capture for one in firsts), board_rms_m, scatter, expansion)
 
 
 def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
@@ -190,19 +202,49 @@ def doubt_cameras(
     """
     if pair.pictures is None or pair.apart is None:
         return []
+    # Pictures are exact enough to show any change that matters.
+    strict = limits.model_copy(update={"max_change": limits.max_camera_difference})
+    changed = doubt_halves(contrast_halves(pair.pictures.expansion), pair.pictures.captures, target, strict)
     first, second = names
-    pictures = pair.pictures
-    contrasts = contrast_halves(pictures.expansion)
-    doubts = [
-        Doubt(doubt.verdict, f"{first} to {second}, by their pictures alone: {doubt.text}")
-        for doubt in doubt_halves(contrasts, pictures.captures, target, limits)
+    return [
+        *(
+            Doubt(doubt.verdict, f"{first} to {second}, by their pictures alone: {doubt.text}")
+            for doubt in changed
+        ),
+        *_scattered(pair.pictures, names, limits),
+        *_elsewhere(pair, pair.pictures, pair.apart, names, target, limits),
     ]
-    rotation_deg = float(np.degrees(np.linalg.norm(pair.apart[3:])))
-    translation_m = float(np.linalg.norm(pair.apart[:3]))
+
+
+def _scattered(pictures: PicturePose, names: tuple[str, str], limits: VerdictSettings) -> list[Doubt]:
+    if pictures.scatter <= _MAX_SCATTER or pictures.board_rms_m <= limits.max_plane_misfit_m:
+        return []
+    first, second = names
+    text = (
+        f"wherever {first} sits to {second}, their pictures put the same board "
+        f"{1000 * pictures.board_rms_m:.0f} mm apart (rms; {pictures.scatter:.1f} times what is usual): "
+        "did the board move between the pictures, or is an intrinsic wrong?"
+    )
+    return [Doubt("marginal", text)]
+
+
+def _elsewhere(
+    pair: CameraPair,
+    pictures: PicturePose,
+    apart: Array,
+    names: tuple[str, str],
+    target: CalibrationSettings,
+    limits: VerdictSettings,
+) -> list[Doubt]:
+    first, second = names
+    rotation_deg, translation_m = (
+        float(np.degrees(np.linalg.norm(apart[3:]))),
+        float(np.linalg.norm(apart[:3])),
+    )
     excess = max(rotation_deg / target.target_sigma_deg, translation_m / target.target_sigma_m)
     excess /= limits.max_camera_difference
     if pair.surprise <= _CHI2 or excess <= 1:
-        return doubts
+        return []
     verdict: Verdict = "fail" if excess > limits.fail_factor else "marginal"
     text = (
         f"{first} and {second} put the same board {1000 * pair.board_rms_m:.0f} mm apart "
@@ -210,4 +252,4 @@ def doubt_cameras(
         f"{rotation_deg:.2f} deg, {1000 * translation_m:.0f} mm on where one camera sits to the other: "
         "was one of them nudged, or is an intrinsic wrong?"
     )
-    return [*doubts, Doubt(verdict, text)]
+    return [Doubt(verdict, text)]

@@ -84,7 +84,8 @@ def _links(rig: Rig, solved: Sequence[Solved]) -> Iterator[_Link]:
     for i, j in combinations(range(len(solved)), 2):
         first, second = solved[i], solved[j]
         if first.lidar == second.lidar and first.is_still and second.is_still:
-            pair = relate(first.estimate, second.estimate)
+            # Captures that contradict each other widen what a method claims: that must not excuse them.
+            pair = relate(first.result.estimate, second.result.estimate)
             if pair is not None:
                 names = first.camera, second.camera
                 yield _Link(i, j, pair, tuple(doubt_cameras(pair, names, rig.calibration, rig.verdict)))
