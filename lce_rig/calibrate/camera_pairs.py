@@ -41,8 +41,8 @@ class PicturePose:
 
     Attributes:
         T_second_first: (4, 4), p_second = R p_first + t.
-        cov: (6, 6) of it, from the scatter between placements; tangent (translation m, rotation rad), axes of the
-            second camera.
+        cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the second camera: from the scatter
+            between placements.
         captures: (F,) that both cameras used, as the first names them.
         board_rms_m: how far apart the two cameras put the middle of a board, rms.
         scatter: of single boards about it, in standard deviations that poses in pictures usually have.
