@@ -90,8 +90,9 @@ class VerdictSettings(Settings):
         max_change: largest difference of earlier and later captures, in targets; twice it fails.
         max_contrast: the same between near and far, left and right, upper and lower boards, whose differences
             all but cancel in the whole.
-        max_camera_difference: how far apart two cameras' extrinsics and their own pictures may put one camera
-            to the other, in targets; `fail_factor` times that fails.
+        max_camera_difference: how far two cameras' extrinsics and their own pictures may differ on where one
+            sits to the other, and how far that may change on the way, in targets; `fail_factor` times that,
+            or twice for a change, fails.
         least_chance: a difference of shares of the captures counts where chance makes it this rarely.
         control_sigmas: how many standard deviations the result is moved for the control, and no less than
             the target; captures that were left out must then fit worse.
