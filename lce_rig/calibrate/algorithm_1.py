@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lce_rig.calibrate.blended_ends import estimate_sooner, move_blended_ends
+from lce_rig.calibrate.background import estimate_effects, move_ends
 from lce_rig.calibrate.draws import Draws, draw_subsets
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.features import CaptureFeatures, extract_features
@@ -31,6 +31,8 @@ from lce_rig.solvers.covariance import jackknife_covariance, systematic_covarian
 # Weights given by the user count in captures with residuals of this size, which sets the scale of the prior.
 NOMINAL_SIGMA_M = 0.01
 _PLANE_FREEDOMS = 3
+# Names of what `estimate_effects` finds.
+_EFFECTS = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m")
 
 
 def calibrate_by_algorithm_1(
@@ -54,9 +56,9 @@ def calibrate_by_algorithm_1(
     problem = Problem(features, board, _weights(options, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
     T_planes = solve_planes(features, problem)
     require_observable(features, problem, T_planes)
-    sooner_m = estimate_sooner(observations, features, T_planes, board)
-    if sooner_m > 0:
-        observations = move_blended_ends(observations, features, T_planes, board, sooner_m)
+    effects_m = estimate_effects(observations, features, T_planes, board)
+    if effects_m.any():
+        observations = move_ends(observations, features, T_planes, board, effects_m)
         features = [extract_features(observation, board, options) for observation in observations]
 
     outliers, sigmas = reject_outliers(features, problem, T_planes, options)
@@ -84,7 +86,7 @@ def calibrate_by_algorithm_1(
         refused=outliers,
         diagnostics={
             **_diagnostics(problem, solution, covariances, draws),
-            "blended_ends_sooner_m": sooner_m,
+            **dict(zip(_EFFECTS, effects_m.tolist(), strict=True)),
         },
     )
 

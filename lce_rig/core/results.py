@@ -74,6 +74,8 @@ class LidarBoard:
             (azimuth = atan2(y, x), counter-clockwise).
         edge_behind_m: (M,) how far behind the board's plane the ring's next return beyond the edge lies;
             inf where there is none. What stands close behind blends into the beam's return.
+        edge_echo: (M,) share 0..1 of the received power that comes from there where a beam meets it and the
+            board alike; 0 where nothing is there. A beam that meets both reports the stronger echo.
         azimuth_step_rad: angle between neighbouring firings of one ring.
         plane: (4,) as (n, d), n.p + d = 0, unit n towards the LiDAR (d > 0).
         sigma_m: rms distance of `points` from the plane.
@@ -90,6 +92,7 @@ class LidarBoard:
     edge_ring: NDArray[np.int16]
     edge_side: NDArray[np.int8]
     edge_behind_m: Array
+    edge_echo: Array
     azimuth_step_rad: float
     plane: Array
     sigma_m: float

@@ -21,13 +21,15 @@ class RingEnds:
         beam: (E,) index in the plane view.
         side: (E,) -1 or +1.
         gap: (E, 2) from one beam to the next along the ring at that end, outwards, in the plane view, m.
-        behind_m: (E,) how far behind the plane the next return outwards lies, inf where there is none.
+        beyond: (E,) index in the scan of the next return outwards.
+        behind_m: (E,) how far behind the plane it lies, inf where there is none.
         is_border: (E,) whether the surface itself ends there: no occluder before it, no plane behind it.
     """
 
     beam: Indices
     side: NDArray[np.int8]
     gap: Array
+    beyond: Indices
     behind_m: Array
     is_border: NDArray[np.bool_]
 
@@ -68,7 +70,7 @@ def find_ring_ends(scan: OrderedScan, view: PlaneView, is_board: NDArray[np.bool
     goes_on = beyond_exists & (np.abs(height_1) <= view.tolerance_m)
     goes_on &= further_exists & (np.abs(height_2) <= view.tolerance_m)
     behind_m = np.where(beyond_exists, -height_1, np.inf)
-    return RingEnds(beam, side, gap, behind_m, ~(is_occluded | goes_on))
+    return RingEnds(beam, side, gap, beyond, behind_m, ~(is_occluded | goes_on))
 
 
 def _outwards(

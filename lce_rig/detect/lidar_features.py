@@ -8,8 +8,8 @@ from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, pose
 from lce_rig.core.results import LidarBoard
-from lce_rig.detect.lidar_edges import SLACK_M, find_ring_ends, measure_size, median
-from lce_rig.detect.lidar_segments import OrderedScan
+from lce_rig.detect.lidar_edges import SLACK_M, RingEnds, find_ring_ends, measure_size, median
+from lce_rig.detect.lidar_segments import Indices, OrderedScan
 from lce_rig.detect.lidar_template import (
     Placement,
     PlaneView,
@@ -23,6 +23,7 @@ from lce_rig.detect.lidar_template import (
 SURROUND_M = 0.20
 MIN_POINTS = 12
 EDGE_TOLERANCE_M = 0.012
+BORDER_M = 0.06  # how bright the board is near its outline is asked of returns so near to it
 SETTLED_M = 0.01  # an outline that moves less leaves the returns inside it, and so the plane, as they are
 
 
@@ -155,6 +156,7 @@ def build_board(
     order = np.lexsort((ends.side, scan.ring[view.member[ends.beam]]))
     order = order[is_good[order]]
     kept, edge = view.member[is_board], view.member[ends.beam[order]]
+    border = kept[away[is_board] > -BORDER_M]
     points = scan.points[kept].astype(np.float64)
     height = points @ view.plane[:3] + view.plane[3]
     low_m, high_m = np.percentile(height, [2.5, 97.5])
@@ -189,6 +191,7 @@ def build_board(
         edge_ring=scan.ring[edge],
         edge_side=ends.side[order],
         edge_behind_m=ends.behind_m[order],
+        edge_echo=_echo_shares(scan, source, ends, view, border)[order],
         azimuth_step_rad=scan.step_rad,
         plane=view.plane,
         sigma_m=float(np.sqrt(np.mean(height**2))),
@@ -196,6 +199,26 @@ def build_board(
         offset_ns=None if source.offset_ns is None else source.offset_ns[scan.index[kept]],
         quality=quality,
     )
+
+
+def _echo_shares(scan: OrderedScan, source: Scan, ends: RingEnds, view: PlaneView, border: Indices) -> Array:
+    """Compute the share (E,) of the power that comes from behind where a beam meets it and the board alike.
+
+    Intensities are those of surfaces; what is received from them falls with the square of the range.
+
+    Args:
+        scan: all returns.
+        source: the scan they come from; where it has no intensities all surfaces count as alike.
+        ends: ring ends.
+        view: beams about the board.
+        border: returns from near the board's outline.
+    """
+    intensity = source.intensity[scan.index].astype(np.float64)
+    end = view.member[ends.beam]
+    of_board = float(np.median(intensity[border])) if len(border) else 0.0
+    brightness = intensity[ends.beyond] / of_board if of_board > 0 else np.ones(len(end))
+    echo = brightness * (scan.range_m[end] / scan.range_m[ends.beyond]) ** 2
+    return np.where(np.isfinite(ends.behind_m), echo / (1 + echo), 0.0)
 
 
 def _pose_of(view: PlaneView, placement: Placement) -> Array:

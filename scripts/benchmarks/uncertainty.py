@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
 from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate
-from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, EdgeRows
+from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, SHIFTS, EdgeRows
 from lce_rig.calibrate.likelihood.end_density import density
 from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import stack_pictures
@@ -26,6 +26,7 @@ CORNER_SIGMA_PX = 0.1
 # Something found in the scan that lies farther than this from the board is not it.
 _FOUND_M = 0.05
 _FREEDOMS = 6
+_ASTRAY = SHIFTS[-2:]
 
 
 @dataclass(frozen=True)
@@ -175,18 +176,25 @@ def _fit_ends(edges: Sequence[EdgeRows]) -> dict[str, float]:
     How far a ring end strays follows from ray-traced footprints, not from a number among the options. The
     beam's width is free.
     """
-    rows, step_m, range_m = (
-        np.concatenate([getattr(e, name) for e in edges]) for name in ("rows", "step_m", "range_m")
+    rows, step_m, range_m, is_backed = (
+        np.concatenate([getattr(e, name) for e in edges])
+        for name in ("rows", "step_m", "range_m", "is_backed")
     )
 
+    # A displacement of all ring ends is the truth's to tell: none.
+    first = rows.shape[1] - 1 - N_SHIFTS
+    by_width_mm = rows[:, first : -1 - len(_ASTRAY)] / 1e3
+    n = by_width_mm.shape[1]
+
     def cost(x: Array) -> float:
-        blur = np.exp(np.where(rows[:, -2] > 0, x[4], x[2])) * range_m / step_m
-        lost_share = float(np.exp(min(x[3], np.log(MOST_LOST))))
-        p, _ = density((rows[:, -1] + rows[:, -3:-1] @ x[:2]) / step_m, blur, lost_share)
-        return -float(np.sum(np.log(p)))
+        blur = np.exp(np.where(is_backed, x[-1], x[-3])) * range_m / step_m
+        lost_share = float(np.exp(min(x[-2], np.log(MOST_LOST))))
+        p, _ = density((rows[:, -1] + by_width_mm @ x[:n]) / step_m, blur, lost_share)
+        return -float(np.mean(np.log(p)))
 
     usual = Levels()
     names = ("edge_rad", "lost_share", "backed_rad")
-    start = [-float(np.median(rows[:, -1])), 0.0, *(np.log(getattr(usual, name)) for name in names)]
-    found = minimize(cost, start, method="Nelder-Mead", options={"maxiter": 2000}).x[2:]
+    width_mm = -1e3 * float(np.median(rows[:, -1]))
+    start = [width_mm, *np.zeros(n - 1), *(np.log(getattr(usual, name)) for name in names)]
+    found = minimize(cost, start, method="L-BFGS-B").x[n:]
     return dict(zip(names, np.exp(np.minimum(found, [np.inf, np.log(MOST_LOST), np.inf])), strict=True))

@@ -171,6 +171,7 @@ def scan_board(
         edge_ring=np.concatenate([rings, rings]).astype(np.int16),
         edge_side=np.repeat(np.array([-1, 1], dtype=np.int8), len(rings)),
         edge_behind_m=np.full(2 * len(rings), np.inf),
+        edge_echo=np.zeros(2 * len(rings)),
         azimuth_step_rad=step,
         plane=plane,
         sigma_m=rms,

@@ -45,6 +45,7 @@ def test_a_capture_without_ring_ends_does_not_spoil_the_mean():
             edge_ring=np.zeros(0, dtype=np.int16),
             edge_side=np.zeros(0, dtype=np.int8),
             edge_behind_m=np.zeros(0),
+            edge_echo=np.zeros(0),
         ),
     )
     residuals = [capture_residual(T_FORWARD, observation, BOARD) for observation in (whole, bare)]

@@ -80,8 +80,7 @@ def board_at(x_m: float, y_m: float) -> ImageBoard:
 
 def plate() -> LidarBoard:
     """What a scan shows of it; only that there is something counts."""
-    none = np.zeros((0, 3))
+    none, nothing = np.zeros((0, 3)), np.zeros(0)
     ring, side = np.zeros(0, np.int16), np.zeros(0, np.int8)
-    return LidarBoard(
-        none, ring, none, ring, side, np.zeros(0), 0.003, np.array([0, 0, 1.0, -3.0]), 0.01, np.eye(4)
-    )
+    plane = np.array([0, 0, 1.0, -3.0])
+    return LidarBoard(none, ring, none, ring, side, nothing, nothing, 0.003, plane, 0.01, np.eye(4))

@@ -1,5 +1,7 @@
 """The board in full scans of a room: where it is, what is measured of it, and what is not taken for it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scans import (
@@ -289,3 +291,23 @@ def test_plate_with_much_else_in_its_plane_is_no_rival_of_a_clear_board():
     found = find(cast([board_plate(T), board_plate(patch), beside, *ROOM], sigma_m=0.01))
     assert_is_board(found, T)
     assert len(found) == 1
+
+
+@pytest.mark.parametrize(("wall_intensity", "brightness"), [(50, 0.5), (20, 0.2), (None, 1.0)])
+def test_ring_ends_tell_how_strong_the_echo_from_behind_is(wall_intensity, brightness):
+    """A wall 2 m behind a board at 2 m, brighter or darker; without intensities both count as alike."""
+    wall = Plate(place(4.0, roll_deg=0.0), 8.0, 6.0)
+    scan = cast([board_plate(place(2.0)), wall], sigma_m=0.005)
+    is_wall = scan.points[:, 0] > 3
+    intensity = np.where(is_wall, wall_intensity, 100) if wall_intensity else np.zeros(len(is_wall))
+    found = find(replace(scan, intensity=intensity.astype(np.float32)))[0]
+    assert len(found.edge_echo) > 10
+    echo = brightness * (found.edge_points[:, 0] / 4.0) ** 2
+    assert np.allclose(found.edge_echo, echo / (1 + echo), rtol=0.02)
+
+
+def test_ring_ends_before_nothing_have_no_echo_behind_them():
+    found = find(cast([board_plate(place(2.0)), *ROOM[1:]], sigma_m=0.005))[0]
+    is_alone = np.isinf(found.edge_behind_m)
+    assert is_alone.any()
+    assert np.all(found.edge_echo[is_alone] == 0)

@@ -58,6 +58,7 @@ def lidar_board(points: Array) -> LidarBoard:
         edge_ring=np.zeros(len(ends), np.int16),
         edge_side=np.ones(len(ends), np.int8),
         edge_behind_m=np.full(len(ends), np.inf),
+        edge_echo=np.zeros(len(ends)),
         azimuth_step_rad=0.0035,
         plane=np.array([-1.0, 0, 0, 2.0]),
         sigma_m=0.01,

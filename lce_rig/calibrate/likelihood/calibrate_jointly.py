@@ -10,6 +10,7 @@ from lce_rig.calibrate.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.expansion import Expansion
 from lce_rig.calibrate.features import extract_features
+from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.refine import JointEstimate, refine
 from lce_rig.calibrate.likelihood.spread import inflate
@@ -136,10 +137,13 @@ def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp])
 def figures_of(joint: JointEstimate, camera: int) -> dict[str, float]:
     """Name the constant errors and noise levels; those of Algorithm 1 that they replace are overwritten."""
     levels = joint.levels
+    shifts = dict(zip(SHIFTS, joint.shifts.tolist(), strict=True))
     return {
-        "edge_shift_m": float(joint.shifts_m[0]),
-        "edge_shift_sigma_m": float(joint.constants_sigma[-2]),
-        "edge_shift_backed_m": float(joint.shifts_m.sum()),
+        "edge_shift_m": shifts["d_0"],
+        "edge_shift_sigma_m": float(joint.constants_sigma[-N_SHIFTS]),
+        "edge_shift_echo_m": shifts["d_1"],
+        "edge_shift_blended_m": shifts["d_0"] + shifts["d_2"],
+        "edge_shift_blended_echo_m": shifts["d_3"],
         "range_offset_m": float(np.mean(joint.offset_m)),
         "laser_spread_m": float(np.std(joint.offset_m)),
         "lens_lateral_m": float(joint.lens_m[0]),

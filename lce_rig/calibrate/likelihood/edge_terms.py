@@ -7,15 +7,23 @@ s + g d lies anywhere between 0 and D. The error
 
     e = s + g d - D / 2                                                                                  (1)
 
-in units of D has the density of `end_density`. Where something stands close behind the edge, its echo blends
-into those of beams that the board fills in part, and their ranges no longer lie on the board: there the board
-is lost sooner, at d + d'.
+in units of D has the density of `end_density`. A beam that meets board and background reports the stronger
+echo: with q the share of the power that would come from the background if the beam met both alike, and r the
+range,
+
+    d = d_0 + c r + d_1 q    where the background is far behind
+    d = d_0 + c r + d_2 + d_3 q    where it is so near that both echoes blend into one                   (2)
+
+Recordings and simulation both show d_1 near -1.5 cm. What is left, the same for all ring ends (a beam that is
+not symmetric, a clock of the rotor), is a small displacement of ring ends against the returns between them,
+along azimuth and upwards.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.calibrate.likelihood.end_density import density, information
 from lce_rig.calibrate.likelihood.levels import Levels
@@ -23,18 +31,21 @@ from lce_rig.calibrate.likelihood.scans import N_FIELDS, Indices, StackedScans
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 
-N_SHIFTS = 2
-# Columns of a row: by board pose, by lens, by d and d', residual.
+SHIFTS = ("d_0", "c", "d_1", "d_2", "d_3", "along azimuth", "upwards")
+"""Unknowns of (2), and the displacement of ring ends."""
+N_SHIFTS = len(SHIFTS)
+# Columns of a row: by board pose, by lens, by shifts, residual.
 _SIZE = 6 + N_FIELDS + N_SHIFTS + 1
+_BACKED = 6 + N_FIELDS + SHIFTS.index("d_2")
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeRows:
-    """Equation (1) for M ring ends, linear in the tangent of T_lidar_board, the lens, d and d'.
+    """Equation (1) for M ring ends, linear in the tangent of T_lidar_board, the lens and the shifts.
 
     Attributes:
         capture: (M,).
-        rows: (M, 11) by board pose (6), by lens (2), by d, by d', e in m.
+        rows: (M, 16) by board pose (6), by lens (2), by `SHIFTS`, e in m.
         step_m: (M,) D.
         range_m: (M,) to the board.
     """
@@ -46,13 +57,17 @@ class EdgeRows:
 
     @cached_property
     def products(self) -> Array:
-        """Products of each row with itself (M, 11, 11)."""
+        """Products of each row with itself (M, 16, 16)."""
         return np.asarray(self.rows[:, :, None] * self.rows[:, None, :])
+
+    @property
+    def is_backed(self) -> NDArray[np.bool_]:
+        """Whether the background's echo blends into the board's (M,)."""
+        return np.asarray(self.rows[:, _BACKED] > 0)
 
     def blur_m(self, levels: Levels) -> Array:
         """Blur (M,) of each interval's ends."""
-        is_backed = self.rows[:, -2] > 0
-        return np.asarray(np.where(is_backed, levels.backed_rad, levels.edge_rad) * self.range_m)
+        return np.asarray(np.where(self.is_backed, levels.backed_rad, levels.edge_rad) * self.range_m)
 
     def variance(self, levels: Levels) -> Array:
         """Variance (M,) of e in m^2, of the blurred interval alone."""
@@ -60,7 +75,7 @@ class EdgeRows:
 
 
 def edge_rows(
-    scans: StackedScans, T_lidar_board: Array, board: Board, lens: Array, shifts_m: Array
+    scans: StackedScans, T_lidar_board: Array, board: Board, lens: Array, shifts: Array
 ) -> EdgeRows:
     """Linearise (1).
 
@@ -69,7 +84,7 @@ def edge_rows(
         T_lidar_board: (F, 4, 4) board poses.
         board: its size.
         lens: (2,) theta.
-        shifts_m: (2,) d and d'.
+        shifts: (7,) `SHIFTS`.
     """
     T = T_lidar_board[scans.end_capture]
     R, t, n = T[:, :3, :3], T[:, :3, 3], T[:, :3, 2]
@@ -91,10 +106,18 @@ def edge_rows(
     rows[:, :3] = sideways
     rows[:, 3:6] = -np.cross(sideways, here)
     rows[:, 6 : 6 + N_FIELDS] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
-    rows[:, -3] = np.linalg.norm(sideways, axis=1)
-    rows[:, -2] = rows[:, -3] * scans.end_is_backed
-    rows[:, -1] = inside_m + rows[:, 6:-1] @ np.concatenate([lens, shifts_m]) - step_m / 2
-    return EdgeRows(scans.end_capture, rows, step_m, h / cosine)
+    range_m = h / cosine
+    rows[:, 6 + N_FIELDS : -1] = _by_shifts(scans, sideways, range_m)
+    rows[:, -1] = inside_m + rows[:, 6:-1] @ np.concatenate([lens, shifts]) - step_m / 2
+    return EdgeRows(scans.end_capture, rows, step_m, range_m)
+
+
+def _by_shifts(scans: StackedScans, sideways: Array, range_m: Array) -> Array:
+    """Differentiate e by `SHIFTS`: (M, 7)."""
+    g, q, is_backed = np.linalg.norm(sideways, axis=1), scans.end_echo, scans.end_is_backed
+    of_width = np.stack([np.ones(len(g)), range_m, q * ~is_backed, is_backed, q * is_backed], axis=1)
+    astray = np.stack([np.sum(sideways * scans.end_fields[:, :, 0], axis=1), sideways[:, 2]], axis=1)
+    return np.hstack([g[:, None] * of_width, -astray])
 
 
 def nearest_edge(xy_m: Array, board: Board) -> Indices:
@@ -107,7 +130,7 @@ def nearest_edge(xy_m: Array, board: Board) -> Indices:
 
 
 def edge_system(edges: EdgeRows, levels: Levels, n_captures: int) -> Array:
-    """Expand -2 ln p of the ring ends to second order, by capture: (F, 11, 11).
+    """Expand -2 ln p of the ring ends to second order, by capture: (F, 16, 16).
 
     With J a row without its residual: J J^T times the information, J times the score in the last column, and
     -2 ln p itself in the corner. The information is the mean over all ring ends of such a blur: that of a

@@ -67,8 +67,11 @@ class Priors:
 
     Attributes:
         offset_m: range offset common to all lasers.
-        shift_m: edge shift d.
-        backed_m: its change d' where something stands close behind the edge.
+        shift_m: edge shift d_0, `edge_terms`.
+        growth: c, its change with range; recordings show none.
+        echo_m: d_1 and d_3, how much sooner the board ends where all power comes from the background.
+        backed_m: d_2, its change where something stands close behind the edge.
+        astray_m: displacement of all ring ends against the returns between them.
         lateral_m: lens beside the LiDAR's axis, `scans`.
         vertical_m: its height, per rad of elevation.
         scale: of the camera's distances, by which squares or focal length are off.
@@ -76,10 +79,19 @@ class Priors:
 
     offset_m: float = 0.005
     shift_m: float = 0.015
+    growth: float = 0.0001
+    echo_m: float = 0.015
     backed_m: float = 0.01
+    astray_m: float = 0.00025
     lateral_m: float = 0.02
     vertical_m: float = 0.04
     scale: float = 0.0005
+
+    @property
+    def shifts(self) -> Array:
+        """Deviations (7,) in the order of `edge_terms.SHIFTS`."""
+        echoes = [self.echo_m, self.backed_m, self.echo_m]
+        return np.array([self.shift_m, self.growth, *echoes, self.astray_m, self.astray_m])
 
 
 # Offsets of lasers that the profile says have none.

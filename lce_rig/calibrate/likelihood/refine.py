@@ -41,9 +41,9 @@ class JointEstimate:
         to_extrinsics: (C, 6, G) derivative of each extrinsic's tangent by the unknowns z of `system`.
         offset_m: (L,) by which ranges of each ring read too long.
         lens_m: (2,) lateral and vertical displacement of the LiDAR's lens, `scans`.
-        shifts_m: (2,) edge shift, and its change where something stands close behind.
+        shifts: (7,) of ring ends, `edge_terms.SHIFTS`.
         scale: (C,) by how much of themselves each camera's distances are too short.
-        constants_sigma: (L + 4,) standard deviations of offsets, lens and edge shifts.
+        constants_sigma: (L + 9,) standard deviations of offsets, lens and shifts.
         levels: of the noise.
         end_sigma_m: standard deviation of ring ends from the edges, without those lost or astray.
         system: normal equations at the optimum.
@@ -55,7 +55,7 @@ class JointEstimate:
     to_extrinsics: Array
     offset_m: Array
     lens_m: Array
-    shifts_m: Array
+    shifts: Array
     scale: Array
     constants_sigma: Array
     levels: Levels
@@ -171,7 +171,7 @@ def _summarise(state: State, terms: Terms, levels: Levels, priors: Priors) -> Jo
         to_extrinsics=J,
         offset_m=rest[: -N_FIELDS - N_SHIFTS],
         lens_m=rest[-N_FIELDS - N_SHIFTS : -N_SHIFTS],
-        shifts_m=rest[-N_SHIFTS:],
+        shifts=rest[-N_SHIFTS:],
         scale=constants[PER_CAMERA * np.arange(C) + 6],
         constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
         levels=levels,

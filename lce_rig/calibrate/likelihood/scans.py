@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.blended_ends import is_blended
+from lce_rig.calibrate.background import is_blended
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard
@@ -42,6 +42,7 @@ class StackedScans:
         next_rays: (M, 3) unit vectors of the firing after it, which missed the board.
         end_fields: (M, 3, 2) as `fields`.
         end_is_backed: (M,) whether something stands close behind the board's edge.
+        end_echo: (M,) share of the power that comes from behind it, `LidarBoard.edge_echo`.
     """
 
     n_captures: int
@@ -56,6 +57,7 @@ class StackedScans:
     next_rays: Array
     end_fields: Array
     end_is_backed: NDArray[np.bool_]
+    end_echo: Array
 
     @property
     def group(self) -> Indices:
@@ -99,6 +101,7 @@ def stack_scans(boards: Sequence[LidarBoard]) -> StackedScans:
         next_rays=turn_about_z(end_rays, angle),
         end_fields=lens_fields(ends),
         end_is_backed=np.concatenate([is_blended(board) for board in boards]),
+        end_echo=np.concatenate([board.edge_echo for board in boards]),
     )
 
 

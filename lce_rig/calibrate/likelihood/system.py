@@ -3,7 +3,7 @@
 Unknowns are the tangent y_k (6) of each board's T_lidar_board, and z, which all captures share:
 
     z = [tangent of T_cam_lidar (6) and scale of each camera, range offset of each ring (L), lens (2),
-         edge shift, its change where something stands close behind]
+         shifts of ring ends (7)]
 
 A board pose meets only the terms of its own capture: the matrix is an arrow head, and y_k is eliminated
 capture by capture (Schur complement).
@@ -11,6 +11,7 @@ capture by capture (Schur complement).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -34,7 +35,7 @@ class State:
     Attributes:
         T_cam_lidar: (C, 4, 4).
         T_lidar_board: (F, 4, 4).
-        constants: (7 C + L + 4,) z, zero in the places of the tangents.
+        constants: (7 C + L + 9,) z, zero in the places of the tangents.
     """
 
     T_cam_lidar: Array
@@ -130,23 +131,55 @@ def assemble(terms: Terms, levels: Levels, priors: Priors) -> System:
         levels: of their noise.
         priors: of the constants.
     """
-    F, L, C = len(terms.ranges.sums), terms.n_rings, len(terms.pictures)
-    G = PER_CAMERA * C + L + N_FIELDS + N_SHIFTS
-    M = np.zeros((F, 6 + G + 1, 6 + G + 1))
-    weighted, log_volumes = weigh_ranges(terms.ranges, levels.range_m, levels.ring_m)
-    log_volume = float(log_volumes.sum())
-    place = np.r_[0:6, 6 + PER_CAMERA * C : 6 + G - N_SHIFTS, 6 + G]
-    M[:, place[:, None], place] += range_system(terms.ranges, weighted)
-    place = np.r_[0:6, 6 + G - N_FIELDS - N_SHIFTS : 6 + G + 1]
-    M[:, place[:, None], place] += edge_system(terms.edges, levels, F)
+    of_ranges, range_volume = _range_block(terms, levels.range_m, levels.ring_m)
+    of_edges = _edge_block(terms, levels.edge_rad, levels.backed_rad, levels.lost_share)
+    of_pictures, picture_volume = _picture_block(terms, tuple(levels.pose))
+    return _eliminate(
+        of_ranges + of_edges + of_pictures, terms, levels, priors, range_volume + picture_volume
+    )
+
+
+# The search for levels changes one at a time: what the others weigh is kept from the time before.
+@lru_cache(maxsize=2)
+def _range_block(terms: Terms, range_m: float, ring_m: float) -> tuple[Array, float]:
+    """Weigh what the returns say, and add up the logs of their covariances' determinants."""
+    block = _no_block(terms)
+    weighted, log_volumes = weigh_ranges(terms.ranges, range_m, ring_m)
+    place = np.r_[
+        0:6, 6 + PER_CAMERA * len(terms.pictures) : block.shape[1] - 1 - N_SHIFTS, block.shape[1] - 1
+    ]
+    block[:, place[:, None], place] = range_system(terms.ranges, weighted)
+    return block, float(log_volumes.sum())
+
+
+@lru_cache(maxsize=2)
+def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: float) -> Array:
+    """Weigh what the ring ends say."""
+    block = _no_block(terms)
+    place = np.r_[0:6, block.shape[1] - 1 - N_FIELDS - N_SHIFTS : block.shape[1]]
+    levels = Levels(edge_rad=edge_rad, backed_rad=backed_rad, lost_share=lost_share)
+    block[:, place[:, None], place] = edge_system(terms.edges, levels, len(block))
+    return block
+
+
+@lru_cache(maxsize=2)
+def _picture_block(terms: Terms, pose_sigmas: tuple[float, ...]) -> tuple[Array, float]:
+    """Weigh what the pictures say, and add up the logs of their covariances' determinants."""
+    block, log_volume = _no_block(terms), 0.0
     for c, (pictures, rows) in enumerate(zip(terms.pictures, terms.picture_rows, strict=True)):
-        cov = pictures.total_cov(levels.pose)
-        products = np.swapaxes(rows, 1, 2) @ np.linalg.solve(cov, rows)
+        cov = pictures.total_cov(np.array(pose_sigmas))
         own = 6 + PER_CAMERA * c
-        place = np.r_[own : own + 6, 0:6, own + 6, 6 + G]
-        M[pictures.capture[:, None, None], place[:, None], place] += products
+        place = np.r_[own : own + 6, 0:6, own + 6, block.shape[1] - 1]
+        products = np.swapaxes(rows, 1, 2) @ np.linalg.solve(cov, rows)
+        block[pictures.capture[:, None, None], place[:, None], place] += products
         log_volume += float(np.linalg.slogdet(cov)[1].sum())
-    return _eliminate(M, terms, levels, priors, log_volume)
+    return block, log_volume
+
+
+def _no_block(terms: Terms) -> Array:
+    """Make room for products of [board pose (6), z (G), residual] by capture."""
+    size = 6 + len(terms.constants) + 1
+    return np.zeros((len(terms.ranges.sums), size, size))
 
 
 def _eliminate(M: Array, terms: Terms, levels: Levels, priors: Priors, log_volume: float) -> System:
@@ -178,5 +211,5 @@ def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, float]:
     ring = np.arange(PER_CAMERA * C, PER_CAMERA * C + L)
     prior[ring[:, None], ring] = np.linalg.inv(cov)
     last = np.arange(PER_CAMERA * C + L, len(prior))
-    prior[last, last] = 1 / np.square([priors.lateral_m, priors.vertical_m, priors.shift_m, priors.backed_m])
+    prior[last, last] = np.concatenate([[priors.lateral_m, priors.vertical_m], priors.shifts]) ** -2.0
     return prior, float(np.linalg.slogdet(cov)[1])

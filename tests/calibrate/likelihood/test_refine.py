@@ -7,6 +7,7 @@ import pytest
 
 from lce_rig.calibrate import CalibrateOptions, calibrate, error_to_reference
 from lce_rig.calibrate.consensus import find_consensus
+from lce_rig.calibrate.likelihood.edge_terms import SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.refine import refine
 from lce_rig.calibrate.likelihood.scans import turn_about_z
@@ -157,10 +158,31 @@ def test_edges_before_something_close_behind_have_a_shift_of_their_own():
     plain = observations(20, 8, REAL)
     held = [hold_from_behind(o, 0.006) if k % 3 else o for k, o in enumerate(plain)]
     joint = refine([held], BOARD, [T_FORWARD], Priors(), Levels(laser_m=0.008))
-    assert abs(joint.shifts_m[1] + 0.006) < 0.0015
+    assert abs(joint.shifts[SHIFTS.index("d_2")] + 0.006) < 0.0015
     error = difference(joint.T_cam_lidar[0], T_FORWARD)
     assert error @ np.linalg.solve(joint.cov[0], error) < 25
     assert np.linalg.norm(error[:3]) < 0.002
+
+
+def test_a_bright_background_takes_the_edges_and_is_allowed_for():
+    """Two of three boards have a bright wall behind their left half, whose echo wins sooner, by 8 mm."""
+    plain = observations(20, 9, REAL)
+    lit = [lighten(o, share=0.5, sooner_m=0.008) if k % 3 else o for k, o in enumerate(plain)]
+    joint = refine([lit], BOARD, [T_FORWARD], Priors(), Levels(laser_m=0.008))
+    assert abs(joint.shifts[SHIFTS.index("d_1")] + 0.016) < 0.003
+    error = difference(joint.T_cam_lidar[0], T_FORWARD)
+    assert error @ np.linalg.solve(joint.cov[0], error) < 25
+    blind = [replace(o, lidar=replace(o.lidar, edge_echo=np.zeros(len(o.lidar.edge_side)))) for o in lit]
+    wrong = difference(refine([blind], BOARD, [T_FORWARD]).T_cam_lidar[0], T_FORWARD)
+    assert np.linalg.norm(wrong[3:]) > 1.5 * np.linalg.norm(error[3:])
+
+
+def lighten(observation, share, sooner_m):
+    """Turn the ring ends of growing azimuth inwards, and tell how bright it is behind them."""
+    held = hold_from_behind(observation, sooner_m).lidar
+    echo = np.where(held.edge_side > 0, share, 0.0)
+    behind = np.where(held.edge_side > 0, 2.0, np.inf)
+    return replace(observation, lidar=replace(held, edge_behind_m=behind, edge_echo=echo))
 
 
 def hold_from_behind(observation, sooner_m):

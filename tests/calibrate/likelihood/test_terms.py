@@ -7,17 +7,17 @@ import pytest
 from scipy.linalg import block_diag
 
 from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.likelihood.edge_terms import EdgeRows, edge_rows
+from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, SHIFTS, EdgeRows, edge_rows
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import picture_rows, stack_pictures
 from lce_rig.calibrate.likelihood.range_terms import sum_ranges, weigh_ranges
-from lce_rig.calibrate.likelihood.scans import stack_scans
+from lce_rig.calibrate.likelihood.scans import N_FIELDS, stack_scans
 from lce_rig.calibrate.likelihood.system import State, assemble, linearise
 from lce_rig.core.geometry import difference, invert, perturb
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 STEP = 1e-6
-NO_LENS, NO_SHIFTS = np.zeros(2), np.zeros(2)
+NO_LENS, NO_SHIFTS = np.zeros(N_FIELDS), np.zeros(N_SHIFTS)
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +92,21 @@ def test_a_displaced_lens_moves_ranges_and_ends_as_its_derivatives_say(
     assert np.allclose(after - before, expected, atol=4e-5)
 
 
+@pytest.mark.parametrize(("shift", "axis"), [("along azimuth", 0), ("upwards", 2)])
+def test_ring_ends_displaced_against_all_returns_are_what_the_shifts_say(scans, T_lidar_board, shift, axis):
+    """Ring ends lie half a millimetre farther along azimuth or upwards than reported; the board stays."""
+    by_shift = NO_SHIFTS.copy()
+    by_shift[SHIFTS.index(shift)] = 5e-4
+    direction = scans.end_fields[:, :, 0] if axis == 0 else np.tile([0.0, 0.0, 1.0], (len(scans.end_rays), 1))
+    plain, told = (edge_rows(scans, T_lidar_board, BOARD, NO_LENS, s) for s in (NO_SHIFTS, by_shift))
+    moved = plain.range_m[:, None] * scans.end_rays + 5e-4 * direction
+    there = replace(scans, end_rays=moved / np.linalg.norm(moved, axis=1, keepdims=True))
+    there = replace(there, next_rays=there.end_rays + scans.next_rays - scans.end_rays)
+    expected = edge_rows(there, T_lidar_board, BOARD, NO_LENS, NO_SHIFTS).rows[:, -1]
+    assert np.allclose(told.rows[:, -1], expected, atol=2e-5)
+    assert np.ptp(expected - plain.rows[:, -1]) > 5e-4
+
+
 def test_derivatives_of_pictures_are_those_of_differences(pictures, T_lidar_board):
     rows = picture_rows(pictures, T_FORWARD, T_lidar_board, 0.0)
     for axis in range(6):
@@ -159,7 +174,7 @@ def terms_normal(terms, k):
 
 
 def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, pictures, T_lidar_board):
-    L, G = len(scans.rings), 7 + len(scans.rings) + 4
+    L, G = len(scans.rings), 7 + len(scans.rings) + N_FIELDS + N_SHIFTS
     terms = linearise(scans, (pictures,), BOARD, State(T_FORWARD[None], T_lidar_board, np.zeros(G)))
     terms = replace(terms, edges=without_ends(terms.edges))
     priors = Priors()
@@ -168,7 +183,7 @@ def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, pictu
     def plainly(levels):
         rows, cov = plain_rows(terms, scans, levels, r)
         lasers = levels.laser_m**2 * (np.eye(L) - 1 / L) + priors.offset_m**2 + 1e-12 * np.eye(L)
-        constants = np.square([priors.lateral_m, priors.vertical_m, priors.shift_m, priors.backed_m])
+        constants = np.square([priors.lateral_m, priors.vertical_m, *priors.shifts])
         known = block_diag(priors.scale**-2, np.linalg.inv(lasers), np.diag(1 / constants))
         A, e = rows[:, :-1], rows[:, -1]
         H, g = A.T @ np.linalg.solve(cov, A), A.T @ np.linalg.solve(cov, e)
