@@ -1,6 +1,7 @@
 """Settings all tests share."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,10 @@ from hypothesis import settings
 
 settings.register_profile("lce-rig", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("lce-rig")
+
+# What a shell runs in the background ignores Ctrl-C, and so would processes that tests start to press it for.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

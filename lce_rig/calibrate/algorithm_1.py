@@ -1,4 +1,4 @@
-"""Algorithm 1: features -> planes -> outliers and weights -> draws -> final solution.
+"""Algorithm 1: features -> planes -> ring ends by background -> outliers and weights -> draws -> solution.
 
 References:
     Jiao et al., "LCE-Calib: Automatic LiDAR-Frame/Event Camera Extrinsic Calibration With a Globally Optimal
@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lce_rig.calibrate.background import estimate_effects, move_ends
+from lce_rig.calibrate.background import estimate_shifts, move_ends
 from lce_rig.calibrate.draws import Draws, draw_subsets
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.features import CaptureFeatures, extract_features
@@ -31,8 +31,8 @@ from lce_rig.solvers.covariance import jackknife_covariance, systematic_covarian
 # Weights given by the user count in captures with residuals of this size, which sets the scale of the prior.
 NOMINAL_SIGMA_M = 0.01
 _PLANE_FREEDOMS = 3
-# Names of what `estimate_effects` finds.
-_EFFECTS = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m")
+# Names of what `estimate_shifts` finds.
+_SHIFTS = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m")
 
 
 def calibrate_by_algorithm_1(
@@ -56,10 +56,13 @@ def calibrate_by_algorithm_1(
     problem = Problem(features, board, _weights(options, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
     T_planes = solve_planes(features, problem)
     require_observable(features, problem, T_planes)
-    effects_m = estimate_effects(observations, features, T_planes, board)
-    if effects_m.any():
-        observations = move_ends(observations, features, T_planes, board, effects_m)
+    shifts_m = np.zeros(len(_SHIFTS))
+    if problem.n_shift:
+        shifts_m = estimate_shifts(observations, features, T_planes, board)
+    if shifts_m.any():
+        observations = move_ends(observations, features, T_planes, board, shifts_m)
         features = [extract_features(observation, board, options) for observation in observations]
+        problem = Problem(features, board, problem.weights)
 
     outliers, sigmas = reject_outliers(features, problem, T_planes, options)
     features = [f for f in features if f.capture not in outliers]
@@ -86,7 +89,7 @@ def calibrate_by_algorithm_1(
         refused=outliers,
         diagnostics={
             **_diagnostics(problem, solution, covariances, draws),
-            **dict(zip(_EFFECTS, effects_m.tolist(), strict=True)),
+            **dict(zip(_SHIFTS, shifts_m.tolist(), strict=True)),
         },
     )
 

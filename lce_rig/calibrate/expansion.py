@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.features import CaptureFeatures, extract_features
-from lce_rig.calibrate.options import CalibrateOptions
+from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M, CalibrateOptions
 from lce_rig.calibrate.placements import group_placements
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, perturb, transform
@@ -31,7 +31,6 @@ SHIFT, SCALE, FIRST_RING = 6, 7, 8
 # Errors of a board's plane and of its ring ends are at least as large as this.
 _PLANE_FLOOR_M, _END_FLOOR_M = 0.001, 0.002
 PLANE_FREEDOMS = 3
-_EDGE_SHIFT_SIGMA_M = 0.015
 # Where a profile states no error of the lasers, their ranges are still no better than this.
 _RANGE_FLOOR_M = 0.0005
 
@@ -150,7 +149,7 @@ def expand(
 def _prior(n_rings: int, laser_m: float, offset_m: float) -> Array:
     """Write priors as information (p, p): of the edge shift, of offsets about their mean, of the mean."""
     prior = np.zeros((FIRST_RING + n_rings, FIRST_RING + n_rings))
-    prior[SHIFT, SHIFT] = 1 / _EDGE_SHIFT_SIGMA_M**2
+    prior[SHIFT, SHIFT] = 1 / EDGE_SHIFT_SIGMA_M**2
     cov = max(laser_m, _RANGE_FLOOR_M) ** 2 * (np.eye(n_rings) - 1 / n_rings)
     prior[FIRST_RING:, FIRST_RING:] = np.linalg.inv(cov + max(offset_m, _RANGE_FLOOR_M) ** 2)
     return prior

@@ -1,6 +1,7 @@
 """From a pair of detected boards to the points, planes and lines that are fitted to each other."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -45,9 +46,7 @@ class CaptureFeatures:
 
 def extract_features(observation: Observation, board: Board, options: CalibrateOptions) -> CaptureFeatures:
     """Build what one capture contributes to the cost."""
-    T_cam_board, lidar = observation.image.T_cam_board, observation.lidar
-    R = T_cam_board[:3, :3]
-    anchors_board, normals_board = board.edges()
+    lidar = observation.lidar
     edge_points, edge_steps_m = _ring_ends(lidar, options)
     return CaptureFeatures(
         capture=observation.capture,
@@ -55,13 +54,36 @@ def extract_features(observation: Observation, board: Board, options: CalibrateO
         edge_points=edge_points,
         edge_steps_m=edge_steps_m,
         lidar_normal=lidar.plane[:3],
-        normal=R[:, 2],
-        centre=T_cam_board[:3, 3],
-        edge_normals=normals_board @ R.T,
-        edge_anchors=transform(T_cam_board, anchors_board),
-        T_board_cam=invert(T_cam_board),
-        cov_normal=normal_covariance(R[:, 2], observation.image.cov),
+        **_seen_at(observation.image.T_cam_board, observation.image.cov, board),
     )
+
+
+def place_features(
+    features: CaptureFeatures, T_cam_board: Array, cov: Array, board: Board
+) -> CaptureFeatures:
+    """Build the features of the same LiDAR's board, seen by the camera elsewhere.
+
+    Args:
+        features: of a capture.
+        T_cam_board: (4, 4).
+        cov: (6, 6) of that pose.
+        board: its size.
+    """
+    return replace(features, **_seen_at(T_cam_board, cov, board))
+
+
+def _seen_at(T_cam_board: Array, cov: Array, board: Board) -> dict[str, Any]:
+    """Compute the features of the camera's side, by the names of `CaptureFeatures`."""
+    R = T_cam_board[:3, :3]
+    anchors_board, normals_board = board.edges()
+    return {
+        "normal": R[:, 2],
+        "centre": T_cam_board[:3, 3],
+        "edge_normals": normals_board @ R.T,
+        "edge_anchors": transform(T_cam_board, anchors_board),
+        "T_board_cam": invert(T_cam_board),
+        "cov_normal": normal_covariance(R[:, 2], cov),
+    }
 
 
 def normal_covariance(normal: Array, cov_pose: Array) -> Array:

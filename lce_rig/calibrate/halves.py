@@ -89,9 +89,9 @@ def _changed_on_the_way(expansion: Expansion, unit: float) -> Contrast:
 
 
 def _tail(chi2: float) -> float:
-    from scipy.stats import chi2 as distribution
+    from scipy.special import chdtrc
 
-    return float(distribution.sf(chi2, 6))
+    return float(chdtrc(6, chi2))
 
 
 def _chi2(expansion: Expansion, shares: Array) -> tuple[Array, Array]:

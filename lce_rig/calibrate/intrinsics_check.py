@@ -99,9 +99,9 @@ class IntrinsicsCheck:
     @property
     def _sure(self) -> float:
         """How many standard deviations are no chance; few captures know their own deviation badly."""
-        from scipy.stats import t
+        from scipy.special import stdtrit  # scipy.stats takes a second to import
 
-        return float(t.ppf(1 - _CHANCE / 2, self.n_captures - 1))
+        return float(stdtrit(self.n_captures - 1, 1 - _CHANCE / 2))
 
 
 def check_intrinsics(
@@ -163,7 +163,7 @@ def compare_with_given(
 
 def _chance(fitted: IntrinsicsEstimate, intrinsics: Intrinsics) -> float | None:
     """Compare all parameters at once by the F distribution, as the deviations come from few captures."""
-    from scipy.stats import f
+    from scipy.special import fdtrc
 
     try:
         change = fitted.model.vector(intrinsics) - fitted.model.vector(fitted.intrinsics)
@@ -173,7 +173,7 @@ def _chance(fitted: IntrinsicsEstimate, intrinsics: Intrinsics) -> float | None:
     scale = 1.0 / fitted.sigma
     correlation = fitted.cov * np.outer(scale, scale)
     chi2 = float(change * scale @ np.linalg.solve(correlation, change * scale))
-    return float(f.sf(chi2 / len(change), len(change), n_captures - 1))
+    return float(fdtrc(len(change), n_captures - 1, chi2 / len(change)))
 
 
 def describe(check: IntrinsicsCheck) -> str:

@@ -172,9 +172,10 @@ def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) 
     heard = samples.information * is_heard[..., None, None]
     lines = _Lines.through(y, heard, time_s)
     habits = USUAL_HABITS
+    H_rates, g_rates = lines.rates()
     for _ in range(_N_LEARNING):
-        mean, cov, _ = lines.fit(habits)
-        second = mean[:, 6:] ** 2 + np.diagonal(cov, axis1=1, axis2=2)[:, 6:]
+        cov = np.linalg.inv(H_rates + _habit_precision(habits))
+        second = (cov @ g_rates[..., None])[..., 0] ** 2 + np.diagonal(cov, axis1=1, axis2=2)
         total = second.reshape(-1, 2, 3).mean(axis=2).sum(axis=0)
         habits = np.sqrt((_USUAL_WEIGHT * USUAL_HABITS**2 + total) / (_USUAL_WEIGHT + len(y)))
     mean, cov, prior = lines.fit(habits)
@@ -229,12 +230,23 @@ class _Lines:
         H = np.einsum("fja,fjb,fjkl->fakbl", powers, powers, information).reshape(-1, 12, 12)
         return cls(H, np.einsum("fja,fjk->fak", powers, pulled).reshape(-1, 12))
 
+    def rates(self) -> tuple[Array, Array]:
+        """Eliminate p: the normal equations (F, 6, 6) and (F, 6) of r alone."""
+        lever = self.H[:, 6:, :6] @ np.linalg.inv(self.H[:, :6, :6])
+        g = self.g[:, 6:] - (lever @ self.g[:, :6, None])[..., 0]
+        return self.H[:, 6:, 6:] - lever @ self.H[:, :6, 6:], g
+
     def fit(self, habits: Array) -> tuple[Array, Array, Array]:
         """Solve for (p, r) (F, 12), its covariance (F, 12, 12), and give the prior's precision (12, 12)."""
         prior = np.zeros((12, 12))
-        prior[6:, 6:] = np.diag(np.repeat(habits, 3) ** -2.0)
+        prior[6:, 6:] = _habit_precision(habits)
         cov = np.asarray(np.linalg.inv(self.H + prior), dtype=np.float64)
         return (cov @ self.g[..., None])[..., 0], cov, prior
+
+
+def _habit_precision(habits: Array) -> Array:
+    """Give the inverse covariance (6, 6) of rates at a hand's habits."""
+    return np.diag(np.repeat(habits, 3) ** -2.0)
 
 
 def _place(

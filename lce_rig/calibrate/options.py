@@ -9,6 +9,10 @@ from lce_rig.core.results import ImageBoard, LidarBoard
 Method = Literal["ml", "paper", "zhou", "corners"]
 
 
+EDGE_SHIFT_SIGMA_M = 0.015
+"""How far ring ends may lie beyond an edge, a priori: beams are about as wide."""
+
+
 @dataclass(frozen=True, eq=False)
 class CaptureCandidates:
     """What both sensors saw of the board in one capture.
@@ -64,7 +68,7 @@ class CalibrateOptions:
     edge_weight: float | None = None
     half_step: bool = True
     edge_shift: Literal["free", "off"] = "free"
-    edge_shift_sigma_m: float = 0.015
+    edge_shift_sigma_m: float = EDGE_SHIFT_SIGMA_M
     laser_bias_sigma_m: float = 0.0
     range_offset_sigma_m: float = 0.0
     reject_outliers: bool = True

@@ -198,6 +198,6 @@ def _rms_figure(calibrations: Iterable[Calibration], key: str) -> float | None:
 
 
 def _tail(chi2: float, dof: int) -> float:
-    from scipy.stats import chi2 as distribution
+    from scipy.special import chdtrc
 
-    return float(distribution.sf(chi2, dof))
+    return float(chdtrc(dof, chi2))

@@ -15,7 +15,7 @@ from itertools import product
 
 import numpy as np
 
-from lce_rig.calibrate.features import extract_features
+from lce_rig.calibrate.features import extract_features, place_features
 from lce_rig.calibrate.motion import BoardMotions, PoseSamples, board_time_s, deskew, fit_motions
 from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.calibrate.problem import Problem, Weights
@@ -110,8 +110,10 @@ def estimate_time_offsets(
 
     def evaluate(offset_s: Array) -> _Evaluation:
         motions = fit_motions(samples, offset_s)
-        moved = at_sweep_time(observations, motions, sweep_s)
-        problem = Problem([extract_features(o, board, options) for o in moved], board, weights)
+        poses = zip(features, motions.at(times_s), motions.cov_at(times_s), strict=True)
+        problem = Problem(
+            [place_features(f, T_cam_board, cov, board) for f, T_cam_board, cov in poses], board, weights
+        )
         solution = problem.solve(np.ones((1, problem.n_captures)), T, 2)
         plane, edge = problem.errors(solution.x)
         cost = weights.plane * plane[0] ** 2 + weights.edge * edge[0] ** 2
@@ -119,6 +121,8 @@ def estimate_time_offsets(
 
     offset_s = _search_grid(samples, observations, T_start, prior_sigma_s, sweep_s)
     observations = deskew_points(observations, fit_motions(samples, offset_s), T_start)
+    features = [extract_features(observation, board, options) for observation in observations]
+    times_s = np.array([board_time_s(observation.lidar, sweep_s) for observation in observations])
     here = evaluate(offset_s)
     for _ in range(_N_ITERATIONS):
         T, unit = here.T, float(np.median(here.cost)) / _FREEDOMS

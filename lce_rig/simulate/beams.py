@@ -92,7 +92,7 @@ def _touches_several(
 ) -> NDArray[np.bool_]:
     """Find beams whose rim meets another surface than the axis, or the same one across a step in depth."""
     sub_origins, sub_directions = _sub_rays(origins, directions, _PROBES, noise)
-    hits = scene.cast(sub_origins.reshape(-1, 3), sub_directions.reshape(-1, 3))
+    hits = scene.cast(sub_origins.reshape(-1, 3), sub_directions.reshape(-1, 3), with_normals=False)
     range_m, surface = hits.range_m.reshape(-1, 4), hits.surface.reshape(-1, 4)
     is_other = np.any(surface != axis_hits.surface[:, None], axis=1)
     with np.errstate(invalid="ignore"):

@@ -1,9 +1,6 @@
 """The scene a ray meets: meshes that stand still, meshes that move with the board, and the board itself."""
 
-import signal
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,6 +10,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.interrupts import without_interrupt
 from lce_rig.simulate.materials import Material, albedo, checker
 from lce_rig.simulate.shapes import Mesh, rectangle
 
@@ -60,7 +58,7 @@ class Raycaster:
 
     @cached_property
     def _engine(self) -> Any:
-        with _without_interrupt():
+        with without_interrupt():
             import open3d as o3d
 
         engine = o3d.t.geometry.RaycastingScene(nthreads=1)
@@ -79,12 +77,13 @@ class Raycaster:
         rays[:, :3], rays[:, 3:] = origins, directions
         return o3d.core.Tensor.from_numpy(rays)
 
-    def cast(self, origins: Array, directions: Array) -> Hits:
+    def cast(self, origins: Array, directions: Array, *, with_normals: bool = True) -> Hits:
         """Find the first surface along each ray.
 
         Args:
             origins: (N, 3) or (3,) m, world.
             directions: (N, 3) unit, world.
+            with_normals: False leaves the normals zero, which spares half the time.
         """
         if not self.surfaces:
             return _nothing(len(directions))
@@ -93,6 +92,8 @@ class Raycaster:
         hit = np.flatnonzero(np.isfinite(range_m))
         surface = np.full(len(directions), -1, dtype=np.int32)
         surface[hit] = answer["geometry_ids"].numpy()[hit]
+        if not with_normals:
+            return Hits(range_m, surface, np.zeros((len(directions), 3)))
         triangle = self._first_triangle[surface[hit]] + answer["primitive_ids"].numpy()[hit]
         u, v = (column[:, None] for column in answer["primitive_uvs"].numpy()[hit].astype(np.float64).T)
         first, second, third = (self._normals[corner] for corner in self._triangles[triangle].T)
@@ -107,23 +108,6 @@ class Raycaster:
         rays = self._rays(origins, targets - origins)
         blocked = self._engine.test_occlusions(rays, tnear=1e-3, tfar=0.999, nthreads=1)
         return np.asarray(blocked.numpy(), dtype=np.bool_)
-
-
-@contextmanager
-def _without_interrupt() -> Iterator[None]:
-    """Let Ctrl-C wait: Open3D, stopped in its initialisation, ends the process by an exit code of its own."""
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
-        yield
-        return
-    pressed = []
-    signal.signal(signal.SIGINT, lambda *arguments: pressed.append(arguments))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if pressed:
-        before(*pressed[0])
 
 
 def _nothing(n: int) -> Hits:
@@ -177,17 +161,19 @@ class Scene:
         plate = rectangle(self.board.width_m, self.board.height_m).moved(self.T_world_board)
         return Raycaster([*self.moving.surfaces, Surface("board", plate, PLATE, self.T_world_board)])
 
-    def cast(self, origins: Array, directions: Array) -> Hits:
+    def cast(self, origins: Array, directions: Array, *, with_normals: bool = True) -> Hits:
         """Find what each ray meets first; the board is met analytically, in float64."""
-        hits = self.static.cast(origins, directions)
-        return self._nearer(hits, self.cast_moving(origins, directions))
+        hits = self.static.cast(origins, directions, with_normals=with_normals)
+        return self._nearer(hits, self.cast_moving(origins, directions, with_normals=with_normals))
 
-    def cast_moving(self, origins: Array, directions: Array, *, with_carrier: bool = True) -> Hits:
+    def cast_moving(
+        self, origins: Array, directions: Array, *, with_carrier: bool = True, with_normals: bool = True
+    ) -> Hits:
         """Find what each ray meets first of the carrier and the board, whatever stands before them."""
         hits = self.cast_board(origins, directions)
         if not with_carrier or not self.moving.surfaces:
             return hits
-        carrier = self.moving.cast(origins, directions)
+        carrier = self.moving.cast(origins, directions, with_normals=with_normals)
         shift = np.where(carrier.surface >= 0, len(self.static.surfaces), 0).astype(np.int32)
         return self._nearer(Hits(carrier.range_m, carrier.surface + shift, carrier.normals), hits)
 

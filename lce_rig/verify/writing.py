@@ -14,6 +14,8 @@ from lce_rig.verify.contact_sheet import contact_sheet
 
 CONTACT_SHEET = "contact_sheet.png"
 _TILE_PX = 480
+# Overlays have large even areas and thin marks: runs pack them as tightly as a search does, in half the time.
+_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 
 
 def write_overlays(folder: Path, overlays: Iterable[tuple[str, Picture, Picture]]) -> list[Path]:
@@ -48,7 +50,7 @@ def write_picture(path: Path, picture: Picture) -> Path:
     Raises:
         SessionError: the file cannot be written.
     """
-    is_encoded, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    is_encoded, data = cv2.imencode(".png", picture, _PNG)
     if not is_encoded:
         raise SessionError(f"{path}: a picture of shape {picture.shape} cannot be written as PNG")
     try:

@@ -26,7 +26,7 @@ CORNER_SIGMA_PX = 0.1
 # Something found in the scan that lies farther than this from the board is not it.
 _FOUND_M = 0.05
 _FREEDOMS = 6
-_ASTRAY = SHIFTS[-2:]
+_DISPLACEMENT = SHIFTS[-2:]
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[R
 
 
 def cramer_rao_bound(terms: Terms, levels: Levels, priors: Priors, T_cam_lidar: Array) -> Array:
-    """Compute the covariance (6, 6) below which no unbiased estimate gets from a session's captures.
+    """Compute the covariance (6, 6) below which no estimate gets on average, from a session's captures.
 
     The inverse of the information of ranges, ring ends and corners at the true poses, with the noise that
     the simulator has. Constant errors of the sensors are unknown, but for what the profile says of them.
@@ -183,7 +183,7 @@ def _fit_ends(edges: Sequence[EdgeRows]) -> dict[str, float]:
 
     # A displacement of all ring ends is the truth's to tell: none.
     first = rows.shape[1] - 1 - N_SHIFTS
-    by_width_mm = rows[:, first : -1 - len(_ASTRAY)] / 1e3
+    by_width_mm = rows[:, first : -1 - len(_DISPLACEMENT)] / 1e3
     n = by_width_mm.shape[1]
 
     def cost(x: Array) -> float:

@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.calibrate import CalibrateOptions, calibrate
 from lce_rig.core.geometry import difference
-from tests.calibrate.boards import BOARD, T_FORWARD, simulate
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 OPTIONS = CalibrateOptions(n_draws=0)
 NAMES = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m")
@@ -53,7 +53,7 @@ def test_what_the_board_ends_sooner_before_a_person_is_found_and_made_good():
     plain = simulate(20, 3)
     captures = [held(c, (c.lidar[0].edge_side > 0) & (k % 4 != 0)) for k, c in enumerate(plain)]
     found = calibrate(captures, BOARD, OPTIONS)
-    assert found.diagnostics["edge_shift_blended_m"] == pytest.approx(0.008, abs=0.003)
+    assert found.diagnostics["edge_shift_blended_m"] == pytest.approx(-0.008, abs=0.003)
     corrected, as_measured = error_m(captures), error_m([unaware(c) for c in captures])
     assert corrected < 0.002
     assert corrected < 0.6 * as_measured
@@ -63,7 +63,7 @@ def test_what_walls_behind_the_board_take_from_its_edges_is_found_and_made_good(
     rng = np.random.default_rng(0)
     captures = [lit(c, rng) for c in simulate(20, 5)]
     found = calibrate(captures, BOARD, OPTIONS)
-    assert found.diagnostics["edge_shift_echo_m"] == pytest.approx(0.015, abs=0.004)
+    assert found.diagnostics["edge_shift_echo_m"] == pytest.approx(-0.015, abs=0.004)
     assert error_m(captures) < 0.6 * error_m([unaware(c) for c in captures])
 
 
@@ -72,10 +72,26 @@ def test_the_echo_of_a_person_counts_by_itself():
     captures = [held(c, c.lidar[0].edge_side > 0, rng.uniform()) for c in simulate(20, 7)]
     found = calibrate(captures, BOARD, OPTIONS).diagnostics
     middle_m = found["edge_shift_blended_m"] + 0.5 * found["edge_shift_blended_echo_m"]
-    assert middle_m == pytest.approx(0.018, abs=0.004)
-    assert found["edge_shift_blended_echo_m"] == pytest.approx(0.02, abs=0.008)
+    assert middle_m == pytest.approx(-0.018, abs=0.004)
+    assert found["edge_shift_blended_echo_m"] == pytest.approx(-0.02, abs=0.008)
 
 
-def test_clean_edges_are_left_as_they_are():
-    found = calibrate(simulate(12, 1), BOARD, OPTIONS).diagnostics
+@pytest.mark.parametrize("seed", range(6))
+def test_edges_that_no_background_moves_are_left_as_they_are(seed):
+    """Backgrounds of any brightness and distance, wide steps, lost returns: and no effect on the edges."""
+    rng = np.random.default_rng(seed)
+    scenario = Scenario(step_deg=0.4, footprint_m=0.008, lost_share=0.2)
+    captures = []
+    for capture in simulate(15, 40 + seed, scenario):
+        n = len(capture.lidar[0].edge_side)
+        captures.append(sooner(capture, np.zeros(n), rng.uniform(0, 0.6, n), rng.uniform(0.1, 3.0, n)))
+    found = calibrate(captures, BOARD, OPTIONS).diagnostics
     assert [found[name] for name in NAMES] == [0, 0, 0]
+
+
+def test_weights_are_those_of_moved_ring_ends():
+    plain = simulate(20, 3)
+    captures = [held(c, (c.lidar[0].edge_side > 0) & (k % 4 != 0)) for k, c in enumerate(plain)]
+    moved, clean = (calibrate(c, BOARD, OPTIONS).diagnostics for c in (captures, plain))
+    for weight in ("plane_weight", "edge_weight"):
+        assert moved[weight] == pytest.approx(clean[weight], rel=0.5)

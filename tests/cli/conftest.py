@@ -58,6 +58,14 @@ def calibrated(calibrated_once, tmp_path) -> Path:
 
 
 @pytest.fixture
+def calibrated_few(calibrated) -> Path:
+    """The same with its first four captures only, for what is quicker to see on few."""
+    for path in sorted((calibrated / "captures").iterdir())[4:]:
+        shutil.rmtree(path)
+    return calibrated
+
+
+@pytest.fixture
 def session(simulated, tmp_path) -> Path:
     """A copy of the simulated session to write into."""
     copy = tmp_path / "session"

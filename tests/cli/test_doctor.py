@@ -79,7 +79,10 @@ def test_warnings_alone_exit_with_0(lce_rig, tmp_path):
     with attach(attached, tmp_path) as (reached, _):
         path = tmp_path / "rig.yaml"
         path.write_text(dump_rig(reached.model_copy(update={"sync": None})))
-        done = lce_rig("doctor", "--rig", path, "--duration", "2")
+        for duration_s in ("2", "6", "18"):  # longer where a computer that is busy with others sends too late
+            done = lce_rig("doctor", "--rig", path, "--duration", duration_s)
+            if done.code == 0:
+                break
     marks = {tuple(line.split()[:2]): line for line in done.out.splitlines()}
     assert ("ok", "lidar") in marks and ("ok", "cam") in marks
     assert marks["warn", "PPS"].split()[2].startswith("absent")

@@ -24,18 +24,34 @@ def doctor(rig: Rig, folder: Path, web_port: int, duration_s: float = 2.0) -> Li
     return {(check.group, check.name): check for check in checks}
 
 
+def doctor_until_scanned(
+    rig: Rig, folder: Path, web_port: int, duration_s: float = 2.0
+) -> tuple[Lines, float, float]:
+    """Examine a rig whose LiDAR is there; longer where a computer that is busy with others sends too late.
+
+    Returns:
+        The lines, how long the sensors were watched for, and how long that took.
+    """
+    for watch_s in (duration_s, 3 * duration_s, 9 * duration_s):
+        start_s = time.monotonic()
+        lines = doctor(rig, folder, web_port, watch_s)
+        took_s = time.monotonic() - start_s
+        if ("lidar", "board") in lines and "no position packets" not in lines["lidar", "PPS"].figure:
+            break
+    return lines, watch_s, took_s
+
+
 @pytest.fixture(scope="module")
-def everything(tmp_path_factory: pytest.TempPathFactory) -> tuple[Lines, float]:
-    """The lines of a rig that is all there, and how long they took."""
+def everything(tmp_path_factory: pytest.TempPathFactory) -> tuple[Lines, float, float]:
+    """The lines of a rig that is all there, how long it was watched for, and how long that took."""
     rig, folder = make_rig(), tmp_path_factory.mktemp("everything")
     board = rig.board.to_board()
     with attach(Attached(rig, picture_of(board), scan_of(board, 2.2)), folder) as (reached, web_port):
-        start_s = time.monotonic()
-        return doctor(reached, folder, web_port, 3.0), time.monotonic() - start_s
+        return doctor_until_scanned(reached, folder, web_port, 3.0)
 
 
-def test_every_device_of_an_attached_rig_answers_by_name(everything: tuple[Lines, float]) -> None:
-    lines, _ = everything
+def test_every_device_of_an_attached_rig_answers_by_name(everything: tuple[Lines, float, float]) -> None:
+    lines, *_ = everything
     assert lines["lidar", "device"].severity == "green"
     assert lines["lidar", "device"].figure.startswith(
         "VLP-16 at 127.0.0.1, firmware 3.0.41.1, serial AG43510116"
@@ -44,8 +60,8 @@ def test_every_device_of_an_attached_rig_answers_by_name(everything: tuple[Lines
     assert lines["sync", "device"].figure == "fake, firmware 1.0, LCE1"
 
 
-def test_its_streams_come_and_none_of_them_is_lost(everything: tuple[Lines, float]) -> None:
-    lines, _ = everything
+def test_its_streams_come_and_none_of_them_is_lost(everything: tuple[Lines, float, float]) -> None:
+    lines, *_ = everything
     # A busy computer sends late and in bursts: how rates are judged is tested by itself.
     assert lines["lidar", "stream"].values["rate_hz"] > 0 and lines["cam", "stream"].values["rate_hz"] > 0
     assert lines["lidar", "stream"].values["data_packets"] > 200
@@ -54,15 +70,15 @@ def test_its_streams_come_and_none_of_them_is_lost(everything: tuple[Lines, floa
     assert lines["sync", "pulses"].values["cam_hz"] > 0
 
 
-def test_its_lidar_is_locked_and_set_as_the_profile_wants(everything: tuple[Lines, float]) -> None:
-    lines, _ = everything
+def test_its_lidar_is_locked_and_set_as_the_profile_wants(everything: tuple[Lines, float, float]) -> None:
+    lines, *_ = everything
     assert lines["lidar", "PPS"].figure.startswith("locked, NMEA ")
     assert (lines["lidar", "settings"].severity, lines["lidar", "settings"].remedy) == ("green", "")
     assert lines["lidar", "settings"].figure.startswith("599 rpm, strongest, 0 to 359 deg")
 
 
-def test_its_board_is_seen_by_both_sensors(everything: tuple[Lines, float]) -> None:
-    lines, _ = everything
+def test_its_board_is_seen_by_both_sensors(everything: tuple[Lines, float, float]) -> None:
+    lines, *_ = everything
     assert lines["lidar", "board"].severity == "green"
     assert lines["lidar", "board"].values["distance_m"] == pytest.approx(2.2, abs=0.02)
     assert lines["cam", "board"].severity == "green"
@@ -71,8 +87,8 @@ def test_its_board_is_seen_by_both_sensors(everything: tuple[Lines, float]) -> N
     assert lines["cam", "picture"].severity == "green"
 
 
-def test_its_clocks_are_compared(everything: tuple[Lines, float]) -> None:
-    lines, _ = everything
+def test_its_clocks_are_compared(everything: tuple[Lines, float, float]) -> None:
+    lines, *_ = everything
     if lines["lidar", "PPS"].severity == "green":  # a LiDAR that sends too late is not believed
         values = lines["rig", "clocks"].values
         assert {"lidar.drift_ppm", "lidar.offset_ms", "sync.drift_ppm"} <= set(values)
@@ -81,10 +97,10 @@ def test_its_clocks_are_compared(everything: tuple[Lines, float]) -> None:
     assert lines["rig", "sync"].severity in ("green", "yellow")
 
 
-def test_it_takes_little_longer_than_the_sensors_are_watched(everything: tuple[Lines, float]) -> None:
-    lines, took_s = everything
-    assert lines["lidar", "stream"].values["watched_s"] < 3.0 + 3.0 + 1.0
-    assert took_s < 20.0  # on a machine that is busy with other tests; some 4 s on one that is not
+def test_it_takes_little_longer_than_the_sensors_are_watched(everything: tuple[Lines, float, float]) -> None:
+    lines, watch_s, took_s = everything
+    assert lines["lidar", "stream"].values["watched_s"] < watch_s + 3.0 + 1.0
+    assert took_s < watch_s + 17.0  # on a machine that is busy with other tests; a second on one that is not
 
 
 def test_a_rig_of_which_nothing_is_there_has_a_red_line_a_sensor_and_all_of_the_computers(
@@ -106,7 +122,7 @@ def test_an_absent_camera_keeps_nothing_else_from_being_looked_at(tmp_path: Path
     unlocked = Vlp16Clock("absent", has_nmea=False, error_us=721_000_000)
     attached = Attached(rig, None, scan_of(rig.board.to_board(), 2.2), unlocked)
     with attach(attached, tmp_path) as (reached, web_port):
-        lines = doctor(reached, tmp_path, web_port)
+        lines, *_ = doctor_until_scanned(reached, tmp_path, web_port)
     assert lines["cam", "device"].severity == "red" and ("cam", "stream") not in lines
     assert lines["lidar", "device"].severity == "green" and lines["lidar", "board"].severity == "green"
     # The profile promises a clock tied by hardware.

@@ -9,21 +9,21 @@ ray that met the board and the first that did not. Three things blur that:
 core   the uniform interval, its ends blurred by t (print, width of the beam): what remains of the interval
        tells more of the edge than a normal distribution of the same variance would;
 lost   the last returns on the board are missing (weak, or blended with whoever holds it): an exponential tail
-       inwards, of few ring ends where the board is on a stand, of a third where a person stands behind it;
+       inwards, of few ring ends where the board is on a stand, of a fifth where a person stands behind it;
 stray  anything else (the neighbouring ray met something just behind the board), Cauchy's distribution.
 """
 
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import ndtr
 
 from lce_rig.core.geometry import Array
 
 STRAY = 0.01
 """Share b of (1), as in simulated and recorded captures; a is theirs to say."""
 _LOST_STEPS = 1.1
-# Blurs and lost shares that the table of informations spans; beyond, the density is normal or uniform.
+# Blurs and lost shares that the table of informations spans. Narrower ones count as the narrowest; wider
+# ones leave a normal density.
 _NARROWEST = 0.01
 _BLURS = np.geomspace(_NARROWEST, 30.0, 60)
 _SHARES = np.array([0.001, 0.02, 0.05, 0.1, 0.2, 0.35, 0.6])
@@ -40,15 +40,13 @@ def density(x: Array, blur: Array, lost_share: float) -> tuple[Array, Array]:
     Returns:
         p and dp/dx, (M,) each.
     """
+    from scipy.special import ndtr
+
     t = np.maximum(blur, _NARROWEST)
     low, high = (x + 0.5) / t, (x - 0.5) / t
     core, core_slope = ndtr(low) - ndtr(high), (_normal(low) - _normal(high)) / t
-    # Normal noise of deviation t plus an exponential one; t is bounded, or the two exponents run away.
-    s = np.minimum(t, 2.0) / _LOST_STEPS
-    grown = np.exp(np.minimum(s**2 / 2 - x / _LOST_STEPS, 50.0)) / _LOST_STEPS
-    z = x / (s * _LOST_STEPS) - s
-    lost = grown * ndtr(z)
-    lost_slope = -lost / _LOST_STEPS + grown * _normal(z) / (s * _LOST_STEPS)
+    lost = _exponential_with_noise(x, t)
+    lost_slope = (_normal(x / t) / t - lost) / _LOST_STEPS
     width = np.maximum(t, 1.0)
     stray = 1 / (np.pi * width * (1 + (x / width) ** 2))
     stray_slope = -2 * x * np.pi / width * stray**2
@@ -60,13 +58,26 @@ def density(x: Array, blur: Array, lost_share: float) -> tuple[Array, Array]:
     return np.asarray(p), np.asarray(slope)
 
 
+def _exponential_with_noise(x: Array, t: Array) -> Array:
+    """Compute the density of an exponential error of mean `_LOST_STEPS` plus a normal one of deviation t."""
+    from scipy.special import erfcx, ndtr
+
+    s = t / _LOST_STEPS
+    z = x / t - s
+    # Both forms are the same; either overflows where the other does not.
+    below = np.exp(-0.5 * (x / t) ** 2) * erfcx(-np.minimum(z, 0.0) / np.sqrt(2)) / 2
+    above = np.exp(np.minimum(s**2 / 2 - x / _LOST_STEPS, 0.0)) * ndtr(z)
+    return np.asarray(np.where(z < 0, below, above) / _LOST_STEPS)
+
+
 def information(blur: Array, lost_share: float) -> Array:
     """Compute Fisher's information (M,) of the edge's place, the mean of (d ln p / dx)^2, per step^2."""
     table = _log_informations()
     row = float(np.interp(lost_share, _SHARES, np.arange(len(_SHARES))))
     low = min(int(row), len(_SHARES) - 2)
     between = table[low] + (row - low) * (table[low + 1] - table[low])
-    return np.asarray(np.exp(np.interp(np.log(np.maximum(blur, _NARROWEST)), np.log(_BLURS), between)))
+    inside = np.exp(np.interp(np.log(np.maximum(blur, _NARROWEST)), np.log(_BLURS), between))
+    return np.asarray(inside * np.minimum(_BLURS[-1] / np.maximum(blur, _NARROWEST), 1.0) ** 2)
 
 
 @lru_cache(maxsize=1)

@@ -4,6 +4,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from lce_rig.calibrate.background import BACKGROUND_SIGMAS_M
+from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.geometry import Array
 
 
@@ -69,20 +71,18 @@ class Priors:
         offset_m: range offset common to all lasers.
         shift_m: edge shift d_0, `edge_terms`.
         growth: c, its change with range; recordings show none.
-        echo_m: d_1 and d_3, how much sooner the board ends where all power comes from the background.
-        backed_m: d_2, its change where something stands close behind the edge.
-        astray_m: displacement of all ring ends against the returns between them.
+        background_m: d_1, d_2 and d_3, by what is behind the edge.
+        displacement_m: displacement of all ring ends against the returns between them.
         lateral_m: lens beside the LiDAR's axis, `scans`.
         vertical_m: its height, per rad of elevation.
         scale: of the camera's distances, by which squares or focal length are off.
     """
 
     offset_m: float = 0.005
-    shift_m: float = 0.015
+    shift_m: float = EDGE_SHIFT_SIGMA_M
     growth: float = 0.0001
-    echo_m: float = 0.015
-    backed_m: float = 0.01
-    astray_m: float = 0.00025
+    background_m: tuple[float, float, float] = BACKGROUND_SIGMAS_M
+    displacement_m: float = 0.00025
     lateral_m: float = 0.02
     vertical_m: float = 0.04
     scale: float = 0.0005
@@ -90,8 +90,7 @@ class Priors:
     @property
     def shifts(self) -> Array:
         """Deviations (7,) in the order of `edge_terms.SHIFTS`."""
-        echoes = [self.echo_m, self.backed_m, self.echo_m]
-        return np.array([self.shift_m, self.growth, *echoes, self.astray_m, self.astray_m])
+        return np.array([self.shift_m, self.growth, *self.background_m, *2 * [self.displacement_m]])
 
 
 # Offsets of lasers that the profile says have none.

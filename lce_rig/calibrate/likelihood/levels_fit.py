@@ -8,7 +8,6 @@ pass over points.
 from dataclasses import fields
 
 import numpy as np
-from scipy.optimize import minimize
 
 from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, Priors
 from lce_rig.calibrate.likelihood.system import Terms, assemble
@@ -30,6 +29,8 @@ def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, n_rou
         priors: of the constants.
         n_rounds: of the search, at most.
     """
+    from scipy.optimize import minimize
+
     middle = usual.to_logs()
     free = np.arange(len(middle)) if usual.laser_m > NO_LASER_M else np.arange(len(middle) - 1)
 

@@ -1,7 +1,7 @@
 """Joint refinement: extrinsics of cameras that share one LiDAR, board poses, constant errors, noise levels.
 
-Gauss-Newton on all terms, with noise levels and robust weights made anew in between (iteratively reweighted
-least squares: a ring end's error has Student's distribution).
+Fisher scoring: Gauss-Newton on ranges and pictures, mean information and score for the density of ring ends
+(`end_density`); noise levels are fitted in between.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,8 @@ from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import Observation
 from lce_rig.solvers.covariance import symmetric_inverse
 
-_STEPS = 3
+# Steps between changes of the levels, and at most in the end.
+_STEPS, _LAST_STEPS = 3, 20
 # Rounds of the search for noise levels, after each of which all is linearised anew.
 _LEVEL_ROUNDS = (12, 4, 4)
 _SETTLED = 1e-7
@@ -45,7 +46,7 @@ class JointEstimate:
         scale: (C,) by how much of themselves each camera's distances are too short.
         constants_sigma: (L + 9,) standard deviations of offsets, lens and shifts.
         levels: of the noise.
-        end_sigma_m: standard deviation of ring ends from the edges, without those lost or astray.
+        end_sigma_m: standard deviation of ring ends from the edges, without those lost or stray.
         system: normal equations at the optimum.
     """
 
@@ -103,7 +104,7 @@ def refine(
     for n_rounds in _LEVEL_ROUNDS if levels is None else ():
         state = problem.settle(state, now)
         now = fit_levels(problem.linearise(state), now, usual, priors, n_rounds)
-    state = problem.settle(state, now)
+    state = problem.settle(state, now, _LAST_STEPS)
     return _summarise(state, problem.linearise(state), now, priors)
 
 
@@ -119,12 +120,12 @@ class _Problem:
     def linearise(self, state: State) -> Terms:
         return linearise(self.scans, self.pictures, self.board, state)
 
-    def settle(self, state: State, levels: Levels) -> State:
+    def settle(self, state: State, levels: Levels, n_steps: int = _STEPS) -> State:
         """Find the optimum at given levels."""
-        for _ in range(_STEPS):
+        for _ in range(n_steps):
             z, y = assemble(self.linearise(state), levels, self.priors).step()
             state = state.moved(z, y)
-            if np.abs(z).max() < _SETTLED:
+            if max(np.abs(z).max(), np.abs(y).max()) < _SETTLED:
                 break
         return state
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lce_rig.core.errors import ProfileError, SourceError
+from lce_rig.core.interrupts import without_interrupt
 from lce_rig.detect.reconstruct.voxels import FloatArray
 
 States = tuple[FloatArray, ...]
@@ -141,7 +142,8 @@ def _require_file(path: Path) -> None:
 
 def _load(path: Path | None, name: str, n_threads: int) -> Any:
     try:
-        import onnxruntime
+        with without_interrupt():
+            import onnxruntime
     except ImportError as error:
         raise SourceError("onnxruntime is not installed", "pip install onnxruntime") from error
     if path is not None:

@@ -161,7 +161,7 @@ def test_edges_before_something_close_behind_have_a_shift_of_their_own():
     assert abs(joint.shifts[SHIFTS.index("d_2")] + 0.006) < 0.0015
     error = difference(joint.T_cam_lidar[0], T_FORWARD)
     assert error @ np.linalg.solve(joint.cov[0], error) < 25
-    assert np.linalg.norm(error[:3]) < 0.002
+    assert np.linalg.norm(error[:3]) < 0.003
 
 
 def test_a_bright_background_takes_the_edges_and_is_allowed_for():

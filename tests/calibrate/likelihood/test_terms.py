@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import block_diag
 
 from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, SHIFTS, EdgeRows, edge_rows
+from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, SHIFTS, edge_rows
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import picture_rows, stack_pictures
 from lce_rig.calibrate.likelihood.range_terms import sum_ranges, weigh_ranges
@@ -162,9 +162,12 @@ def plain_rows(terms, scans, levels, r):
     return np.concatenate(rows), block_diag(*noise)
 
 
+EDGE_FIELDS = ("rows", "step_m", "range_m", "is_backed")
+
+
 def without_ends(edges):
     none = np.zeros(0, dtype=np.intp)
-    return EdgeRows(none, edges.rows[none], edges.step_m[none], edges.range_m[none])
+    return replace(edges, capture=none, **{name: getattr(edges, name)[none] for name in EDGE_FIELDS})
 
 
 def terms_normal(terms, k):

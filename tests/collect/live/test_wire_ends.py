@@ -49,7 +49,7 @@ def test_signals_end_a_collection_cleanly(
 def test_a_collection_that_is_killed_loses_no_capture(wire: Start, tmp_path: Path) -> None:
     rig, session, said = wire(), tmp_path / "session", list[str]()
     chance = random.Random(0)
-    for turn in range(5):
+    for turn in range(3):
         with Collecting(rig.profile, session, "--hold", "0") as collecting:
             collecting.wait_for("moving" if turn else "captured 000000")
             time.sleep(chance.uniform(0, 2))
@@ -65,9 +65,11 @@ def test_what_is_recorded_beside_a_collection_can_be_collected_from(
 ) -> None:
     rig, record = wire(), tmp_path / "recording"
     live, later = tmp_path / "live", tmp_path / "later"
+    began_ns = time.time_ns()
     with Collecting(rig.profile, live, "--hold", "0", "--record", str(record)) as collecting:
         collecting.wait_for_captures(2)
         assert collecting.end() == 0
+    ended_ns = time.time_ns()
     assert "samples recorded" in collecting.said
     words = ["collect", "--rig", str(rig.profile), str(later), "--from", str(record)]
     code = "from lce_rig.cli.main import main; main()"
@@ -76,15 +78,15 @@ def test_what_is_recorded_beside_a_collection_can_be_collected_from(
     )
     assert done.returncode == 0, done.stderr
     # Live, on this rig, every board that stands still is captured; of a recording a place counts once.
-    seen = {(capture.scan("lidar").stamp_ns or 0) // 1_000 for capture in check_whole(live)}
+    for capture in check_whole(live):
+        assert began_ns < (capture.scan("lidar").stamp_ns or 0) < ended_ns
     stored, sent = check_whole(later), read_sent(reel, rig.rig.lidars["lidar"])
     assert 1 <= len(stored) <= 4
     for capture in stored:
         stamp_ns = capture.scan("lidar").stamp_ns or 0
         shown = placement_at(stamp_ns, LOOPS_PER_HOLD, reel.n_placements)
         assert check_sent(capture, sent) == shown, "pictures and packets are of one moment"
-        stamp_us = stamp_ns // 1_000
-        assert min(seen) - 5_000_000 < stamp_us < max(seen) + 5_000_000
+        assert began_ns < stamp_ns < ended_ns
 
 
 def test_a_camera_whose_command_writes_no_pictures_is_named_where_nothing_was_captured(

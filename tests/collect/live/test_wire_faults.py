@@ -158,14 +158,14 @@ def test_a_computer_whose_clock_is_set_goes_on(wire: Start, reel: Reel, tmp_path
 def test_a_full_disk_is_one_clear_error_and_spares_the_captures(wire: Start, tmp_path: Path) -> None:
     rig, session = wire(), tmp_path / "session"
     with Collecting(rig.profile, session, "--hold", "0") as collecting:
-        collecting.wait_for_captures(2)
+        collecting.wait_for_captures(1)
         # From now on no file of that process grows beyond 100 kB.
         resource.prlimit(collecting.pid, resource.RLIMIT_FSIZE, (100_000, 100_000))
         assert collecting.wait() == 4
     assert len(errors(collecting.said)) == 1 and "cannot be written" in errors(collecting.said)[0]
     assert "Make room or choose another disk" in collecting.said and "Traceback" not in collecting.said
     n_safe = len(check_whole(session))
-    assert n_safe >= 2
+    assert n_safe >= 1
     with Collecting(rig.profile, session, "--hold", "0", "--frames", str(n_safe + 1)) as again:
         assert again.wait() == 0
     assert len(check_whole(session)) == n_safe + 1
