@@ -48,8 +48,9 @@ class CalibrationEstimate:
         weak_direction: the least certain motion in words, with its standard deviation.
         diagnostics: further figures by name.
         method: that found it, as `CalibrateOptions.method`.
-        expansion: the method's own cost about its result, capture by capture and in the extrinsic alone; None
-            of methods that give none.
+        expansion: the method's own cost about its result, capture by capture, in the extrinsic (and those of
+            cameras estimated with it) alone; None of methods that give none.
+        estimated_with: cameras whose extrinsics were estimated together with this one.
     """
 
     T_cam_lidar: Array
@@ -65,3 +66,4 @@ class CalibrationEstimate:
     diagnostics: Mapping[str, float]
     method: str = "paper"
     expansion: Expansion | None = None
+    estimated_with: tuple[str, ...] = ()

@@ -47,6 +47,7 @@ class Expansion:
         placement: (F,) number of the board placement that a capture shows.
         centres: (F, 3) middle of the board, frame camera, m.
         plane_sigma_m, end_sigma_m: errors by which planes and ring ends are weighed.
+        has_scale: whether x has the camera's scale in its place; else what follows the tangent is all alike.
     """
 
     T_cam_lidar: Array
@@ -57,6 +58,7 @@ class Expansion:
     centres: Array
     plane_sigma_m: float
     end_sigma_m: float
+    has_scale: bool = True
 
     @cached_property
     def groups(self) -> Array:
@@ -74,7 +76,7 @@ class Expansion:
 
     def _solve(self, shares: Array, is_scale_free: bool) -> tuple[Array, Array]:
         p = self.gradients.shape[1]
-        free = np.array([k for k in range(p) if k != SCALE or is_scale_free])
+        free = np.array([k for k in range(p) if k != SCALE or is_scale_free or not self.has_scale])
         rows, cols = free[:, None], free[None]
         H = np.tensordot(shares, self.hessians[:, rows, cols], axes=1) + self.prior[rows, cols]
         inverse = symmetric_inverse(H)

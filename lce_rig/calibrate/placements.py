@@ -1,6 +1,6 @@
 """Captures of a board that was not moved in between repeat each other: they are no independent evidence."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,3 +35,32 @@ def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
             numbers[k] = len(firsts)
             firsts.append((T[:3, 3], T[:3, 2]))
     return numbers
+
+
+def group_shared_placements(
+    cameras: Sequence[Sequence[Observation]], order: Mapping[str, int]
+) -> NDArray[np.intp]:
+    """Number the board placements of captures that several cameras share.
+
+    Captures that one camera sees in the same place stood in the same place, whatever the others see.
+
+    Args:
+        cameras: observations of each.
+        order: place of each capture by name, 0 to F - 1.
+
+    Returns:
+        (F,) numbers from 0.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n_captures, links = len(order), []
+    for k, own in enumerate(cameras):
+        # Each placement of a camera is a node beside those of the captures.
+        placement = group_placements(own) + n_captures * (k + 1)
+        links += [(order[o.capture], number) for o, number in zip(own, placement, strict=True)]
+    n_nodes = n_captures * (len(cameras) + 1)
+    graph = coo_array((np.ones(len(links)), np.array(links).T), shape=(n_nodes, n_nodes))
+    _, component = connected_components(graph, directed=False)
+    _, first, inverse = np.unique(component[:n_captures], return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[inverse], dtype=np.intp)

@@ -1,5 +1,7 @@
 """May this extrinsic be used? Each doubt is one reason with its figure and what to do about it."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from lce_rig.calibrate.channels import ChannelsEstimate
@@ -34,6 +36,7 @@ def judge(
     camera: str,
     lidar: str,
     n_captures: int,
+    between_cameras: Sequence[Doubt] = (),
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Weigh everything known about an extrinsic.
 
@@ -44,6 +47,7 @@ def judge(
         camera: name of the camera.
         lidar: name of the LiDAR.
         n_captures: captures looked at, with those in which no board was found.
+        between_cameras: where this camera and another contradict each other.
 
     Returns:
         The verdict, and the reasons for anything but a pass: worst first, causes before symptoms. A remark on
@@ -56,6 +60,7 @@ def judge(
         *_plate(estimate, rig.board.to_board()),
         *_shared(examination, rig, lidar),
         *doubt_halves(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
+        *between_cameras,
         *_motion(result, estimate, rig.verdict.max_plane_misfit_m),
         *_channels(result, rig),
         *_residuals(estimate, rig),

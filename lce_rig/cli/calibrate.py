@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
+from lce_rig.cli.cameras import camera_lines, together_lines
 from lce_rig.cli.options import event_image_option, session_argument, split_names
 from lce_rig.cli.uncertainty import uncertainty_lines
 from lce_rig.core.results import Calibration
@@ -136,6 +137,8 @@ def calibrate(
     else:
         for calibration, estimate in results:
             show.print_lines(_lines(calibration, estimate.held_out_m, estimate.weak_direction))
+        for calibration in calibrations:
+            show.print_lines(camera_lines(calibration, calibrations))
         show.note("written: " + ", ".join(path.name for path in files) + f" in {files[0].parent}")
     exit_by_verdict(calibrations, are_told=not as_json)
 
@@ -174,7 +177,7 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
         f"{_left_out(held_out_m)}corners {metrics.reprojection_px:.2f} px",
         f"  certificate  {_certificate(c)}",
     ]
-    lines += _channel_lines(c)
+    lines += [*_channel_lines(c), *together_lines(c)]
     if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
         lines.append(
             f"  reference    off by {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"

@@ -201,6 +201,32 @@ class PointUncertainty:
 
 
 @dataclass(frozen=True, eq=False)
+class OtherCamera:
+    """Where a camera sits to another one that saw the same boards in the same scans.
+
+    Attributes:
+        camera: name of the other one.
+        n_captures: that both used.
+        T_cam_other: (4, 4) to which the extrinsics of both with the LiDAR compose, p_cam = R p_other + t.
+        cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the camera; None where the
+            extrinsics were not estimated together.
+        T_cam_other_pictures: (4, 4) from the pictures of both alone; None where too few boards tell.
+        apart_rotation_deg, apart_translation_m: how far that lies from what the extrinsics compose to, each
+            estimated by itself.
+        board_rms_m: how far apart those put the middle of the same board, rms.
+    """
+
+    camera: str
+    n_captures: int
+    T_cam_other: Array
+    cov: Array | None
+    T_cam_other_pictures: Array | None
+    apart_rotation_deg: float | None
+    apart_translation_m: float | None
+    board_rms_m: float
+
+
+@dataclass(frozen=True, eq=False)
 class Calibration:
     """The extrinsic of one camera and one LiDAR, with everything needed to judge it.
 
@@ -216,6 +242,8 @@ class Calibration:
         diagnostics: further figures by name.
         method: that found the extrinsic, as `CalibrateOptions.method`.
         uncertainty: what `cov` means for points at several distances; empty where no lens was at hand.
+        estimated_with: cameras whose extrinsics were estimated together with this one.
+        other_cameras: those that saw the same boards held still.
     """
 
     camera: str
@@ -237,6 +265,8 @@ class Calibration:
     channel_results: tuple[ChannelResult, ...] = ()
     method: str = "paper"
     uncertainty: tuple[PointUncertainty, ...] = ()
+    estimated_with: tuple[str, ...] = ()
+    other_cameras: tuple[OtherCamera, ...] = ()
 
     @property
     def channels(self) -> tuple[str, ...]:

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 
 from lce_rig.core.errors import ResultRefusedError, SessionError
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration, ChannelResult, PointUncertainty
-from lce_rig.export.result_schema import ChannelRecord, PairRecord, ResultRecord
+from lce_rig.core.results import Calibration, ChannelResult, OtherCamera, PointUncertainty
+from lce_rig.export.result_schema import ChannelRecord, OtherCameraRecord, PairRecord, ResultRecord
 from lce_rig.export.writing import MADE_BY, write_atomically
 
 FORMAT_VERSION = 1
@@ -91,6 +91,8 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
         "channels": [_channel(result, calibration) for result in calibration.channel_results],
         "method": calibration.method,
         "uncertainty": [asdict(each) for each in calibration.uncertainty],
+        "estimated_with": list(calibration.estimated_with),
+        "other_cameras": [_other_camera(other, calibration) for other in calibration.other_cameras],
     }
 
 
@@ -105,6 +107,22 @@ def _channel(result: ChannelResult, calibration: Calibration) -> dict[str, Any]:
         "depth_scatter_still_m": float(result.depth_scatter_still_m),
         "time_offset_s": _figure(result.time_offset_s),
         "time_offset_sigma_s": _figure(result.time_offset_sigma_s),
+    }
+
+
+def _other_camera(other: OtherCamera, calibration: Calibration) -> dict[str, Any]:
+    def matrix(value: Array | None, name: str) -> list[list[float]] | None:
+        return None if value is None else _matrix(value, f"{name} to {other.camera}", calibration)
+
+    return {
+        "camera": other.camera,
+        "n_captures": int(other.n_captures),
+        "T_cam_other": matrix(other.T_cam_other, "T_cam_other"),
+        "cov": matrix(other.cov, "cov"),
+        "T_cam_other_pictures": matrix(other.T_cam_other_pictures, "T_cam_other_pictures"),
+        "apart_rotation_deg": _figure(other.apart_rotation_deg),
+        "apart_translation_m": _figure(other.apart_translation_m),
+        "board_rms_m": float(other.board_rms_m),
     }
 
 
@@ -225,6 +243,8 @@ def _calibration(pair: PairRecord) -> Calibration:
         channel_results=tuple(_channel_result(record) for record in pair.channels),
         method=pair.method,
         uncertainty=tuple(PointUncertainty(**each.model_dump()) for each in pair.uncertainty),
+        estimated_with=tuple(pair.estimated_with),
+        other_cameras=tuple(_other(record) for record in pair.other_cameras),
     )
 
 
@@ -232,3 +252,10 @@ def _channel_result(record: ChannelRecord) -> ChannelResult:
     figures = record.model_dump()
     figures |= {name: np.array(figures[name], dtype=np.float64) for name in ("T_cam_lidar", "cov")}
     return ChannelResult(**figures)
+
+
+def _other(record: OtherCameraRecord) -> OtherCamera:
+    figures = record.model_dump()
+    for name in ("T_cam_other", "cov", "T_cam_other_pictures"):
+        figures[name] = None if figures[name] is None else np.array(figures[name], dtype=np.float64)
+    return OtherCamera(**figures)

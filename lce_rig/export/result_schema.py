@@ -54,6 +54,19 @@ class UncertaintyRecord(_Record):
     corner_m: _NotNegative
 
 
+class OtherCameraRecord(_Record):
+    """Where a camera sits to another one; cov is null where they were not estimated together."""
+
+    camera: str
+    n_captures: _Count
+    T_cam_other: Annotated[list[_Row4], Field(min_length=4, max_length=4)]
+    cov: Annotated[list[_Row6], Field(min_length=6, max_length=6)] | None
+    T_cam_other_pictures: Annotated[list[_Row4], Field(min_length=4, max_length=4)] | None
+    apart_rotation_deg: _NotNegative | None
+    apart_translation_m: _NotNegative | None
+    board_rms_m: _NotNegative
+
+
 class PairRecord(_Record):
     """One camera and one LiDAR; figures that could not be computed are null."""
 
@@ -81,6 +94,8 @@ class PairRecord(_Record):
     channels: list[ChannelRecord] = Field(default_factory=list)
     method: str = "paper"
     uncertainty: list[UncertaintyRecord] = Field(default_factory=list)
+    estimated_with: list[str] = Field(default_factory=list)
+    other_cameras: list[OtherCameraRecord] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "PairRecord":

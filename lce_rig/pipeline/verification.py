@@ -8,11 +8,11 @@ from lce_rig.core.errors import SessionError
 from lce_rig.core.results import Calibration, Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.detect.event_board import EventImage
-from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detection import event_picture
 from lce_rig.pipeline.event_detection import event_channels
 from lce_rig.pipeline.progress import Progress, silent
 from lce_rig.pipeline.result_files import CALIBRATION, OVERLAYS
+from lce_rig.pipeline.solving import clocks_of
 from lce_rig.session import Capture, Session
 from lce_rig.verify.event_picture import CameraView
 from lce_rig.verify.session_check import SessionCheck, check_session

@@ -90,7 +90,10 @@ class VerdictSettings(Settings):
         max_change: largest difference of earlier and later captures, in targets; twice it fails.
         max_contrast: the same between near and far, left and right, upper and lower boards, whose differences
             all but cancel in the whole.
-        least_chance: such a difference counts where chance makes it this rarely.
+        max_camera_difference: how far two cameras' extrinsics and their own pictures may differ on where one
+            sits to the other, and how far that may change on the way, in targets; `fail_factor` times that,
+            or twice for a change, fails.
+        least_chance: a difference of shares of the captures counts where chance makes it this rarely.
         control_sigmas: how many standard deviations the result is moved for the control, and no less than
             the target; captures that were left out must then fit worse.
         max_spread_ratio: where resampled captures spread the result by more than this many claimed standard
@@ -105,6 +108,7 @@ class VerdictSettings(Settings):
     max_prior_sigmas: Positive = 4.0
     max_change: Positive = 1.5
     max_contrast: Positive = 2.5
+    max_camera_difference: Positive = 1.0
     least_chance: Annotated[float, Field(gt=0, lt=0.5)] = 0.001
     control_sigmas: Positive = 3.0
     max_spread_ratio: Annotated[float, Field(ge=1)] = 1.2

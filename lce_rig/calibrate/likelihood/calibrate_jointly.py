@@ -1,9 +1,10 @@
 """The joint estimate as a method of calibration: Algorithm 1 finds the place, the likelihood the optimum."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.calibrate.estimate import CalibrationEstimate
@@ -13,6 +14,7 @@ from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.refine import JointEstimate, refine
 from lce_rig.calibrate.likelihood.spread import inflate
+from lce_rig.calibrate.likelihood.system import PER_CAMERA
 from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.calibrate.placements import group_placements
@@ -47,14 +49,52 @@ def calibrate_by_likelihood(
     """
     start = calibrate_by_algorithm_1(observations, board, options, progress)
     used = [observation for observation in observations if observation.capture in start.used]
-    priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=options.edge_shift_sigma_m)
-    joint = refine([used], board, [start.T_cam_lidar], priors, Levels(laser_m=options.laser_bias_sigma_m))
+    priors, usual = what_is_known(options)
+    joint = refine([used], board, [start.T_cam_lidar], priors, usual)
     placement = group_placements(used)
     cov, inflation = inflate(joint, placement)
-    figures = _figures(joint, start.T_cam_lidar) | {"covariance_inflation": inflation}
+    offset_deg, offset_m = error_to_reference(joint.T_cam_lidar[0], start.T_cam_lidar)
+    figures = {
+        **figures_of(joint, 0),
+        "algorithm_1_offset_deg": offset_deg,
+        "algorithm_1_offset_m": offset_m,
+        "covariance_inflation": inflation,
+    }
+    estimate = describe(joint, 0, cov, start, used, board, options, figures)
+    return replace(estimate, expansion=expand_joint(joint, 0, placement))
+
+
+def what_is_known(options: CalibrateOptions) -> tuple[Priors, Levels]:
+    """Read off the options what is known of constant errors and of noise before any capture is seen."""
+    priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=options.edge_shift_sigma_m)
+    return priors, Levels(laser_m=options.laser_bias_sigma_m)
+
+
+def describe(
+    joint: JointEstimate,
+    camera: int,
+    cov: Array,
+    start: CalibrationEstimate,
+    used: Sequence[Observation],
+    board: Board,
+    options: CalibrateOptions,
+    figures: Mapping[str, float],
+) -> CalibrationEstimate:
+    """Report one camera's extrinsic of a joint estimate.
+
+    Args:
+        joint: of one or several cameras.
+        camera: its number there.
+        cov: (6, 6) of its extrinsic.
+        start: Algorithm 1's estimate, or one that stands on it: certificate, held-out residuals, refusals.
+        used: the camera's observations, those that the start used.
+        board: the board.
+        options: switches of the features.
+        figures: diagnostics; those of the start are overwritten.
+    """
     features = [extract_features(observation, board, options) for observation in used]
-    estimate = report_estimate(
-        joint.T_cam_lidar[0],
+    return report_estimate(
+        joint.T_cam_lidar[camera],
         cov,
         used,
         features,
@@ -64,23 +104,38 @@ def calibrate_by_likelihood(
         refused=start.refused,
         diagnostics={**start.diagnostics, **figures},
     )
-    # Constant errors are held where they are: the first six unknowns alone.
-    expansion = Expansion(
-        joint.T_cam_lidar[0],
-        joint.system.gradients[:, :6],
-        joint.system.hessians[:, :6, :6],
-        np.zeros((6, 6)),
+
+
+def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp]) -> Expansion:
+    """Expand the cost about a joint estimate, in the extrinsics alone, the camera's own first.
+
+    Constant errors are held where they are.
+
+    Args:
+        joint: of F captures.
+        camera: its number.
+        placement: (F,) number of each capture's placement.
+    """
+    n_cameras = len(joint.T_cam_lidar)
+    order = [camera, *(c for c in range(n_cameras) if c != camera)]
+    mine = np.concatenate([np.arange(6) + PER_CAMERA * c for c in order])
+    T = joint.T_cam_lidar[camera]
+    return Expansion(
+        T,
+        joint.system.gradients[:, mine],
+        joint.system.hessians[:, mine[:, None], mine],
+        # Shares of captures that another camera did not see leave its extrinsic open: 1 m, 1 rad.
+        np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6)),
         placement,
-        np.array([f.centre for f in features]),
+        (T @ joint.T_lidar_board)[:, :3, 3],
         joint.levels.depth_m,
         joint.end_sigma_m,
+        has_scale=False,
     )
-    return replace(estimate, expansion=expansion)
 
 
-def _figures(joint: JointEstimate, T_start: Array) -> dict[str, float]:
+def figures_of(joint: JointEstimate, camera: int) -> dict[str, float]:
     """Name the constant errors and noise levels; those of Algorithm 1 that they replace are overwritten."""
-    offset_deg, offset_m = error_to_reference(joint.T_cam_lidar[0], T_start)
     levels = joint.levels
     shifts = dict(zip(SHIFTS, joint.shifts.tolist(), strict=True))
     return {
@@ -93,7 +148,7 @@ def _figures(joint: JointEstimate, T_start: Array) -> dict[str, float]:
         "laser_spread_m": float(np.std(joint.offset_m)),
         "lens_lateral_m": float(joint.lens_m[0]),
         "lens_vertical_m_per_rad": float(joint.lens_m[1]),
-        "camera_scale": 1.0 - float(joint.scale[0]),
+        "camera_scale": 1.0 - float(joint.scale[camera]),
         "noise_range_m": levels.range_m,
         "noise_ring_m": levels.ring_m,
         "noise_ring_end_mrad": 1e3 * levels.edge_rad,
@@ -102,6 +157,4 @@ def _figures(joint: JointEstimate, T_start: Array) -> dict[str, float]:
         "noise_spin_deg": float(np.degrees(levels.spin_rad)),
         "noise_depth_m": levels.depth_m,
         "noise_across_m": levels.across_m,
-        "algorithm_1_offset_deg": offset_deg,
-        "algorithm_1_offset_m": offset_m,
     }

@@ -17,32 +17,36 @@ from lce_rig.solvers.covariance import symmetric_inverse
 _SURE = 2.0
 
 
-def inflate(joint: JointEstimate, placement: NDArray[np.intp]) -> tuple[Array, float]:
-    """Multiply the first camera's covariance (6, 6) by what the spread over placements shows.
+def inflate(
+    joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0, n_seen: int | None = None
+) -> tuple[Array, float]:
+    """Multiply a camera's covariance (6, 6) by what the spread over placements shows.
 
     Args:
         joint: of F captures.
         placement: (F,) number of each capture's placement.
+        camera: its number.
+        n_seen: placements that it saw; all where None.
 
     Returns:
         The covariance and the factor, 1 where model and spread agree.
     """
-    cov = joint.cov[0]
-    n = int(placement.max()) + 1
-    ratio = float(np.trace(symmetric_inverse(cov) @ jackknife(joint, placement))) / len(cov)
+    cov = joint.cov[camera]
+    n = int(placement.max()) + 1 if n_seen is None else n_seen
+    ratio = float(np.trace(symmetric_inverse(cov) @ jackknife(joint, placement, camera))) / len(cov)
     # A mean of 6 chi squares over n - 1 freedoms each.
     chance = np.sqrt(2 / (len(cov) * max(n - 1, 1)))
     factor = ratio if ratio > 1 + _SURE * chance else 1.0
     return factor * cov, factor
 
 
-def jackknife(joint: JointEstimate, placement: NDArray[np.intp]) -> Array:
-    """Compute the jackknife covariance (6, 6) of the first camera's extrinsic over placements."""
+def jackknife(joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0) -> Array:
+    """Compute the jackknife covariance (6, 6) of a camera's extrinsic over placements."""
     n = int(placement.max()) + 1
     system = joint.system
     hessians, gradients = (np.zeros((n, *a.shape[1:])) for a in (system.hessians, system.gradients))
     np.add.at(hessians, placement, system.hessians)
     np.add.at(gradients, placement, system.gradients)
     steps = -(symmetric_inverse(system.information - hessians) @ gradients[..., None])[..., 0]
-    moves = steps @ joint.to_extrinsics[0].T
+    moves = steps @ joint.to_extrinsics[camera].T
     return np.asarray((n - 1) / n * moves.T @ moves)

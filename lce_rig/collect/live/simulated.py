@@ -28,6 +28,7 @@ from lce_rig.simulate.live_scene import LiveScene
 from lce_rig.sources.live.base import LiveSource, Mailbox, SourceStatus
 from lce_rig.sources.live.reading import RateMeter
 
+# For each camera: what it sees of the room is rendered first.
 START_S = 120.0
 # How people behave: they react, walk, and try again where nothing happens.
 REACTION_S = 0.7
@@ -148,7 +149,7 @@ class SimulatedRig:
         _start_without_interrupts(self._process)
         theirs.close()
         try:
-            if not self._connection.poll(START_S):
+            if not self._connection.poll(START_S * len(self._views)):
                 raise SourceError("the simulated rig does not start", "Is the computer very busy?")
             answer = self._connection.recv()
         except (EOFError, OSError):

@@ -1,0 +1,145 @@
+"""Two cameras before the same boards: silent where both are sound, outspoken where one was moved."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.calibrate import CalibrateOptions, calibrate
+from lce_rig.calibrate.camera_pairs import doubt_cameras, pose_from_pictures, relate, shared_boards
+from lce_rig.core.geometry import difference, invert, perturb
+from lce_rig.core.results import Observation
+from lce_rig.rig.thresholds import CalibrationSettings, VerdictSettings
+from tests.calibrate.boards import BOARD
+from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, simulate_two
+
+OPTIONS = CalibrateOptions(n_draws=0, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
+TARGET, LIMITS = CalibrationSettings(), VerdictSettings()
+N_SOUND = 21
+TURNED = np.array([0, 0, 0, 0, np.radians(0.5), 0])
+
+
+def observed(session):
+    """Pair both cameras' boards as a calibration would, whose consensus is not what is tested."""
+    return list(
+        zip(
+            *([Observation(c.capture, c.image, c.lidar[0]) for c in session[name]] for name in (LEFT, RIGHT)),
+            strict=True,
+        )
+    )
+
+
+def related(session):
+    left, right = (calibrate(session[name], BOARD, OPTIONS) for name in (LEFT, RIGHT))
+    return relate(left, right)
+
+
+def doubts(pair):
+    return [doubt.text for doubt in doubt_cameras(pair, (LEFT, RIGHT), TARGET, LIMITS)]
+
+
+@pytest.fixture(scope="module")
+def sound():
+    """Sessions of 12 captures, with lasers off by 8 mm and a beam that reaches 8 mm over edges."""
+    return [simulate_two(12, seed) for seed in range(N_SOUND)]
+
+
+def test_pictures_alone_find_where_cameras_sit_as_well_as_they_claim(sound):
+    found = [pose_from_pictures(observed(session)) for session in sound]
+    errors = np.array([difference(each.T_second_first, T_RIGHT_LEFT) for each in found])
+    assert np.degrees(np.sqrt(np.mean(np.sum(errors[:, 3:] ** 2, axis=1)))) < 0.03
+    assert np.sqrt(np.mean(np.sum(errors[:, :3] ** 2, axis=1))) < 0.001
+    nees = [e @ np.linalg.solve(f.cov, e) for e, f in zip(errors, found, strict=True)]
+    # 6 expected; the mean of 21 samples of chi square with 6 degrees has a standard error of 0.76, and
+    # covariances from 12 captures have heavier tails than that.
+    assert 3.5 < np.mean(nees) < 10
+
+
+def test_of_few_boards_the_claim_is_that_of_usual_errors(sound):
+    found = [pose_from_pictures(observed(session)[:5]) for session in sound]
+    errors = [difference(each.T_second_first, T_RIGHT_LEFT) for each in found]
+    nees = [e @ np.linalg.solve(f.cov, e) for e, f in zip(errors, found, strict=True)]
+    # Corners of a simulated lens have no errors in common: the claim is rather too large.
+    assert 0.5 < np.mean(nees) < 8
+
+
+def test_sound_sessions_are_not_doubted(sound):
+    for session in sound:
+        pair = related(session)
+        assert len(pair.captures) == 12
+        assert pair.surprise < 16.81
+        assert doubts(pair) == []
+
+
+@pytest.mark.parametrize(
+    ("nudge", "figure"),
+    [(TURNED, r"0\.[45]\d deg"), (np.array([0.02, 0, 0, 0, 0, 0]), r"(19|2\d) mm")],
+    ids=["turned", "shifted"],
+)
+@pytest.mark.parametrize("seed", range(2))
+def test_a_camera_that_is_nudged_on_the_way_is_found_by_the_pictures(seed, nudge, figure):
+    found = doubts(related(simulate_two(12, seed, nudge=nudge, nudged_from=6)))
+    about = "left to right, by their pictures alone: captures before 000006 and from it on differ"
+    (text,) = (text for text in found if about in text)
+    assert re.search(figure, text)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_extrinsics_that_contradict_the_pictures_are_told_with_how_far_apart_they_put_boards(seed):
+    """An extrinsic made before the camera was turned, captures of both from after it."""
+    session = simulate_two(12, seed)
+    left, right = (calibrate(session[name], BOARD, OPTIONS) for name in (LEFT, RIGHT))
+    stale = replace(right, T_cam_lidar=perturb(right.T_cam_lidar, 2 * TURNED))
+    (text,) = doubts(relate(left, stale))
+    assert text.startswith("left and right put the same board ")
+    apart_mm = float(text.split("same board ")[1].split(" mm")[0])
+    # Boards lie 1.2 to 3.5 m away: 1 deg is 21 to 61 mm.
+    assert 25 < apart_mm < 55
+    assert "was one of them nudged" in text
+
+
+def test_cameras_that_wrongly_scaled_lenses_see_the_boards_in_different_places(sound):
+    session = observed(sound[0])
+    longer = []
+    for left, right in session:
+        T = right.image.T_cam_board.copy()
+        T[:3, 3] *= 1.03
+        longer.append((left, replace(right, image=replace(right.image, T_cam_board=T))))
+    plain, scaled = (pose_from_pictures(each) for each in (session, longer))
+    assert plain.scatter < 2 < scaled.scatter
+    assert plain.board_rms_m < 0.002 < 0.012 < scaled.board_rms_m
+
+
+def test_a_board_seen_wrongly_hardly_matters(sound):
+    session = observed(sound[1])
+    left, right = session[3]
+    wrong = perturb(right.image.T_cam_board, np.array([0.05, 0, 0.1, 0.2, 0, 0]))
+    session[3] = left, replace(right, image=replace(right.image, T_cam_board=wrong))
+    error = difference(pose_from_pictures(session).T_second_first, T_RIGHT_LEFT)
+    assert np.degrees(np.linalg.norm(error[3:])) < 0.1
+    assert np.linalg.norm(error[:3]) < 0.003
+
+
+def test_few_boards_tell_nothing_and_none_no_pair(sound):
+    session = sound[2]
+    assert pose_from_pictures(observed(session)[:3]) is None
+    left = calibrate(session[LEFT][:6], BOARD, OPTIONS)
+    right = calibrate(session[RIGHT][6:], BOARD, OPTIONS)
+    assert relate(left, right) is None
+    three = relate(left, calibrate(session[RIGHT][3:], BOARD, OPTIONS))
+    assert three.pictures is None
+    assert len(three.captures) == 3
+    assert doubts(three) == []
+    T = TRUTH[RIGHT] @ invert(TRUTH[LEFT])
+    assert np.linalg.norm(difference(three.T_second_first, T)[:3]) < 0.05
+
+
+def test_boards_are_paired_by_their_scan_whatever_their_captures_are_called(sound):
+    pairs = observed(sound[3])
+    left = {o.capture: o for o, _ in pairs}
+    renamed = {f"{k:06d}": replace(o, capture=f"{k:06d}") for k, (_, o) in enumerate(pairs, 100)}
+    shared = shared_boards(left, renamed)
+    assert [(one.capture, int(other.capture)) for one, other in shared] == [
+        (f"{k:06d}", k + 100) for k in range(12)
+    ]

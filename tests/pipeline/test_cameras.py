@@ -1,0 +1,205 @@
+"""Cameras of one session: estimated together where they share boards, else compared."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig import pipeline
+from lce_rig.calibrate import CalibrateOptions
+from lce_rig.cli.cameras import camera_lines, together_lines
+from lce_rig.core.geometry import difference, invert
+from lce_rig.core.results import Refusal
+from lce_rig.detect.detection import Detections
+from lce_rig.export import write_exports
+from lce_rig.export.result import read_result, write_result
+from lce_rig.export.urdf import read_urdf
+from lce_rig.rig import load_rig
+from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, simulate_two
+
+RIG = load_rig(str(Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"))
+ML, PAPER = CalibrateOptions(method="ml", n_draws=0), CalibrateOptions(n_draws=0)
+TURNED = np.array([0, 0, 0, 0, np.radians(0.6), 0])
+
+
+def detections(session, **kept):
+    """What detectors would have seen; `kept` names captures by camera in which it saw the board."""
+    unseen = Refusal("image", "no board", "hold it into the picture")
+    images = {
+        (name, "frames"): {
+            c.capture: c.image if k in kept.get(name, range(len(captures))) else unseen
+            for k, c in enumerate(captures)
+        }
+        for name, captures in session.items()
+    }
+    return Detections(images, {"lidar": {c.capture: list(c.lidar) for c in next(iter(session.values()))}})
+
+
+def calibrated(seen, options, rig=RIG):
+    results, troubles = pipeline.calibrate(rig, seen, options)
+    assert not troubles
+    return {calibration.camera: calibration for calibration, _ in results}
+
+
+@pytest.fixture(scope="module")
+def session():
+    return simulate_two(12, 0)
+
+
+@pytest.fixture(scope="module")
+def together(session):
+    return calibrated(detections(session), ML)
+
+
+@pytest.fixture(scope="module")
+def by_paper(session):
+    return calibrated(detections(session), PAPER)
+
+
+def test_cameras_that_share_boards_are_estimated_together_and_say_so(together):
+    for name, other in ((LEFT, RIGHT), (RIGHT, LEFT)):
+        own = together[name]
+        assert own.verdict == "pass"
+        assert own.method == "ml"
+        assert own.estimated_with == (other,)
+        error = difference(own.T_cam_lidar, TRUTH[name])
+        assert error @ np.linalg.solve(own.cov, error) < 25  # 0.9997 of chi square with 6 degrees
+        assert own.sigma_rotation_deg < own.diagnostics["alone_sigma_rotation_deg"]
+        (line,) = together_lines(own)
+        assert line.startswith(f"  together     with {other}; alone it is known to 0.0")
+
+
+def test_where_one_camera_sits_to_the_other_is_told_from_both_sides(together):
+    (to_left,), (to_right,) = (together[name].other_cameras for name in (RIGHT, LEFT))
+    assert (to_left.camera, to_left.n_captures) == (LEFT, 12)
+    assert (to_right.camera, to_right.n_captures) == (RIGHT, 12)
+    for other, truth in ((to_left, T_RIGHT_LEFT), (to_right, invert(T_RIGHT_LEFT))):
+        error = difference(other.T_cam_other, truth)
+        assert error @ np.linalg.solve(other.cov, error) < 25
+        assert np.linalg.norm(error[:3]) < 0.001
+        assert np.linalg.norm(difference(other.T_cam_other_pictures, truth)[:3]) < 0.003
+        assert other.apart_rotation_deg < 0.1
+        assert other.board_rms_m < 0.003
+    assert np.allclose(to_left.T_cam_other, invert(to_right.T_cam_other))
+
+
+def test_what_is_told_agrees_with_the_extrinsics(together, by_paper):
+    for results in (together, by_paper):
+        T = results[RIGHT].T_cam_lidar @ invert(results[LEFT].T_cam_lidar)
+        assert np.allclose(results[RIGHT].other_cameras[0].T_cam_other, T)
+
+
+def test_other_methods_estimate_each_camera_by_itself_but_compare_them(session, together, by_paper):
+    for name in (LEFT, RIGHT):
+        alone = detections({name: session[name]})
+        (own,) = calibrated(alone, PAPER, only(name)).values()
+        assert np.array_equal(own.T_cam_lidar, by_paper[name].T_cam_lidar)
+        assert by_paper[name].estimated_with == ()
+        assert together_lines(by_paper[name]) == []
+        (other,) = by_paper[name].other_cameras
+        assert other.cov is None
+        assert other.apart_rotation_deg < 0.2
+        assert np.allclose(
+            other.T_cam_other_pictures, together[name].other_cameras[0].T_cam_other_pictures, atol=2e-3
+        )
+
+
+def only(camera):
+    data = RIG.model_dump()
+    data["cameras"] = {camera: data["cameras"][camera]}
+    data["nominal_extrinsics"] = [e for e in data["nominal_extrinsics"] if e["camera"] == camera]
+    return type(RIG).model_validate(data)
+
+
+def test_one_camera_alone_is_what_it_is_without_another_in_the_profile(session):
+    left = {LEFT: session[LEFT]}
+    alone, beside = (calibrated(detections(left), ML, rig)[LEFT] for rig in (only(LEFT), RIG))
+    assert np.array_equal(alone.T_cam_lidar, beside.T_cam_lidar)
+    assert np.array_equal(alone.cov, beside.cov)
+    assert alone.other_cameras == alone.estimated_with == ()
+
+
+def test_cameras_without_a_common_board_stay_by_themselves(session):
+    found = calibrated(detections(session, left=range(6), right=range(6, 12)), ML)
+    for own in found.values():
+        assert own.estimated_with == own.other_cameras == ()
+        assert "alone_sigma_rotation_deg" not in own.diagnostics
+
+
+@pytest.mark.parametrize("options", [ML, PAPER], ids=["ml", "paper"])
+def test_a_nudged_camera_is_told_at_both_and_not_estimated_with_the_other(options):
+    found = calibrated(detections(simulate_two(12, 1, nudge=TURNED, nudged_from=6)), options)
+    for own in found.values():
+        assert own.verdict in ("marginal", "fail")
+        assert own.estimated_with == ()
+        (reason,) = (
+            text for text in own.reasons if text.startswith("left to right, by their pictures alone")
+        )
+        assert "captures before 000006" in reason
+        assert "nudged" in reason
+    # The left camera, which nobody touched, is what it is without the other.
+    error = difference(found[LEFT].T_cam_lidar, TRUTH[LEFT])
+    assert error @ np.linalg.solve(found[LEFT].cov, error) < 25
+
+
+def test_boards_that_moved_keep_cameras_apart(session):
+    """Pictures about each scan tell of boards on their way: each camera has board poses of its own."""
+    stamp_ns, track_s = 10**18, np.array([-0.1, -0.05, 0.05, 0.1])
+
+    def moved(captures):
+        found = []
+        for k, c in enumerate(captures):
+            rate = np.array([0.2 * np.sin(k), 0.2 * np.cos(k), 0.1 * np.sin(3 * k), 0, 0, 0])
+            poses = np.array([c.image.T_cam_board] * 4)
+            poses[:, :3, 3] += track_s[:, None] * rate[:3]
+            image = replace(
+                c.image,
+                stamp_ns=stamp_ns,
+                track_ns=(stamp_ns + 1e9 * track_s).astype(np.int64),
+                track_T_cam_board=poses,
+                track_cov=np.array([c.image.cov] * 4),
+            )
+            found.append(replace(c, image=image, lidar=[replace(b, stamp_ns=stamp_ns) for b in c.lidar]))
+        return found
+
+    found = calibrated(detections({name: moved(captures) for name, captures in session.items()}), PAPER)
+    for own in found.values():
+        assert own.channel_results[0].time_offset_s is not None
+        assert own.estimated_with == own.other_cameras == ()
+
+
+def test_the_result_file_holds_it_and_gives_it_back(together, by_paper, tmp_path):
+    for results in (together, by_paper):
+        path = tmp_path / "result.json"
+        write_result(path, RIG.name, list(results.values()))
+        for read in read_result(path).calibrations:
+            written = results[read.camera]
+            assert read.estimated_with == written.estimated_with
+            (other,), (expected,) = read.other_cameras, written.other_cameras
+            assert np.array_equal(other.T_cam_other, expected.T_cam_other)
+            assert (other.cov is None) == (expected.cov is None)
+            assert other.cov is None or np.array_equal(other.cov, expected.cov)
+            assert other.apart_translation_m == expected.apart_translation_m
+
+
+def test_exports_put_both_cameras_where_they_are(together, tmp_path):
+    write_exports(list(together.values()), RIG, tmp_path, is_forced=False)
+    links = read_urdf(tmp_path / "two_cameras.urdf")
+    T = invert(links["right_optical_frame"]) @ links["left_optical_frame"]
+    assert np.allclose(T, together[RIGHT].other_cameras[0].T_cam_other, atol=1e-9)
+    assert links.keys() >= {"velodyne", "left_link", "right_link"}
+
+
+def test_the_report_states_each_two_cameras_once(together, by_paper):
+    calibrations = list(together.values())
+    assert camera_lines(calibrations[0], calibrations) == []
+    text = "\n".join(camera_lines(calibrations[1], calibrations))
+    assert "left and right" in text
+    assert "T_right_left (p_right = R p_left + t)" in text
+    assert "known to     0.00" in text
+    assert "each camera by itself" in text
+    calibrations = list(by_paper.values())
+    text = "\n".join(camera_lines(calibrations[1], calibrations))
+    assert "known to" not in text
+    assert "pictures     differ by 0.0" in text
