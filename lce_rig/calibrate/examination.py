@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from lce_rig.calibrate.claim import resample, widen
 from lce_rig.calibrate.control import Control, run_control
 from lce_rig.calibrate.estimate import CalibrationEstimate
@@ -77,7 +79,8 @@ def examine(
         rig.calibration,
         rig.verdict.control_sigmas,
     )
-    nuisances = estimate_nuisances(expansion)
+    rings = np.unique(np.concatenate([observation.lidar.ring for observation in observations]))
+    nuisances = estimate_nuisances(expansion, rings)
     return Examination(widened, remark, contrast_halves(settled), control, nuisances, intrinsics)
 
 

@@ -6,6 +6,7 @@ A range offset that all lasers share cannot be told from translation and scale; 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.calibrate.doubt import Doubt, Verdict
 from lce_rig.calibrate.expansion import FIRST_RING, SCALE, SHIFT, Expansion
@@ -39,11 +40,12 @@ class Nuisances:
     laser: int
 
 
-def estimate_nuisances(expansion: Expansion) -> Nuisances:
+def estimate_nuisances(expansion: Expansion, rings: NDArray[np.int16]) -> Nuisances:
     """Estimate what all captures share, the scale without any prior.
 
     Args:
         expansion: of the captures, not settled.
+        rings: (L,) numbers of those that occur, ascending.
     """
     every = np.ones((1, len(expansion.gradients)))
     without = 1 - expansion.groups
@@ -59,7 +61,7 @@ def estimate_nuisances(expansion: Expansion) -> Nuisances:
         edge_shift_m=float(x[0, SHIFT]),
         edge_shift_sigma_m=float(np.sqrt(expansion.covariance()[SHIFT, SHIFT] + _jackknife(x[1:, SHIFT]))),
         laser_offset_m=float(about_mean[laser]),
-        laser=laser,
+        laser=int(rings[laser]),
     )
 
 

@@ -36,6 +36,11 @@ def expanded(observations, T=T_NEAR, laser=0.008, offset=0.005):
     return expand(observations, BOARD, T, laser_bias_sigma_m=laser, range_offset_sigma_m=offset)
 
 
+def nuisances(observations, first_ring=0):
+    rings = np.unique(np.concatenate([seen.lidar.ring for seen in observations]))
+    return estimate_nuisances(expanded(observations), rings + first_ring)
+
+
 def moved(seen, T_cam_board):
     return replace(seen, image=replace(seen.image, T_cam_board=T_cam_board))
 
@@ -68,8 +73,9 @@ def test_offsets_of_single_lasers_and_the_edge_shift_are_found():
         return replace(seen, lidar=replace(lidar, points=points))
 
     boards = [lengthened(seen, 8, 0.04) for seen in observed(25, 3, Scenario(footprint_m=0.006))]
-    found = estimate_nuisances(expanded(boards))
+    found = nuisances(boards)
     assert found.laser == 8
+    assert nuisances(boards, first_ring=3).laser == 11
     assert abs(found.laser_offset_m - 0.04) < 0.012
     assert abs(found.edge_shift_m - 0.006) < 0.0025
 
@@ -77,13 +83,13 @@ def test_offsets_of_single_lasers_and_the_edge_shift_are_found():
 def test_scales_agree_within_their_sigma_where_the_board_is_right():
     errors = []
     for seed in range(6):
-        found = estimate_nuisances(expanded(observed(15, seed)))
+        found = nuisances(observed(15, seed))
         errors.append(found.scale / found.scale_sigma)
     assert np.sqrt(np.mean(np.square(errors))) < 1.6
 
 
 def test_what_cannot_be_is_doubted_and_what_can_is_not():
-    found = estimate_nuisances(expanded(observed()))
+    found = nuisances(observed())
     lidar = RIG.lidars["lidar"]
     assert doubt_nuisances(found, BOARD, lidar, LIMITS) == []
     for changed, words in (

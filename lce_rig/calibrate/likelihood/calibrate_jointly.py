@@ -22,6 +22,7 @@ from lce_rig.calibrate.report import report_estimate
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
+from lce_rig.solvers.covariance import symmetric_inverse
 
 # A profile that states no error of the ranges is taken at its word.
 _EXACT_M = 1e-6
@@ -139,6 +140,7 @@ def figures_of(joint: JointEstimate, camera: int) -> dict[str, float]:
     levels = joint.levels
     shifts = dict(zip(SHIFTS, joint.shifts.tolist(), strict=True))
     return {
+        **_sigmas(joint, camera),
         "edge_shift_m": shifts["d_0"],
         "edge_shift_sigma_m": float(joint.constants_sigma[-N_SHIFTS]),
         "edge_shift_echo_m": shifts["d_1"],
@@ -158,3 +160,18 @@ def figures_of(joint: JointEstimate, camera: int) -> dict[str, float]:
         "noise_depth_m": levels.depth_m,
         "noise_across_m": levels.across_m,
     }
+
+
+def _sigmas(joint: JointEstimate, camera: int) -> dict[str, float]:
+    """Part a camera's claim in what differs between sessions and what priors of constant errors let through.
+
+    With information H = sum_k H_k + P, the covariance H^-1 is H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1.
+    """
+    system = joint.system
+    J = joint.to_extrinsics[camera] @ symmetric_inverse(system.information)
+    figures = {}
+    for name, part in (("scatter", system.hessians.sum(axis=0)), ("systematic", system.prior)):
+        cov = J @ part @ J.T
+        figures[f"sigma_{name}_rotation_deg"] = float(np.degrees(np.sqrt(np.trace(cov[3:, 3:]))))
+        figures[f"sigma_{name}_translation_m"] = float(np.sqrt(np.trace(cov[:3, :3])))
+    return figures

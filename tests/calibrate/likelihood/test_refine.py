@@ -54,6 +54,15 @@ def test_noise_and_constant_errors_come_out_as_simulated(sessions):
         assert estimate.method == "ml"
 
 
+def test_the_claim_is_parted_in_what_differs_between_sessions_and_what_they_share(sessions):
+    for estimate in sessions:
+        figures = estimate.diagnostics
+        parts = [figures[f"sigma_{name}_translation_m"] ** 2 for name in ("scatter", "systematic")]
+        claimed = np.trace(estimate.cov[:3, :3]) / figures["covariance_inflation"]
+        assert sum(parts) == pytest.approx(claimed, rel=1e-6)
+        assert min(parts) > 0.01 * claimed
+
+
 def test_an_offset_common_to_all_ranges_is_found_though_it_is_four_times_what_the_profile_says():
     scenario = replace(REAL, range_offset_m=0.02, footprint_m=0.003)
     estimate = calibrate(simulate(30, 3, scenario), BOARD, ML)
