@@ -57,6 +57,9 @@ def main() -> None:
     parser.add_argument(
         "--methods", default="", help="those `paper` runs anew (default: what is not kept); that of `real`"
     )
+    parser.add_argument(
+        "--scans", type=int, default=100, help="simulated sessions that `faults` draws from (100)"
+    )
     parser.add_argument("--seconds", type=float, default=60, help="that `live` takes (default 60)")
     arguments = parser.parse_args()
     bench = getattr(import_module(f"benchmarks.{arguments.part}"), f"bench_{arguments.part}")
@@ -67,6 +70,8 @@ def main() -> None:
         bench(arguments.seeds or PARTS["paper"], arguments.output, methods, arguments.only)
     elif arguments.part == "uncertainty":
         bench(arguments.seeds or PARTS["uncertainty"], arguments.output, arguments.only, arguments.captures)
+    elif arguments.part == "faults":
+        bench(arguments.seeds or PARTS["faults"], n_sessions=arguments.scans)
     elif arguments.part == "live":
         bench(arguments.seconds)
     elif arguments.part == "speed":

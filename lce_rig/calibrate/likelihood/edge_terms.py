@@ -59,9 +59,15 @@ class EdgeRows:
     is_backed: NDArray[np.bool_]
 
     @cached_property
+    def columns(self) -> Array:
+        """Derivatives (15, M), each column of `rows` contiguous."""
+        return np.ascontiguousarray(self.rows[:, :-1].T)
+
+    @cached_property
     def products(self) -> Array:
-        """Products of each row with itself (M, 16, 16)."""
-        return np.asarray(self.rows[:, :, None] * self.rows[:, None, :])
+        """Products of each row's derivatives with each other (120, M), in the order of `np.triu_indices`."""
+        i, j = np.triu_indices(_SIZE - 1)
+        return np.asarray(self.columns[i] * self.columns[j])
 
     def blur_m(self, levels: Levels) -> Array:
         """Blur (M,) of each interval's ends."""
@@ -138,10 +144,15 @@ def edge_system(edges: EdgeRows, levels: Levels, n_captures: int) -> Array:
     if len(edges.rows):
         D, blur = edges.step_m, edges.blur_m(levels) / edges.step_m
         p, slope = density(edges.rows[:, -1] / D, blur, levels.lost_share)
-        weighted = edges.products * (information(blur, levels.lost_share) / D**2)[:, None, None]
-        weighted[:, :-1, -1] = edges.rows[:, :-1] * (-slope / p / D)[:, None]
-        weighted[:, -1, :-1] = weighted[:, :-1, -1]
-        weighted[:, -1, -1] = -2 * np.log(p / D)
+        weighted = [
+            edges.products * (information(blur, levels.lost_share) / D**2),
+            edges.columns * (-slope / p / D),
+            -2 * np.log(p / D)[None],
+        ]
         first = np.flatnonzero(np.diff(edges.capture, prepend=-1))
-        system[edges.capture[first]] = np.add.reduceat(weighted, first, axis=0)
+        sums = np.add.reduceat(np.concatenate(weighted), first, axis=1).T
+        seen, (i, j) = edges.capture[first], np.triu_indices(_SIZE - 1)
+        system[seen[:, None], i, j] = system[seen[:, None], j, i] = sums[:, : len(i)]
+        system[seen, :-1, -1] = system[seen, -1, :-1] = sums[:, len(i) : -1]
+        system[seen, -1, -1] = sums[:, -1]
     return system

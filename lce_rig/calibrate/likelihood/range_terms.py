@@ -56,7 +56,11 @@ def sum_ranges(scans: StackedScans, T_lidar_board: Array, offset_m: Array, lens:
     v[:, -1] = r + v[:, _ONE + 1 : -1] @ lens + offset_m[scans.ring] - scans.range_m
     sums = np.zeros((scans.n_captures * len(scans.rings), _SIZE, _SIZE))
     first = np.flatnonzero(np.diff(scans.group, prepend=-1))
-    sums[scans.group[first]] = np.add.reduceat(v[:, :, None] * v[:, None, :], first, axis=0)
+    # Products of columns, each one contiguous: several times faster than outer products of rows.
+    i, j = np.triu_indices(_SIZE)
+    columns = np.ascontiguousarray(v.T)
+    products = np.add.reduceat(columns[i] * columns[j], first, axis=1).T
+    sums[scans.group[first, None], i, j] = sums[scans.group[first, None], j, i] = products
     return RangeSums(sums.reshape(scans.n_captures, len(scans.rings), _SIZE, _SIZE), _by_pose(n, t, h))
 
 
