@@ -21,7 +21,7 @@ from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.calibrate.outliers import reject_outliers
 from lce_rig.calibrate.placements import group_placements
 from lce_rig.calibrate.problem import Problem, Solutions, Weights
-from lce_rig.calibrate.report import report_estimate
+from lce_rig.calibrate.report import name_sigmas, report_estimate
 from lce_rig.calibrate.systematic import ring_sensitivities
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
@@ -163,8 +163,7 @@ def _diagnostics(
         "fit_edge_rms_m": float(np.sqrt(np.mean(edge**2))),
     }
     for name, cov in zip(("scatter", "systematic"), covariances, strict=True):
-        figures[f"sigma_{name}_rotation_deg"] = float(np.degrees(np.sqrt(np.trace(cov[3:6, 3:6]))))
-        figures[f"sigma_{name}_translation_m"] = float(np.sqrt(np.trace(cov[:3, :3])))
+        figures |= name_sigmas(name, cov)
     if problem.n_shift:
         figures["edge_shift_m"] = float(solution.linear[0, 3])
         figures["edge_shift_sigma_m"] = float(np.sqrt(covariances[0][6, 6] + covariances[1][6, 6]))

@@ -26,6 +26,8 @@ BACKGROUND_SIGMAS_M = (0.015, 0.01, 0.015)
 # What is believed of the extrinsic near which the shifts are sought.
 _SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD = 0.02, 0.01
 _N_SHIFTS = len(BACKGROUND_SIGMAS_M)
+BLENDS = 1
+"""Column of `describe_background` that tells whether the background's echo blends into the board's."""
 # Noise of a ring end, and beyond how many sigmas one counts less.
 _END_SIGMA_M, _HUBER = 0.003, 1.5
 _ROUNDS = 5
@@ -40,8 +42,10 @@ def is_blended(lidar: LidarBoard) -> NDArray[np.bool_]:
 
 
 def describe_background(lidar: LidarBoard) -> Array:
-    """Tell what takes edges from each ring end: (M, 3), the background's share of the power where it is far
-    behind, whether it blends, and its share where it does.
+    """Tell what is behind each ring end (M, 3).
+
+    Columns are the background's share of the power where it is far behind, whether it blends, and its share
+    where it does.
     """
     blends = is_blended(lidar)
     return np.stack([lidar.edge_echo * ~blends, blends, lidar.edge_echo * blends], axis=1)
@@ -61,6 +65,8 @@ def estimate_shifts(
         T_cam_lidar: (4, 4) near the truth.
         board: the board.
     """
+    from scipy.special import chdtri
+
     parts = [end_rows(f, T_cam_lidar, board, FIRST_RING) for f in features]
     inside = np.concatenate([r for r, _ in parts])
     background = np.concatenate([describe_background(observation.lidar) for observation in observations])
@@ -77,8 +83,6 @@ def estimate_shifts(
     gradients = np.add.reduceat(A * (weights * (A @ x - inside))[:, None], first, axis=0)
     hessians = np.add.reduceat(A[:, :, None] * (weights[:, None] * A)[:, None, :], first, axis=0)
     cov = jackknife_covariance(gradients, hessians, prior)[-_N_SHIFTS:, -_N_SHIFTS:]
-    from scipy.special import chdtri
-
     # A column that no ring end has is known to be zero.
     shifts, is_seen = x[-_N_SHIFTS:], np.any(background > 0, axis=0)
     chi2 = shifts[is_seen] @ np.linalg.solve(cov[np.ix_(is_seen, is_seen)], shifts[is_seen])

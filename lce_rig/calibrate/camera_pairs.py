@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.calibrate.doubt import Doubt, Verdict
+from lce_rig.calibrate.doubt import SURPRISING_CHI2, Doubt, Verdict
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.expansion import Expansion
 from lce_rig.calibrate.halves import contrast_halves, doubt_halves
@@ -17,7 +17,7 @@ from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.picture_terms import stack_pictures
 from lce_rig.calibrate.placements import group_placements
 from lce_rig.calibrate.relative_pose import relative_covariance, relative_pose
-from lce_rig.core.geometry import Array, difference, perturb
+from lce_rig.core.geometry import Array, difference, perturb, tangent_sizes
 from lce_rig.core.results import Observation
 from lce_rig.rig import CalibrationSettings, VerdictSettings
 from lce_rig.solvers.covariance import jackknife_covariance, symmetric_inverse
@@ -31,8 +31,6 @@ _STEPS = 20
 _STUDENT = 5.0
 # Boards scatter for a reason where they do so by this many times what is usual.
 _MAX_SCATTER = 2.0
-# 99 % of the chi-squared distribution of six freedoms.
-_CHI2 = 16.81
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,13 +235,9 @@ def _elsewhere(
     limits: VerdictSettings,
 ) -> list[Doubt]:
     first, second = names
-    rotation_deg, translation_m = (
-        float(np.degrees(np.linalg.norm(apart[3:]))),
-        float(np.linalg.norm(apart[:3])),
-    )
-    excess = max(rotation_deg / target.target_sigma_deg, translation_m / target.target_sigma_m)
-    excess /= limits.max_camera_difference
-    if pair.surprise <= _CHI2 or excess <= 1:
+    rotation_deg, translation_m = tangent_sizes(apart)
+    excess = target.in_targets(rotation_deg, translation_m) / limits.max_camera_difference
+    if pair.surprise <= SURPRISING_CHI2 or excess <= 1:
         return []
     verdict: Verdict = "fail" if excess > limits.fail_factor else "marginal"
     text = (

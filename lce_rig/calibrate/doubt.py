@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 Verdict = Literal["pass", "marginal", "fail"]
+SURPRISING_CHI2 = 16.81
+"""99 % of the chi-squared distribution of six freedoms: differences beyond it are no chance."""
 _ORDER: tuple[Verdict, ...] = ("pass", "marginal", "fail")
 
 

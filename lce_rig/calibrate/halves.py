@@ -11,7 +11,7 @@ import numpy as np
 
 from lce_rig.calibrate.doubt import Doubt, Verdict
 from lce_rig.calibrate.expansion import Expansion
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, tangent_sizes
 from lce_rig.rig import CalibrationSettings, VerdictSettings
 
 # Fewer placements are not worth halving.
@@ -109,10 +109,7 @@ def _chi2(expansion: Expansion, shares: Array) -> tuple[Array, Array]:
 
 
 def _contrast(first: str, second: str, apart: Array, chance: float, n_first: int) -> Contrast:
-    rotation_deg, translation_m = (
-        float(np.degrees(np.linalg.norm(apart[3:]))),
-        float(np.linalg.norm(apart[:3])),
-    )
+    rotation_deg, translation_m = tangent_sizes(apart)
     return Contrast(first, second, rotation_deg, translation_m, chance, n_first)
 
 
@@ -133,7 +130,7 @@ def doubt_halves(
     doubts = []
     for c in contrasts:
         is_change = c.first == "before"
-        excess = max(c.rotation_deg / target.target_sigma_deg, c.translation_m / target.target_sigma_m)
+        excess = target.in_targets(c.rotation_deg, c.translation_m)
         excess /= limits.max_change if is_change else limits.max_contrast
         if c.chance > limits.least_chance or excess <= 1:
             continue

@@ -10,11 +10,17 @@ from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.calibrate.observability import describe_weakest
 from lce_rig.calibrate.placements import group_placements
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.results import Certificate, Observation, Refusal
 
 # Of methods that prove nothing about their minimum.
 NO_CERTIFICATE = Certificate(is_optimal=False, gap=float("inf"))
+
+
+def name_sigmas(part: str, cov: Array) -> dict[str, float]:
+    """Name the sizes of a part of a claim, "scatter" or "systematic", as diagnostics: cov (6 + k, 6 + k)."""
+    sigma_deg, sigma_m = sigma_sizes(cov)
+    return {f"sigma_{part}_rotation_deg": sigma_deg, f"sigma_{part}_translation_m": sigma_m}
 
 
 def report_estimate(

@@ -1,6 +1,6 @@
 """What the channels of one camera saw while the LiDAR made one scan."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +12,7 @@ from lce_rig.core.results import ImageBoard, LidarBoard, Observation, Refusal
 
 # Pictures without stamps may lie anywhere about the scan they were saved with.
 NO_STAMPS_SIGMA_S = 0.15
+REMOVE_OTHERS = "remove other things of the board's size, or cover them"
 
 
 @dataclass(frozen=True)
@@ -88,9 +89,7 @@ def join_scans(
                 cause = (
                     f"its {channel} put the board at another place of the scan than its {next(iter(group))}"
                 )
-                refused[observation.capture] = Refusal(
-                    "pair", cause, "remove other things of the board's size, or cover them"
-                )
+                refused[observation.capture] = Refusal("pair", cause, REMOVE_OTHERS)
             elif channel not in group:
                 group[channel] = observation
     scans = [
@@ -102,6 +101,11 @@ def join_scans(
         for group in groups.values()
     ]
     return sorted(scans, key=lambda scan: scan.capture), refused
+
+
+def take_apart(names: Iterable[str]) -> set[str]:
+    """Take names of captures that share a scan ("000003+000060") apart."""
+    return {single for name in names for single in name.split("+")}
 
 
 def sample_scans(scans: Sequence[SharedScan], clocks: Clocks, noise_px: Mapping[str, float]) -> PoseSamples:

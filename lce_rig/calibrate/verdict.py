@@ -6,21 +6,19 @@ import numpy as np
 
 from lce_rig.calibrate.channels import ChannelsEstimate
 from lce_rig.calibrate.control import doubt_control
-from lce_rig.calibrate.doubt import Doubt, Verdict, weigh
+from lce_rig.calibrate.doubt import SURPRISING_CHI2, Doubt, Verdict, weigh
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.examination import Examination
 from lce_rig.calibrate.halves import doubt_halves
 from lce_rig.calibrate.intrinsics_check import explain
 from lce_rig.calibrate.nuisances import doubt_nuisances
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import rotation_angle
+from lce_rig.core.geometry import rotation_angle, tangent_sizes
 from lce_rig.core.results import Metrics
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 
 # A side of the plate counts as measured below this deviation; 5 % of it is more than the beam's spot.
 PLATE_KNOWN_M, PLATE_FAIL = 0.03, 0.05
-# 99 % of the chi-squared distribution of six freedoms.
-CHANNELS_CHI2 = 16.81
 _AXES = ("x right", "y down", "z forward")
 # What helps where more captures do not.
 MEASURE_RANGES = (
@@ -166,13 +164,9 @@ def _channels(result: ChannelsEstimate, rig: Rig) -> list[Doubt]:
         return []
     apart = result.difference
     surprise = float(apart @ np.linalg.solve(result.difference_cov, apart))
-    rotation_deg, translation_m = (
-        float(np.degrees(np.linalg.norm(apart[3:]))),
-        float(np.linalg.norm(apart[:3])),
-    )
-    target = rig.calibration
-    excess = max(rotation_deg / target.target_sigma_deg, translation_m / target.target_sigma_m)
-    if surprise <= CHANNELS_CHI2 or excess <= 1:
+    rotation_deg, translation_m = tangent_sizes(apart)
+    excess = rig.calibration.in_targets(rotation_deg, translation_m)
+    if surprise <= SURPRISING_CHI2 or excess <= 1:
         return []
     names = " and ".join(channel.channel for channel in result.channels)
     verdict: Verdict = "fail" if excess > rig.verdict.fail_factor else "marginal"

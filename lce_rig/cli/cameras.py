@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
+from lce_rig.core.geometry import sigma_sizes
 from lce_rig.core.results import Calibration, OtherCamera
 
 
@@ -34,8 +33,8 @@ def _lines(camera: str, other: OtherCamera) -> list[str]:
         *("    " + "  ".join(f"{value: .6f}" for value in row) for row in other.T_cam_other[:3]),
     ]
     if other.cov is not None:
-        sigmas = [np.sqrt(np.trace(other.cov[part, part])) for part in (slice(3, 6), slice(0, 3))]
-        lines.append(f"  known to     {np.degrees(sigmas[0]):.3f} deg, {1000 * sigmas[1]:.1f} mm (1 sigma)")
+        sigma_deg, sigma_m = sigma_sizes(other.cov)
+        lines.append(f"  known to     {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm (1 sigma)")
     if other.apart_rotation_deg is not None and other.apart_translation_m is not None:
         by_itself = ", each camera by itself" if other.cov is not None else ""
         lines.append(

@@ -122,6 +122,21 @@ def difference(T_1: Array, T_2: Array) -> Array:
     return np.concatenate([T_1[..., :3, 3] - T_2[..., :3, 3], phi], axis=-1)
 
 
+def tangent_sizes(tangent: Array) -> tuple[float, float]:
+    """Measure the angle in deg and the distance in m of a tangent (6,)."""
+    return float(np.degrees(np.linalg.norm(tangent[3:]))), float(np.linalg.norm(tangent[:3]))
+
+
+def sigma_sizes(cov: Array) -> tuple[float, float]:
+    """Take the roots of the summed variances, rotation in deg and translation in m, of a tangent.
+
+    Args:
+        cov: (6 + k, 6 + k), the tangent first.
+    """
+    rotation, translation = np.trace(cov[3:6, 3:6]), np.trace(cov[:3, :3])
+    return float(np.degrees(np.sqrt(rotation))), float(np.sqrt(translation))
+
+
 def fit_plane(points: NDArray[Any]) -> tuple[Array, float]:
     """Fit n.p + d = 0 by least squares, n towards the origin of the points' frame (d >= 0).
 

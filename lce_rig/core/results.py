@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, sigma_sizes
 
 
 @dataclass(frozen=True)
@@ -276,9 +276,9 @@ class Calibration:
     @property
     def sigma_rotation_deg(self) -> float:
         """Root of the summed rotation variances, deg."""
-        return float(np.degrees(np.sqrt(np.trace(self.cov[3:, 3:]))))
+        return sigma_sizes(self.cov)[0]
 
     @property
     def sigma_translation_m(self) -> float:
         """Root of the summed translation variances, m."""
-        return float(np.sqrt(np.trace(self.cov[:3, :3])))
+        return sigma_sizes(self.cov)[1]

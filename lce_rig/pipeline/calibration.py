@@ -3,20 +3,19 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate
 from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.calibrate.reach import point_uncertainties
+from lce_rig.calibrate.shared_scans import take_apart
 from lce_rig.calibrate.verdict import judge
 from lce_rig.core.errors import NotEnoughDataError, UsageError
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, tangent_sizes
 from lce_rig.core.results import Calibration, Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.pipeline.cameras import InCompany, bring_cameras_together
 from lce_rig.pipeline.progress import Progress, silent
-from lce_rig.pipeline.solving import solve, take_apart
+from lce_rig.pipeline.solving import solve
 from lce_rig.rig import Rig
 
 
@@ -95,8 +94,8 @@ def _judged(rig: Rig, detections: Detections, member: InCompany, reference: Refe
     verdict, reasons = judge(result, solved.examination, rig, camera, lidar, n_captures, member.doubts)
     diagnostics = dict(estimate.diagnostics)
     if result.difference is not None:
-        diagnostics["channels_rotation_deg"] = float(np.degrees(np.linalg.norm(result.difference[3:])))
-        diagnostics["channels_translation_m"] = float(np.linalg.norm(result.difference[:3]))
+        rotation_deg, translation_m = tangent_sizes(result.difference)
+        diagnostics |= {"channels_rotation_deg": rotation_deg, "channels_translation_m": translation_m}
     lens = rig.cameras[camera].to_intrinsics()
     calibration = Calibration(
         camera=camera,

@@ -10,7 +10,7 @@ from lce_rig.calibrate.camera_pairs import CameraPair, doubt_cameras, relate
 from lce_rig.calibrate.doubt import Doubt
 from lce_rig.calibrate.likelihood.calibrate_together import TogetherEstimate, calibrate_together
 from lce_rig.calibrate.relative_pose import relative_pose
-from lce_rig.core.geometry import Array, invert
+from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
 from lce_rig.core.results import OtherCamera
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.solving import Solved, examine_pairs
@@ -106,11 +106,8 @@ def _groups(n: int, links: Sequence[_Link]) -> list[list[int]]:
 def _examined(rig: Rig, detections: Detections, alone: Solved, together: TogetherEstimate) -> Solved:
     """Put the joint estimate in the place of a camera's own, and check it anew."""
     estimate = together.estimates[alone.camera]
-    cov = alone.estimate.cov
-    figures = {
-        "alone_sigma_rotation_deg": float(np.degrees(np.sqrt(np.trace(cov[3:, 3:])))),
-        "alone_sigma_translation_m": float(np.sqrt(np.trace(cov[:3, :3]))),
-    }
+    sigma_deg, sigma_m = sigma_sizes(alone.estimate.cov)
+    figures = {"alone_sigma_rotation_deg": sigma_deg, "alone_sigma_translation_m": sigma_m}
     estimate = replace(estimate, diagnostics={**estimate.diagnostics, **figures})
     result = replace(alone.result, estimate=estimate)
     return replace(alone, result=result, examination=examine_pairs(rig, detections, alone.pairs, result))
@@ -132,14 +129,15 @@ def _other(members: Sequence[Solved], k: int, link: _Link, covs: dict[tuple[int,
     pair, is_second = link.pair, k == link.second
     other = link.first if is_second else link.second
     T, _ = relative_pose(members[k].estimate.T_cam_lidar, members[other].estimate.T_cam_lidar)
-    seen, apart = None if pair.pictures is None else pair.pictures.T_second_first, pair.apart
+    seen = None if pair.pictures is None else pair.pictures.T_second_first
+    apart_deg, apart_m = (None, None) if pair.apart is None else tangent_sizes(pair.apart)
     return OtherCamera(
         camera=members[other].camera,
         n_captures=len(pair.captures),
         T_cam_other=T,
         cov=covs.get((k, other)),
         T_cam_other_pictures=seen if seen is None or is_second else invert(seen),
-        apart_rotation_deg=None if apart is None else float(np.degrees(np.linalg.norm(apart[3:]))),
-        apart_translation_m=None if apart is None else float(np.linalg.norm(apart[:3])),
+        apart_rotation_deg=apart_deg,
+        apart_translation_m=apart_m,
         board_rms_m=pair.board_rms_m,
     )

@@ -1,7 +1,7 @@
 """One camera and one LiDAR of a session: what both saw -> estimate -> examination, before it is judged."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from lce_rig.calibrate import (
@@ -15,6 +15,7 @@ from lce_rig.calibrate import (
 from lce_rig.calibrate.consensus import find_consensus
 from lce_rig.calibrate.examination import Examination, examine
 from lce_rig.calibrate.intrinsics_estimate import View
+from lce_rig.calibrate.shared_scans import take_apart
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.detect.detection import Detections, Pair
@@ -110,11 +111,6 @@ def _views(detections: Detections, pairs: Sequence[Pair], result: ChannelsEstima
             if pair.channel in channels and isinstance(image, ImageBoard):
                 views.append(View(name, pair.channel, image))
     return views
-
-
-def take_apart(names: Iterable[str]) -> set[str]:
-    """Take names of captures that share a scan ("000003+000060") apart."""
-    return {single for name in names for single in name.split("+")}
 
 
 def _usable(

@@ -76,6 +76,10 @@ class CalibrationSettings(Settings):
     target_sigma_deg: Positive = 0.2
     target_sigma_m: Positive = 0.01
 
+    def in_targets(self, rotation_deg: float, translation_m: float) -> float:
+        """Measure an error or a difference in units of the targets; the larger of the two counts."""
+        return max(rotation_deg / self.target_sigma_deg, translation_m / self.target_sigma_m)
+
 
 class VerdictSettings(Settings):
     """When a result passes; what is beyond a limit is marginal, and fails where a second limit says so.

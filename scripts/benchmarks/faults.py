@@ -80,6 +80,5 @@ def _calibrate(case: Case) -> Outcome:
     except NotEnoughDataError as error:
         return Outcome("refused", float("inf"), (str(error),))
     rotation_deg, translation_mm = compare(calibration.T_cam_lidar, case.T_cam_lidar)
-    target = rig.calibration
-    error = max(rotation_deg / target.target_sigma_deg, translation_mm / 1000 / target.target_sigma_m)
+    error = rig.calibration.in_targets(rotation_deg, translation_mm / 1000)
     return Outcome(calibration.verdict, error, calibration.reasons)

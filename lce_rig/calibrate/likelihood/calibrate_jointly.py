@@ -18,7 +18,7 @@ from lce_rig.calibrate.likelihood.system import PER_CAMERA
 from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.calibrate.placements import group_placements
-from lce_rig.calibrate.report import report_estimate
+from lce_rig.calibrate.report import name_sigmas, report_estimate
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
@@ -169,9 +169,7 @@ def _sigmas(joint: JointEstimate, camera: int) -> dict[str, float]:
     """
     system = joint.system
     J = joint.to_extrinsics[camera] @ symmetric_inverse(system.information)
-    figures = {}
+    figures: dict[str, float] = {}
     for name, part in (("scatter", system.hessians.sum(axis=0)), ("systematic", system.prior)):
-        cov = J @ part @ J.T
-        figures[f"sigma_{name}_rotation_deg"] = float(np.degrees(np.sqrt(np.trace(cov[3:, 3:]))))
-        figures[f"sigma_{name}_translation_m"] = float(np.sqrt(np.trace(cov[:3, :3])))
+        figures |= name_sigmas(name, J @ part @ J.T)
     return figures

@@ -17,6 +17,7 @@ from lce_rig.calibrate.likelihood.refine import refine
 from lce_rig.calibrate.likelihood.spread import inflate
 from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.calibrate.placements import group_shared_placements
+from lce_rig.calibrate.shared_scans import REMOVE_OTHERS, take_apart
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation, Refusal
@@ -95,7 +96,7 @@ def calibrate_together(
 
 def _without(start: CalibrationEstimate, conflicts: Mapping[str, Refusal]) -> CalibrationEstimate:
     """Leave captures out, and figures that hold for the camera alone."""
-    singles = [set(name.split("+")) for name in start.used]
+    singles = [take_apart([name]) for name in start.used]
     kept = [k for k, names in enumerate(singles) if not names & conflicts.keys()]
     mine = {name: why for name, why in conflicts.items() if name in set().union(*singles)}
     return replace(
@@ -114,12 +115,11 @@ def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
     for camera, estimate in sorted(alone.items()):
         for observation in estimate.observations.values():
             key = scan_key(observation)
-            for capture in observation.capture.split("+"):
+            for capture in sorted(take_apart([observation.capture])):
                 other, held = seen.setdefault(capture, (camera, key))
                 if held != key:
                     cause = f"{other} and {camera} put the board at different places of the scan"
-                    action = "remove other things of the board's size, or cover them"
-                    found[capture] = Refusal("pair", cause, action)
+                    found[capture] = Refusal("pair", cause, REMOVE_OTHERS)
     return found
 
 

@@ -25,6 +25,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.background import BLENDS
 from lce_rig.calibrate.likelihood.end_density import density, information
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.scans import N_FIELDS, Indices, StackedScans
@@ -69,13 +70,13 @@ class EdgeRows:
         i, j = np.triu_indices(_SIZE - 1)
         return np.asarray(self.columns[i] * self.columns[j])
 
-    def blur_m(self, levels: Levels) -> Array:
-        """Blur (M,) of each interval's ends."""
-        return np.asarray(np.where(self.is_backed, levels.backed_rad, levels.edge_rad) * self.range_m)
+    def blur_m(self, edge_rad: float, backed_rad: float) -> Array:
+        """Blur (M,) of each interval's ends, by `Levels`."""
+        return np.asarray(np.where(self.is_backed, backed_rad, edge_rad) * self.range_m)
 
     def variance(self, levels: Levels) -> Array:
         """Variance (M,) of e in m^2, of the blurred interval alone."""
-        return np.asarray(self.step_m**2 / 12 + self.blur_m(levels) ** 2)
+        return np.asarray(self.step_m**2 / 12 + self.blur_m(levels.edge_rad, levels.backed_rad) ** 2)
 
 
 def edge_rows(
@@ -113,15 +114,14 @@ def edge_rows(
     range_m = h / cosine
     rows[:, 6 + N_FIELDS : -1] = _by_shifts(scans, sideways, range_m)
     rows[:, -1] = inside_m + rows[:, 6:-1] @ np.concatenate([lens, shifts]) - step_m / 2
-    return EdgeRows(scans.end_capture, rows, step_m, range_m, scans.end_is_backed)
+    return EdgeRows(scans.end_capture, rows, step_m, range_m, scans.end_background[:, BLENDS] > 0)
 
 
 def _by_shifts(scans: StackedScans, sideways: Array, range_m: Array) -> Array:
     """Differentiate e by `SHIFTS`: (M, 7)."""
-    g, q, is_backed = np.linalg.norm(sideways, axis=1), scans.end_echo, scans.end_is_backed
-    of_width = np.stack([np.ones(len(g)), range_m, q * ~is_backed, is_backed, q * is_backed], axis=1)
+    of_width = np.column_stack([np.ones(len(range_m)), range_m, scans.end_background])
     displacement = np.stack([np.sum(sideways * scans.end_fields[:, :, 0], axis=1), sideways[:, 2]], axis=1)
-    return np.hstack([g[:, None] * of_width, -displacement])
+    return np.hstack([np.linalg.norm(sideways, axis=1, keepdims=True) * of_width, -displacement])
 
 
 def nearest_edge(xy_m: Array, board: Board) -> Indices:
@@ -133,7 +133,9 @@ def nearest_edge(xy_m: Array, board: Board) -> Indices:
     return np.where(to_side < to_rail, side, rail).astype(np.intp)
 
 
-def edge_system(edges: EdgeRows, levels: Levels, n_captures: int) -> Array:
+def edge_system(
+    edges: EdgeRows, edge_rad: float, backed_rad: float, lost_share: float, n_captures: int
+) -> Array:
     """Expand -2 ln p of the ring ends to second order, by capture: (F, 16, 16).
 
     With J a row without its residual: J J^T times the information, J times the score in the last column, and
@@ -142,10 +144,10 @@ def edge_system(edges: EdgeRows, levels: Levels, n_captures: int) -> Array:
     """
     system = np.zeros((n_captures, _SIZE, _SIZE))
     if len(edges.rows):
-        D, blur = edges.step_m, edges.blur_m(levels) / edges.step_m
-        p, slope = density(edges.rows[:, -1] / D, blur, levels.lost_share)
+        D, blur = edges.step_m, edges.blur_m(edge_rad, backed_rad) / edges.step_m
+        p, slope = density(edges.rows[:, -1] / D, blur, lost_share)
         weighted = [
-            edges.products * (information(blur, levels.lost_share) / D**2),
+            edges.products * (information(blur, lost_share) / D**2),
             edges.columns * (-slope / p / D),
             -2 * np.log(p / D)[None],
         ]

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.background import is_blended
+from lce_rig.calibrate.background import describe_background
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard
@@ -41,8 +41,7 @@ class StackedScans:
         end_rays: (M, 3) unit vectors towards it.
         next_rays: (M, 3) unit vectors of the firing after it, which missed the board.
         end_fields: (M, 3, 2) as `fields`.
-        end_is_backed: (M,) whether something stands close behind the board's edge.
-        end_echo: (M,) share of the power that comes from behind it, `LidarBoard.edge_echo`.
+        end_background: (M, 3) what is behind it, `describe_background`.
     """
 
     n_captures: int
@@ -56,8 +55,7 @@ class StackedScans:
     end_rays: Array
     next_rays: Array
     end_fields: Array
-    end_is_backed: NDArray[np.bool_]
-    end_echo: Array
+    end_background: Array
 
     @property
     def group(self) -> Indices:
@@ -100,8 +98,7 @@ def stack_scans(boards: Sequence[LidarBoard]) -> StackedScans:
         end_rays=end_rays,
         next_rays=turn_about_z(end_rays, angle),
         end_fields=lens_fields(ends),
-        end_is_backed=np.concatenate([is_blended(board) for board in boards]),
-        end_echo=np.concatenate([board.edge_echo for board in boards]),
+        end_background=np.concatenate([describe_background(board) for board in boards]),
     )
 
 

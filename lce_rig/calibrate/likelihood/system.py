@@ -157,8 +157,7 @@ def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: fl
     """Weigh what the ring ends say."""
     block = _no_block(terms)
     place = np.r_[0:6, block.shape[1] - 1 - N_FIELDS - N_SHIFTS : block.shape[1]]
-    levels = Levels(edge_rad=edge_rad, backed_rad=backed_rad, lost_share=lost_share)
-    block[:, place[:, None], place] = edge_system(terms.edges, levels, len(block))
+    block[:, place[:, None], place] = edge_system(terms.edges, edge_rad, backed_rad, lost_share, len(block))
     return block
 
 
