@@ -38,8 +38,8 @@ class TriggeringBoard(FakeBoard):
     def _run(self) -> None:
         # A pipe can be written to when its reader is there; ours is the camera's process.
         due, rest = time.time_ns() // PERIOD_NS + 1, b""
-        while not self._is_stopping.is_set():
-            if not self.has_gone and self._has_said_something():
+        while not self.has_gone:
+            if self._has_said_something():
                 rest = self._answer(rest + self._read())
             if time.time_ns() >= due * PERIOD_NS:
                 with self._lock:

@@ -1,6 +1,5 @@
 """A sync board played by a thread at the other end of a pty: it drifts, resets, stalls, garbles, is gone."""
 
-import contextlib
 import errno
 import os
 import pty
@@ -39,7 +38,6 @@ class FakeBoard:
         self.started_ns = time.time_ns()
         self.n_to_lose = 0
         self.has_gone = self.is_stalled = False
-        self._is_stopping = threading.Event()
         self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._run)
 
@@ -52,11 +50,8 @@ class FakeBoard:
         return self
 
     def __exit__(self, *_):
-        self._is_stopping.set()
-        self._thread.join()
-        for descriptor in (self._slave, self._master):
-            with contextlib.suppress(OSError):
-                os.close(descriptor)
+        if not self.has_gone:
+            self.unplug()
 
     def board_us(self, host_ns=None):
         """Read the board's clock, now or at a moment of the host's."""
@@ -76,17 +71,16 @@ class FakeBoard:
                 self._say(write_sentence(self.hello))
 
     def unplug(self):
-        """Be gone."""
-        with self._lock:
-            self.has_gone = True
-            os.close(self._master)
-            os.close(self._slave)
-        self._is_stopping.set()
+        """Be gone: the thread ends first, since it uses the port."""
+        self.has_gone = True
+        self._thread.join()
+        os.close(self._slave)
+        os.close(self._master)
 
     def _run(self):
         due_s, rest = time.monotonic(), b""
-        while not self._is_stopping.is_set():
-            if not self.has_gone and select.select([self._master], [], [], 0.001)[0]:
+        while not self.has_gone:
+            if select.select([self._master], [], [], 0.001)[0]:
                 rest = self._answer(rest + self._read())
             if time.monotonic() >= due_s and not self.is_mute:
                 due_s += self.period_s
@@ -97,7 +91,7 @@ class FakeBoard:
         try:
             return os.read(self._master, 4096)
         except OSError as error:
-            assert error.errno in (errno.EIO, errno.EBADF)
+            assert error.errno == errno.EIO
             return b""
 
     def _answer(self, data):
@@ -108,7 +102,7 @@ class FakeBoard:
             words = sentence if isinstance(sentence, list) else [line.strip()]
             self.commands.append(b",".join(words).decode())
             with self._lock:
-                if self.is_mute or self.is_stalled or self.has_gone:
+                if self.is_mute or self.is_stalled:
                     continue
                 if words[0] == b"LCEHI?" and self.dialect == "lce1":
                     self._say(write_sentence(self.hello))
@@ -121,7 +115,7 @@ class FakeBoard:
         return rest
 
     def _pulse(self):
-        if self.has_gone or self.is_stalled:
+        if self.is_stalled:
             return
         self.n_sent += 1
         number, t_us = self.n_sent, self.board_us()
@@ -144,6 +138,6 @@ class FakeBoard:
             self._say(write_sentence(time.strftime("GPRMC,%H%M%S,A,,,,,,,%d%m%y,,", time.gmtime())))
 
     def _say(self, data):
-        while data and not self.has_gone and not self._is_stopping.is_set():
+        while data and not self.has_gone:
             if select.select([], [self._master], [], 0.01)[1]:
                 data = data[os.write(self._master, data) :]
