@@ -1,6 +1,7 @@
 """A rig with a second camera of which the session holds nothing: it is said, and can be left out."""
 
 import json
+import shutil
 
 import pytest
 import yaml
@@ -57,3 +58,15 @@ def test_a_reference_that_names_no_sensors_is_that_of_one_camera_only(lce_rig, w
     outcome = lce_rig("calibrate", with_second, "--camera", "davis", "--reference", with_second / "bare.json")
     assert outcome.code == 0
     assert "reference    off by 0." in outcome.out
+
+
+def test_a_result_of_two_cameras_is_checked_on_captures_of_one(lce_rig, with_second, calibrated_once):
+    for path in sorted((with_second / "captures").iterdir())[3:]:
+        shutil.rmtree(path)
+    document = json.loads((calibrated_once / "calibration" / "result.json").read_text())
+    document["pairs"].append(document["pairs"][0] | {"camera": "right"})
+    (with_second / "deployed.json").write_text(json.dumps(document))
+    outcome = lce_rig("verify", with_second, "--result", with_second / "deployed.json")
+    assert outcome.code == 0, outcome.err
+    assert "holds no captures of right.frames and lidar: not checked" in outcome.err
+    assert "these captures: agree" in outcome.out
