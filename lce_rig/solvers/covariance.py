@@ -24,7 +24,7 @@ def jackknife_covariance(gradients: Array, hessians: Array, prior: Array) -> Arr
     """
     n_groups, p = gradients.shape
     correction = (n_groups - 1) / max(n_groups - p - 2, 2)  # equation (2)
-    return correction * jackknife_scatter(gradients, hessians, prior)
+    return np.asarray(correction * jackknife_scatter(gradients, hessians, prior))
 
 
 def jackknife_scatter(gradients: Array, hessians: Array, prior: Array) -> Array:
