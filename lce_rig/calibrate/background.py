@@ -31,8 +31,8 @@ BLENDS = 1
 # Noise of a ring end, and beyond how many sigmas one counts less.
 _END_SIGMA_M, _HUBER = 0.003, 1.5
 _ROUNDS = 5
-# Effects that count together or not at all: by what is far behind, by what is close behind.
-_TOGETHER = ((0,), (1, 2))
+# Columns that count if together they are sure: all, what is far behind, what is close behind.
+_TOGETHER = ((0, 1, 2), (0,), (1, 2))
 # They count if they would come about by chance in one session of so many.
 _ONE_IN = 1000
 
@@ -82,7 +82,7 @@ def estimate_shifts(
         for group in _TOGETHER:
             seen = np.array([column for column in group if free[column]], dtype=int)
             if len(seen):
-                is_sure[seen] = _is_sure(shifts[seen], scatter[np.ix_(seen, seen)], int(n_having[seen].max()))
+                is_sure[seen] |= _is_sure(shifts[seen], scatter[np.ix_(seen, seen)], n_having[seen].max())
         if is_sure[free].all():
             return shifts
         free = is_sure
