@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.expansion import FIRST_RING, SHIFT, end_rows, nearest_edge
+from lce_rig.calibrate.expansion import FIRST_RING, SHIFT, end_rows
 from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.board import Board
@@ -100,7 +100,7 @@ def move_ends(
     """Take the shifts (3,) of `estimate_shifts` off ring ends."""
     moved = []
     for observation, f in zip(observations, features, strict=True):
-        edge = nearest_edge(transform(f.T_board_cam @ T_cam_lidar, f.edge_points), board)
+        edge = board.nearest_edge(transform(f.T_board_cam @ T_cam_lidar, f.edge_points))
         outwards = f.edge_normals[edge] @ T_cam_lidar[:3, :3]
         shift = (describe_background(observation.lidar) @ shifts_m)[:, None] * outwards
         lidar = replace(observation.lidar, edge_points=observation.lidar.edge_points - shift)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lce_rig.calibrate.doubt import Doubt, Verdict
-from lce_rig.calibrate.expansion import PLANE_FREEDOMS, Expansion, nearest_edge
+from lce_rig.calibrate.expansion import PLANE_FREEDOMS, Expansion
 from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.observability import name_direction
 from lce_rig.calibrate.options import CalibrateOptions
@@ -89,7 +89,7 @@ def _costs(seen: Observation, board: Board, T: Array, expansion: Expansion) -> A
     plane = ((transform(T, f.plane_points) - f.centre) @ f.normal) ** 2
     ends = transform(f.T_board_cam @ T, f.edge_points)
     anchors, normals = board.edges()
-    edge = nearest_edge(ends, board)
+    edge = board.nearest_edge(ends)
     beyond = np.sum((ends - anchors[edge]) * normals[edge], axis=-1)
     # Returns reach beyond the plate by the beam's width, alike on all sides.
     own = beyond - beyond.mean(axis=1, keepdims=True) if beyond.shape[1] else beyond

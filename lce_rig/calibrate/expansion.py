@@ -173,7 +173,7 @@ def _plane_rows(
 def end_rows(f: CaptureFeatures, T: Array, board: Board, p: int) -> tuple[Array, Array]:
     """Write m . ((1 - s) g + a - R q - t) + d for each ring end and its nearest edge: (M,) and (M, p)."""
     turned = f.edge_points @ T[:3, :3].T
-    edge = nearest_edge(transform(f.T_board_cam @ T, f.edge_points), board)
+    edge = board.nearest_edge(transform(f.T_board_cam @ T, f.edge_points))
     normals, anchors = f.edge_normals[edge], f.edge_anchors[edge]
     J = np.zeros((len(turned), p))
     J[:, :3] = -normals
@@ -181,14 +181,6 @@ def end_rows(f: CaptureFeatures, T: Array, board: Board, p: int) -> tuple[Array,
     J[:, SHIFT] = 1
     J[:, SCALE] = -normals @ f.centre
     return np.asarray(np.sum((anchors - turned - T[:3, 3]) * normals, axis=1)), J
-
-
-def nearest_edge(points_board: Array, board: Board) -> NDArray[np.intp]:
-    """Number the edge nearest to each point (..., 3), frame board, in the order of `Board.edges`."""
-    anchors, normals = board.edges()
-    beyond = np.sum((points_board[..., None, :] - anchors) * normals, axis=-1)
-    # Of a rectangle's edges the nearest is the one that a point is farthest beyond, or least within.
-    return np.asarray(np.argmax(beyond, axis=-1))
 
 
 def _distance(f: CaptureFeatures, T: Array) -> float:
