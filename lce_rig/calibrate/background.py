@@ -11,13 +11,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.expansion import FIRST_RING, SHIFT, end_rows
+from lce_rig.calibrate.expansion import SHIFT, end_rows
 from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import LidarBoard, Observation
-from lce_rig.solvers.covariance import jackknife_covariance
+from lce_rig.solvers.jackknife import jackknife_covariance
 
 BLENDS_M = 0.35
 """Echoes from surfaces nearer to each other than this blend into one."""
@@ -67,7 +67,7 @@ def estimate_shifts(
     """
     from scipy.special import chdtri
 
-    parts = [end_rows(f, T_cam_lidar, board, FIRST_RING) for f in features]
+    parts = [end_rows(f, T_cam_lidar, board) for f in features]
     inside = np.concatenate([r for r, _ in parts])
     background = np.concatenate([describe_background(observation.lidar) for observation in observations])
     # Inside distance = - (change of the extrinsic) - beam's width - shifts.

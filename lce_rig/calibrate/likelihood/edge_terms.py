@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.background import BLENDS
 from lce_rig.calibrate.likelihood.end_density import density, information
-from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.scans import N_FIELDS, Indices, StackedScans
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
@@ -73,10 +72,6 @@ class EdgeRows:
     def blur_m(self, edge_rad: float, backed_rad: float) -> Array:
         """Blur (M,) of each interval's ends, by `Levels`."""
         return np.asarray(np.where(self.is_backed, backed_rad, edge_rad) * self.range_m)
-
-    def variance(self, levels: Levels) -> Array:
-        """Variance (M,) of e in m^2, of the blurred interval alone."""
-        return np.asarray(self.step_m**2 / 12 + self.blur_m(levels.edge_rad, levels.backed_rad) ** 2)
 
 
 def edge_rows(

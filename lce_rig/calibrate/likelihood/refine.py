@@ -46,7 +46,6 @@ class JointEstimate:
         scale: (C,) by how much of themselves each camera's distances are too short.
         constants_sigma: (L + 9,) standard deviations of offsets, lens and shifts.
         levels: of the noise.
-        end_sigma_m: standard deviation of ring ends from the edges, without those lost or stray.
         system: normal equations at the optimum.
     """
 
@@ -60,7 +59,6 @@ class JointEstimate:
     scale: Array
     constants_sigma: Array
     levels: Levels
-    end_sigma_m: float
     system: System
 
 
@@ -176,6 +174,5 @@ def _summarise(state: State, terms: Terms, levels: Levels, priors: Priors) -> Jo
         scale=constants[PER_CAMERA * np.arange(C) + 6],
         constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
         levels=levels,
-        end_sigma_m=float(np.sqrt(np.mean(terms.edges.variance(levels)))),
         system=system,
     )
