@@ -95,3 +95,13 @@ def test_weights_are_those_of_moved_ring_ends():
     moved, clean = (calibrate(c, BOARD, OPTIONS).diagnostics for c in (captures, plain))
     for weight in ("plane_weight", "edge_weight"):
         assert moved[weight] == pytest.approx(clean[weight], rel=0.5)
+
+
+def test_a_person_behind_one_or_two_boards_is_too_little_to_tell():
+    # One capture says nothing of how captures scatter, and two hardly tell two effects from chance.
+    rng = np.random.default_rng(2)
+    for n_held in (1, 2):
+        boards = enumerate(simulate(6, 9))
+        captures = [held(c, (c.lidar[0].edge_side > 0) & (k < n_held), rng.uniform()) for k, c in boards]
+        found = calibrate(captures, BOARD, OPTIONS).diagnostics
+        assert [found[name] for name in NAMES] == [0.0, 0.0, 0.0]

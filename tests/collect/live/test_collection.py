@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lce_rig.collect.live.collection import Key, LiveOptions, collect_live, make_guides
+from lce_rig.collect.live.collection import collect_live, make_guides
+from lce_rig.collect.live.options import Key, LiveOptions
 from lce_rig.collect.live.state import LiveState
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.session import Session

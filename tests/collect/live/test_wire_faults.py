@@ -12,7 +12,8 @@ from wire.collecting import Collecting
 from wire.reel import Reel
 from wire.rig import WireRig
 
-from lce_rig.collect.live.collection import LiveOptions, collect_live
+from lce_rig.collect.live.collection import collect_live
+from lce_rig.collect.live.options import LiveOptions
 from lce_rig.collect.live.state import LiveState
 from lce_rig.session import Session
 from lce_rig.sources.live.opening import open_live

@@ -12,7 +12,8 @@ from pathlib import Path
 from wire.reel import Reel
 from wire.rig import WireRig, small_rig
 
-from lce_rig.collect.live.collection import LiveOptions, collect_live
+from lce_rig.collect.live.collection import collect_live
+from lce_rig.collect.live.options import LiveOptions
 from lce_rig.collect.live.state import LiveState
 from lce_rig.rig.sync import SyncSettings, TriggerSettings
 from lce_rig.session import Session
