@@ -11,13 +11,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.expansion import FIRST_RING, SHIFT, end_rows, nearest_edge
+from lce_rig.calibrate.expansion import SHIFT, end_rows
 from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import LidarBoard, Observation
-from lce_rig.solvers.covariance import jackknife_scatter, symmetric_inverse
+from lce_rig.solvers.covariance import symmetric_inverse
+from lce_rig.solvers.jackknife import jackknife_scatter, leave_one_out_moves
 
 BLENDS_M = 0.35
 """Echoes from surfaces nearer to each other than this blend into one."""
@@ -67,7 +68,7 @@ def estimate_shifts(
         T_cam_lidar: (4, 4) near the truth.
         board: the board.
     """
-    parts = [end_rows(f, T_cam_lidar, board, FIRST_RING) for f in features]
+    parts = [end_rows(f, T_cam_lidar, board) for f in features]
     first = np.flatnonzero(np.concatenate([np.arange(len(r)) == 0 for r, _ in parts]))
     inside = np.concatenate([r for r, _ in parts])
     background = np.concatenate([describe_background(observation.lidar) for observation in observations])
@@ -106,7 +107,8 @@ def _fit_shifts(
         x = np.linalg.solve(information, A.T @ (weights * inside_m))
     gradients = np.add.reduceat(A * (weights * (A @ x - inside_m))[:, None], first, axis=0)
     hessians = np.add.reduceat(A[:, :, None] * (weights[:, None] * A)[:, None, :], first, axis=0)
-    scatter = jackknife_scatter(gradients, hessians, prior)
+    moves = leave_one_out_moves(gradients, hessians, hessians.sum(axis=0) + prior)
+    scatter = jackknife_scatter(moves)
     return x[-_N_SHIFTS:], scatter[-_N_SHIFTS:, -_N_SHIFTS:]
 
 
@@ -132,7 +134,7 @@ def move_ends(
     """Take the shifts (3,) of `estimate_shifts` off ring ends."""
     moved = []
     for observation, f in zip(observations, features, strict=True):
-        edge = nearest_edge(transform(f.T_board_cam @ T_cam_lidar, f.edge_points), board)
+        edge = board.nearest_edge(transform(f.T_board_cam @ T_cam_lidar, f.edge_points))
         outwards = f.edge_normals[edge] @ T_cam_lidar[:3, :3]
         shift = (describe_background(observation.lidar) @ shifts_m)[:, None] * outwards
         lidar = replace(observation.lidar, edge_points=observation.lidar.edge_points - shift)
