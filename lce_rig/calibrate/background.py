@@ -34,6 +34,8 @@ _END_SIGMA_M, _HUBER = 0.003, 1.5
 _ROUNDS = 5
 # Columns that count if together they are sure: all, what is far behind, what is close behind.
 _TOGETHER = ((0, 1, 2), (0,), (1, 2))
+# Each column must differ from 0 in so many captures.
+_MIN_CAPTURES = 5
 # They count if they would come about by chance in one session of so many.
 _ONE_IN = 1000
 
@@ -74,9 +76,9 @@ def estimate_shifts(
     background = np.concatenate([describe_background(observation.lidar) for observation in observations])
     # Inside distance = - (change of the extrinsic) - beam's width - shifts.
     A = -np.column_stack([np.concatenate([J[:, : SHIFT + 1] for _, J in parts]), background])
-    # A column that no ring end has is known to be zero, and so is what is found to be uncertain.
+    # What few captures have is not told from their scatter; it stays zero, and so does what is uncertain.
     n_having = np.count_nonzero(np.add.reduceat(background, first, axis=0) > 0, axis=0)
-    free = n_having > 0
+    free = n_having >= _MIN_CAPTURES
     while free.any():
         shifts, scatter = _fit_shifts(A, inside, first, free)
         is_sure = np.zeros(_N_SHIFTS, dtype=bool)
@@ -117,8 +119,6 @@ def _is_sure(shifts: Array, scatter: Array, n_captures: int) -> bool:
     from scipy.special import fdtri
 
     freedoms, n_left = len(shifts), n_captures - len(shifts)
-    if n_left < 1:
-        return False
     T2 = shifts @ symmetric_inverse(scatter) @ shifts
     limit = fdtri(freedoms, n_left, 1 - 1 / _ONE_IN) * freedoms * (n_captures - 1) / n_left
     return bool(limit < T2)
