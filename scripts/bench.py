@@ -12,8 +12,8 @@
     scripts/bench.py uncertainty  the joint estimate: errors against their bound, truth of its claim
     scripts/bench.py speed       detection, Algorithm 1, the command line
 
-Detections are made anew, but for those that `paper` keeps in its folder; random choices are seeded. Run it
-on a machine that does nothing else.
+Simulated boards are kept, as long as neither simulator nor detectors change; random choices are seeded. Run
+it on a machine that does nothing else.
 """
 
 import argparse

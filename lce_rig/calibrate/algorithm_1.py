@@ -26,7 +26,8 @@ from lce_rig.calibrate.systematic import ring_sensitivities
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Certificate, Observation
-from lce_rig.solvers.covariance import jackknife_covariance, systematic_covariance
+from lce_rig.solvers.covariance import systematic_covariance
+from lce_rig.solvers.jackknife import jackknife_covariance, sum_by_group
 
 # Weights given by the user count in captures with residuals of this size, which sets the scale of the prior.
 NOMINAL_SIGMA_M = 0.01
@@ -136,11 +137,8 @@ def _covariances(
         prior[6, 6] = problem.weights.shift_prior
     # Captures of one placement share its errors: they are left out together.
     placement = group_placements(observations)
-    n_placements = int(placement.max()) + 1
-    together_g, together_H = (np.zeros((n_placements, *a.shape[1:])) for a in (gradients, hessians))
-    np.add.at(together_g, placement, gradients)
-    np.add.at(together_H, placement, hessians)
-    scatter = jackknife_covariance(together_g, together_H, prior)
+    together = [sum_by_group(each, placement) for each in (gradients, hessians)]
+    scatter = jackknife_covariance(together[0], together[1], prior)
     laser_m, offset_m = options.laser_bias_sigma_m, options.range_offset_sigma_m
     if laser_m == 0 and offset_m == 0:
         return scatter, np.zeros_like(scatter)

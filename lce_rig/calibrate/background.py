@@ -11,13 +11,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.expansion import FIRST_RING, SHIFT, end_rows, nearest_edge
+from lce_rig.calibrate.expansion import SHIFT, end_rows
 from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import LidarBoard, Observation
-from lce_rig.solvers.covariance import jackknife_covariance
+from lce_rig.solvers.covariance import symmetric_inverse
+from lce_rig.solvers.jackknife import jackknife_scatter, leave_one_out_moves
 
 BLENDS_M = 0.35
 """Echoes from surfaces nearer to each other than this blend into one."""
@@ -31,7 +32,11 @@ BLENDS = 1
 # Noise of a ring end, and beyond how many sigmas one counts less.
 _END_SIGMA_M, _HUBER = 0.003, 1.5
 _ROUNDS = 5
-# Effects count if they would come about by chance in one session of so many.
+# Columns that count if together they are sure: all, what is far behind, what is close behind.
+_TOGETHER = ((0, 1, 2), (0,), (1, 2))
+# Each column must differ from 0 in so many captures.
+_MIN_CAPTURES = 5
+# They count if they would come about by chance in one session of so many.
 _ONE_IN = 1000
 
 
@@ -56,8 +61,8 @@ def estimate_shifts(
 ) -> Array:
     """Estimate how far each column of `describe_background` shifts ring ends, outwards: (3,) m.
 
-    Zeros where that is not certain, held against the scatter between captures. Robust least squares over all
-    ring ends, with the extrinsic, the beam's width and the shifts unknown.
+    Zeros where that is not certain. Robust least squares over all ring ends, with the extrinsic, the beam's
+    width and the shifts unknown.
 
     Args:
         observations: F captures.
@@ -65,29 +70,58 @@ def estimate_shifts(
         T_cam_lidar: (4, 4) near the truth.
         board: the board.
     """
-    from scipy.special import chdtri
-
-    parts = [end_rows(f, T_cam_lidar, board, FIRST_RING) for f in features]
+    parts = [end_rows(f, T_cam_lidar, board) for f in features]
+    first = np.flatnonzero(np.concatenate([np.arange(len(r)) == 0 for r, _ in parts]))
     inside = np.concatenate([r for r, _ in parts])
     background = np.concatenate([describe_background(observation.lidar) for observation in observations])
     # Inside distance = - (change of the extrinsic) - beam's width - shifts.
     A = -np.column_stack([np.concatenate([J[:, : SHIFT + 1] for _, J in parts]), background])
+    # What few captures have is not told from their scatter; it stays zero, and so does what is uncertain.
+    n_having = np.count_nonzero(np.add.reduceat(background, first, axis=0) > 0, axis=0)
+    free = n_having >= _MIN_CAPTURES
+    while free.any():
+        shifts, scatter = _fit_shifts(A, inside, first, free)
+        is_sure = np.zeros(_N_SHIFTS, dtype=bool)
+        for group in _TOGETHER:
+            seen = np.array([column for column in group if free[column]], dtype=int)
+            if len(seen):
+                is_sure[seen] |= _is_sure(shifts[seen], scatter[np.ix_(seen, seen)], n_having[seen].max())
+        if is_sure[free].all():
+            return shifts
+        free = is_sure
+    return np.zeros(_N_SHIFTS)
+
+
+def _fit_shifts(
+    A: Array, inside_m: Array, first: NDArray[np.intp], free: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Solve A x = inside distances (M,) robustly: the shifts (3,), and their scatter (3, 3) over captures.
+
+    Captures begin at the rows `first`; shifts that are not free (3,) are zero.
+    """
     extrinsic = np.repeat([_SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD], 3)
     sigmas = np.concatenate([extrinsic, [EDGE_SHIFT_SIGMA_M], BACKGROUND_SIGMAS_M])
+    A = A * np.concatenate([np.ones(SHIFT + 1), free])
     prior, x = np.diag(np.square(_END_SIGMA_M / sigmas)), np.zeros(len(sigmas))
     for _ in range(_ROUNDS):
-        weights = 1 / np.maximum(np.abs(inside - A @ x) / (_HUBER * _END_SIGMA_M), 1.0)
+        weights = 1 / np.maximum(np.abs(inside_m - A @ x) / (_HUBER * _END_SIGMA_M), 1.0)
         information = A.T @ (weights[:, None] * A) + prior
-        x = np.linalg.solve(information, A.T @ (weights * inside))
-    first = np.flatnonzero(np.concatenate([np.arange(len(r)) == 0 for r, _ in parts]))
-    gradients = np.add.reduceat(A * (weights * (A @ x - inside))[:, None], first, axis=0)
+        x = np.linalg.solve(information, A.T @ (weights * inside_m))
+    gradients = np.add.reduceat(A * (weights * (A @ x - inside_m))[:, None], first, axis=0)
     hessians = np.add.reduceat(A[:, :, None] * (weights[:, None] * A)[:, None, :], first, axis=0)
-    cov = jackknife_covariance(gradients, hessians, prior)[-_N_SHIFTS:, -_N_SHIFTS:]
-    # A column that no ring end has is known to be zero.
-    shifts, is_seen = x[-_N_SHIFTS:], np.any(background > 0, axis=0)
-    chi2 = shifts[is_seen] @ np.linalg.solve(cov[np.ix_(is_seen, is_seen)], shifts[is_seen])
-    is_sure = is_seen.any() and chi2 > chdtri(np.count_nonzero(is_seen), 1 / _ONE_IN)
-    return np.asarray(shifts if is_sure else np.zeros(_N_SHIFTS))
+    moves = leave_one_out_moves(gradients, hessians, hessians.sum(axis=0) + prior)
+    scatter = jackknife_scatter(moves)
+    return x[-_N_SHIFTS:], scatter[-_N_SHIFTS:, -_N_SHIFTS:]
+
+
+def _is_sure(shifts: Array, scatter: Array, n_captures: int) -> bool:
+    """Tell whether shifts (K,) are too large for chance, by Hotelling's test with their scatter (K, K)."""
+    from scipy.special import fdtri
+
+    freedoms, n_left = len(shifts), n_captures - len(shifts)
+    T2 = shifts @ symmetric_inverse(scatter) @ shifts
+    limit = fdtri(freedoms, n_left, 1 - 1 / _ONE_IN) * freedoms * (n_captures - 1) / n_left
+    return bool(limit < T2)
 
 
 def move_ends(
@@ -100,7 +134,7 @@ def move_ends(
     """Take the shifts (3,) of `estimate_shifts` off ring ends."""
     moved = []
     for observation, f in zip(observations, features, strict=True):
-        edge = nearest_edge(transform(f.T_board_cam @ T_cam_lidar, f.edge_points), board)
+        edge = board.nearest_edge(transform(f.T_board_cam @ T_cam_lidar, f.edge_points))
         outwards = f.edge_normals[edge] @ T_cam_lidar[:3, :3]
         shift = (describe_background(observation.lidar) @ shifts_m)[:, None] * outwards
         lidar = replace(observation.lidar, edge_points=observation.lidar.edge_points - shift)

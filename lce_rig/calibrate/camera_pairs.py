@@ -15,18 +15,19 @@ from lce_rig.calibrate.expansion import Expansion
 from lce_rig.calibrate.halves import contrast_halves, doubt_halves
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.picture_terms import stack_pictures
+from lce_rig.calibrate.mean_pose import mean_pose
 from lce_rig.calibrate.placements import group_placements
 from lce_rig.calibrate.relative_pose import relative_covariance, relative_pose
-from lce_rig.core.geometry import Array, difference, perturb, tangent_sizes
+from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation
 from lce_rig.rig import CalibrationSettings, VerdictSettings
-from lce_rig.solvers.covariance import jackknife_covariance, symmetric_inverse
+from lce_rig.solvers.covariance import symmetric_inverse
+from lce_rig.solvers.jackknife import jackknife_covariance, sum_by_group
 
 # Fewer placements show no scatter.
 _MIN_PLACEMENTS = 4
 # Of fewer, the scatter has no shape that could be told: that of usual errors is taken.
 _MIN_JACKKNIFE = 10
-_STEPS = 20
 # Freedoms of the Student distribution that weighs single boards: one in some may be seen wrongly.
 _STUDENT = 5.0
 # Boards scatter for a reason where they do so by this many times what is usual.
@@ -133,17 +134,16 @@ def pose_from_pictures(shared: Sequence[tuple[Observation, Observation]]) -> Pic
     T_second, cov_second = _poses(seconds)
     T, J = relative_pose(T_second, T_first)
     information = symmetric_inverse(relative_covariance(J, cov_second, cov_first))
-    mean, weight = _robust_mean(T, information)
+    middle = T[int(np.argmin(np.median(_distances(T, information), axis=1)))]
+    mean, weight = mean_pose(T, information, middle, _student_weights)
     apart = difference(T, mean)
     chi2 = float(np.einsum("ki,kij,kj->", apart, information, apart))
     hessians = weight[:, None, None] * information
     gradients = -(hessians @ apart[..., None])[..., 0]
     none, board_rms_m = np.zeros((6, 6)), _board_rms_m(shared, mean)
-    expansion = Expansion(
-        mean, gradients, hessians, none, placement, T_first[:, :3, 3], board_rms_m, board_rms_m
-    )
+    expansion = Expansion(mean, gradients, hessians, none, placement, T_first[:, :3, 3])
     scatter = float(np.sqrt(chi2 / (6 * (len(T) - 1))))
-    pulls, stiffness = (np.tensordot(expansion.groups, each, axes=1) for each in (gradients, hessians))
+    pulls, stiffness = (sum_by_group(each, placement) for each in (gradients, hessians))
     if len(pulls) < _MIN_JACKKNIFE:
         cov = max(scatter, 1.0) ** 2 * symmetric_inverse(stiffness.sum(axis=0))
     else:
@@ -159,20 +159,9 @@ def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
     return pictures.T_cam_board, pictures.total_cov(Levels().pose)
 
 
-def _robust_mean(T: Array, information: Array) -> tuple[Array, Array]:
-    """Find the pose (4, 4) about which T (F, 4, 4) scatter, and the weight (F,) of each."""
-    mean = T[int(np.argmin(np.median(_distances(T, information), axis=1)))]
-    weight = np.ones(len(T))
-    for _ in range(_STEPS):
-        apart = difference(T, mean)
-        chi2 = np.einsum("ki,kij,kj->k", apart, information, apart)
-        weight = (_STUDENT + 6) / (_STUDENT + chi2 / max(float(np.median(chi2)) / 6, 1.0))
-        weighted = weight[:, None, None] * information
-        step = np.linalg.solve(weighted.sum(axis=0), np.einsum("kij,kj->i", weighted, apart))
-        mean = perturb(mean, np.asarray(step))
-        if np.linalg.norm(step) < 1e-10:
-            break
-    return mean, weight
+def _student_weights(chi2: Array) -> Array:
+    """Weigh poses by their squared distances (F,) from the mean, in units of what is usual among them."""
+    return np.asarray((_STUDENT + 6) / (_STUDENT + chi2 / max(float(np.median(chi2)) / 6, 1.0)))
 
 
 def _distances(T: Array, information: Array) -> Array:

@@ -8,6 +8,7 @@ from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.expansion import Expansion
 from lce_rig.core.geometry import Array
 from lce_rig.rig import VerdictSettings
+from lce_rig.solvers.jackknife import jackknife_scatter
 
 _N_DRAWS = 300
 
@@ -67,13 +68,11 @@ def resample(expansion: Expansion, seed: int = 0) -> Spread:
     # Draws of few different placements may leave a direction open.
     drawn = drawn[np.count_nonzero(drawn, axis=1) >= min(n, 4)]
     halves = (np.argsort(rng.random((_N_DRAWS, n)), axis=1) < n // 2).astype(np.float64)
-    without = expansion.solve(1 - groups)[:, :6]
+    without = expansion.without_each()[:, :6]
     apart = (expansion.solve(halves @ groups) - expansion.solve((1 - halves) @ groups))[:, :6] / 2
     return Spread(
         bootstrap=_robust_cov(expansion.solve(drawn @ groups)[:, :6]),
-        left_out=np.asarray(
-            (n - 1) / n * (without - without.mean(axis=0)).T @ (without - without.mean(axis=0))
-        ),
+        left_out=jackknife_scatter(without - without.mean(axis=0)),
         halves=_robust_cov(np.concatenate([apart, -apart])),
     )
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lce_rig.calibrate.doubt import Doubt, Verdict
-from lce_rig.calibrate.expansion import PLANE_FREEDOMS, Expansion, nearest_edge
-from lce_rig.calibrate.features import extract_features
+from lce_rig.calibrate.expansion import PLANE_FREEDOMS, Expansion, FeatureSigmas, feature_sigmas
+from lce_rig.calibrate.features import CaptureFeatures, extract_features
 from lce_rig.calibrate.observability import name_direction
 from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.core.board import Board
@@ -70,12 +70,14 @@ def run_control(
     )
     steps /= np.minimum(sizes, 1.0)[:, None]
     moves = np.concatenate([steps, -steps])
-    left_out = expansion.solve(1 - expansion.groups)[:, :6][expansion.placement]
+    left_out = expansion.without_each()[expansion.placement]
     own = perturb(T_cam_lidar, left_out)
+    features = [extract_features(seen, board, CalibrateOptions()) for seen in observations]
+    sigmas = feature_sigmas(features, board, T_cam_lidar)
     costs = np.array(
         [
-            _costs(seen, board, perturb(T, np.vstack([np.zeros(6), moves])), expansion)
-            for seen, T in zip(observations, own, strict=True)
+            _costs(f, board, perturb(T, np.vstack([np.zeros(6), moves])), sigmas)
+            for f, T in zip(features, own, strict=True)
         ]
     )
     usual = float(np.median(costs[:, 0]))
@@ -83,18 +85,17 @@ def run_control(
     return Control(moves, increase.mean(axis=0), increase.std(axis=0, ddof=1) / np.sqrt(len(observations)))
 
 
-def _costs(seen: Observation, board: Board, T: Array, expansion: Expansion) -> Array:
-    """Sum a capture's squared distances from plane and edges, weighed as the expansion does: (B,)."""
-    f = extract_features(seen, board, CalibrateOptions())
+def _costs(f: CaptureFeatures, board: Board, T: Array, sigmas: FeatureSigmas) -> Array:
+    """Sum a capture's squared distances from plane and edges under T (B, 4, 4), weighed as by `expand`."""
     plane = ((transform(T, f.plane_points) - f.centre) @ f.normal) ** 2
     ends = transform(f.T_board_cam @ T, f.edge_points)
     anchors, normals = board.edges()
-    edge = nearest_edge(ends, board)
+    edge = board.nearest_edge(ends)
     beyond = np.sum((ends - anchors[edge]) * normals[edge], axis=-1)
     # Returns reach beyond the plate by the beam's width, alike on all sides.
     own = beyond - beyond.mean(axis=1, keepdims=True) if beyond.shape[1] else beyond
-    by_plane = PLANE_FREEDOMS * plane.mean(axis=1) / expansion.plane_sigma_m**2
-    return np.asarray(by_plane + np.sum(own**2, axis=1) / expansion.end_sigma_m**2)
+    by_plane = PLANE_FREEDOMS * plane.mean(axis=1) / sigmas.plane_m**2
+    return np.asarray(by_plane + np.sum(own**2, axis=1) / sigmas.end_m**2)
 
 
 def doubt_control(control: Control) -> list[Doubt]:

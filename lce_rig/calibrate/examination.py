@@ -8,7 +8,7 @@ import numpy as np
 from lce_rig.calibrate.claim import resample, widen
 from lce_rig.calibrate.control import Control, run_control
 from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.expansion import expand
+from lce_rig.calibrate.expansion import SCALE, expand
 from lce_rig.calibrate.halves import Contrast, contrast_halves
 from lce_rig.calibrate.intrinsics_check import IntrinsicsCheck, check_intrinsics
 from lce_rig.calibrate.intrinsics_estimate import View
@@ -67,7 +67,7 @@ def examine(
     )
     if len(expansion.groups) < _MIN_PLACEMENTS:
         return Examination(estimate, "", (), None, None, intrinsics)
-    settled = expansion.settled()
+    settled = expansion.hold(SCALE).settled()
     # A cost made anew scatters as it does itself: a claim is held against the scatter of its own method.
     widened, remark = widen(estimate, resample(estimate.expansion or settled), rig.verdict)
     control = run_control(

@@ -25,8 +25,9 @@ from lce_rig.core.geometry import Array, perturb, transform
 from lce_rig.core.results import LidarBoard, Observation
 from lce_rig.solvers.covariance import symmetric_inverse
 
-SHIFT, SCALE, FIRST_RING = 6, 7, 8
-"""Places in x after the tangent (translation m, rotation rad): edge shift m, scale, range offsets m."""
+SHIFT, FIRST_RING, SCALE = 6, 7, -1
+"""Places in the x of `expand`, after the tangent (translation m, rotation rad): edge shift m, range offset m
+of each ring, and last the camera's scale."""
 
 # Errors of a board's plane and of its ring ends are at least as large as this.
 _PLANE_FLOOR_M, _END_FLOOR_M = 0.001, 0.002
@@ -46,8 +47,6 @@ class Expansion:
         prior: (p, p) P.
         placement: (F,) number of the board placement that a capture shows.
         centres: (F, 3) middle of the board, frame camera, m.
-        plane_sigma_m, end_sigma_m: errors by which planes and ring ends are weighed.
-        has_scale: whether x has the camera's scale in its place; else what follows the tangent is all alike.
     """
 
     T_cam_lidar: Array
@@ -56,9 +55,6 @@ class Expansion:
     prior: Array
     placement: NDArray[np.intp]
     centres: Array
-    plane_sigma_m: float
-    end_sigma_m: float
-    has_scale: bool = True
 
     @cached_property
     def groups(self) -> Array:
@@ -66,28 +62,35 @@ class Expansion:
         numbers = np.arange(int(self.placement.max()) + 1)
         return np.asarray(numbers[:, None] == self.placement, dtype=np.float64)
 
-    def solve(self, shares: Array, *, is_scale_free: bool = False) -> Array:
-        """Compute (1) for B shares (B, F): unknowns (B, p), the camera's scale 0 unless it is free."""
-        return self._solve(shares, is_scale_free)[0]
+    def solve(self, shares: Array) -> Array:
+        """Compute (1) for B shares (B, F): unknowns (B, p)."""
+        H = np.tensordot(shares, self.hessians, axes=1) + self.prior
+        return np.asarray(-(symmetric_inverse(H) @ (shares @ self.gradients)[..., None])[..., 0])
 
-    def covariance(self, *, is_scale_free: bool = False) -> Array:
+    def optimum(self) -> Array:
+        """Compute (1) for all captures: (p,)."""
+        return np.asarray(self.solve(np.ones((1, len(self.gradients))))[0])
+
+    def without_each(self) -> Array:
+        """Compute (1) without each of the placements: (G, p)."""
+        return self.solve(1 - self.groups)
+
+    def covariance(self) -> Array:
         """Compute the covariance (p, p) of all captures' unknowns if every error is independent."""
-        return np.asarray(self._solve(np.ones((1, len(self.gradients))), is_scale_free)[1][0])
+        return symmetric_inverse(self.hessians.sum(axis=0) + self.prior)
 
-    def _solve(self, shares: Array, is_scale_free: bool) -> tuple[Array, Array]:
-        p = self.gradients.shape[1]
-        free = np.array([k for k in range(p) if k != SCALE or is_scale_free or not self.has_scale])
-        rows, cols = free[:, None], free[None]
-        H = np.tensordot(shares, self.hessians[:, rows, cols], axes=1) + self.prior[rows, cols]
-        inverse = symmetric_inverse(H)
-        x, cov = np.zeros((len(shares), p)), np.zeros((len(shares), p, p))
-        x[:, free] = -(inverse @ (shares @ self.gradients[:, free])[..., None])[..., 0]
-        cov[:, rows, cols] = inverse
-        return x, cov
+    def hold(self, unknown: int) -> "Expansion":
+        """Hold an unknown beside the tangent where it is: an expansion in the others."""
+        return replace(
+            self,
+            gradients=np.delete(self.gradients, unknown, axis=1),
+            hessians=np.delete(np.delete(self.hessians, unknown, axis=1), unknown, axis=2),
+            prior=np.delete(np.delete(self.prior, unknown, axis=0), unknown, axis=1),
+        )
 
     def settled(self) -> "Expansion":
         """Hold what captures share at its estimate: an expansion of the extrinsic alone, at its optimum."""
-        x = self.solve(np.ones((1, len(self.gradients))))[0]
+        x = self.optimum()
         return replace(
             self,
             T_cam_lidar=perturb(self.T_cam_lidar, x[:6]),
@@ -95,6 +98,28 @@ class Expansion:
             hessians=self.hessians[:, :6, :6],
             prior=np.zeros((6, 6)),
         )
+
+
+@dataclass(frozen=True)
+class FeatureSigmas:
+    """Errors by which planes and ring ends are weighed: how far they lie from the camera's.
+
+    Attributes:
+        plane_m: of a capture's plane, rms over the board.
+        end_m: of a ring end.
+    """
+
+    plane_m: float
+    end_m: float
+
+
+def feature_sigmas(features: Sequence[CaptureFeatures], board: Board, T_cam_lidar: Array) -> FeatureSigmas:
+    """Take the typical errors of captures' planes and ring ends under an extrinsic (4, 4)."""
+    plane_m = float(np.median([_distance(f, T_cam_lidar) for f in features]))
+    beyond = np.concatenate([end_rows(f, T_cam_lidar, board)[0] for f in features])
+    # Ring ends reach beyond the plate by the beam's width, which is no error.
+    end_m = 1.4826 * float(np.median(np.abs(beyond - np.median(beyond))))
+    return FeatureSigmas(max(plane_m, _PLANE_FLOOR_M), max(end_m, _END_FLOOR_M))
 
 
 def expand(
@@ -118,20 +143,17 @@ def expand(
         range_offset_sigma_m: of that mean.
     """
     features = [extract_features(seen, board, CalibrateOptions()) for seen in observations]
+    sigmas = feature_sigmas(features, board, T_cam_lidar)
     rings = np.unique(np.concatenate([seen.lidar.ring for seen in observations]))
-    p = FIRST_RING + len(rings)
-    planes = [
-        _plane_rows(f, seen.lidar, rings, T_cam_lidar) for f, seen in zip(features, observations, strict=True)
-    ]
-    ends = [end_rows(f, T_cam_lidar, board, p) for f in features]
-    plane_sigma_m = max(float(np.median([_distance(f, T_cam_lidar) for f in features])), _PLANE_FLOOR_M)
-    beyond = np.concatenate([r for r, _ in ends])
-    # Ring ends reach beyond the plate by the beam's width, which is no error.
-    end_sigma_m = max(1.4826 * float(np.median(np.abs(beyond - np.median(beyond)))), _END_FLOOR_M)
+    p = FIRST_RING + len(rings) + 1
     gradients, hessians = np.zeros((len(features), p)), np.zeros((len(features), p, p))
-    for k, parts in enumerate(zip(planes, ends, strict=True)):
-        by_plane = PLANE_FREEDOMS / (plane_sigma_m**2 * max(len(parts[0][0]), 1))
-        for (r, J), weight in zip(parts, (by_plane, 1 / end_sigma_m**2), strict=True):
+    for k, (f, seen) in enumerate(zip(features, observations, strict=True)):
+        r_plane, J_plane = _plane_rows(f, seen.lidar, rings, T_cam_lidar)
+        r_end, by_end = end_rows(f, T_cam_lidar, board)
+        J_end = np.zeros((len(r_end), p))
+        J_end[:, [*range(FIRST_RING), SCALE]] = by_end
+        by_plane = PLANE_FREEDOMS / (sigmas.plane_m**2 * max(len(r_plane), 1))
+        for r, J, weight in ((r_plane, J_plane, by_plane), (r_end, J_end, 1 / sigmas.end_m**2)):
             gradients[k] += weight * r @ J
             hessians[k] += weight * J.T @ J
     return Expansion(
@@ -141,17 +163,15 @@ def expand(
         _prior(len(rings), laser_bias_sigma_m, range_offset_sigma_m),
         group_placements(observations),
         np.array([f.centre for f in features]),
-        plane_sigma_m,
-        end_sigma_m,
     )
 
 
 def _prior(n_rings: int, laser_m: float, offset_m: float) -> Array:
     """Write priors as information (p, p): of the edge shift, of offsets about their mean, of the mean."""
-    prior = np.zeros((FIRST_RING + n_rings, FIRST_RING + n_rings))
+    prior = np.zeros((FIRST_RING + n_rings + 1, FIRST_RING + n_rings + 1))
     prior[SHIFT, SHIFT] = 1 / EDGE_SHIFT_SIGMA_M**2
     cov = max(laser_m, _RANGE_FLOOR_M) ** 2 * (np.eye(n_rings) - 1 / n_rings)
-    prior[FIRST_RING:, FIRST_RING:] = np.linalg.inv(cov + max(offset_m, _RANGE_FLOOR_M) ** 2)
+    prior[FIRST_RING:SCALE, FIRST_RING:SCALE] = np.linalg.inv(cov + max(offset_m, _RANGE_FLOOR_M) ** 2)
     return prior
 
 
@@ -161,7 +181,7 @@ def _plane_rows(
     """Write n . ((1 - s) g - R (p - b u) - t) for each point as measured: values, derivatives (N, p)."""
     points = np.asarray(lidar.points, dtype=np.float64)
     turned = points @ T[:3, :3].T
-    J = np.zeros((len(points), FIRST_RING + len(rings)))
+    J = np.zeros((len(points), FIRST_RING + len(rings) + 1))
     J[:, :3] = -f.normal
     J[:, 3:6] = -np.cross(turned, f.normal)
     J[:, SCALE] = -f.normal @ f.centre
@@ -170,25 +190,20 @@ def _plane_rows(
     return np.asarray((f.centre - turned - T[:3, 3]) @ f.normal), J
 
 
-def end_rows(f: CaptureFeatures, T: Array, board: Board, p: int) -> tuple[Array, Array]:
-    """Write m . ((1 - s) g + a - R q - t) + d for each ring end and its nearest edge: (M,) and (M, p)."""
+def end_rows(f: CaptureFeatures, T: Array, board: Board) -> tuple[Array, Array]:
+    """Write m . ((1 - s) g + a - R q - t) + d for each ring end and its nearest edge.
+
+    Returns:
+        Values (M,), and their derivatives (M, 8) by the tangent (6), d and s.
+    """
     turned = f.edge_points @ T[:3, :3].T
-    edge = nearest_edge(transform(f.T_board_cam @ T, f.edge_points), board)
+    edge = board.nearest_edge(transform(f.T_board_cam @ T, f.edge_points))
     normals, anchors = f.edge_normals[edge], f.edge_anchors[edge]
-    J = np.zeros((len(turned), p))
+    J = np.ones((len(turned), 8))
     J[:, :3] = -normals
     J[:, 3:6] = -np.cross(turned, normals)
-    J[:, SHIFT] = 1
-    J[:, SCALE] = -normals @ f.centre
+    J[:, 7] = -normals @ f.centre
     return np.asarray(np.sum((anchors - turned - T[:3, 3]) * normals, axis=1)), J
-
-
-def nearest_edge(points_board: Array, board: Board) -> NDArray[np.intp]:
-    """Number the edge nearest to each point (..., 3), frame board, in the order of `Board.edges`."""
-    anchors, normals = board.edges()
-    beyond = np.sum((points_board[..., None, :] - anchors) * normals, axis=-1)
-    # Of a rectangle's edges the nearest is the one that a point is farthest beyond, or least within.
-    return np.asarray(np.argmax(beyond, axis=-1))
 
 
 def _distance(f: CaptureFeatures, T: Array) -> float:

@@ -33,7 +33,7 @@ def capture_residual(
     points_cam = transform(T_cam_lidar, observation.lidar.points)
     plane = np.abs((points_cam - features.centre) @ features.normal)
     ends_board = transform(features.T_board_cam @ T_cam_lidar, features.edge_points)
-    edge = edge_distances(ends_board, board)
+    edge = board.outline_distance(ends_board)
     return CaptureResidual(
         capture=observation.capture,
         plane_mean_m=_mean(plane),
@@ -43,14 +43,6 @@ def capture_residual(
         held_out_m=held_out_m,
         reprojection_px=observation.image.reprojection_px,
     )
-
-
-def edge_distances(points_board: Array, board: Board) -> Array:
-    """Measure in the board's plane how far points (N, 3), frame board, are from the nearest edge: (N,) m."""
-    beyond = np.abs(points_board[:, :2]) - [board.width_m / 2, board.height_m / 2]
-    to_side = np.hypot(beyond[:, 0], np.maximum(beyond[:, 1], 0))
-    to_rail = np.hypot(beyond[:, 1], np.maximum(beyond[:, 0], 0))
-    return np.asarray(np.minimum(to_side, to_rail))
 
 
 def summarise(residuals: Sequence[CaptureResidual]) -> Metrics:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.doubt import Doubt, Verdict
 from lce_rig.calibrate.expansion import FIRST_RING, SCALE, SHIFT, Expansion
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array
 from lce_rig.rig import LidarSettings, VerdictSettings
+from lce_rig.solvers.jackknife import jackknife_scatter
 
 # A scale that is off by this many times the limit leaves nothing to be used.
 _SCALE_FAIL = 2.5
@@ -44,31 +44,29 @@ def estimate_nuisances(expansion: Expansion, rings: NDArray[np.int16]) -> Nuisan
     """Estimate what all captures share, the scale without any prior.
 
     Args:
-        expansion: of the captures, not settled.
+        expansion: by `expand`, not settled.
         rings: (L,) numbers of those that occur, ascending.
     """
-    every = np.ones((1, len(expansion.gradients)))
-    without = 1 - expansion.groups
-    scaled = expansion.solve(np.concatenate([every, without]), is_scale_free=True)[:, SCALE]
-    formal = expansion.covariance(is_scale_free=True)[SCALE, SCALE]
-    x = expansion.solve(np.concatenate([every, without]))
-    offsets = x[0, FIRST_RING:]
+    held = expansion.hold(SCALE)
+    x = held.optimum()
+    offsets = x[FIRST_RING:]
     about_mean = offsets - offsets.mean()
     laser = int(np.argmax(np.abs(about_mean)))
     return Nuisances(
-        scale=float(scaled[0]),
-        scale_sigma=float(np.sqrt(formal + _jackknife(scaled[1:]))),
-        edge_shift_m=float(x[0, SHIFT]),
-        edge_shift_sigma_m=float(np.sqrt(expansion.covariance()[SHIFT, SHIFT] + _jackknife(x[1:, SHIFT]))),
+        scale=float(expansion.optimum()[SCALE]),
+        scale_sigma=_sigma(expansion, SCALE),
+        edge_shift_m=float(x[SHIFT]),
+        edge_shift_sigma_m=_sigma(held, SHIFT),
         laser_offset_m=float(about_mean[laser]),
         laser=int(rings[laser]),
     )
 
 
-def _jackknife(without: Array) -> float:
-    """Estimate a variance from the estimates without each of the placements."""
-    n = len(without)
-    return float((n - 1) / n * np.sum((without - without.mean()) ** 2))
+def _sigma(expansion: Expansion, unknown: int) -> float:
+    """Estimate a deviation from what single errors do, and from the estimates without each placement."""
+    without = expansion.without_each()[:, [unknown]]
+    scatter = jackknife_scatter(without - without.mean(axis=0))[0, 0]
+    return float(np.sqrt(expansion.covariance()[unknown, unknown] + scatter))
 
 
 def doubt_nuisances(

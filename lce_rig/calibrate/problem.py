@@ -95,7 +95,7 @@ class Problem:
         self.n_shift = 0 if weights.shift_prior is None else 1
         self.size = 13 + self.n_shift
         self._upper = np.triu_indices(self.size)
-        self._half_size = np.array([board.width_m, board.height_m]) / 2
+        self._board = board
         masks = [np.ones(len(f.plane_points), dtype=bool) for f in features] if keep is None else keep
         self.plane = np.stack([self._plane_moments(f, mask) for f, mask in zip(features, masks, strict=True)])
         counts = [len(f.edge_points) for f in features]
@@ -123,15 +123,10 @@ class Problem:
             x: (B, m).
 
         Returns:
-            (B, n): 0 bottom, 1 right, 2 top, 3 left, as `Board.edges`.
+            (B, n), as `Board.nearest_edge`.
         """
-        along_x, along_y = x @ self._to_board[:, 0].T, x @ self._to_board[:, 1].T
-        width, height = self._half_size
-        beyond_x, beyond_y = np.abs(along_x) - width, np.abs(along_y) - height
-        to_side = beyond_x**2 + np.maximum(beyond_y, 0) ** 2
-        to_rail = beyond_y**2 + np.maximum(beyond_x, 0) ** 2
-        side, rail = np.where(along_x > 0, 1, 3), np.where(along_y > 0, 2, 0)
-        return np.where(to_side < to_rail, side, rail).astype(np.int8)
+        xy_m = np.stack([x @ self._to_board[:, 0].T, x @ self._to_board[:, 1].T], axis=-1)
+        return self._board.nearest_edge(xy_m).astype(np.int8)
 
     def moments(self, selection: Array, edge_ids: NDArray[np.int8], weights: Weights | None = None) -> Array:
         """Sum (1) over sets of captures.

@@ -6,14 +6,14 @@ from itertools import combinations
 
 import numpy as np
 
-from lce_rig.core.geometry import Array, difference, log_so3, perturb
+from lce_rig.calibrate.mean_pose import mean_pose
+from lce_rig.core.geometry import Array, difference, log_so3
 from lce_rig.core.results import Calibration
 
 # Agreement is denied where chance spreads sound calibrations so far this seldom.
 _CHANCE = 0.01
 # Where chance spreads sound calibrations farther this often, the stated uncertainties are generous.
 _GENEROUS = 0.95
-_STEPS = 20
 _COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
@@ -125,7 +125,7 @@ def compare_calibrations(calibrations: Mapping[str, Calibration]) -> Repeatabili
     T = np.array([calibrations[name].T_cam_lidar for name in names])
     cov = np.array([calibrations[name].cov for name in names])
     # Weighted by full covariances a mean may lie beside all it is made of: right for chi2, odd to look at.
-    mean = _mean(T, np.broadcast_to(np.eye(6), cov.shape))
+    mean, _ = mean_pose(T, np.broadcast_to(np.eye(6), cov.shape))
     deviations = difference(T, mean)
     chi2 = _spread(T, cov)
     dof = 6 * (len(names) - 1)
@@ -153,22 +153,10 @@ def compare_calibrations(calibrations: Mapping[str, Calibration]) -> Repeatabili
     )
 
 
-def _mean(T: Array, weights: Array) -> Array:
-    """Find the pose (4, 4) of least sum of x_k^T W_k x_k, x_k the tangent from it to pose k."""
-    mean: Array = T[0]
-    for _ in range(_STEPS):
-        deviations = difference(T, mean)
-        step = np.linalg.solve(weights.sum(axis=0), np.einsum("kij,kj->i", weights, deviations))
-        mean = perturb(mean, np.asarray(step))
-        if np.linalg.norm(step) < 1e-12:
-            break
-    return mean
-
-
 def _spread(T: Array, cov: Array) -> float:
     """Compute chi2: the least sum of squared Mahalanobis distances from one pose."""
     weights = np.asarray(np.linalg.inv(cov))
-    deviations = difference(T, _mean(T, weights))
+    deviations = difference(T, mean_pose(T, weights)[0])
     return float(np.einsum("ki,kij,kj->", deviations, weights, deviations))
 
 

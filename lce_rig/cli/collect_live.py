@@ -16,7 +16,7 @@ from lce_rig.cli.simulate import TRUTH, require_kind, write_truth
 from lce_rig.core.errors import LceRigError
 
 if TYPE_CHECKING:
-    from lce_rig.collect.live.collection import LiveReport
+    from lce_rig.collect.live.options import LiveReport
     from lce_rig.collect.live.recorder import SampleRecorder
     from lce_rig.collect.live.simulated import SimulatedRig
     from lce_rig.collect.live.state import LiveState
@@ -55,7 +55,8 @@ class LiveArguments:
 def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
     """Collect live into a session, and say how it went."""
     from lce_rig.cli.live_view import open_view
-    from lce_rig.collect.live.collection import HOLD_S, LiveOptions, collect_live
+    from lce_rig.collect.live.collection import collect_live
+    from lce_rig.collect.live.options import HOLD_S, LiveOptions
     from lce_rig.core.errors import UsageError
     from lce_rig.rig import load_rig
 

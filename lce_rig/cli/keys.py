@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
-from lce_rig.collect.live.collection import Key
+from lce_rig.collect.live.options import Key
 
 _KEYS: dict[str, Key] = {"q": "stop", "\x03": "stop", " ": "capture", "n": "next"}
 HELP = "q stop   space capture now   n another place"

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array
 
@@ -65,3 +66,29 @@ class Board:
         midpoints = (outline + np.roll(outline, -1, axis=0)) / 2
         normals = np.array([[0, -1, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0]], dtype=np.float64)
         return midpoints, normals
+
+    def nearest_edge(self, xy_m: Array) -> NDArray[np.intp]:
+        """Number the edge nearest to each point of the board's plane, in the order of `edges`.
+
+        Beyond a corner two edges are equally near; there the bottom or the top counts.
+
+        Args:
+            xy_m: (..., 2) x and y, frame board; further coordinates are ignored.
+
+        Returns:
+            (...): 0 bottom, 1 right, 2 top, 3 left.
+        """
+        x, y = xy_m[..., 0], xy_m[..., 1]
+        beyond_x, beyond_y = np.abs(x) - self.width_m / 2, np.abs(y) - self.height_m / 2
+        is_side = (beyond_y < 0) & (beyond_x > beyond_y)
+        return np.where(is_side, np.where(x > 0, 1, 3), np.where(y > 0, 2, 0)).astype(np.intp)
+
+    def outline_distance(self, xy_m: Array) -> Array:
+        """Measure how far points of the board's plane lie from the nearest point on the outline, m.
+
+        Args:
+            xy_m: (..., 2) x and y, frame board; further coordinates are ignored.
+        """
+        beyond = np.abs(xy_m[..., :2]) - [self.width_m / 2, self.height_m / 2]
+        outside = np.linalg.norm(np.maximum(beyond, 0), axis=-1)
+        return np.asarray(outside - np.minimum(beyond.max(axis=-1), 0))

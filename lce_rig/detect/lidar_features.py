@@ -160,23 +160,16 @@ def build_board(
     points = scan.points[kept].astype(np.float64)
     height = points @ view.plane[:3] + view.plane[3]
     low_m, high_m = np.percentile(height, [2.5, 97.5])
-    size_m = 2 * np.asarray(fitted.half_m)
-    size_sigma_m = np.hypot(size_sigma_m, beyond_m)  # how much of the light spot counts is not known
-    spec_m = np.array([board.width_m, board.height_m])
-    weight = 1.0 / size_sigma_m**2
+    rms_m = float(np.sqrt(np.mean(height**2)))
     incidence = np.arccos(np.clip(view.plane[3] / distance_m, 0.0, 1.0))
-    quality = {
+    # How much of the light spot counts is not known.
+    quality = _size_figures(2 * np.asarray(fitted.half_m), np.hypot(size_sigma_m, beyond_m), board) | {
         "n_rings": float(1 + np.count_nonzero(np.diff(scan.ring[kept]))),
         "n_points": float(len(kept)),
         "n_ring_ends": float(len(edge)),
         "n_ring_ends_dropped": float(len(ends.beam) - len(edge)),
         "thickness_m": float(high_m - low_m),
-        "plane_rms_m": float(np.sqrt(np.mean(height**2))),
-        "width_m": float(size_m[0]),
-        "height_m": float(size_m[1]),
-        "width_sigma_m": float(size_sigma_m[0]),
-        "height_sigma_m": float(size_sigma_m[1]),
-        "size_ratio": float((weight * size_m / spec_m).sum() / weight.sum()),
+        "plane_rms_m": rms_m,
         "edge_rms_m": float(np.sqrt(np.mean(residual[is_good] ** 2))) if is_good.any() else float("nan"),
         "template_m": placement.error_m,
         "beyond_share": float((view.is_on & (away > SLACK_M)).sum()) / max(1, len(kept)),
@@ -194,11 +187,24 @@ def build_board(
         edge_echo=_echo_shares(scan, source, ends, view, border)[order],
         azimuth_step_rad=scan.step_rad,
         plane=view.plane,
-        sigma_m=float(np.sqrt(np.mean(height**2))),
+        sigma_m=rms_m,
         T_lidar_board=_pose_of(view, fitted),
         offset_ns=None if source.offset_ns is None else source.offset_ns[scan.index[kept]],
         quality=quality,
     )
+
+
+def _size_figures(size_m: Array, sigma_m: Array, board: Board) -> dict[str, float]:
+    """State width and height (2,) with their sigmas (2,), and how large they are beside the nominal ones."""
+    weight = 1.0 / sigma_m**2
+    ratio = (weight * size_m / [board.width_m, board.height_m]).sum() / weight.sum()
+    return {
+        "width_m": float(size_m[0]),
+        "height_m": float(size_m[1]),
+        "width_sigma_m": float(sigma_m[0]),
+        "height_sigma_m": float(sigma_m[1]),
+        "size_ratio": float(ratio),
+    }
 
 
 def _echo_shares(scan: OrderedScan, source: Scan, ends: RingEnds, view: PlaneView, border: Indices) -> Array:

@@ -112,7 +112,7 @@ class _Finder:
     def __init__(self, session: Session, event_image: EventImage | None) -> None:
         self._session = session
         self._event_image = event_image
-        self._digest = _detection_digest(session.rig)
+        self._digest = detection_digest(session.rig)
         self._event_digests: dict[Key, str] = {}
 
     def held(self, captures: list[Capture]) -> list[_Held]:
@@ -256,8 +256,8 @@ def detect_scan(rig: Rig, scan: Scan) -> LidarDetection:
     return gate_lidar_boards([replace(each, stamp_ns=scan.stamp_ns) for each in found], board, limits)
 
 
-def _detection_digest(rig: Rig) -> str:
-    """Name the cache after everything a detection depends on beside the capture: the profile and the code."""
+def detection_digest(rig: Rig) -> str:
+    """Name by 12 digits what a detection depends on beside the capture: the profile and the code."""
     digest = hashlib.sha256(rig.model_dump_json(include={"board", "cameras", "lidars", "quality"}).encode())
     package = Path(__file__).parents[1]
     sources = [

@@ -1,45 +1,10 @@
-"""Covariance of an estimate: how its groups of residuals (captures) disagree, and what errors they share."""
+"""Covariance by errors that residuals share, and inverses of information; `jackknife` takes their scatter."""
 
 import numpy as np
 
 from lce_rig.core.geometry import Array
 
 _RELATIVE_FLOOR = 1e-12
-
-
-def jackknife_covariance(gradients: Array, hessians: Array, prior: Array) -> Array:
-    """Compute the covariance of argmin sum_k f_k + prior from leave-one-out steps.
-
-    Leaving out group k moves the minimum by (H - H_k)^-1 g_k to first order, hence
-
-        cov = (F - 1) / F sum_k (H - H_k)^-1 g_k g_k^T (H - H_k)^-1,   H = sum_k H_k + prior             (1)
-
-    No model of the noise enters, and errors within a group may be correlated in any way; unlike s^2 H^-1,
-    which takes every residual for independent, (1) sees what a whole group has in common. Dividing by H - H_k
-    and not H corrects for the pull that each group has on its own residuals, which matters for few groups.
-
-    The inverse of a covariance from few samples is too large: for normal errors in p unknowns it averages
-    (F - 1) / (F - p - 2) times the true inverse (2). Multiplied by that factor, (1) gives normalised errors
-    e^T cov^-1 e of the right size; below p + 4 groups the factor is held at (F - 1) / 2.
-
-    Args:
-        gradients: (F, p) half the gradient of each group's cost at the minimum.
-        hessians: (F, p, p) half the Hessian of each (Gauss-Newton).
-        prior: (p, p).
-
-    Returns:
-        (p, p).
-
-    References:
-        MacKinnon, White, "Some heteroskedasticity-consistent covariance matrix estimators", J. Econometrics,
-        1985; Bell, McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage
-        samples", Survey Methodology, 2002 (CR3).
-    """
-    n_groups, p = gradients.shape
-    remaining = hessians.sum(axis=0) + prior - hessians
-    steps = -(symmetric_inverse(remaining) @ gradients[..., None])[..., 0]
-    correction = (n_groups - 1) / max(n_groups - p - 2, 2)  # equation (2)
-    return np.asarray(correction * (n_groups - 1) / n_groups * steps.T @ steps)
 
 
 def systematic_covariance(sensitivities: Array, sigma_each: float, sigma_common: float) -> Array:

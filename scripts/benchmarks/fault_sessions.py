@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.kept import kept_folder
 from benchmarks.still_sessions import scan_held_board, with_small_pictures
 from lce_rig import pipeline
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
@@ -58,10 +59,10 @@ class SimulatedScans:
 
 
 def simulated_scans(rig: Rig, seed: int, folder: Path) -> SimulatedScans:
-    """Read a session from a folder, or simulate it and keep it there."""
-    path = folder / f"{rig.name}-{seed:04d}.npz"
+    """Read a session from where it is kept, or simulate it and keep it."""
+    path = kept_folder(folder, rig) / f"{seed:04d}.npz"
     if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = path.with_suffix(".part.npz")
         np.savez_compressed(unfinished, **_flatten(_simulate(rig, seed)))
         unfinished.rename(path)

@@ -41,7 +41,7 @@ def bench_faults(n_seeds: int, folder: Path | None = None, n_sessions: int = 100
 
     Args:
         n_seeds: sessions with each fault.
-        folder: where simulated sessions are kept; delete it when the simulation or the detectors change.
+        folder: where simulated sessions are kept.
         n_sessions: simulated; with fewer than seeds, several seeds share the scans of one.
     """
     folder = folder or Path(tempfile.gettempdir()) / "lce-rig-benchmarks" / "faults"

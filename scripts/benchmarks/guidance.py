@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.kept import kept_folder
 from benchmarks.tables import print_head, print_row, rms
 from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
@@ -35,6 +36,8 @@ RIGS = ("rlfs", "rles")
 FIRST_SEED = 20
 #: Simulated sessions are kept here: to calibrate them again takes seconds.
 FOLDER = Path("build/guidance")
+# Packages that decide where a simulated board is held.
+_MAKERS = ("simulate", "collect/guidance")
 # After so many tries a person gives a placement up: a wall is in the way, or the board is never seen whole.
 _TRIES = 8
 _PERSON, _OFFSET = 101, 102
@@ -96,11 +99,11 @@ def bench_prediction(n_seeds: int, n_captures: int = 15, rigs: Sequence[str] = (
 
 def kept(kind: str, name: str, seed: int, n_captures: int) -> list[Visit]:
     """Simulate a session, or take it from the folder of those simulated before."""
-    path = FOLDER / f"{name}_{kind}_{seed}_{n_captures}.pkl"
+    path = kept_folder(FOLDER, load_rig(name), packages=_MAKERS) / f"{kind}_{seed}_{n_captures}.pkl"
     if not path.exists():
         simulate = guided_session if kind == "guided" else random_session
         visits = simulate(name, seed, n_captures)
-        FOLDER.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(pickle.dumps(visits))
     known: list[Visit] = pickle.loads(path.read_bytes())
     return known

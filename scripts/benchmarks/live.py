@@ -21,7 +21,8 @@ from wire.sync_board import WireSyncBoard
 from wire.timing import LOOP_NS
 
 from benchmarks.tables import print_head, print_row
-from lce_rig.collect.live.collection import Key, LiveOptions, LiveReport, collect_live
+from lce_rig.collect.live.collection import collect_live
+from lce_rig.collect.live.options import Key, LiveOptions, LiveReport
 from lce_rig.collect.live.state import LiveState
 from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig, load_rig

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.kept import kept_folder
 from benchmarks.paper_sets import LEVELS, N_CAPTURES, PaperSet, paper_rig, paper_set
 from benchmarks.tables import compare
 from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate, capture_residual
@@ -55,13 +56,14 @@ def simulated_runs(folder: Path, n_seeds: int, methods: Sequence[str], anew: Seq
         methods: to run.
         anew: those of them that have changed since their results were kept.
     """
-    path = folder / "simulated.csv"
+    sets = folder / "sets"
+    path = kept_folder(sets, paper_rig()) / "simulated.csv"
     runs = [run for run in read_runs(path) if run.method not in anew]
     for seed in range(n_seeds):
         missing = [name for name in methods if (name, seed) not in {(run.method, run.seed) for run in runs}]
         if not missing:
             continue
-        seen = paper_set(folder / "sets", seed)
+        seen = paper_set(sets, seed)
         for level in LEVELS:
             counts = FRAME_COUNTS if level == MIDDLE_LEVEL else (N_CAPTURES,)
             for method in missing:

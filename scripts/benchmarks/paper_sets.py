@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.kept import kept_folder
 from lce_rig import pipeline
 from lce_rig.core.geometry import Array, invert
 from lce_rig.detect.detection import ImageDetection, LidarDetection, from_arrays, to_arrays
@@ -78,9 +79,10 @@ def paper_set(folder: Path, seed: int, n_captures: int = N_CAPTURES) -> PaperSet
         n_captures: placements.
     """
     maker = _Maker(seed)
+    own = kept_folder(folder, maker.rig)
     placements = []
     for index in range(n_captures):
-        path = folder / f"seed{seed:03d}" / f"{index:06d}.npz"
+        path = own / f"seed{seed:03d}" / f"{index:06d}.npz"
         placement = _read(path)
         if placement is None:
             placement = maker.place(index)
@@ -93,14 +95,14 @@ class _Maker:
     """Simulates placements; the room is built only where one is missing."""
 
     def __init__(self, seed: int) -> None:
-        self._seed, self._rig = seed, paper_rig()
+        self._seed, self.rig = seed, paper_rig()
         # Any level: what the beams meet is the same for all.
         self._options = replace(SimulationOptions.for_rig("sss"), noise_level=LEVELS[0])
-        self.T_cam_lidar = truth_extrinsics(self._rig, seed, self._options)[CAMERA, LIDAR]
+        self.T_cam_lidar = truth_extrinsics(self.rig, seed, self._options)[CAMERA, LIDAR]
 
     @cached_property
     def _stage(self) -> Stage:
-        return set_stage(self._rig, self._seed, self._options)
+        return set_stage(self.rig, self._seed, self._options)
 
     def place(self, index: int) -> Placement:
         """Photograph and sweep a board, and detect it at every level."""
@@ -114,9 +116,9 @@ class _Maker:
         for level in LEVELS:
             noise = replace(self._options, noise_level=level).lidar_noise
             scan = measure_sweep(sweep, model, noise, stage.rng(index, SCAN, level), sensor=LIDAR)
-            scans[level] = pipeline.detect_scan(self._rig, scan)
+            scans[level] = pipeline.detect_scan(self.rig, scan)
         normal = (invert(T_world_lidar) @ T_world_board)[:3, 2]
-        return Placement(pipeline.detect_image(self._rig, image), scans, normal)
+        return Placement(pipeline.detect_image(self.rig, image), scans, normal)
 
 
 def _flatten(placement: Placement) -> tuple[dict[str, Array], dict[str, list[float]]]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.kept import kept_folder
 from lce_rig import pipeline
 from lce_rig.calibrate import CaptureCandidates
 from lce_rig.core.data import Scan
@@ -53,14 +54,14 @@ def still_session(
     Args:
         rig: of one camera and one LiDAR.
         seed: of everything random.
-        options: of the simulation; the folder must have been made with the same.
+        options: of the simulation.
         n_captures: placements of the board.
         sigma_px: noise of each corner's coordinates.
-        folder: where detections are kept; delete it when the simulation or the detectors change.
+        folder: where detections are kept, see `kept_folder`.
     """
-    path = folder / f"{rig.name}-{n_captures}-{seed:04d}.npz"
+    path = kept_folder(folder, rig, options) / f"{n_captures}-{seed:04d}.npz"
     if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = path.with_suffix(".part.npz")
         np.savez_compressed(unfinished, **_simulate(rig, seed, options, n_captures))
         unfinished.rename(path)

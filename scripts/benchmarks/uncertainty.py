@@ -68,7 +68,7 @@ def bench_uncertainty(n_seeds: int, folder: Path, only: str = "", n_captures: in
 
     Args:
         n_seeds: sessions of each case.
-        folder: where detections are kept; delete it when the simulation or the detectors change.
+        folder: where detections are kept.
         only: cases whose label contains this.
         n_captures: of each session.
     """
@@ -115,9 +115,9 @@ def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[R
         laser_bias_sigma_m=lidar.laser_bias_sigma_m,
         range_offset_sigma_m=lidar.range_offset_sigma_m,
     )
-    own = folder / "".join(c if c.isalnum() else "-" for c in case.label)
     sessions = [
-        still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, own) for seed in range(n_seeds)
+        still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder)
+        for seed in range(n_seeds)
     ]
     at_truth = [_at_truth(rig, session) for session in sessions]
     levels = _true_levels(case.options().lidar_noise, [terms.edges for terms in at_truth])

@@ -9,7 +9,7 @@ from lce_rig.calibrate import CalibrateOptions, calibrate
 from lce_rig.calibrate.claim import resample, widen
 from lce_rig.calibrate.control import doubt_control, run_control
 from lce_rig.calibrate.examination import examine
-from lce_rig.calibrate.expansion import SHIFT, expand
+from lce_rig.calibrate.expansion import SCALE, SHIFT, expand
 from lce_rig.calibrate.halves import contrast_halves, doubt_halves
 from lce_rig.calibrate.nuisances import doubt_nuisances, estimate_nuisances
 from lce_rig.core.geometry import difference, perturb
@@ -32,13 +32,14 @@ def observed(n=15, seed=1, scenario=None):
     return [Observation(item.capture, item.image, item.lidar[0]) for item in simulate(n, seed, scenario)]
 
 
-def expanded(observations, T=T_NEAR, laser=0.008, offset=0.005):
-    return expand(observations, BOARD, T, laser_bias_sigma_m=laser, range_offset_sigma_m=offset)
+def expanded(observations, T=T_NEAR, laser=0.008, offset=0.005, is_scale_free=False):
+    every = expand(observations, BOARD, T, laser_bias_sigma_m=laser, range_offset_sigma_m=offset)
+    return every if is_scale_free else every.hold(SCALE)
 
 
 def nuisances(observations, first_ring=0):
     rings = np.unique(np.concatenate([seen.lidar.ring for seen in observations]))
-    return estimate_nuisances(expanded(observations), rings + first_ring)
+    return estimate_nuisances(expanded(observations, is_scale_free=True), rings + first_ring)
 
 
 def moved(seen, T_cam_board):

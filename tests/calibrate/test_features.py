@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate.features import extract_features, normal_covariance
-from lce_rig.calibrate.metrics import edge_distances
 from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.core.geometry import exp_so3, transform
 from lce_rig.core.results import Observation
@@ -44,7 +43,7 @@ def test_half_a_step_removes_the_bias_of_ring_ends(half_step, bias_m):
         features = extract_features(observation, BOARD, CalibrateOptions(half_step=half_step))
         ends = transform(features.T_board_cam @ T_FORWARD, features.edge_points)
         is_inside = np.all(np.abs(ends[:, :2]) < [BOARD.width_m / 2, BOARD.height_m / 2], axis=1)
-        beyond.append(np.where(is_inside, 1, -1) * edge_distances(ends, BOARD))
+        beyond.append(np.where(is_inside, 1, -1) * BOARD.outline_distance(ends))
     mean_m = np.concatenate(beyond).mean()
     assert abs(mean_m - bias_m) < 0.001
 

@@ -4,18 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.calibrate.metrics import capture_residual, edge_distances, error_to_reference, summarise
+from lce_rig.calibrate.metrics import capture_residual, error_to_reference, summarise
 from lce_rig.core.geometry import exp_so3, pose
 from lce_rig.core.results import Observation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
-
-
-def test_the_nearest_edge_counts_inside_outside_and_beyond_a_corner():
-    w, h = BOARD.width_m / 2, BOARD.height_m / 2
-    points = np.array(
-        [[w - 0.01, 0, 0], [w + 0.02, 0, 0.5], [0, -h + 0.03, 0], [w + 0.03, h + 0.04, 0], [0, 0, 0]]
-    )
-    np.testing.assert_allclose(edge_distances(points, BOARD), [0.01, 0.02, 0.03, 0.05, h], atol=1e-12)
 
 
 def test_the_error_to_a_reference_is_the_angle_and_the_distance():

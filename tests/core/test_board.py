@@ -32,3 +32,24 @@ def test_every_edge_lies_on_the_outline_with_its_normal_outwards():
 def test_a_pattern_looks_the_same_turned_when_its_squares_add_up_to_an_even_number():
     assert BOARD.is_symmetric
     assert not Board(9, 6, 0.068, 0.8, 0.6).is_symmetric
+
+
+def test_the_distance_from_the_outline_counts_inside_outside_and_beyond_a_corner():
+    w, h = BOARD.width_m / 2, BOARD.height_m / 2
+    points = np.array(
+        [[w - 0.01, 0, 0], [w + 0.02, 0, 0.5], [0, -h + 0.03, 0], [w + 0.03, h + 0.04, 0], [0, 0, 0]]
+    )
+    np.testing.assert_allclose(BOARD.outline_distance(points), [0.01, 0.02, 0.03, 0.05, h], atol=1e-12)
+
+
+def test_the_nearest_edge_is_the_one_that_holds_the_nearest_point_of_the_outline():
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, (500, 2))
+    outline = BOARD.outline()[:, :2]
+    ways = np.roll(outline, -1, axis=0) - outline
+    along = np.sum((points[:, None] - outline) * ways, axis=2) / np.sum(ways**2, axis=1)
+    feet = outline + np.clip(along, 0, 1)[..., None] * ways
+    distances = np.linalg.norm(points[:, None] - feet, axis=2)
+    nearest = np.take_along_axis(distances, BOARD.nearest_edge(points)[:, None], axis=1)[:, 0]
+    np.testing.assert_allclose(nearest, distances.min(axis=1), atol=1e-12)
+    np.testing.assert_allclose(nearest, BOARD.outline_distance(points), atol=1e-12)
+    assert BOARD.nearest_edge(np.array([1.0, 1.0])) == 2

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
@@ -64,7 +63,7 @@ def pair_lines(observation: Observation, board: Board, T_cam_lidar: Array) -> li
     T_lidar_board = resolve_half_turn(observation, T_cam_lidar)
     anchors, outward = board.edges()
     along = np.cross([0.0, 0.0, 1.0], outward)
-    nearest = _nearest_border(transform(invert(T_lidar_board), ends), board)
+    nearest = board.nearest_edge(transform(invert(T_lidar_board), ends))
     T_cam_board = observation.image.T_cam_board
     pairs = []
     for border in range(4):
@@ -107,13 +106,3 @@ def fit_line(points: Array) -> tuple[Array, Array] | None:
     is_in = away < INLIER_M
     inliers = points[is_in[np.argmax(is_in.sum(axis=1))]]
     return inliers, np.linalg.svd(inliers - inliers.mean(axis=0))[2][0]
-
-
-def _nearest_border(points_board: Array, board: Board) -> NDArray[np.intp]:
-    """Find the border nearest to points (N, 3), frame board: (N,) in the order of `Board.edges`."""
-    anchors, outward = board.edges()
-    half_m = np.array([board.width_m, board.height_m, board.width_m, board.height_m]) / 2
-    offset = points_board[:, None] - anchors
-    beyond = np.sum(offset * outward, axis=-1)
-    along = np.abs(np.sum(offset * np.cross([0.0, 0.0, 1.0], outward), axis=-1))
-    return np.asarray(np.argmin(np.hypot(beyond, np.maximum(along - half_m, 0)), axis=1))

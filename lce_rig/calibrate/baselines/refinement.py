@@ -7,7 +7,7 @@ import numpy as np
 from lce_rig.calibrate.placements import group_placements
 from lce_rig.core.geometry import Array, pose
 from lce_rig.core.results import Observation
-from lce_rig.solvers.covariance import jackknife_covariance
+from lce_rig.solvers.jackknife import jackknife_covariance, sum_by_group
 from lce_rig.solvers.registration import (
     N_ROTATION,
     eliminate_linear,
@@ -71,9 +71,7 @@ def placement_covariance(moments: Array, T: Array, observations: Sequence[Observ
         T: (4, 4) the minimum.
         observations: of each capture.
     """
-    placement = group_placements(observations)
-    groups = np.zeros((int(placement.max()) + 1, *moments.shape[1:]))
-    np.add.at(groups, placement, moments)
+    groups = sum_by_group(moments, group_placements(observations))
     x = with_one(np.concatenate([vec_rotation(T[:3, :3]), T[:3, 3]]))
     J = tangent_basis(T[:3, :3], 0)
     return jackknife_covariance(groups @ x @ J, J.T @ groups @ J, np.zeros((6, 6)))

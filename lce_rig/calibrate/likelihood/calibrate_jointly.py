@@ -129,9 +129,6 @@ def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp])
         np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6)),
         placement,
         (T @ joint.T_lidar_board)[:, :3, 3],
-        joint.levels.depth_m,
-        joint.end_sigma_m,
-        has_scale=False,
     )
 
 

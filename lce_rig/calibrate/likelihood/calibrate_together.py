@@ -13,6 +13,7 @@ from lce_rig.calibrate.likelihood.calibrate_jointly import (
     figures_of,
     what_is_known,
 )
+from lce_rig.calibrate.likelihood.levels import PoseLevels
 from lce_rig.calibrate.likelihood.refine import refine
 from lce_rig.calibrate.likelihood.spread import inflate
 from lce_rig.calibrate.options import CalibrateOptions
@@ -23,8 +24,13 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation, Refusal
 from lce_rig.solvers.covariance import symmetric_inverse
 
-# Diagnostics that hold a camera's pose errors beyond corner noise, in the order of `Levels.pose`.
-_POSE_FIGURES = ("noise_tilt_deg", "noise_spin_deg", "noise_depth_m", "noise_across_m")
+# Diagnostics that hold a camera's pose errors beyond corner noise, by the level that they are.
+_POSE_FIGURES = {
+    "tilt_rad": "noise_tilt_deg",
+    "spin_rad": "noise_spin_deg",
+    "depth_m": "noise_depth_m",
+    "across_m": "noise_across_m",
+}
 # Those that say what a camera's own estimate did, and nothing of this one.
 _OF_ONE = ("algorithm_1_offset_deg", "algorithm_1_offset_m")
 
@@ -72,7 +78,7 @@ def calibrate_together(
     labelled = _label_scans(used)
     priors, usual = what_is_known(options)
     T_start = [start.T_cam_lidar for start in starts]
-    joint = refine(labelled, board, T_start, priors, usual, pose_sizes=_pose_sizes(starts))
+    joint = refine(labelled, board, T_start, priors, usual, pose_ratios=_pose_ratios(starts))
     order = {name: k for k, name in enumerate(sorted({o.capture for own in labelled for o in own}))}
     placement = group_shared_placements(labelled, order)
     J = joint.to_extrinsics.reshape(-1, joint.to_extrinsics.shape[2])
@@ -134,7 +140,8 @@ def _label_scans(used: Sequence[Sequence[Observation]]) -> list[list[Observation
     return labelled
 
 
-def _pose_sizes(starts: Sequence[CalibrationEstimate]) -> list[Array]:
-    """Compare cameras' pose errors, as each alone estimates them, with their geometric mean: (4,) each."""
-    logs = np.log([[start.diagnostics[name] for name in _POSE_FIGURES] for start in starts])
-    return list(np.exp(logs - logs.mean(axis=0)))
+def _pose_ratios(starts: Sequence[CalibrationEstimate]) -> list[PoseLevels]:
+    """Compare cameras' pose errors, as each alone estimates them, with their geometric mean."""
+    logs = np.log([[start.diagnostics[name] for name in _POSE_FIGURES.values()] for start in starts])
+    ratios = np.exp(logs - logs.mean(axis=0))
+    return [PoseLevels(**dict(zip(_POSE_FIGURES, own, strict=True))) for own in ratios.tolist()]

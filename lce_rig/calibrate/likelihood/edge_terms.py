@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.background import BLENDS
 from lce_rig.calibrate.likelihood.end_density import density, information
-from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.scans import N_FIELDS, Indices, StackedScans
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
@@ -74,10 +73,6 @@ class EdgeRows:
         """Blur (M,) of each interval's ends, by `Levels`."""
         return np.asarray(np.where(self.is_backed, backed_rad, edge_rad) * self.range_m)
 
-    def variance(self, levels: Levels) -> Array:
-        """Variance (M,) of e in m^2, of the blurred interval alone."""
-        return np.asarray(self.step_m**2 / 12 + self.blur_m(levels.edge_rad, levels.backed_rad) ** 2)
-
 
 def edge_rows(
     scans: StackedScans, T_lidar_board: Array, board: Board, lens: Array, shifts: Array
@@ -99,7 +94,7 @@ def edge_rows(
     beyond = (h / np.sum(n * scans.next_rays, axis=1))[:, None] * scans.next_rays - t
     xy, xy_next = (np.einsum("mji,mj->mi", R[:, :, :2], p) for p in (here, beyond))
     anchors, normals = board.edges()
-    edge = nearest_edge((xy + xy_next) / 2, board)
+    edge = board.nearest_edge((xy + xy_next) / 2)
     outwards = normals[edge, :2]
     inside_m = np.sum((anchors[edge, :2] - xy) * outwards, axis=1)
     step_m = np.maximum(np.abs(np.sum((xy_next - xy) * outwards, axis=1)), _SHORTEST_STEP_M)
@@ -122,15 +117,6 @@ def _by_shifts(scans: StackedScans, sideways: Array, range_m: Array) -> Array:
     of_width = np.column_stack([np.ones(len(range_m)), range_m, scans.end_background])
     displacement = np.stack([np.sum(sideways * scans.end_fields[:, :, 0], axis=1), sideways[:, 2]], axis=1)
     return np.hstack([np.linalg.norm(sideways, axis=1, keepdims=True) * of_width, -displacement])
-
-
-def nearest_edge(xy_m: Array, board: Board) -> Indices:
-    """Find the edge nearest to points (M, 2) of the board's plane, in the order of `Board.edges`."""
-    beyond = np.abs(xy_m) - [board.width_m / 2, board.height_m / 2]
-    to_side = np.hypot(beyond[:, 0], np.maximum(beyond[:, 1], 0))
-    to_rail = np.hypot(beyond[:, 1], np.maximum(beyond[:, 0], 0))
-    side, rail = np.where(xy_m[:, 0] > 0, 1, 3), np.where(xy_m[:, 1] > 0, 2, 0)
-    return np.where(to_side < to_rail, side, rail).astype(np.intp)
 
 
 def edge_system(

@@ -1,12 +1,23 @@
 """Sizes of the errors that the likelihood knows, and what is believed of them before any capture is seen."""
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from lce_rig.calibrate.background import BACKGROUND_SIGMAS_M
 from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.geometry import Array
+
+
+class PoseLevels(NamedTuple):
+    """Errors of a board's pose in a picture beyond corner noise, as in `Levels`; or ratios of them."""
+
+    tilt_rad: float
+    spin_rad: float
+    depth_m: float
+    across_m: float
 
 
 @dataclass(frozen=True)
@@ -38,27 +49,29 @@ class Levels:
     laser_m: float = 0.008
 
     @property
-    def pose(self) -> Array:
-        """Deviations of a picture's pose in the order of `Pictures.shapes`."""
-        return np.array([self.tilt_rad, self.spin_rad, self.depth_m, self.across_m])
+    def pose(self) -> PoseLevels:
+        """Those of a picture's pose."""
+        return PoseLevels(self.tilt_rad, self.spin_rad, self.depth_m, self.across_m)
 
     def blurred(self, blur_rad: float) -> "Levels":
         """Blur ring ends by so much at least."""
         edge_rad, backed_rad = max(self.edge_rad, blur_rad), max(self.backed_rad, blur_rad)
         return replace(self, edge_rad=edge_rad, backed_rad=backed_rad)
 
-    def to_logs(self) -> Array:
-        """Take logs, in the order of the fields."""
-        return np.log([getattr(self, field.name) for field in fields(self)])
 
-    @classmethod
-    def from_logs(cls, logs: Array) -> "Levels":
-        """Undo `to_logs`."""
-        return cls(*(float(value) for value in np.exp(logs)))
-
-
-# One deviation of the logarithm of each level, a priori; the lasers' spread is the profile's to state.
-LOG_SIGMA = np.array([0.7, 0.7, 0.7, 1.0, 1.0, 0.7, 0.7, 0.7, 0.7, 0.3])
+LOG_SIGMA: Mapping[str, float] = {
+    "range_m": 0.7,
+    "ring_m": 0.7,
+    "edge_rad": 0.7,
+    "backed_rad": 1.0,
+    "lost_share": 1.0,
+    "tilt_rad": 0.7,
+    "spin_rad": 0.7,
+    "depth_m": 0.7,
+    "across_m": 0.7,
+    "laser_m": 0.3,
+}
+"""One deviation of the logarithm of each level, a priori; the lasers' spread is the profile's to state."""
 # Most ring ends are where the board ends, or there would be nothing to go by.
 MOST_LOST = 0.6
 

@@ -8,17 +8,15 @@ that part of the picture, the print, the board's bend, its motion. The covarianc
         sigma_depth^2 along the line of sight, sigma_across^2 across it                                   (1)
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lce_rig.calibrate.likelihood.levels import PoseLevels
 from lce_rig.calibrate.likelihood.scans import Indices
 from lce_rig.core.geometry import Array, difference, skew
 from lce_rig.core.results import ImageBoard
-
-N_POSE_LEVELS = 4
-_SIGMA_FLOOR_PX = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,17 +27,25 @@ class Pictures:
         capture: (P,) which of the stacked captures.
         T_cam_board: (P, 4, 4).
         cov: (P, 6, 6) of the corners' noise, tangent of T_cam_board.
-        shapes: (P, 4, 6, 6) derivative of Q by the squares of tilt, spin, depth and across.
+        shapes: (P, 6, 6) each, derivative of Q by the square of each of `PoseLevels`, by name.
     """
 
     capture: Indices
     T_cam_board: Array
     cov: Array
-    shapes: Array
+    shapes: Mapping[str, Array]
 
-    def total_cov(self, sigmas: Array) -> Array:
-        """Add Q for the four deviations of (1) to the corners' covariance: (P, 6, 6)."""
-        return np.asarray(self.cov + np.einsum("q,pqij->pij", np.square(sigmas), self.shapes))
+    def total_cov(self, levels: PoseLevels) -> Array:
+        """Add Q to the corners' covariance: (P, 6, 6)."""
+        Q = np.zeros_like(self.cov)
+        for name, shape in self.shapes.items():
+            Q += getattr(levels, name) ** 2 * shape
+        return self.cov + Q
+
+    def with_larger_errors(self, ratios: PoseLevels) -> "Pictures":
+        """Let the pictures err beyond corner noise by so many times what levels say."""
+        shapes = {name: getattr(ratios, name) ** 2 * shape for name, shape in self.shapes.items()}
+        return replace(self, shapes=shapes)
 
 
 def stack_pictures(capture: Indices, images: Sequence[ImageBoard], n_repeats: Array) -> Pictures:
@@ -53,12 +59,14 @@ def stack_pictures(capture: Indices, images: Sequence[ImageBoard], n_repeats: Ar
     """
     T = np.array([image.T_cam_board for image in images])
     cov = np.array([image.cov for image in images])
-    shapes = np.zeros((len(T), N_POSE_LEVELS, 6, 6))
+    shapes = {name: np.zeros((len(T), 6, 6)) for name in PoseLevels._fields}
     normal, sight = T[:, :3, 2], T[:, :3, 3] / np.linalg.norm(T[:, :3, 3], axis=1, keepdims=True)
     about, along = (v[:, :, None] * v[:, None, :] for v in (normal, sight))
-    shapes[:, 0, 3:, 3:], shapes[:, 1, 3:, 3:] = np.eye(3) - about, about
-    shapes[:, 2, :3, :3], shapes[:, 3, :3, :3] = along, np.eye(3) - along
-    return Pictures(capture, T, cov, shapes * n_repeats[:, None, None, None])
+    shapes["tilt_rad"][:, 3:, 3:], shapes["spin_rad"][:, 3:, 3:] = np.eye(3) - about, about
+    shapes["depth_m"][:, :3, :3], shapes["across_m"][:, :3, :3] = along, np.eye(3) - along
+    return Pictures(
+        capture, T, cov, {name: n_repeats[:, None, None] * shape for name, shape in shapes.items()}
+    )
 
 
 def picture_rows(pictures: Pictures, T_cam_lidar: Array, T_lidar_board: Array, scale: float) -> Array:

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS
-from lce_rig.calibrate.likelihood.levels import NO_LASER_M, Levels, Priors
+from lce_rig.calibrate.likelihood.levels import NO_LASER_M, Levels, PoseLevels, Priors
 from lce_rig.calibrate.likelihood.levels_fit import fit_levels
-from lce_rig.calibrate.likelihood.picture_terms import N_POSE_LEVELS, Pictures, stack_pictures
+from lce_rig.calibrate.likelihood.picture_terms import Pictures, stack_pictures
 from lce_rig.calibrate.likelihood.scans import N_FIELDS, StackedScans, interior, lens_fields, stack_scans
 from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, System, Terms, assemble, linearise
 from lce_rig.calibrate.placements import group_placements
@@ -46,7 +46,6 @@ class JointEstimate:
         scale: (C,) by how much of themselves each camera's distances are too short.
         constants_sigma: (L + 9,) standard deviations of offsets, lens and shifts.
         levels: of the noise.
-        end_sigma_m: standard deviation of ring ends from the edges, without those lost or stray.
         system: normal equations at the optimum.
     """
 
@@ -60,7 +59,6 @@ class JointEstimate:
     scale: Array
     constants_sigma: Array
     levels: Levels
-    end_sigma_m: float
     system: System
 
 
@@ -71,7 +69,7 @@ def refine(
     priors: Priors | None = None,
     usual: Levels | None = None,
     levels: Levels | None = None,
-    pose_sizes: Sequence[Array] | None = None,
+    pose_ratios: Sequence[PoseLevels] | None = None,
 ) -> JointEstimate:
     """Refine extrinsics of C cameras; captures of the same name share their scan and the board's pose.
 
@@ -82,16 +80,17 @@ def refine(
         priors: of the constant errors.
         usual: what the noise levels usually are.
         levels: of the noise, where they are known; else estimated.
-        pose_sizes: (4,) for each camera, by how much its pictures' errors beyond corner noise (tilt, spin,
-            depth, across) are larger than `levels` says; 1 where None.
+        pose_ratios: for each camera, by how many times its pictures' errors beyond corner noise are larger
+            than `levels` says; 1 where None.
     """
     priors, usual = priors or Priors(), usual or Levels()
     usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
     seen = {o.capture: (o, T) for own, T in zip(cameras, T_cam_lidar, strict=True) for o in own}
     order = {name: k for k, name in enumerate(sorted(seen))}
     scans = stack_scans([interior(seen[name][0].lidar, board) for name in order])
-    sizes = pose_sizes or [np.ones(N_POSE_LEVELS)] * len(cameras)
-    pictures = tuple(_pictures(own, order, size) for own, size in zip(cameras, sizes, strict=True))
+    pictures = tuple(_pictures(own, order) for own in cameras)
+    if pose_ratios is not None:
+        pictures = tuple(p.with_larger_errors(r) for p, r in zip(pictures, pose_ratios, strict=True))
     state = State(
         np.array(T_cam_lidar),
         np.array([invert(T) @ o.image.T_cam_board for o, T in (seen[name] for name in order)]),
@@ -130,12 +129,11 @@ class _Problem:
         return state
 
 
-def _pictures(observations: Sequence[Observation], order: dict[str, int], sizes: Array) -> Pictures:
+def _pictures(observations: Sequence[Observation], order: dict[str, int]) -> Pictures:
     placement = group_placements(observations)
     capture = np.array([order[o.capture] for o in observations], dtype=np.intp)
     n_repeats = np.bincount(placement)[placement].astype(np.float64)
-    pictures = stack_pictures(capture, [o.image for o in observations], n_repeats)
-    return replace(pictures, shapes=pictures.shapes * np.square(sizes)[:, None, None])
+    return stack_pictures(capture, [o.image for o in observations], n_repeats)
 
 
 def to_extrinsic(T_cam_lidar: Array, camera: int, n_unknowns: int) -> Array:
@@ -176,6 +174,5 @@ def _summarise(state: State, terms: Terms, levels: Levels, priors: Priors) -> Jo
         scale=constants[PER_CAMERA * np.arange(C) + 6],
         constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
         levels=levels,
-        end_sigma_m=float(np.sqrt(np.mean(terms.edges.variance(levels)))),
         system=system,
     )

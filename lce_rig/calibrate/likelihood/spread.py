@@ -1,9 +1,8 @@
 """Do placements disagree by more than the likelihood says they may?
 
-With g_k and H_k of all captures of placement k, leaving it out moves the optimum by (H - H_k)^-1 g_k. The
-spread of these moves (jackknife) knows nothing of the noise model; where it exceeds the model's covariance
-by more than chance allows, errors are at work that the model does not have, and the covariance is
-multiplied.
+The spread of the optimum without each placement (`lce_rig.solvers.jackknife`) knows nothing of the noise
+model; where it exceeds the model's covariance by more than chance allows, errors are at work that the model
+does not have, and the covariance is multiplied.
 """
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.likelihood.refine import JointEstimate
 from lce_rig.core.geometry import Array
 from lce_rig.solvers.covariance import symmetric_inverse
+from lce_rig.solvers.jackknife import jackknife_scatter, leave_one_out_moves, sum_by_group
 
 # So many standard deviations of its own must the ratio of covariances lie above 1 to count.
 _SURE = 2.0
@@ -42,11 +42,7 @@ def inflate(
 
 def jackknife(joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0) -> Array:
     """Compute the jackknife covariance (6, 6) of a camera's extrinsic over placements."""
-    n = int(placement.max()) + 1
     system = joint.system
-    hessians, gradients = (np.zeros((n, *a.shape[1:])) for a in (system.hessians, system.gradients))
-    np.add.at(hessians, placement, system.hessians)
-    np.add.at(gradients, placement, system.gradients)
-    steps = -(symmetric_inverse(system.information - hessians) @ gradients[..., None])[..., 0]
-    moves = steps @ joint.to_extrinsics[camera].T
-    return np.asarray((n - 1) / n * moves.T @ moves)
+    gradients, hessians = (sum_by_group(each, placement) for each in (system.gradients, system.hessians))
+    moves = leave_one_out_moves(gradients, hessians, system.information)
+    return jackknife_scatter(moves @ joint.to_extrinsics[camera].T)

@@ -11,12 +11,12 @@ capture by capture (Schur complement).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
 from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, EdgeRows, edge_rows, edge_system
-from lce_rig.calibrate.likelihood.levels import Levels, Priors
+from lce_rig.calibrate.likelihood.levels import Levels, PoseLevels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import Pictures, picture_rows
 from lce_rig.calibrate.likelihood.range_terms import RangeSums, range_system, sum_ranges, weigh_ranges
 from lce_rig.calibrate.likelihood.scans import N_FIELDS, StackedScans
@@ -131,16 +131,39 @@ def assemble(terms: Terms, levels: Levels, priors: Priors) -> System:
         levels: of their noise.
         priors: of the constants.
     """
-    of_ranges, range_volume = _range_block(terms, levels.range_m, levels.ring_m)
-    of_edges = _edge_block(terms, levels.edge_rad, levels.backed_rad, levels.lost_share)
-    of_pictures, picture_volume = _picture_block(terms, tuple(levels.pose))
-    return _eliminate(
-        of_ranges + of_edges + of_pictures, terms, levels, priors, range_volume + picture_volume
-    )
+    return Assembly(terms, priors).at(levels)
 
 
-# The search for levels changes one at a time: what the others weigh is kept from the time before.
-@lru_cache(maxsize=2)
+class Assembly:
+    """The normal equations of terms at one level of noise after another.
+
+    A search for levels changes one at a time: what the others weigh is kept from the evaluations before.
+
+    Args:
+        terms: of F captures.
+        priors: of the constants.
+    """
+
+    def __init__(self, terms: Terms, priors: Priors) -> None:
+        self._terms, self._priors = terms, priors
+        self._range_block = lru_cache(maxsize=2)(partial(_range_block, terms))
+        self._edge_block = lru_cache(maxsize=2)(partial(_edge_block, terms))
+        self._picture_block = lru_cache(maxsize=2)(partial(_picture_block, terms))
+
+    def at(self, levels: Levels) -> System:
+        """Weigh all terms and eliminate the board poses."""
+        of_ranges, range_volume = self._range_block(levels.range_m, levels.ring_m)
+        of_edges = self._edge_block(levels.edge_rad, levels.backed_rad, levels.lost_share)
+        of_pictures, picture_volume = self._picture_block(levels.pose)
+        return _eliminate(
+            of_ranges + of_edges + of_pictures,
+            self._terms,
+            levels,
+            self._priors,
+            range_volume + picture_volume,
+        )
+
+
 def _range_block(terms: Terms, range_m: float, ring_m: float) -> tuple[Array, float]:
     """Weigh what the returns say, and add up the logs of their covariances' determinants."""
     block = _no_block(terms)
@@ -152,7 +175,6 @@ def _range_block(terms: Terms, range_m: float, ring_m: float) -> tuple[Array, fl
     return block, float(log_volumes.sum())
 
 
-@lru_cache(maxsize=2)
 def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: float) -> Array:
     """Weigh what the ring ends say."""
     block = _no_block(terms)
@@ -161,12 +183,11 @@ def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: fl
     return block
 
 
-@lru_cache(maxsize=2)
-def _picture_block(terms: Terms, pose_sigmas: tuple[float, ...]) -> tuple[Array, float]:
+def _picture_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, float]:
     """Weigh what the pictures say, and add up the logs of their covariances' determinants."""
     block, log_volume = _no_block(terms), 0.0
     for c, (pictures, rows) in enumerate(zip(terms.pictures, terms.picture_rows, strict=True)):
-        cov = pictures.total_cov(np.array(pose_sigmas))
+        cov = pictures.total_cov(pose_levels)
         own = 6 + PER_CAMERA * c
         place = np.r_[own : own + 6, 0:6, own + 6, block.shape[1] - 1]
         products = np.swapaxes(rows, 1, 2) @ np.linalg.solve(cov, rows)

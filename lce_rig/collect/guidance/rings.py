@@ -73,7 +73,7 @@ def cross_board(model: SensorModel, T_lidar_board: Array) -> Rings:
     ends = np.where((n_points > 0)[..., None, None], ends, 0.0)
     length_m = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
     spacing_m = length_m / np.maximum(n_points, 1)
-    return Rings(n_points, ends, spacing_m, _nearest_edge(ends, half))
+    return Rings(n_points, ends, spacing_m, board.nearest_edge(ends))
 
 
 def _azimuths(model: SensorModel, T_lidar_board: Array) -> tuple[Array, Array]:
@@ -86,10 +86,3 @@ def _azimuths(model: SensorModel, T_lidar_board: Array) -> tuple[Array, Array]:
     low, span = turned.min(axis=1), np.ptp(turned, axis=1)
     share = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
     return (middle + low)[:, None] + span[:, None] * share, span
-
-
-def _nearest_edge(ends: Array, half: Array) -> NDArray[np.intp]:
-    beyond = np.abs(ends) - half
-    side = np.where(ends[..., 0] > 0, 1, 3)
-    rail = np.where(ends[..., 1] > 0, 2, 0)
-    return np.asarray(np.where(beyond[..., 0] > beyond[..., 1], side, rail), dtype=np.intp)

@@ -8,8 +8,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Literal
 
 from lce_rig.collect.live.frame_feed import FrameFeed
 from lce_rig.collect.live.gates import LiveGate, SlowBoards, StillBoards
@@ -17,6 +15,7 @@ from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.keeper import Keeper, Task
 from lce_rig.collect.live.monitor import Monitor
 from lce_rig.collect.live.narration import Narration, narrate_unseen
+from lce_rig.collect.live.options import Ending, Key, LiveOptions, LiveReport
 from lce_rig.collect.live.pumps import Pumps
 from lce_rig.collect.live.recorder import SampleRecorder
 from lce_rig.collect.live.rig_clock import RigClock, SyncTimes
@@ -24,17 +23,11 @@ from lce_rig.collect.live.state import LiveState
 from lce_rig.collect.novelty import Placements, capture_poses
 from lce_rig.collect.sync import pair_times
 from lce_rig.collect.watching import BoardWatcher, ImageKey, Moment, Sighting
-from lce_rig.core.errors import LceRigError, SourceError
+from lce_rig.core.errors import LceRigError
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.sources.live.base import LiveSource
 
-Ending = Literal["enough", "frames", "timeout", "stopped", "lost"]
-Key = Literal["stop", "capture", "next"]
-"""stop: end; capture: take what is seen now; next: propose another placement."""
-
-#: How long a board stands still before it is captured, beyond the first half second.
-HOLD_S = 1.5
 #: How often a picture without a board is searched thoroughly, during which nothing is said.
 THOROUGH_S = 3.0
 #: How often a scan is searched for other things of the board's size while all that are known are followed.
@@ -42,54 +35,6 @@ RESCAN_S = 1.0
 _WAIT_S = 0.1
 _TURN_S = 0.0005
 _NOVEL_M, _NOVEL_DEG = 0.15, 10.0
-
-
-@dataclass(frozen=True)
-class LiveOptions:
-    """How a live collection goes.
-
-    Attributes:
-        n_wanted: captures that the session is to hold; None until the target is predicted to be met.
-        timeout_s: ends after so long; None never.
-        hold_s: how long a board stands still before it is captured, beyond the first half second.
-        lost_s: how long a lost sensor is waited for.
-        goes_on: whether to go on when the target is met, until told to stop.
-        search_interval_s: how often a whole picture is searched while no board is in sight.
-    """
-
-    n_wanted: int | None = None
-    timeout_s: float | None = None
-    hold_s: float = HOLD_S
-    lost_s: float = 60.0
-    goes_on: bool = False
-    search_interval_s: float = 0.3
-
-
-@dataclass
-class LiveReport:
-    """How a live collection went.
-
-    Attributes:
-        ending: why it ended.
-        captured: names of the new captures, in order.
-        latencies_s: from each decision until its capture was safe on the disk.
-        n_frames: frames looked at.
-        n_skipped: frames that came while one before was looked at.
-        n_lost: what sensors lost or nobody took, by sensor.
-        lost: sensors that were lost when it ended, and why, by name.
-        error: the sensor that is lost for good; None where none is.
-        notes: what else was odd.
-    """
-
-    ending: Ending = "stopped"
-    captured: list[str] = field(default_factory=list)
-    latencies_s: list[float] = field(default_factory=list)
-    n_frames: int = 0
-    n_skipped: int = 0
-    n_lost: dict[str, int] = field(default_factory=dict)
-    lost: dict[str, SourceError] = field(default_factory=dict)
-    error: SourceError | None = None
-    notes: list[str] = field(default_factory=list)
 
 
 def collect_live(

@@ -1,5 +1,6 @@
 """Residuals of the joint likelihood: derivatives, sums and evidence against the same computed plainly."""
 
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import picture_rows, stack_pictures
 from lce_rig.calibrate.likelihood.range_terms import sum_ranges, weigh_ranges
 from lce_rig.calibrate.likelihood.scans import N_FIELDS, stack_scans
-from lce_rig.calibrate.likelihood.system import State, assemble, linearise
+from lce_rig.calibrate.likelihood.system import Assembly, State, assemble, linearise
 from lce_rig.core.geometry import difference, invert, perturb
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
@@ -203,3 +204,17 @@ def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, pictu
     ):
         fast = [assemble(terms, levels, priors).minus_2_log_evidence for levels in (base, changed)]
         assert np.isclose(fast[1] - fast[0], plainly(changed) - plainly(base), rtol=1e-5)
+
+
+def test_what_a_search_for_levels_keeps_is_right_at_each_step_and_gone_with_it(
+    scans, pictures, T_lidar_board
+):
+    zeros = np.zeros(7 + len(scans.rings) + N_FIELDS + N_SHIFTS)
+    terms = linearise(scans, (pictures,), BOARD, State(T_FORWARD[None], T_lidar_board, zeros))
+    assembly, base = Assembly(terms, Priors()), Levels()
+    for changed in (base, replace(base, range_m=0.02), replace(base, lost_share=0.3), base):
+        plainly = assemble(terms, changed, Priors()).minus_2_log_evidence
+        assert assembly.at(changed).minus_2_log_evidence == plainly
+    kept = weakref.ref(terms)
+    del terms, assembly
+    assert kept() is None

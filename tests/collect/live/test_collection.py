@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lce_rig.collect.live.collection import Key, LiveOptions, collect_live, make_guides
+from lce_rig.collect.live.collection import collect_live, make_guides
+from lce_rig.collect.live.options import Key, LiveOptions
 from lce_rig.collect.live.state import LiveState
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.session import Session
@@ -56,6 +57,7 @@ def test_a_placement_that_was_captured_is_not_captured_twice(tmp_path: Path) -> 
     assert states[-2].drawing is not None and states[-2].drawing.wanted_px is not None
 
 
+@pytest.mark.long
 def test_a_session_is_continued_and_its_captures_count(tmp_path: Path) -> None:
     path = tmp_path / "session"
     show = Show(placements()[:2], each_s=2.0)

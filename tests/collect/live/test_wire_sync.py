@@ -9,10 +9,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from wire.reel import Reel
 from wire.rig import WireRig, small_rig
 
-from lce_rig.collect.live.collection import LiveOptions, collect_live
+from lce_rig.collect.live.collection import collect_live
+from lce_rig.collect.live.options import LiveOptions
 from lce_rig.collect.live.state import LiveState
 from lce_rig.rig.sync import SyncSettings, TriggerSettings
 from lce_rig.session import Session
@@ -68,6 +70,7 @@ class TriggeringBoard(FakeBoard):
             self._line = -1
 
 
+@pytest.mark.long
 def test_pulses_tie_the_cameras_pictures_to_the_lidars_time(
     wire: Callable[..., WireRig], reel: Reel, tmp_path: Path
 ) -> None:
