@@ -126,11 +126,10 @@ def _weights(
         plane, edge = _PLANE_FREEDOMS / plane_sigma_m**2, n_ends / edge_sigma_m**2
     else:
         plane, edge = options.plane_weight * unit, options.edge_weight * unit
-    has_shift = options.edge_shift == "free" and options.use_ptl
     return Weights(
         plane=plane if options.use_ptpl else 0.0,
         edge=edge if options.use_ptl else 0.0,
-        shift_prior=1 / options.edge_shift_sigma_m**2 if has_shift else None,
+        shift_prior=options.edge_shift_precision,
     )
 
 
