@@ -32,8 +32,10 @@ BLENDS = 1
 # Noise of a ring end, and beyond how many sigmas one counts less.
 _END_SIGMA_M, _HUBER = 0.003, 1.5
 _ROUNDS = 5
-# Effects that count together or not at all: by what is far behind, by what is close behind.
-_TOGETHER = ((0,), (1, 2))
+# Columns that count if together they are sure: all, what is far behind, what is close behind.
+_TOGETHER = ((0, 1, 2), (0,), (1, 2))
+# Each column must differ from 0 in so many captures.
+_MIN_CAPTURES = 5
 # They count if they would come about by chance in one session of so many.
 _ONE_IN = 1000
 
@@ -74,16 +76,16 @@ def estimate_shifts(
     background = np.concatenate([describe_background(observation.lidar) for observation in observations])
     # Inside distance = - (change of the extrinsic) - beam's width - shifts.
     A = -np.column_stack([np.concatenate([J[:, : SHIFT + 1] for _, J in parts]), background])
-    # A column that no ring end has is known to be zero, and so is what is found to be uncertain.
+    # What few captures have is not told from their scatter; it stays zero, and so does what is uncertain.
     n_having = np.count_nonzero(np.add.reduceat(background, first, axis=0) > 0, axis=0)
-    free = n_having > 0
+    free = n_having >= _MIN_CAPTURES
     while free.any():
         shifts, scatter = _fit_shifts(A, inside, first, free)
         is_sure = np.zeros(_N_SHIFTS, dtype=bool)
         for group in _TOGETHER:
             seen = np.array([column for column in group if free[column]], dtype=int)
             if len(seen):
-                is_sure[seen] = _is_sure(shifts[seen], scatter[np.ix_(seen, seen)], int(n_having[seen].max()))
+                is_sure[seen] |= _is_sure(shifts[seen], scatter[np.ix_(seen, seen)], n_having[seen].max())
         if is_sure[free].all():
             return shifts
         free = is_sure
@@ -117,8 +119,6 @@ def _is_sure(shifts: Array, scatter: Array, n_captures: int) -> bool:
     from scipy.special import fdtri
 
     freedoms, n_left = len(shifts), n_captures - len(shifts)
-    if n_left < 1:
-        return False
     T2 = shifts @ symmetric_inverse(scatter) @ shifts
     limit = fdtri(freedoms, n_left, 1 - 1 / _ONE_IN) * freedoms * (n_captures - 1) / n_left
     return bool(limit < T2)

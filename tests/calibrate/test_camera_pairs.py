@@ -64,6 +64,7 @@ def test_of_few_boards_the_claim_is_that_of_usual_errors(sound):
     assert 0.5 < np.mean(nees) < 8
 
 
+@pytest.mark.long
 def test_sound_sessions_are_not_doubted(sound):
     for session in sound:
         pair = related(session)

@@ -33,6 +33,7 @@ def keep(session: Path, n_captures: int) -> None:
         shutil.rmtree(capture.path)
 
 
+@pytest.mark.long
 def test_inner_corners_counted_wrongly_are_named_with_what_is_seen(lce_rig, session):
     keep(session, 3)
     edit_profile(session, board__inner_corners=[8, 5])
@@ -102,6 +103,7 @@ def test_a_session_whose_captures_are_all_damaged_names_the_damage(lce_rig, sess
     assert "000000" in outcome.err
 
 
+@pytest.mark.long
 def test_a_plate_of_the_boards_size_that_stands_in_the_room_is_not_taken_for_the_board(tmp_path):
     """The decoy is in every scan; only the board moves with what the camera sees."""
     session = tmp_path / "session"

@@ -47,6 +47,7 @@ def test_a_second_run_captures_nothing_again(collected, bag, rig):
     assert (report.captured, report.n_resumed, len(session.captures)) == ([], 2, 2)
 
 
+@pytest.mark.long
 def test_a_recording_stops_at_the_target_or_says_what_is_missing(tmp_path, bag, rig):
     with Session.create(tmp_path / "one", rig) as session:
         report = collect(session, [open_recording(bag, rig)], CollectOptions(target=1))

@@ -31,6 +31,7 @@ while True:
 """
 
 
+@pytest.mark.long
 def test_a_writer_killed_at_any_moment_leaves_only_whole_captures(tmp_path):
     path = tmp_path / "s"
     promised: set[str] = set()

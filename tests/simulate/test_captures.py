@@ -178,6 +178,7 @@ def test_walls_floor_and_furniture_surround_the_board(captures: list[SimulatedCa
         assert contrast > 25
 
 
+@pytest.mark.long
 def test_carriers_follow_the_rig_and_the_option(rig: Rig) -> None:
     assert SimulationOptions.for_rig("rlfs").carrier == "stand"
     assert SimulationOptions.for_rig("rles").carrier == "person"

@@ -75,6 +75,7 @@ def found_corners(rig: Rig, image: Image, T_cam_board: Array) -> tuple[Array, Ar
     return found, truth
 
 
+@pytest.mark.long
 def test_the_board_passes_its_placement_when_the_lidar_looks_ahead(
     rig: Rig, captures: list[SimulatedCapture]
 ) -> None:

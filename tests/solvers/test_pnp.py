@@ -58,6 +58,7 @@ def test_exact_corners_give_the_exact_pose(
     assert np.abs(difference(solved.T_cam_board, T)).max() < 1e-4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("camera", "tilt_deg", "z_m"),
     [(RADTAN, 40.0, 1.5), (RADTAN, 25.0, 2.5), (FISHEYE, 25.0, 2.5)],

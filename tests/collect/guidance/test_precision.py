@@ -78,6 +78,7 @@ def test_lasers_pull_as_in_the_calibration(poses, linearised):
     assert np.abs((predicted[:, rings] - sensitivities) / scale)[:6].max() < 0.15
 
 
+@pytest.mark.long
 def test_predicted_scatter_is_that_of_many_sessions(poses):
     scenario = Scenario(range_sigma_m=0.01, corner_sigma_px=0.1)
     options = CalibrateOptions(n_draws=0)

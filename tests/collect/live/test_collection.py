@@ -57,6 +57,7 @@ def test_a_placement_that_was_captured_is_not_captured_twice(tmp_path: Path) -> 
     assert states[-2].drawing is not None and states[-2].drawing.wanted_px is not None
 
 
+@pytest.mark.long
 def test_a_session_is_continued_and_its_captures_count(tmp_path: Path) -> None:
     path = tmp_path / "session"
     show = Show(placements()[:2], each_s=2.0)

@@ -27,6 +27,7 @@ from tests.collect.live.sent import (
 Start = Callable[..., WireRig]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("number", "code"),
     [(signal.SIGTERM, 0), (signal.SIGINT, 130), pytest.param(signal.SIGHUP, 0, marks=pytest.mark.slow)],
@@ -46,6 +47,7 @@ def test_signals_end_a_collection_cleanly(
     assert set(captured_names(collecting.said)) <= set(names)
 
 
+@pytest.mark.long
 def test_a_collection_that_is_killed_loses_no_capture(wire: Start, tmp_path: Path) -> None:
     rig, session, said = wire(), tmp_path / "session", list[str]()
     chance = random.Random(0)

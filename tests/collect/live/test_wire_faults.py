@@ -31,6 +31,7 @@ time.time_ns = lambda: real_ns() + ({set_ns} if os.path.exists({file!r}) else 0)
 """
 
 
+@pytest.mark.long
 def test_a_camera_that_is_unplugged_is_waited_for_and_taken_again(wire: Start, tmp_path: Path) -> None:
     rig = wire()
     with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
@@ -46,6 +47,7 @@ def test_a_camera_that_is_unplugged_is_waited_for_and_taken_again(wire: Start, t
     check_whole(tmp_path / "session")
 
 
+@pytest.mark.long
 def test_a_lidar_that_falls_silent_for_a_while_is_taken_again(
     wire: Start, reel: Reel, tmp_path: Path
 ) -> None:
@@ -98,6 +100,7 @@ def test_a_lidar_that_is_gone_for_a_minute_is_an_error_of_the_command(wire: Star
     check_whole(tmp_path / "session")
 
 
+@pytest.mark.long
 def test_losses_of_the_network_are_counted_and_shown_and_collection_goes_on(
     wire: Start, tmp_path: Path
 ) -> None:
@@ -156,6 +159,7 @@ def test_a_computer_whose_clock_is_set_goes_on(wire: Start, reel: Reel, tmp_path
         check_sent(capture, sent)
 
 
+@pytest.mark.long
 def test_a_full_disk_is_one_clear_error_and_spares_the_captures(wire: Start, tmp_path: Path) -> None:
     rig, session = wire(), tmp_path / "session"
     with Collecting(rig.profile, session, "--hold", "0") as collecting:
@@ -172,6 +176,7 @@ def test_a_full_disk_is_one_clear_error_and_spares_the_captures(wire: Start, tmp
     assert len(check_whole(session)) == n_safe + 1
 
 
+@pytest.mark.long
 def test_guidance_goes_on_while_a_slow_disk_takes_a_capture(
     wire: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from wire.reel import Reel
 from wire.rig import WireRig, small_rig
 
@@ -69,6 +70,7 @@ class TriggeringBoard(FakeBoard):
             self._line = -1
 
 
+@pytest.mark.long
 def test_pulses_tie_the_cameras_pictures_to_the_lidars_time(
     wire: Callable[..., WireRig], reel: Reel, tmp_path: Path
 ) -> None:
