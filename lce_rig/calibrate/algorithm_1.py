@@ -9,6 +9,7 @@ References:
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.calibrate.background import estimate_shifts, move_ends
 from lce_rig.calibrate.draws import Draws, draw_subsets
@@ -54,29 +55,29 @@ def calibrate_by_algorithm_1(
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
     features = [extract_features(observation, board, options) for observation in observations]
-    problem = Problem(features, board, _weights(options, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
-    T_planes = solve_planes(features, problem)
-    require_observable(features, problem, T_planes)
-    shifts_m = np.zeros(len(_SHIFTS))
+    problem, T_planes = _start(features, board, _weights(options, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
+    fitted, shifts = list(observations), dict.fromkeys(_SHIFTS, 0.0)
     if problem.n_shift:
         shifts_m = estimate_shifts(observations, features, T_planes, board)
-    if shifts_m.any():
-        observations = move_ends(observations, features, T_planes, board, shifts_m)
-        features = [extract_features(observation, board, options) for observation in observations]
-        problem = Problem(features, board, problem.weights)
+        if shifts_m.any():
+            fitted = move_ends(observations, features, T_planes, board, shifts_m)
+            features = [extract_features(observation, board, options) for observation in fitted]
+            problem = Problem(features, board, problem.weights)
+        shifts = dict(zip(_SHIFTS, shifts_m.tolist(), strict=True))
 
     outliers, sigmas = reject_outliers(features, problem, T_planes, options)
+    observations, fitted = (
+        [observation for observation in each if observation.capture not in outliers]
+        for each in (observations, fitted)
+    )
     features = [f for f in features if f.capture not in outliers]
-    observations = [o for o in observations if o.capture not in outliers]
     keep = drop_uncertain(features, T_planes) if options.use_uncertainty else None
-    problem = Problem(features, board, _weights(options, features, *sigmas), keep)
-    T_planes = solve_planes(features, problem)
-    require_observable(features, problem, T_planes)
+    problem, T_planes = _start(features, board, _weights(options, features, *sigmas), keep)
 
     draws = draw_subsets(problem, T_planes, options.n_draws, options.n_rounds, options.seed, progress)
     T_start = T_planes if draws is None else draws.T_mean[draws.best]
     solution = problem.solve(np.ones((1, problem.n_captures)), T_start, options.n_rounds)
-    covariances = _covariances(observations, board, options, problem, solution)
+    covariances = _covariances(fitted, board, options, problem, solution)
     held_out = np.full(len(features), np.nan) if draws is None else draws.capture_held_out_m
     certificates, cov = solution.certificates, covariances[0] + covariances[1]
     return report_estimate(
@@ -85,14 +86,29 @@ def calibrate_by_algorithm_1(
         observations,
         features,
         board,
+        fitted=fitted,
         certificate=Certificate(bool(certificates.is_optimal[0]), float(certificates.relative_gap[0])),
         held_out_m=held_out,
         refused=outliers,
-        diagnostics={
-            **_diagnostics(problem, solution, covariances, draws),
-            **dict(zip(_SHIFTS, shifts_m.tolist(), strict=True)),
-        },
+        diagnostics={**_diagnostics(problem, solution, covariances, draws), **shifts},
     )
+
+
+def _start(
+    features: Sequence[CaptureFeatures],
+    board: Board,
+    weights: Weights,
+    keep: Sequence[NDArray[np.bool_]] | None = None,
+) -> tuple[Problem, Array]:
+    """Solve for T_cam_lidar (4, 4) from the planes alone; also the problem that goes on from there.
+
+    Raises:
+        NotEnoughDataError: the planes leave a direction undetermined, which is named.
+    """
+    problem = Problem(features, board, weights, keep)
+    T_planes = solve_planes(features, problem)
+    require_observable(features, problem, T_planes)
+    return problem, T_planes
 
 
 def _weights(
@@ -110,11 +126,10 @@ def _weights(
         plane, edge = _PLANE_FREEDOMS / plane_sigma_m**2, n_ends / edge_sigma_m**2
     else:
         plane, edge = options.plane_weight * unit, options.edge_weight * unit
-    has_shift = options.edge_shift == "free" and options.use_ptl
     return Weights(
         plane=plane if options.use_ptpl else 0.0,
         edge=edge if options.use_ptl else 0.0,
-        shift_prior=1 / options.edge_shift_sigma_m**2 if has_shift else None,
+        shift_prior=options.edge_shift_precision,
     )
 
 

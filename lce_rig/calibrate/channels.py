@@ -179,9 +179,7 @@ def _offsets(
     weights = Weights(
         plane=start.diagnostics["plane_weight"] * unit,
         edge=start.diagnostics["edge_weight"] * unit,
-        shift_prior=1 / options.edge_shift_sigma_m**2
-        if options.edge_shift == "free" and options.use_ptl
-        else None,
+        shift_prior=options.edge_shift_precision,
     )
     moving = np.flatnonzero(samples.tells_motion).tolist()
     offsets = estimate_time_offsets(

@@ -39,10 +39,12 @@ class CalibrationEstimate:
             captures shows, and what range errors of the LiDAR add that are the same in all captures. Errors
             of the intrinsics and of the board's size are not in it.
         certificate: of the final cost over all captures used; its gap is infinite where there is none.
-        metrics: errors over all captures used.
+        metrics: errors over all captures used, of the boards as measured.
         used: names of the captures behind the estimate, sorted.
         refused: why each other capture is not.
-        observations: capture -> the boards that were paired, for each capture used.
+        observations: capture -> the boards that were paired, as measured, for each capture used.
+        fitted: the same as the method's cost takes them: Algorithm 1 moves ring ends by what the background
+            does to them.
         residuals: one per capture used, in the order of `used`.
         held_out_m: mean over captures of `CaptureResidual.held_out_m`.
         weak_direction: the least certain motion in words, with its standard deviation.
@@ -60,6 +62,7 @@ class CalibrationEstimate:
     used: tuple[str, ...]
     refused: Mapping[str, Refusal]
     observations: Mapping[str, Observation]
+    fitted: Mapping[str, Observation]
     residuals: tuple[CaptureResidual, ...]
     held_out_m: float
     weak_direction: str

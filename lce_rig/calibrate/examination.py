@@ -57,7 +57,7 @@ def examine(
     """
     board = rig.board.to_board()
     intrinsics = check_intrinsics(_thinned(views), lens, board) if views else None
-    observations = [estimate.observations[name] for name in estimate.used]
+    observations = [estimate.fitted[name] for name in estimate.used]
     expansion = expand(
         observations,
         board,

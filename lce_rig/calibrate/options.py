@@ -73,3 +73,9 @@ class CalibrateOptions:
     range_offset_sigma_m: float = 0.0
     reject_outliers: bool = True
     min_captures: int = 3
+
+    @property
+    def edge_shift_precision(self) -> float | None:
+        """Inverse variance of the edge shift a priori, 1/m^2; None where it is held at zero."""
+        is_free = self.edge_shift == "free" and self.use_ptl
+        return 1 / self.edge_shift_sigma_m**2 if is_free else None

@@ -30,6 +30,7 @@ def report_estimate(
     features: Sequence[CaptureFeatures],
     board: Board,
     *,
+    fitted: Sequence[Observation] | None = None,
     certificate: Certificate = NO_CERTIFICATE,
     held_out_m: Array | None = None,
     refused: Mapping[str, Refusal],
@@ -40,9 +41,10 @@ def report_estimate(
     Args:
         T_cam_lidar: (4, 4).
         cov: (6, 6) of it, tangent (translation m, rotation rad).
-        observations: the F captures used.
+        observations: the F captures used, as measured: residuals are of these.
         features: of each.
         board: the board.
+        fitted: the same as the method's cost takes them, where it moves ring ends; as measured where None.
         certificate: of the minimum, where the method gives one.
         held_out_m: (F,) rms residual of each capture where it was not fitted, where the method knows it.
         refused: captures that the method left out.
@@ -68,6 +70,7 @@ def report_estimate(
         used=tuple(f.capture for f in features),
         refused=dict(sorted(refused.items())),
         observations={observation.capture: observation for observation in observations},
+        fitted={observation.capture: observation for observation in fitted or observations},
         residuals=residuals,
         held_out_m=float(np.mean(held_out)),
         weak_direction=describe_weakest(cov, features),

@@ -9,13 +9,13 @@ with c_k the cost of capture k, u its typical size, m_k + l_k = -2 ln p of its p
 channels that nearly agree would need boards faster than hands), and rho bounding what one capture can say.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
-from lce_rig.calibrate.features import extract_features, place_features
+from lce_rig.calibrate.features import CaptureFeatures, extract_features, place_features
 from lce_rig.calibrate.motion import BoardMotions, PoseSamples, board_time_s, deskew, fit_motions
 from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.calibrate.problem import Problem, Weights
@@ -105,50 +105,51 @@ def estimate_time_offsets(
         prior_sigma_s: (C,) standard deviation of each offset beforehand.
         sweep_s: of the LiDAR.
     """
-    precision = np.diag(prior_sigma_s**-2.0)
-    T = T_start
-
-    def evaluate(offset_s: Array) -> _Evaluation:
-        motions = fit_motions(samples, offset_s)
-        poses = zip(features, motions.at(times_s), motions.cov_at(times_s), strict=True)
-        problem = Problem(
-            [place_features(f, T_cam_board, cov, board) for f, T_cam_board, cov in poses], board, weights
-        )
-        solution = problem.solve(np.ones((1, problem.n_captures)), T, 2)
-        plane, edge = problem.errors(solution.x)
-        cost = weights.plane * plane[0] ** 2 + weights.edge * edge[0] ** 2
-        return _Evaluation(cost, motions, solution.T[0], float(offset_s @ precision @ offset_s))
-
     offset_s = _search_grid(samples, observations, T_start, prior_sigma_s, sweep_s)
     observations = deskew_points(observations, fit_motions(samples, offset_s), T_start)
-    features = [extract_features(observation, board, options) for observation in observations]
-    times_s = np.array([board_time_s(observation.lidar, sweep_s) for observation in observations])
-    here = evaluate(offset_s)
-    for _ in range(_N_ITERATIONS):
-        T, unit = here.T, float(np.median(here.cost)) / _FREEDOMS
-        g, H, T_rates = _derivatives(evaluate, offset_s, here, unit)
-        step = symmetric_inverse(H + precision) @ (g.sum(axis=0) + precision @ offset_s)
-        step *= min(1.0, _GRID_S / max(float(np.max(np.abs(step))), 1e-9))
-        if np.max(np.abs(step)) < _CONVERGED_S:
-            break
-        there = evaluate(offset_s - step)
-        while there.total(unit) > here.total(unit) and np.max(np.abs(step)) > _CONVERGED_S:
-            step /= 3
-            there = evaluate(offset_s - step)
-        if there.total(unit) > here.total(unit):
-            break
-        offset_s, here = offset_s - step, there
-    inverse = symmetric_inverse(H + precision)
+    cost = _Cost(
+        samples,
+        [extract_features(observation, board, options) for observation in observations],
+        np.array([board_time_s(observation.lidar, sweep_s) for observation in observations]),
+        board,
+        weights,
+        precision=np.diag(prior_sigma_s**-2.0),
+    )
+    offset_s, slopes = _descend(cost, offset_s, T_start)
+    inverse = symmetric_inverse(slopes.hessian + cost.precision)
     few = len(observations) / max(len(observations) - len(offset_s) - 6, 1)
-    cov = inverse @ (few * g.T @ g + precision) @ inverse
+    cov = inverse @ (few * slopes.gradients.T @ slopes.gradients + cost.precision) @ inverse
     # Captures that say little scatter little: never claim more than the curvature of (1) does.
     widen = np.sqrt(np.maximum(np.diag(inverse) / np.diag(cov), 1.0))
-    return TimeOffsets(samples.channels, offset_s, np.asarray(widen[:, None] * cov * widen), T_rates)
+    return TimeOffsets(samples.channels, offset_s, np.asarray(widen[:, None] * cov * widen), slopes.T_rates)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cost:
+    """Equation (1) for F captures, whose boards the LiDAR saw at times (F,) after their scans' stamps."""
+
+    samples: PoseSamples
+    features: Sequence[CaptureFeatures]
+    times_s: Array
+    board: Board
+    weights: Weights
+    precision: Array
+
+    def at(self, offset_s: Array, T_start: Array) -> "_Evaluation":
+        """Solve for the extrinsic at offsets (C,), from T_cam_lidar (4, 4) nearby."""
+        motions = fit_motions(self.samples, offset_s)
+        poses = zip(self.features, motions.at(self.times_s), motions.cov_at(self.times_s), strict=True)
+        placed = [place_features(f, T_cam_board, cov, self.board) for f, T_cam_board, cov in poses]
+        problem = Problem(placed, self.board, self.weights)
+        solution = problem.solve(np.ones((1, problem.n_captures)), T_start, 2)
+        plane, edge = problem.errors(solution.x)
+        cost = self.weights.plane * plane[0] ** 2 + self.weights.edge * edge[0] ** 2
+        return _Evaluation(cost, motions, solution.T[0], float(offset_s @ self.precision @ offset_s))
 
 
 @dataclass(frozen=True, eq=False)
 class _Evaluation:
-    """Equation (1) at one choice of offsets."""
+    """Equation (1) at one choice of offsets: c_k (F,), motions, T_cam_lidar (4, 4), the offsets' prior."""
 
     cost: Array
     motions: BoardMotions
@@ -167,30 +168,60 @@ def _rho(squared: Array) -> Array:
     return np.asarray(_ROBUST * np.log1p(squared / _ROBUST))
 
 
-def _derivatives(
-    evaluate: Callable[[Array], _Evaluation], offset_s: Array, here: _Evaluation, unit: float
-) -> tuple[Array, Array, Array]:
-    """Differentiate half of (1), without its prior, numerically.
+@dataclass(frozen=True, eq=False)
+class _Slopes:
+    """Derivatives of half of (1), without its prior, by the offsets.
 
-    Returns:
-        Each capture's gradient (F, C), the Hessian (C, C), and the extrinsic's rates (6, C).
+    Attributes:
+        gradients: (F, C) of each capture.
+        hessian: (C, C) of all.
+        T_rates: (6, C) of the extrinsic's tangent.
     """
+
+    gradients: Array
+    hessian: Array
+    T_rates: Array
+
+
+def _descend(cost: _Cost, offset_s: Array, T_start: Array) -> tuple[Array, _Slopes]:
+    """Minimise (1) by Newton steps, shortened where they lead upwards: the offsets (C,), slopes near them."""
+    here = cost.at(offset_s, T_start)
+    for _ in range(_N_ITERATIONS):
+        unit = float(np.median(here.cost)) / _FREEDOMS
+        slopes = _differentiate(cost, offset_s, here, unit)
+        gradient = slopes.gradients.sum(axis=0) + cost.precision @ offset_s
+        step = symmetric_inverse(slopes.hessian + cost.precision) @ gradient
+        step *= min(1.0, _GRID_S / max(float(np.max(np.abs(step))), 1e-9))
+        if np.max(np.abs(step)) < _CONVERGED_S:
+            break
+        there = cost.at(offset_s - step, here.T)
+        while there.total(unit) > here.total(unit) and np.max(np.abs(step)) > _CONVERGED_S:
+            step /= 3
+            there = cost.at(offset_s - step, here.T)
+        if there.total(unit) > here.total(unit):
+            break
+        offset_s, here = offset_s - step, there
+    return offset_s, slopes
+
+
+def _differentiate(cost: _Cost, offset_s: Array, here: _Evaluation, unit: float) -> _Slopes:
+    """Differentiate numerically at offsets (C,); costs of captures count in units of `unit`."""
     n = len(offset_s)
     steps = _STEP_S * np.eye(n)
     middle = here.by_capture(unit)
-    ahead, behind = ([evaluate(offset_s + sign * step) for step in steps] for sign in (1, -1))
+    ahead, behind = ([cost.at(offset_s + sign * step, here.T) for step in steps] for sign in (1, -1))
     up, down = ([e.by_capture(unit) for e in side] for side in (ahead, behind))
     g = np.stack([(a - b) / (2 * _STEP_S) for a, b in zip(up, down, strict=True)], axis=1)
     H = np.zeros((n, n))
     for i in range(n):
         H[i, i] = float(np.sum(up[i] + down[i] - 2 * middle)) / _STEP_S**2
         for j in range(i):
-            corner = evaluate(offset_s + steps[i] + steps[j]).by_capture(unit)
+            corner = cost.at(offset_s + steps[i] + steps[j], here.T).by_capture(unit)
             H[i, j] = H[j, i] = float(np.sum(corner - up[i] - up[j] + middle)) / _STEP_S**2
     rates = [difference(a.T, b.T) / (2 * _STEP_S) for a, b in zip(ahead, behind, strict=True)]
     # Far from the minimum the cost may bend the other way.
     values, vectors = np.linalg.eigh(H)
-    return g, np.asarray((vectors * np.abs(values)) @ vectors.T), np.stack(rates, axis=1)
+    return _Slopes(g, np.asarray((vectors * np.abs(values)) @ vectors.T), np.stack(rates, axis=1))
 
 
 def _search_grid(

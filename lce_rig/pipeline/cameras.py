@@ -116,11 +116,7 @@ def _examined(rig: Rig, detections: Detections, alone: Solved, together: Togethe
 def _covariance(together: TogetherEstimate, camera: Solved, other: Solved) -> Array:
     """Compute the covariance (6, 6) of where a camera sits to another, widened as both extrinsics were."""
     _, J = relative_pose(camera.estimate.T_cam_lidar, other.estimate.T_cam_lidar)
-    by_extrinsic = [
-        np.full(6, np.sqrt(each.estimate.cov[0, 0] / each.result.estimate.cov[0, 0]))
-        for each in (camera, other)
-    ]
-    J = J * np.concatenate(by_extrinsic)
+    J = J * np.repeat([camera.widened_by, other.widened_by], 6)
     return np.asarray(J @ together.covariance_of(camera.camera, other.camera) @ J.T)
 
 

@@ -57,6 +57,11 @@ class Solved:
         return self.examination.estimate
 
     @property
+    def widened_by(self) -> float:
+        """By how many times the examination widened the method's standard deviations; 1 where it did not."""
+        return self.estimate.diagnostics.get("sigma_widened", 1.0)
+
+    @property
     def is_still(self) -> bool:
         """Whether boards stood still, so that pictures count as they are, whenever they were taken."""
         return all(channel.time_offset_s is None for channel in self.result.channels)

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, calibrate
+from lce_rig.calibrate import CalibrateOptions, calibrate, capture_residual
 from lce_rig.core.geometry import difference
+from lce_rig.core.results import Observation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 OPTIONS = CalibrateOptions(n_draws=0)
@@ -54,6 +55,10 @@ def test_what_the_board_ends_sooner_before_a_person_is_found_and_made_good():
     captures = [held(c, (c.lidar[0].edge_side > 0) & (k % 4 != 0)) for k, c in enumerate(plain)]
     found = calibrate(captures, BOARD, OPTIONS)
     assert found.diagnostics["edge_shift_blended_m"] == pytest.approx(-0.008, abs=0.003)
+    for residual in found.residuals:
+        (capture,) = (c for c in captures if c.capture == residual.capture)
+        observation = Observation(capture.capture, capture.image, capture.lidar[0])
+        assert residual.edge_mean_m == capture_residual(found.T_cam_lidar, observation, BOARD).edge_mean_m
     corrected, as_measured = error_m(captures), error_m([unaware(c) for c in captures])
     assert corrected < 0.002
     assert corrected < 0.6 * as_measured

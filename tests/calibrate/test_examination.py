@@ -192,8 +192,8 @@ def test_three_ways_of_resampling_agree_with_the_scatter_over_sessions():
 
 def test_few_placements_leave_nothing_to_be_left_out():
     estimate = calibrated(20, 1)
-    few = {name: estimate.observations[estimate.used[k % 3]] for k, name in enumerate(estimate.used)}
-    estimate = replace(estimate, observations=few)
+    few = {name: estimate.fitted[estimate.used[k % 3]] for k, name in enumerate(estimate.used)}
+    estimate = replace(estimate, fitted=few)
     examination = examine(estimate, RIG, RIG.lidars["lidar"], CAMERA, [])
     assert examination.control is None
     assert examination.contrasts == ()
