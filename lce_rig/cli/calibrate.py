@@ -1,15 +1,21 @@
 """`lce-rig calibrate`: the extrinsics of a session, judged and written as files."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.cameras import camera_lines, together_lines
-from lce_rig.cli.options import event_image_option, session_argument, split_names
+from lce_rig.cli.cameras import camera_lines, require_extrinsics, together_lines
+from lce_rig.cli.options import (
+    cameras_option,
+    event_image_option,
+    require_cameras,
+    session_argument,
+    split_names,
+)
 from lce_rig.cli.uncertainty import uncertainty_lines
 from lce_rig.core.results import Calibration
 from lce_rig.detect.detection import Pair
@@ -23,6 +29,7 @@ from lce_rig.detect.detection import Pair
     metavar="FILE",
     help="JSON with a T_cam_lidar to report the error against; never used in the estimate.",
 )
+@cameras_option
 @click.option(
     "--channels",
     callback=split_names,
@@ -90,6 +97,7 @@ from lce_rig.detect.detection import Pair
 def calibrate(
     session: Path,
     reference: Path | None,
+    cameras: tuple[str, ...],
     channels: list[str] | None,
     event_image: Any,
     as_json: bool,
@@ -100,7 +108,8 @@ def calibrate(
     """Estimate where the LiDAR sits relative to each camera of SESSION (default: session/).
 
     Writes SESSION/calibration/: result.json, extrinsics.yaml, URDF, camera_info and static transforms.
-    Exits with 7 where the result must not be used; exports are then left out unless --force is given.
+    Exits with 7 where a result must not be used: that camera is then left out of the exports, unless --force
+    is given. Exits with 6 where a camera has no result.
     """
     from lce_rig import pipeline
     from lce_rig.calibrate import CalibrateOptions
@@ -109,19 +118,37 @@ def calibrate(
     from lce_rig.session import Session
 
     opened = Session.open(session)
+    rig = opened.rig
+    require_cameras(cameras, rig.cameras)
     if weights == "profile":
-        settings = opened.rig.calibration
+        settings = rig.calibration
         switches |= {"plane_weight": settings.plane_weight, "edge_weight": settings.edge_weight}
     if not (switches["use_ptpl"] or switches["use_ptl"]):
         raise UsageError("--no-ptpl and --no-ptl together leave nothing to fit")
     options = CalibrateOptions(**switches)
+    wanted = [
+        name
+        for name, camera in rig.cameras.items()
+        if name in (cameras or rig.cameras) and (channels is None or set(channels) & set(camera.channels))
+    ]
     truth = None if reference is None else read_reference(reference)
+    if truth is not None and truth.default is not None and len(wanted) * len(rig.lidars) > 1:
+        raise UsageError(
+            f"{reference}: T_cam_lidar names no sensors, and there are several: {', '.join(wanted)}",
+            'Write {"pairs": [{"camera": ..., "lidar": ..., "T_cam_lidar": ...}, ...]}, or name a --camera.',
+        )
     pipeline.remove_results(opened)
     with show.progress_bar("detecting") as progress:
         detections = pipeline.detect(opened, event_image=event_image, progress=progress)
     with show.progress_bar("calibrating") as progress:
         results, troubles = pipeline.calibrate(
-            opened.rig, detections, options, channels=channels, reference=truth, progress=progress
+            rig,
+            detections,
+            options,
+            cameras=cameras or None,
+            channels=channels,
+            reference=truth,
+            progress=progress,
         )
     for trouble in troubles:
         show.warn(str(trouble))
@@ -133,14 +160,32 @@ def calibrate(
         from lce_rig.export.result import to_json_dict
 
         inputs = pipeline.inputs_sha256(opened, calibrations)
-        show.print_json(to_json_dict(opened.rig.name, calibrations, inputs))
+        show.print_json(to_json_dict(rig.name, calibrations, inputs))
     else:
         for calibration, estimate in results:
             show.print_lines(_lines(calibration, estimate.held_out_m, estimate.weak_direction))
         for calibration in calibrations:
             show.print_lines(camera_lines(calibration, calibrations))
         show.note("written: " + ", ".join(path.name for path in files) + f" in {files[0].parent}")
-    exit_by_verdict(calibrations, are_told=not as_json)
+    _exit(calibrations, wanted, {pair.camera for pair in detections.pairs}, are_told=not as_json)
+
+
+def _exit(
+    calibrations: Sequence[Calibration], wanted: Sequence[str], seen: Collection[str], *, are_told: bool
+) -> None:
+    """Leave with exit code 7 where a result must not be used, else 6 where a camera has none."""
+    from lce_rig.core.errors import NotEnoughDataError
+
+    lacking: NotEnoughDataError | None = None
+    try:
+        require_extrinsics(wanted, seen, calibrations)
+    except NotEnoughDataError as error:
+        lacking = error
+    if lacking is not None and any(c.verdict == "fail" for c in calibrations):
+        show.warn(str(lacking))
+    exit_by_verdict(calibrations, are_told=are_told)
+    if lacking is not None:
+        raise lacking
 
 
 def exit_by_verdict(calibrations: Sequence[Calibration], *, are_told: bool = False) -> None:

@@ -1,7 +1,8 @@
-"""How the report of a calibration states what several cameras have to do with each other."""
+"""How a calibration is reported of several cameras: how they sit to each other, which one has no result."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
+from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import sigma_sizes
 from lce_rig.core.results import Calibration, OtherCamera
 
@@ -21,8 +22,41 @@ def together_lines(calibration: Calibration) -> list[str]:
 def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) -> list[str]:
     """State where cameras earlier in the result sit to this one; each two cameras are stated once."""
     c = calibration
-    earlier = [each.camera for each in calibrations[: calibrations.index(c)] if each.lidar == c.lidar]
-    return [line for other in c.other_cameras if other.camera in earlier for line in _lines(c.camera, other)]
+    others = {other.camera: other for other in c.other_cameras}
+    lines: list[str] = []
+    for earlier in calibrations[: calibrations.index(c)]:
+        if earlier.lidar == c.lidar and earlier.camera in others:
+            lines += _lines(c.camera, others[earlier.camera])
+        elif earlier.lidar == c.lidar:
+            lines.append(
+                f"[bold]{earlier.camera} and {c.camera}[/]: no board held still before both: "
+                "neither is held against the other"
+            )
+    return lines
+
+
+def require_extrinsics(
+    wanted: Sequence[str], seen: Collection[str], calibrations: Sequence[Calibration]
+) -> None:
+    """Make sure that every camera has an extrinsic: half a rig must not pass for the whole.
+
+    Args:
+        wanted: cameras that should have one.
+        seen: cameras of which the session holds captures.
+        calibrations: what there is, at least one.
+
+    Raises:
+        NotEnoughDataError: a camera has none.
+    """
+    calibrated = {calibration.camera for calibration in calibrations}
+    missing = [camera for camera in wanted if camera not in calibrated]
+    if missing:
+        causes = [f"No capture holds a picture of {name} and a scan." for name in missing if name not in seen]
+        others = " ".join(f"--camera {name}" for name in wanted if name in calibrated)
+        raise NotEnoughDataError(
+            f"no extrinsic of camera {', '.join(missing)}",
+            "\n".join([*causes, f"Collect more captures; to do without: {others}"]),
+        )
 
 
 def _lines(camera: str, other: OtherCamera) -> list[str]:

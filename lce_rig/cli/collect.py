@@ -1,5 +1,6 @@
 """`lce-rig collect`: a session from attached sensors, guided, or from recordings, unattended."""
 
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +29,9 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     multiple=True,
     type=click.Path(path_type=Path),
     metavar="PATH",
-    help="Read a recording: a folder with img/ and pcd/, what --record kept, a ROS 1 or ROS 2 bag, an mcap "
-    "or pcap file, or an event camera's file (AEDAT4, Prophesee RAW, HDF5); may be repeated, also for "
-    "several recorders of one moment.",
+    help="Read a recording: a folder with img/ (several cameras: img/CAMERA/) and pcd/, what --record kept, "
+    "a ROS 1 or ROS 2 bag, an mcap or pcap file, or an event camera's file (AEDAT4, Prophesee RAW, HDF5); "
+    "may be repeated, also for several recorders of one moment.",
 )
 @click.option(
     "--pair",
@@ -43,9 +44,28 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 @click.option(
     "--topic", "topics", multiple=True, callback=_topics, metavar="SENSOR=/TOPIC", help="Topic of a sensor."
 )
-@click.option("--camera", help="Camera that a folder's pictures belong to, where the rig has several.")
-@click.option("--channel", help="Channel of it, such as events for pictures reconstructed from events.")
-@click.option("--lidar", help="LiDAR that a folder's clouds belong to, where the rig has several.")
+@click.option(
+    "--camera",
+    "cameras",
+    multiple=True,
+    metavar="NAME",
+    help="Camera that a folder's pictures belong to, where the rig has several and the folder none of its "
+    "name: one for all, or one for each --from in turn.",
+)
+@click.option(
+    "--channel",
+    "channels",
+    multiple=True,
+    metavar="NAME",
+    help="Channel of it, such as events for pictures reconstructed from events; likewise.",
+)
+@click.option(
+    "--lidar",
+    "lidars",
+    multiple=True,
+    metavar="NAME",
+    help="LiDAR that a folder's clouds belong to, where the rig has several; likewise.",
+)
 @click.option("--max-captures", type=click.IntRange(1), metavar="N", help="Leave the session at N captures.")
 @click.option(
     "--target",
@@ -84,9 +104,9 @@ def collect(
     pair: Any,
     pair_tolerance: float | None,
     topics: dict[str, str],
-    camera: str | None,
-    channel: str | None,
-    lidar: str | None,
+    cameras: tuple[str, ...],
+    channels: tuple[str, ...],
+    lidars: tuple[str, ...],
     max_captures: int | None,
     target: int | None,
     **live: Any,
@@ -98,7 +118,8 @@ def collect(
     pressed. Collection ends when the calibration is predicted to meet the profile's target, and can be
     continued any time. `lce-rig doctor` checks the rig first.
 
-    With --from, every pair of a folder becomes a capture. Bags are cut where the board stands still in both
+    With --from, every pair of a folder becomes a capture; pictures of several cameras lie in img/CAMERA/, and
+    go with the same cloud. Bags are cut where the board stands still in both
     sensors and is somewhere new; where they hold raw events, where it moves slowly, and the events are kept.
     Recordings of one moment, such as --from lidar.bag --from events.aedat4, are read as one: each adds a
     sensor to those before it. Run it again to continue: what is captured already is not captured twice.
@@ -122,7 +143,13 @@ def collect(
 
     rig = load_rig(rig_name)
     require_kind(session, None)
-    options = SourceOptions(camera, channel, lidar, pair, pair_tolerance, topics)
+    sensors = zip(
+        _one_for_each(paths, "--camera", cameras, rig.cameras),
+        _one_for_each(paths, "--channel", channels),
+        _one_for_each(paths, "--lidar", lidars, rig.lidars),
+        strict=True,
+    )
+    options = [SourceOptions(*names, pair, pair_tolerance, topics) for names in sensors]
     recordings = open_recordings(paths, rig, options)
     with Session.resume(session, rig) as writer, show.progress_bar("collecting") as progress:
         report = fill(
@@ -146,12 +173,36 @@ _OF_RECORDINGS = (
     "pair",
     "pair_tolerance",
     "topics",
-    "camera",
-    "channel",
-    "lidar",
+    "cameras",
+    "channels",
+    "lidars",
     "max_captures",
     "target",
 )
+
+
+def _one_for_each(
+    paths: Sequence[Path], option: str, names: Sequence[str], known: Collection[str] | None = None
+) -> list[str | None]:
+    """Give each recording the name it is read by: the only one, its own, or None.
+
+    Raises:
+        UsageError: there are some, but neither one nor as many as recordings; or one is not known.
+    """
+    from lce_rig.core.errors import UsageError
+
+    for name in names:
+        if known is not None and name not in known:
+            what = option.removeprefix("--")
+            raise UsageError(f"there is no {what} {name!r}; there is {', '.join(known)}")
+    if len(names) < 2:
+        return [*names, None][:1] * len(paths)
+    if len(names) != len(paths):
+        raise UsageError(
+            f"{option} is given {len(names)} times for {show.counted(len(paths), 'recording')}",
+            f"Give it once, or for each --from: --from A {option} {names[0]} --from B {option} {names[1]}",
+        )
+    return list(names)
 
 
 def _refuse_options(names: tuple[str, ...], what: str, hint: str) -> None:

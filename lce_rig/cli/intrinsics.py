@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import session_argument, split_names
+from lce_rig.cli.options import cameras_option, require_cameras, session_argument, split_names
 
 if TYPE_CHECKING:
     from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
@@ -16,7 +16,7 @@ _MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")
 
 @click.command()
 @session_argument
-@click.option("--camera", "cameras", multiple=True, metavar="NAME", help="Only this camera; may be repeated.")
+@cameras_option
 @click.option(
     "--channels",
     callback=split_names,
@@ -56,9 +56,7 @@ def intrinsics(
     from lce_rig.session import Session
 
     opened = Session.open(session)
-    unknown = sorted(set(cameras) - set(opened.rig.cameras))
-    if unknown:
-        raise UsageError(f"there is no camera {unknown[0]!r}; there is {', '.join(opened.rig.cameras)}")
+    require_cameras(cameras, opened.rig.cameras)
     if save_profile is not None and save_profile.exists():
         raise UsageError(f"{save_profile} exists already", "Name another file: nothing is written over.")
     wanted, measured, troubles = channels or [], [], []
@@ -72,8 +70,6 @@ def intrinsics(
             troubles.append(error)
     if not measured:
         raise troubles[0]
-    for trouble in troubles:
-        show.warn(str(trouble))
     files = write_intrinsics(opened, measured)
     if as_json:
         show.print_json(document(opened.rig, measured))
@@ -86,6 +82,9 @@ def intrinsics(
     if save_profile is not None:
         write_profile(opened, measured, save_profile)
         show.note(f"written: {save_profile}")
+    if troubles:
+        first, *others = troubles
+        raise NotEnoughDataError(first.what, "\n".join([first.hint, *map(str, others)]).strip())
 
 
 def _head(measured: "MeasuredIntrinsics") -> list[str]:

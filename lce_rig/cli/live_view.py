@@ -227,6 +227,10 @@ def _drawing(state: LiveState, n_lacking: int) -> Any:
     # No lower than the bars beside it, whose lines are taken anyway.
     size = columns, max(lines - n_lacking, 7)
     rows = draw_outlines((width, height), drawing.wanted_px, drawing.present_px, size)
+    if sum("." in stream.name for stream in state.streams) > 1:
+        # Guidance goes from camera to camera: whose picture this is stands in its border.
+        name = f" {drawing.camera} "[: len(rows[0]) - 3]
+        rows[0] = f"┌─{name}{rows[0][2 + len(name) :]}"
     return Text("\n".join(rows), style="green" if drawing.is_there else "", no_wrap=True)
 
 

@@ -1,6 +1,7 @@
 """Kinds of option values that several verbs share."""
 
 import math
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,24 @@ rig_option = click.option(
 )
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print every figure as JSON.")
+
+cameras_option = click.option(
+    "--camera", "cameras", multiple=True, metavar="NAME", help="Only this camera; may be repeated."
+)
+
+
+def require_cameras(cameras: Sequence[str], known: Collection[str]) -> None:
+    """Make sure that cameras asked for are those of a rig.
+
+    Raises:
+        UsageError: one is not.
+    """
+    from lce_rig.core.errors import UsageError
+
+    unknown = sorted(set(cameras) - set(known))
+    if unknown:
+        raise UsageError(f"there is no camera {unknown[0]!r}; there is {', '.join(known)}")
+
 
 EVENT_IMAGES = click.Choice(["network", "map"])
 

@@ -95,6 +95,9 @@ def _sensor_table(rig: "Rig") -> Any:
                 _stamps(settings.timestamps),
             )
             table.add_row(f"{name}/{channel}", *row)
+    for column in table.columns:
+        # A topic or a frame that is cut short is of no use.
+        column.overflow = "fold"
     return table
 
 

@@ -103,6 +103,13 @@ def simulate(
     from lce_rig.rig import load_rig
 
     rig = load_rig(rig_name)
+    drawn = {entry.camera for entry in rig.nominal_extrinsics}
+    for name in rig.cameras:
+        if len(rig.cameras) > 1 and name not in drawn:
+            show.warn(
+                f"the profile has no nominal extrinsic of {name}: it is put where the first LiDAR is, looks "
+                "along its x axis, and may see few of the boards"
+            )
     if recording is None:
         if duration is not None or ros is not None:
             raise UsageError("--duration and --ros belong to a recording", "Add --recording FOLDER.")

@@ -33,6 +33,7 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
     from lce_rig import pipeline
     from lce_rig.cli.calibrate import exit_by_verdict
     from lce_rig.core.errors import ResultRefusedError, SessionError
+    from lce_rig.detect.detection import Pair
     from lce_rig.export.result import read_result
     from lce_rig.pipeline.result_files import CALIBRATION
     from lce_rig.session import Session
@@ -64,12 +65,17 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
         for checked in checks:
             show.print_table(_table(checked))
             show.print_lines(_summary(checked))
+    held = {(checked.pair.camera, checked.pair.lidar) for checked in checks}
+    for c in calibrations:
+        if (c.camera, c.lidar) not in held:
+            show.warn(f"{session} holds no captures of {Pair.of(c)}: not checked")
     exit_by_verdict(calibrations)
     contradicted = [checked for checked in checks if checked.doubts]
     if contradicted:
         raise ResultRefusedError(
-            f"the captures of {session} contradict the extrinsic of {contradicted[0].pair}",
-            "\n".join(contradicted[0].doubts),
+            f"the captures of {session} contradict the extrinsic of "
+            + " and that of ".join(str(checked.pair) for checked in contradicted),
+            "\n".join(f"{checked.pair}: {doubt}" for checked in contradicted for doubt in checked.doubts),
         )
 
 

@@ -26,7 +26,8 @@ def export_camera_info(calibrations: Sequence[Calibration], rig: Rig, folder: Pa
     for name, calibration in chosen.items():
         path = folder / f"camera_info_{name}.yaml"
         intrinsics = rig.cameras[name].to_intrinsics()
-        write_atomically(path, camera_info_text(name, intrinsics, header("camera_info", rig, [calibration])))
+        lines = header("camera_info", rig, [calibration], of_one_camera=True)
+        write_atomically(path, camera_info_text(name, intrinsics, lines))
         read = read_camera_info(path)
         check_projection(path, "the camera model", calibration.T_cam_lidar, read, calibration, rig)
         paths.append(path)

@@ -51,8 +51,17 @@ def rows(matrix: Array, indent: str) -> list[str]:
     return [f"{indent}- {numbers(row)}" for row in matrix]
 
 
-def header(what: str, rig: Rig, calibrations: Sequence[Calibration]) -> list[str]:
-    """List the lines every file begins with, as comments: what it is, by whom, whether to use it."""
+def header(
+    what: str, rig: Rig, calibrations: Sequence[Calibration], *, of_one_camera: bool = False
+) -> list[str]:
+    """List the lines every file begins with, as comments: what it is, by whom, whether to use it.
+
+    Args:
+        what: what the file is.
+        rig: the profile.
+        calibrations: what the file holds.
+        of_one_camera: whether that is all it should hold; else cameras that it lacks are named.
+    """
     lines = [f"{what} of rig {rig.name}, written by {MADE_BY}"]
     for calibration in calibrations:
         pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
@@ -61,6 +70,10 @@ def header(what: str, rig: Rig, calibrations: Sequence[Calibration]) -> list[str
         if calibration.verdict == "fail":
             reasons = "; ".join(calibration.reasons) or "no reason given"
             lines.append(f"NOT FOR USE: the calibration of {pair} failed: {' '.join(reasons.split())}")
+    held = {calibration.camera for calibration in calibrations}
+    lacking = [camera for camera in rig.cameras if camera not in held]
+    if lacking and not of_one_camera:
+        lines.append(f"not in this file, for want of a result to use: {', '.join(lacking)}")
     return lines
 
 

@@ -24,6 +24,7 @@ def calibrate(
     detections: Detections,
     options: CalibrateOptions,
     *,
+    cameras: Sequence[str] | None = None,
     channels: Sequence[str] | None = None,
     reference: Reference | None = None,
     progress: Progress = silent,
@@ -37,6 +38,7 @@ def calibrate(
         rig: thresholds, targets and nominal extrinsics.
         detections: of one session.
         options: switches of the algorithm.
+        cameras: to calibrate, as if the session held no others; None takes all.
         channels: of the cameras, to use; None takes all that the session holds.
         reference: extrinsics to report errors against; they never enter the estimate or the verdict.
         progress: called with (done, total) for each camera and LiDAR in turn.
@@ -49,24 +51,33 @@ def calibrate(
         UsageError: no capture holds one of the channels.
     """
     solved, troubles = [], []
-    for pairs in _pairs_by_sensors(detections, channels):
+    for pairs in _pairs_by_sensors(detections, cameras, channels):
         try:
             solved.append(solve(rig, detections, pairs, options, progress))
         except NotEnoughDataError as error:
             troubles.append(error)
     if not solved:
-        raise (
-            troubles[0]
-            if troubles
-            else NotEnoughDataError(
-                "the session holds no capture with a picture and a scan", "Collect captures first."
-            )
-        )
+        raise _nothing_solved(troubles, cameras)
     members = bring_cameras_together(rig, detections, solved)
     return [(_judged(rig, detections, each, reference), each.solved.estimate) for each in members], troubles
 
 
-def _pairs_by_sensors(detections: Detections, channels: Sequence[str] | None) -> list[list[Pair]]:
+def _nothing_solved(
+    troubles: Sequence[NotEnoughDataError], cameras: Sequence[str] | None
+) -> NotEnoughDataError:
+    """Say of every pair why it could not be calibrated."""
+    if not troubles:
+        of_cameras = f" of {' or '.join(cameras)}" if cameras else ""
+        return NotEnoughDataError(
+            f"the session holds no capture with a picture{of_cameras} and a scan", "Collect captures first."
+        )
+    first, *others = troubles
+    return NotEnoughDataError(first.what, "\n".join([first.hint, *map(str, others)]).strip())
+
+
+def _pairs_by_sensors(
+    detections: Detections, cameras: Sequence[str] | None, channels: Sequence[str] | None
+) -> list[list[Pair]]:
     """Bring together the pairs of one camera and LiDAR, whose channels are calibrated as one."""
     held = sorted({pair.channel for pair in detections.pairs})
     unknown = sorted(set(channels or ()) - set(held))
@@ -74,7 +85,11 @@ def _pairs_by_sensors(detections: Detections, channels: Sequence[str] | None) ->
         raise UsageError(
             f"no capture of the session holds channel {unknown[0]!r}", f"there is {', '.join(held)}"
         )
-    wanted = [pair for pair in detections.pairs if channels is None or pair.channel in channels]
+    wanted = [
+        pair
+        for pair in detections.pairs
+        if (cameras is None or pair.camera in cameras) and (channels is None or pair.channel in channels)
+    ]
     groups: dict[tuple[str, str], list[Pair]] = {}
     for pair in wanted:
         groups.setdefault((pair.camera, pair.lidar), []).append(pair)

@@ -128,19 +128,20 @@ def _is_of_sensors(difference: str) -> bool:
 
 
 def _require_independent(sessions: dict[str, Session]) -> None:
-    """Refuse sessions that share captures: a copy agrees with its original whatever is wrong with both."""
-    contents: dict[str, set[str]] = {}
+    """Refuse sessions that share pictures or scans: a copy agrees with its original whatever is wrong."""
+    hashes: dict[str, list[frozenset[str]]] = {}
     for name, session in sessions.items():
-        contents[name] = set()
+        hashes[name] = []
         for capture in session.captures:
             # A damaged capture is named where it is read.
             with suppress(SessionError):
-                contents[name].add(capture.content_sha256)
+                hashes[name].append(capture.file_hashes)
     for one, other in combinations(sessions, 2):
-        shared = contents[one] & contents[other]
-        if shared:
+        theirs = frozenset().union(*hashes[other])
+        n_shared = sum(not own.isdisjoint(theirs) for own in hashes[one])
+        if n_shared:
             raise SessionError(
-                f"{one} and {other} share {len(shared)} captures: they are not independent",
+                f"{one} and {other} share {n_shared} captures: they are not independent",
                 "Collect each session anew, best with the board put up again.",
             )
 

@@ -40,11 +40,19 @@ def verify(
             folder each.
         progress: called with (done, total) for each pair in turn.
 
+    Returns:
+        A check of each channel; of sensors of which the session has no captures there is none.
+
     Raises:
-        SessionError: the session has no captures of a calibration's sensors.
+        SessionError: the session has no captures of any calibration's sensors.
     """
     base = folder or session.path / CALIBRATION / OVERLAYS
-    jobs = [(c, pair) for c in calibrations for pair in _pairs_held(session, detections, c)]
+    jobs = [(c, pair) for c in calibrations for pair in _pairs_held(detections, c)]
+    if not jobs:
+        wanted = ", ".join(str(Pair.of(c)) for c in calibrations)
+        raise SessionError(
+            f"{session.path} holds no captures of {wanted}", "The result belongs to another session."
+        )
     checks = []
     for c, pair in jobs:
         checks.append(
@@ -62,14 +70,10 @@ def verify(
     return checks
 
 
-def _pairs_held(session: Session, detections: Detections, calibration: Calibration) -> list[Pair]:
+def _pairs_held(detections: Detections, calibration: Calibration) -> list[Pair]:
     """Name those pairs behind a calibration that the session holds captures of."""
     pairs = [Pair(calibration.camera, channel, calibration.lidar) for channel in sorted(calibration.channels)]
-    held = [pair for pair in pairs if pair in detections.pairs]
-    if not held:
-        hint = "The result belongs to another session."
-        raise SessionError(f"{session.path} holds no captures of {Pair.of(calibration)}", hint)
-    return held
+    return [pair for pair in pairs if pair in detections.pairs]
 
 
 def write_debug_images(

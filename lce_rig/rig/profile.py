@@ -46,7 +46,8 @@ class Rig(Settings):
         seen: dict[str, str] = {}
         for key, frame in self._frames():
             if frame in seen:
-                raise problem(f"frame {frame} is used already by {seen[frame]}", key)
+                own = key.split(".")[1] + ("_optical_frame" if key.endswith("optical_frame") else "_link")
+                raise problem(f"frame {frame} is used already by {seen[frame]}; give it its own: {own}", key)
             seen[frame] = key
         roots = [frame for key, frame in self._frames() if not key.endswith("optical_frame")]
         if self.base_frame is not None and self.base_frame not in roots:
@@ -110,6 +111,25 @@ class Rig(Settings):
             for key, settings in stamps
             if settings.clock == "device" and settings.sync == "none"
         ]
+        return found + self._shared()
+
+    def _shared(self) -> list[str]:
+        """List what two sensors can hardly have in common, as a copied block gives it."""
+        owned = [(f"lidars.{n}.topic", "topic", lidar.topic) for n, lidar in self.lidars.items()]
+        for name, camera in self.cameras.items():
+            owned += [
+                (f"cameras.{name}.channels.{n}.topic", "topic", c.topic) for n, c in camera.channels.items()
+            ]
+            owned.append(
+                (f"cameras.{name}.driver.device", "device", camera.driver.device if camera.driver else None)
+            )
+        first: dict[tuple[str, str], str] = {}
+        found = []
+        for key, kind, value in owned:
+            if value is not None and first.setdefault((kind, value), key) != key:
+                found.append(
+                    f"{key}: {value} is that of {first[kind, value]} too: two sensors would send the same"
+                )
         return found
 
     def nominal(self, camera: str, lidar: str) -> NominalExtrinsic | None:

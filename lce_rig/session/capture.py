@@ -53,6 +53,11 @@ class Capture:
         return str(self._manifest["content_sha256"])
 
     @property
+    def file_hashes(self) -> frozenset[str]:
+        """SHA-256 of every picture, scan and stretch of events in it."""
+        return frozenset(str(entry["sha256"]) for entry in self._manifest["files"])
+
+    @property
     def manifest_sha256(self) -> str:
         """A fingerprint of the manifest: of what the sensors saw, and when.
 

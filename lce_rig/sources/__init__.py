@@ -1,6 +1,6 @@
 """Recordings and sensors behind one door: `open_recording` finds the reader for a path."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -47,17 +47,25 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
     return recording
 
 
-def open_recordings(paths: Iterable[Path], rig: Rig, options: SourceOptions | None = None) -> list[Recording]:
+def open_recordings(
+    paths: Iterable[Path], rig: Rig, options: SourceOptions | Sequence[SourceOptions] | None = None
+) -> list[Recording]:
     """Open what lies at several paths; a folder that several recorders filled gives each of their files.
+
+    Args:
+        paths: of the recordings.
+        rig: the profile.
+        options: how they are read: all alike, or each by its own.
 
     Raises:
         SourceError: as `open_recording`; of a folder's files only where none of them can be read.
     """
     paths, options = list(paths), options or SourceOptions()
-    options = replace(options, is_part=options.is_part or len(paths) > 1)
+    by_path = [options] * len(paths) if isinstance(options, SourceOptions) else options
     recordings: list[Recording] = []
-    for path in paths:
-        recordings += _open_parts(list_parts(path, rig, options), rig)
+    for path, own in zip(paths, by_path, strict=True):
+        own = replace(own, is_part=own.is_part or len(paths) > 1)
+        recordings += _open_parts(list_parts(path, rig, own), rig)
     return recordings
 
 

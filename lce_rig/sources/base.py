@@ -36,7 +36,8 @@ class SourceOptions:
     """How a recording is read, where the profile does not say or says otherwise.
 
     Attributes:
-        camera, channel, lidar: whose pictures and clouds a folder holds; None takes the rig's first.
+        camera, channel, lidar: whose pictures and clouds a folder holds; None takes the rig's first channel
+            and LiDAR, and its camera where it has one only or folders are named after them.
         pair: how a folder's pictures and clouds are matched.
         pair_tolerance_s: largest difference in time of a pair; None takes the profile's.
         topics: topic by sensor ("cam", "cam.events", "lidar"), in place of the profile's.

@@ -1,6 +1,7 @@
-"""A folder of pictures and clouds, one of each for every board placement."""
+"""A folder of pictures and clouds: for every board placement a cloud, and a picture of each camera."""
 
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,52 +10,60 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.sources import cloud_file, image_file
-from lce_rig.sources.base import Pair, SourceOptions
+from lce_rig.sources.base import Pair, PairMethod, SourceOptions
 from lce_rig.sources.cloud import to_scan
-from lce_rig.sources.pairing import natural_order, pair_names, parse_times
+from lce_rig.sources.folder_layout import list_clouds, list_pictures, list_pictures_by_camera
+from lce_rig.sources.pairing import Pairing, pair_names, parse_times
 from lce_rig.sources.sensors import choose_camera, choose_lidar
 
-IMAGE_FOLDERS = ("img", "imgs", "image", "images", "camera", "cam", "rgb", "color", "frames")
-CLOUD_FOLDERS = (
-    "pcd",
-    "raw_pcd",
-    "pcds",
-    "cloud",
-    "clouds",
-    "lidar",
-    "velodyne",
-    "points",
-    "pointcloud",
-    "ply",
-)
+
+@dataclass(frozen=True)
+class PictureOnDisk:
+    """A picture that has not been read yet; the stamp is that in its name.
+
+    Attributes:
+        label: its name, for messages; with its folder's where several cameras may have the same names.
+    """
+
+    path: Path
+    label: str
+    camera: str
+    channel: str
+    stamp_ns: int | None
+
+    def read(self) -> Image:
+        """Decode it.
+
+        Raises:
+            SourceError: it is missing, empty, truncated or damaged.
+        """
+        return Image(self.camera, self.channel, self.stamp_ns, image_file.read_image(self.path))
 
 
 @dataclass(frozen=True)
 class PairOnDisk:
-    """A picture and a cloud that have not been read yet; the stamps are those in their names."""
+    """Pictures and a cloud that have not been read yet; the cloud's stamp is that in its name."""
 
-    image_path: Path
+    pictures: tuple[PictureOnDisk, ...]
     cloud_path: Path
-    camera: str
-    channel: str
     lidar: str
     settings: LidarSettings
-    image_stamp_ns: int | None
     cloud_stamp_ns: int | None
 
     @property
     def label(self) -> str:
         """The files' names, for messages."""
-        return f"{self.image_path.name} + {self.cloud_path.name}"
+        return " + ".join([*(picture.label for picture in self.pictures), self.cloud_path.name])
 
     def key(self) -> str:
-        """Fingerprint the bytes of both files and the sensors they are read for.
+        """Fingerprint the bytes of all files and the sensors they are read for.
 
         Raises:
             SourceError: a file cannot be read.
         """
-        digest = hashlib.sha256(f"{self.camera} {self.channel} {self.lidar}".encode())
-        for path in (self.image_path, self.cloud_path):
+        sensors = [f"{picture.camera} {picture.channel}" for picture in self.pictures]
+        digest = hashlib.sha256(" ".join([*sensors, self.lidar]).encode())
+        for path in (*(picture.path for picture in self.pictures), self.cloud_path):
             try:
                 digest.update(hashlib.sha256(path.read_bytes()).digest())
             except OSError as error:
@@ -62,97 +71,122 @@ class PairOnDisk:
         return digest.hexdigest()
 
     def read(self) -> Pair:
-        """Decode both files.
+        """Decode all files.
 
         Raises:
             SourceError: one is missing, empty, truncated or damaged.
         """
-        pixels = image_file.read_image(self.image_path)
+        images = tuple(picture.read() for picture in self.pictures)
         cloud = cloud_file.read_cloud(self.cloud_path)
         reading = to_scan(cloud, self.lidar, self.settings, str(self.cloud_path), self.cloud_stamp_ns)
         notes = list(reading.notes)
         if reading.n_not_finite or reading.n_zero_range:
             n_dropped = reading.n_not_finite + reading.n_zero_range
             notes.append(f"{self.cloud_path.name}: {n_dropped} points without a return left out")
-        image = Image(self.camera, self.channel, self.image_stamp_ns, pixels)
-        return Pair(self.label, self.key(), (image,), (reading.scan,), tuple(notes))
+        return Pair(self.label, self.key(), images, (reading.scan,), tuple(notes))
 
 
 class FolderRecording:
-    """Pictures and clouds in two folders side by side, or in one.
+    """Pictures and clouds in folders side by side, or in one; pictures of several cameras in a folder each.
 
     Attributes:
         path: the folder.
         notes: how pairs were found and what was left over.
-        pairs: every pair, by name of its picture; read them one by one.
+        pairs: every cloud with its pictures, by name of the cloud; read them one by one.
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
         """Find the files and pair them; nothing is decoded yet.
 
         Raises:
-            SourceError: no pictures, no clouds, or no way to pair them.
+            SourceError: no pictures, no clouds, no way to pair them, or no telling whose pictures they are.
         """
         self.path = path
         self.notes: list[str] = []
-        camera, channel = choose_camera(rig, options, self.notes)
+        self._rig, self._options = rig, options
         lidar = choose_lidar(rig, options, self.notes)
-        image_paths = self._list(IMAGE_FOLDERS, image_file.SUFFIXES, "pictures")
-        cloud_paths = self._list(CLOUD_FOLDERS, frozenset(cloud_file.DECODERS), "clouds")
-        stems = [p.stem for p in image_paths], [p.stem for p in cloud_paths]
-        tolerance_s = options.pair_tolerance_s
-        if tolerance_s is None:
-            tolerance_s = rig.cameras[camera].channels[channel].timestamps.tolerance_s
-        try:
-            pairing = pair_names(*stems, options.pair, tolerance_s)
-        except SourceError as error:
-            raise SourceError(f"{path}: {error.what}", error.hint) from None
-        self.notes.append(f"{path.name}: {pairing.explanation}")
-        lone = [image_paths[i].name for i in pairing.lone_images] + [
-            cloud_paths[j].name for j in pairing.lone_clouds
-        ]
+        pictures = self._pictures()
+        clouds = list_clouds(path, self.notes)
+        cloud_ns = parse_times([cloud.stem for cloud in clouds])
+        # The second picture of one camera that goes with a cloud makes a pair of its own.
+        together: dict[tuple[int, int], list[PictureOnDisk]] = {}
+        lone = []
+        for own, pairing in zip(pictures, self._pair(pictures, clouds), strict=True):
+            n_held = Counter[int]()
+            for i, j in pairing.pairs:
+                together.setdefault((j, n_held[j]), []).append(own[i])
+                n_held[j] += 1
+            lone += [own[i].label for i in pairing.lone_images]
+        with_picture = {j for j, _ in together}
+        lone += [cloud.name for j, cloud in enumerate(clouds) if j not in with_picture]
         if lone:
             self.notes.append(f"{path.name}: without a partner: {_shorten(lone)}")
-        image_ns, cloud_ns = parse_times(stems[0]), parse_times(stems[1])
         self.pairs = [
             PairOnDisk(
-                image_paths[i],
-                cloud_paths[j],
-                camera,
-                channel,
+                tuple(held),
+                clouds[j],
                 lidar,
                 rig.lidars[lidar],
-                None if image_ns is None else int(image_ns[i]),
                 None if cloud_ns is None else int(cloud_ns[j]),
             )
-            for i, j in pairing.pairs
+            for (j, _), held in sorted(together.items(), key=lambda item: item[0])
         ]
 
-    def _list(self, names: Sequence[str], suffixes: frozenset[str], what: str) -> list[Path]:
-        """List the files of one kind in the folder whose name says so, else in the only one that has any."""
-        folders = {p.name.lower(): p for p in sorted(self.path.iterdir()) if p.is_dir() and p.name[0] != "."}
-        holding = {name: files for name, p in folders.items() if (files := _files(p, suffixes))}
-        named = [name for name in names if name in holding]
-        if len(named) > 1:
-            self.notes.append(
-                f"{self.path.name}: {what} taken from {named[0]}/, not from {', '.join(named[1:])}"
+    def _pictures(self) -> list[list[PictureOnDisk]]:
+        """List the pictures of each camera.
+
+        Raises:
+            SourceError: there are none, or none of the camera that was asked for.
+        """
+        rig, wanted = self._rig, self._options.camera
+        found = list_pictures_by_camera(self.path, rig.cameras) if len(rig.cameras) > 1 else {}
+        if not found:
+            return [self._of_camera(list_pictures(self.path, self.notes), None, is_alone=True)]
+        if wanted in rig.cameras:
+            if wanted not in found:
+                raise SourceError(f"{self.path}: pictures of {', '.join(found)} lie there, none of {wanted}")
+            found = {wanted: found[wanted]}
+        return [self._of_camera(paths, camera, is_alone=len(found) == 1) for camera, paths in found.items()]
+
+    def _of_camera(self, paths: Sequence[Path], camera: str | None, *, is_alone: bool) -> list[PictureOnDisk]:
+        camera, channel = choose_camera(self._rig, self._options, self.notes, camera)
+        times_ns = parse_times([path.stem for path in paths])
+        return [
+            PictureOnDisk(
+                path,
+                path.name if is_alone else f"{path.parent.name}/{path.name}",
+                camera,
+                channel,
+                None if times_ns is None else int(times_ns[i]),
             )
-        if named:
-            return holding[named[0]]
-        if here := _files(self.path, suffixes):
-            return here
-        if len(holding) == 1:
-            return next(iter(holding.values()))
-        hint = f"Put them into {names[0]}/ below it; {', '.join(sorted(suffixes))} are read."
-        if holding:
-            raise SourceError(f"{self.path}: {what} lie in {', '.join(sorted(holding))}: which?", hint)
-        empty = next((name for name in names if name in folders), None)
-        raise SourceError(f"{self.path}{'/' + empty if empty else ''}: no {what} there", hint)
+            for i, path in enumerate(paths)
+        ]
 
+    def _pair(self, pictures: Sequence[Sequence[PictureOnDisk]], clouds: Sequence[Path]) -> list[Pairing]:
+        """Match each camera's pictures with the clouds, all cameras' in one way."""
+        pairings = [self._pair_camera(own, clouds, self._options.pair) for own in pictures]
+        methods = {pairing.method for pairing in pairings}
+        if len(methods) > 1:
+            # A camera whose names match less well must not be counted off against the others' names.
+            method: PairMethod = "stem" if "stem" in methods else "time"
+            pairings = [self._pair_camera(own, clouds, method) for own in pictures]
+        for own, pairing in zip(pictures, pairings, strict=True):
+            whose = f"{own[0].camera}: " if len(pictures) > 1 else ""
+            self.notes.append(f"{self.path.name}: {whose}{pairing.explanation}")
+        return pairings
 
-def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
-    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and p.name[0] != "."]
-    return sorted(found, key=lambda p: (natural_order(p.stem), p.name))
+    def _pair_camera(
+        self, pictures: Sequence[PictureOnDisk], clouds: Sequence[Path], method: PairMethod
+    ) -> Pairing:
+        first, tolerance_s = pictures[0], self._options.pair_tolerance_s
+        if tolerance_s is None:
+            tolerance_s = self._rig.cameras[first.camera].channels[first.channel].timestamps.tolerance_s
+        stems = [picture.path.stem for picture in pictures], [cloud.stem for cloud in clouds]
+        try:
+            return pair_names(*stems, method, tolerance_s)
+        except SourceError as error:
+            whose = f" (camera {first.camera})" if len(self._rig.cameras) > 1 else ""
+            raise SourceError(f"{self.path}{whose}: {error.what}", error.hint) from None
 
 
 def _shorten(names: Sequence[str], n_shown: int = 6) -> str:

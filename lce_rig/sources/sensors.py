@@ -6,22 +6,46 @@ from lce_rig.sources.base import SourceOptions
 from lce_rig.sources.rig_time import event_channel
 
 
-def choose_camera(rig: Rig, options: SourceOptions, notes: list[str]) -> tuple[str, str]:
-    """Name the (camera, channel) that a folder's pictures belong to: as asked, else the rig's first.
+def choose_camera(
+    rig: Rig, options: SourceOptions, notes: list[str], camera: str | None = None
+) -> tuple[str, str]:
+    """Name the (camera, channel) that a folder's pictures belong to: as asked, else the rig's only camera.
+
+    Args:
+        rig: the profile.
+        options: what was asked for.
+        notes: takes what was chosen.
+        camera: that the folder itself names; None where it does not.
 
     Raises:
-        SourceError: the rig has no such camera or channel.
+        SourceError: the rig has no such camera or channel, or several cameras and none was named.
     """
-    camera = options.camera or next(iter(rig.cameras))
+    camera = camera or options.camera or _only_camera(rig)
     if camera not in rig.cameras:
         raise SourceError(f"rig {rig.name!r} has no camera {camera!r}; it has {', '.join(rig.cameras)}")
     channels = rig.cameras[camera].channels
     channel = options.channel or next(iter(channels))
     if channel not in channels:
         raise SourceError(f"camera {camera!r} has no channel {channel!r}; it has {', '.join(channels)}")
-    if (len(rig.cameras) > 1 and not options.camera) or (len(channels) > 1 and not options.channel):
+    if len(channels) > 1 and not options.channel:
         notes.append(f"pictures taken as camera {camera}, channel {channel}")
     return camera, channel
+
+
+def _only_camera(rig: Rig) -> str:
+    """Name the rig's camera; pictures of one that were taken for another's would spoil both extrinsics.
+
+    Raises:
+        SourceError: it has several.
+    """
+    first, *others = rig.cameras
+    if others:
+        raise SourceError(
+            f"rig {rig.name!r} has cameras {', '.join(rig.cameras)}: whose are these pictures?",
+            f"Say so with --camera {first}, or keep those of each camera in a folder of its name: "
+            f"img/{first}/, img/{others[0]}/ and pcd/.",
+        )
+    return first
 
 
 def choose_lidar(rig: Rig, options: SourceOptions, notes: list[str]) -> str:

@@ -60,6 +60,15 @@ def test_everything_fits_into_80_by_24() -> None:
     assert "captured 000006" in text and "boards must stand still" in text and "q stop" in text
 
 
+def test_of_several_cameras_the_picture_says_whose_it_is() -> None:
+    (first, *others) = STREAMS
+    two = (replace(first, name="left.frames"), replace(first, name="right.frames"), *others[:1])
+    drawing = replace(STATE.drawing, camera="right.frames")
+    text = "\n".join(drawn(replace(STATE, streams=two, drawing=drawing)))
+    assert "┌─ right.frames ─" in text
+    assert len(drawn(replace(STATE, streams=two, drawing=drawing))[0]) <= 80
+
+
 def test_the_page_s_link_stays_on_the_screen_which_covers_what_was_printed_before() -> None:
     link = "http://192.168.100.200:8765/?token=q3Zk9Xw0aB4_q3Zk9Xw0aB4_"
     log = ("01:01 the first", *STATE.log)

@@ -93,6 +93,17 @@ def test_a_copy_is_no_second_session(lce_rig, made, tmp_path):
     assert "monday and copy share 1 captures: they are not independent" in outcome.err
 
 
+def test_a_picture_in_two_sessions_makes_them_one_whatever_lies_beside_it(lce_rig, made):
+    a, b = made("monday", [0] * 6), made("tuesday", [0] * 6)
+    pixels = np.full((260, 346), 80, np.uint8)
+    for path, stamp_ns in ((a, 1), (b, None)):
+        with Session.open(path, writable=True) as session:
+            session.add_capture([Image("davis", "frames", stamp_ns, pixels)], [], {})
+    outcome = lce_rig("repeat", a, b)
+    assert outcome.code == 4
+    assert "monday and tuesday share 1 captures" in outcome.err
+
+
 def test_other_rigs_and_other_lenses_are_refused_and_another_board_is_remarked(lce_rig, made):
     a = made("monday", [0] * 6)
     other = made("other", [0] * 6, set_value(RLES, "name", "rles02"))

@@ -9,6 +9,7 @@ import pytest
 from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.cli.cameras import camera_lines, together_lines
+from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import difference, invert
 from lce_rig.core.results import Refusal
 from lce_rig.detect.detection import Detections
@@ -125,6 +126,27 @@ def test_cameras_without_a_common_board_stay_by_themselves(session):
     for own in found.values():
         assert own.estimated_with == own.other_cameras == ()
         assert "alone_sigma_rotation_deg" not in own.diagnostics
+    left, right = found.values()
+    assert camera_lines(left, [left, right]) == []
+    (line,) = camera_lines(right, [left, right])
+    assert "left and right" in line
+    assert "neither is held against the other" in line
+
+
+def test_the_camera_asked_for_is_calibrated_as_if_there_were_no_other(session):
+    ((asked, _),), _ = pipeline.calibrate(RIG, detections(session), ML, cameras=[RIGHT])
+    (alone,) = calibrated(detections({RIGHT: session[RIGHT]}), ML, only(RIGHT)).values()
+    assert asked.camera == RIGHT
+    assert np.array_equal(asked.T_cam_lidar, alone.T_cam_lidar)
+    assert asked.estimated_with == asked.other_cameras == ()
+
+
+def test_why_no_camera_could_be_calibrated_is_told_of_each(session):
+    with pytest.raises(NotEnoughDataError) as caught:
+        pipeline.calibrate(RIG, detections(session, left=range(3), right=range(4)), PAPER)
+    assert "left.frames and lidar" in caught.value.what
+    assert "in 3 of 12 captures" in caught.value.what
+    assert "right.frames and lidar: the board was found by both sensors in 4 of 12" in caught.value.hint
 
 
 @pytest.mark.parametrize("options", [ML, PAPER], ids=["ml", "paper"])

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import exp_so3
-from lce_rig.rig import CalibrationSettings, QualitySettings, find_profile, load_rig, parse_rig
+from lce_rig.rig import CalibrationSettings, QualitySettings, Rig, find_profile, load_rig, parse_rig
 from lce_rig.rig.explaining import all_keys
 from lce_rig.rig.sensors import LidarSettings
 
@@ -264,3 +264,12 @@ def test_documented_defaults_are_those_of_the_code() -> None:
         for key, field in model.model_fields.items():
             if isinstance(field.default, int | float):
                 assert float(documented[key]) == field.default, key
+
+
+def test_what_a_copied_camera_shares_with_the_first_is_doubted() -> None:
+    document = load_rig("rlfs").model_dump(exclude_none=True)
+    right = document["cameras"]["cam"] | {"frame": "right_link", "optical_frame": "right_optical"}
+    document["cameras"]["right"] = right
+    topic, device = Rig.model_validate(document).doubts()
+    assert topic.startswith("cameras.right.channels.frames.topic: /camera/image_raw is that of cameras.cam.")
+    assert device.startswith("cameras.right.driver.device: /dev/video0 is that of cameras.cam.driver.device")

@@ -1,6 +1,8 @@
 """Folders of pictures and clouds."""
 
 import os
+import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -103,6 +105,52 @@ def test_raw_clouds_beside_cut_ones_are_mentioned(make_folder, rig):
     path = make_folder()
     make_folder(names=("img", "raw_pcd"))
     assert "recording: clouds taken from pcd/, not from raw_pcd" in open_recording(path, rig).notes
+
+
+TWO = load_rig(str(Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"))
+
+
+@pytest.mark.parametrize(
+    "names", [("img/left", "img/right"), ("left", "right"), ("images/Left", "images/Right")]
+)
+def test_pictures_in_folders_named_after_cameras_go_with_the_same_cloud(make_folder, names):
+    make_folder(images=("00000", "00001"), clouds=("00000", "00001", "00002"), names=(names[0], "pcd"))
+    recording = open_recording(make_folder(("00001", "00002", "00003"), (), (names[1], "pcd")), TWO)
+    seen = [[(i.sensor, i.channel, int(i.pixels.max())) for i in p.read().images] for p in recording.pairs]
+    left, right = ("left", "frames"), ("right", "frames")
+    assert seen == [[(*left, 10)], [(*left, 11), (*right, 10)], [(*right, 11)]]
+    folder = Path(names[1]).name
+    assert recording.pairs[1].label == f"{Path(names[0]).name}/00001.png + {folder}/00001.png + 00001.pcd"
+    assert recording.notes == [
+        "recording: left: 2 pairs, paired by equal file names; 0 pictures and 1 clouds have no partner",
+        "recording: right: 2 pairs, paired by equal file names; 1 pictures and 1 clouds have no partner",
+        f"recording: without a partner: {folder}/00003.png",
+    ]
+
+
+def test_one_of_several_cameras_can_be_read_by_itself(make_folder):
+    make_folder(names=("img/left", "pcd"))
+    path = make_folder(names=("img/right", "pcd"))
+    (pair, _) = open_recording(path, TWO, SourceOptions(camera="right")).pairs
+    assert [image.sensor for image in pair.read().images] == ["right"]
+    shutil.rmtree(path / "img" / "right")
+    with pytest.raises(SourceError, match="pictures of left lie there, none of right"):
+        open_recording(path, TWO, SourceOptions(camera="right"))
+
+
+def test_pictures_are_not_taken_for_those_of_a_camera_that_nobody_named(make_folder):
+    path = make_folder()
+    with pytest.raises(SourceError, match="has cameras left, right: whose are these pictures") as caught:
+        open_recording(path, TWO)
+    assert "--camera left" in caught.value.hint and "img/right/" in caught.value.hint
+    (pair, _) = open_recording(path, TWO, SourceOptions(camera="right")).pairs
+    assert pair.read().images[0].sensor == "right"
+
+
+def test_two_pictures_of_one_name_are_two_pairs(make_folder, rig):
+    path = make_folder()
+    shutil.copy(path / "img" / "00000.png", path / "img" / "00000.bmp")
+    assert [len(pair.read().images) for pair in open_recording(path, rig).pairs] == [1, 1, 1]
 
 
 @pytest.mark.parametrize("name", ["img/00001.png", "pcd/00001.pcd"])

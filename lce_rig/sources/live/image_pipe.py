@@ -1,6 +1,7 @@
 """Pictures from a command's standard output: GStreamer, ffmpeg or any program that writes them."""
 
 import os
+import re
 import selectors
 import signal
 import subprocess
@@ -23,7 +24,9 @@ _N_SLOTS = 16
 _WAIT_S = 0.25
 _PATIENCE_S = 2.0
 _PIPE_BYTES = 1 << 20
-_N_BEGIN = 10
+_N_BEGIN = 16
+# What no raw picture begins with: a whole header of PGM or PPM, or that of Y4M.
+_HEADER = re.compile(rb"P[56]\s\d+\s\d+\s|YUV4MPEG2 ")
 _TAIL_BYTES = 2000
 _EXAMPLE = (
     "gst-launch-1.0 -q v4l2src device=/dev/video0 ! videoconvert ! video/x-raw,format=I420 ! y4menc ! fdsink"
@@ -145,6 +148,26 @@ class ImagePipeSource:
             else RawPictures(code, *self._settings.resolution_px)
         )
 
+    def _begin_stream(self) -> None:
+        """Find out by its first bytes what the command writes, and whether it is what the profile says.
+
+        Raises:
+            SourceError: it is nothing that is read, or no raw pictures though the profile says so.
+        """
+        if self._stream is None:
+            self._stream = find_stream(self._begin)
+            if self._stream is None:
+                begin = self._begin[:16]
+                what = f"{self._who}: its command writes no Y4M, PGM, PPM or JPEG; it begins {begin!r}"
+                raise SourceError(what, f"For raw pictures set driver.pixel_format. An example: {_EXAMPLE}")
+        elif isinstance(self._stream, RawPictures) and _HEADER.match(self._begin):
+            wanted = self._settings.driver.pixel_format
+            raise SourceError(
+                f"{self._who}: driver.pixel_format says raw {wanted}, but its command writes pictures with a "
+                f"header: {self._begin[:16]!r}",
+                "Leave pixel_format out: such pictures name their form themselves.",
+            )
+
     def _pipes(self) -> tuple[IO[bytes], IO[bytes]]:
         assert self._process.stdout is not None and self._process.stderr is not None  # both are pipes
         return self._process.stdout, self._process.stderr
@@ -165,14 +188,12 @@ class ImagePipeSource:
         return samples
 
     def _to_images(self, data: bytes) -> Iterator[Image]:
-        if self._stream is None:
+        if len(self._begin) < _N_BEGIN:
             self._begin = data = self._begin + data
             if len(data) < _N_BEGIN:
                 return
-            self._stream = find_stream(data)
-            if self._stream is None:
-                what = f"{self._who}: its command writes no Y4M, PGM, PPM or JPEG; it begins {data[:16]!r}"
-                raise SourceError(what, f"For raw pictures set driver.pixel_format. An example: {_EXAMPLE}")
+            self._begin_stream()
+        assert self._stream is not None  # it has begun
         try:
             for pixels in self._stream.feed(data):
                 host_ns = time.time_ns()

@@ -204,6 +204,17 @@ def test_raw_pictures_need_their_format_in_the_profile(tmp_path: Path) -> None:
     assert "driver.pixel_format" in caught.value.hint
 
 
+def test_pictures_with_a_header_are_not_taken_for_raw_ones(tmp_path: Path) -> None:
+    header = f"P5 {WIDTH} {HEIGHT} 255\n".encode()
+    command = child(tmp_path, header + raw(grey_pictures(2)))
+    with (
+        ImagePipeSource("cam", camera(*command, pixel_format="UYVY")) as source,
+        pytest.raises(SourceError, match="pixel_format says raw UYVY, but its command writes") as caught,
+    ):
+        take(source, 1)
+    assert "Leave pixel_format out" in caught.value.hint
+
+
 def test_rows_that_gstreamer_would_pad_are_warned_of(tmp_path: Path) -> None:
     odd = camera(*child(tmp_path, bytes(30 * HEIGHT)), pixel_format="GREY")
     with ImagePipeSource("cam", odd.model_copy(update={"resolution_px": (30, HEIGHT)})) as source:

@@ -1,0 +1,69 @@
+"""Folders of pictures of a rig with two cameras: whose they are is said, never guessed."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lce_rig.core.pcd import encode_pcd
+
+TWO = Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"
+
+
+@pytest.fixture
+def folders(tmp_path) -> list[Path]:
+    """Two folders of one picture and one cloud each, of the same cloud."""
+    cloud = np.zeros(16, [(name, "f4") for name in ("x", "y", "z", "intensity")] + [("ring", "u2")])
+    cloud["x"], cloud["ring"] = 3, np.arange(16)
+    paths = [tmp_path / "a", tmp_path / "b"]
+    for k, path in enumerate(paths):
+        for name in ("img", "pcd"):
+            (path / name).mkdir(parents=True)
+        cv2.imwrite(str(path / "img" / "0.png"), np.full((720, 1280), 100 + k, np.uint8))
+        (path / "pcd" / "0.pcd").write_bytes(encode_pcd(cloud))
+    return paths
+
+
+def cameras_held(session):
+    """Camera and brightness of the pictures of every capture."""
+    held = []
+    for capture in sorted((session / "captures").iterdir()):
+        for entry in json.loads((capture / "meta.json").read_text())["files"]:
+            if entry["kind"] == "image":
+                held.append((entry["camera"], int(cv2.imread(str(capture / entry["file"])).max())))
+    return held
+
+
+def test_each_folder_is_read_for_the_camera_named_with_it(lce_rig, folders, tmp_path):
+    words = [
+        w
+        for p, camera in zip(folders, ("left", "right"), strict=True)
+        for w in ("--from", p, "--camera", camera)
+    ]
+    outcome = lce_rig("collect", "--rig", TWO, tmp_path / "session", *words)
+    assert outcome.code == 0, outcome.err
+    assert cameras_held(tmp_path / "session") == [("left", 100), ("right", 101)]
+
+
+def test_one_camera_named_once_is_that_of_all_folders(lce_rig, folders, tmp_path):
+    words = [w for p in folders for w in ("--from", p)]
+    assert lce_rig("collect", "--rig", TWO, tmp_path / "session", *words, "--camera", "right").code == 0
+    assert cameras_held(tmp_path / "session") == [("right", 100), ("right", 101)]
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "told"),
+    [
+        ([], 5, "whose are these pictures?"),
+        (["--camera", "left", "--camera", "right"], 2, "--camera is given 2 times for 1 recording"),
+        (["--camera", "left,right"], 2, "there is no camera 'left,right'; there is left, right"),
+        (["--lidar", "top"], 2, "there is no lidar 'top'; there is lidar"),
+    ],
+)
+def test_what_does_not_tell_whose_pictures_they_are_is_refused(lce_rig, folders, tmp_path, words, code, told):
+    outcome = lce_rig("collect", "--rig", TWO, tmp_path / "session", "--from", folders[0], *words)
+    assert outcome.code == code
+    assert told in outcome.err
+    assert not (tmp_path / "session").exists()
