@@ -75,8 +75,8 @@ def calibrate_by_algorithm_1(
     problem, T_planes = _start(features, board, _weights(options, features, *sigmas), keep)
 
     draws = draw_subsets(problem, T_planes, options.n_draws, options.n_rounds, options.seed, progress)
-    T_start = T_planes if draws is None else draws.T_mean[draws.best]
-    solution = problem.solve(np.ones((1, problem.n_captures)), T_start, options.n_rounds)
+    # Draws judge the solution and do not choose it: all begin at the same place.
+    solution = problem.solve(np.ones((1, problem.n_captures)), T_planes, options.n_rounds)
     covariances = _covariances(fitted, board, options, problem, solution)
     held_out = np.full(len(features), np.nan) if draws is None else draws.capture_held_out_m
     certificates, cov = solution.certificates, covariances[0] + covariances[1]

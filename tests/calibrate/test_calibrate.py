@@ -109,6 +109,16 @@ def test_every_switch_changes_the_result_or_nothing_but_never_breaks_it(switch):
     assert is_same <= (set(switch) <= unchanged)
 
 
+@pytest.mark.parametrize("draws", [{"n_draws": 1}, {"n_draws": 1, "seed": 5}, {"n_draws": 10}])
+def test_draws_judge_the_result_and_do_not_change_it(draws):
+    # Lost returns and wide steps near the corners: ring ends may be taken for either edge's.
+    captures = simulate(8, 21, Scenario(step_deg=0.4, footprint_m=0.01, lost_share=0.3))
+    T, T_drawn = (
+        calibrate(captures, BOARD, replace(FAST, **own)).T_cam_lidar for own in ({"n_draws": 0}, draws)
+    )
+    assert np.array_equal(T, T_drawn)
+
+
 def test_a_board_that_moved_between_the_sensors_is_refused_with_its_figures():
     captures = simulate(15, 9)
     moved = captures[4].lidar[0]
