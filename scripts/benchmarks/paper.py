@@ -8,7 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.paper_plots import frame_errors, label_of, level_rms, methods_of, plot_frames, plot_noise
+from benchmarks.paper_plots import (
+    LABELS,
+    frame_errors,
+    label_of,
+    level_rms,
+    methods_of,
+    plot_frames,
+    plot_noise,
+)
 from benchmarks.paper_published import (
     ABLATION,
     LCE_CALIB,
@@ -57,7 +65,7 @@ def bench_paper(n_seeds: int, folder: Path, anew: Sequence[str] = (), only: str 
     if only in ("", "simulated"):
         _bench_simulated(n_seeds, folder, anew)
     if only != "simulated" and os.environ.get("LCE_RIG_DATA"):
-        _bench_recorded(open_recordings(folder, only), folder, anew or list(METHODS))
+        _bench_recorded(open_recordings(folder, only), folder, anew or list(LABELS))
 
 
 def _bench_simulated(n_seeds: int, folder: Path, anew: Sequence[str]) -> None:

@@ -64,7 +64,7 @@ def plot_noise(path: Path, runs: Sequence[Run], normals_deg: Mapping[int, float]
         if name:
             for method in methods_of(runs):
                 values = [level_rms(runs, method, level, name) for level in LEVELS]
-                panel.plot(_NOISE_CM, values, **_style(methods_of(runs), method))
+                panel.plot(_NOISE_CM, values, **_style(method))
         else:
             values = [normals_deg[level] for level in LEVELS]
             panel.plot(_NOISE_CM, values, "o-", color="black", **_LINE, label="ours: boards found in scans")
@@ -88,7 +88,7 @@ def plot_frames(path: Path, columns: Mapping[str, FrameErrors]) -> None:
         panels[0].set_title(title, fontsize=9)
         for row, (panel, unit) in enumerate(zip(panels, ("rotation [deg]", "translation [mm]"), strict=True)):
             for method, values in errors.items():
-                panel.plot(counts, values[:, row], **_style(list(errors), method))
+                panel.plot(counts, values[:, row], **_style(method))
             panel.set_ylabel(unit)
             _scale(panel)
         panels[1].set_xlabel("frames")
@@ -125,8 +125,8 @@ def level_rms(
     return rms(np.array(values)) if values else float("nan")
 
 
-def _style(methods: Sequence[str], method: str) -> dict[str, Any]:
-    k = methods.index(method)
+def _style(method: str) -> dict[str, Any]:
+    k = list(LABELS).index(method)
     return {"marker": _MARKERS[k], "color": _COLOURS[k], "label": label_of(method), **_LINE}
 
 
