@@ -138,7 +138,10 @@ def test_a_picture_without_a_board_says_what_to_show(tmp_path: Path) -> None:
     pixels = picture_of(rig.board.to_board())
     pixels[:, :200] = 120
     with attach(Attached(rig, pixels, has_board=False), tmp_path) as (reached, web_port):
-        lines = doctor(reached, tmp_path, web_port, 1.0)
+        for watch_s in (1.0, 3.0, 9.0):  # A busy computer may start the camera's program late.
+            lines = doctor(reached, tmp_path, web_port, watch_s)
+            if ("cam", "board") in lines:
+                break
     assert lines["cam", "board"].severity == "yellow" and lines["cam", "board"].remedy
 
 

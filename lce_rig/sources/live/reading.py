@@ -81,8 +81,11 @@ class ReaderThread:
         self._mailbox = Mailbox(self._n_slots)
         self._rate = RateMeter()
         self._is_stopping.clear()
-        self._thread = threading.Thread(target=self._run, name=f"reader of {self._who}", daemon=True)
-        self._thread.start()
+        thread = threading.Thread(target=self._run, name=f"reader of {self._who}", daemon=True)
+        thread.start()
+        self._thread = (
+            thread  # Stopping, which another thread may do meanwhile, waits for one that has begun.
+        )
 
     def stop(self) -> None:
         """Stop reading and wait for the thread to end."""

@@ -109,8 +109,9 @@ class Vlp16Source:
         self._ports = data, UdpPort(position_port, f"{self.sensor}: position packets")
         if self._record_to is not None:
             self._recorder = PcapRecorder(self._record_to)
-        self._thread = threading.Thread(target=self._run, name=f"read {self.sensor}", daemon=True)
-        self._thread.start()
+        thread = threading.Thread(target=self._run, name=f"read {self.sensor}", daemon=True)
+        thread.start()
+        self._thread = thread  # Closing, which another thread may do meanwhile, waits for one that has begun.
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
