@@ -244,6 +244,7 @@ def test_a_source_may_be_closed_while_another_thread_opens_it_again(lidar: Lidar
         while not has_ended.is_set():
             try:
                 source.__enter__()
+                source.__exit__(None, None, None)  # As whoever opened it does when all is closed.
             except SourceError:
                 continue
             except Exception as failure:
