@@ -8,11 +8,11 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.cameras import camera_lines, require_extrinsics, together_lines
+from lce_rig.cli.cameras import camera_lines, lacking_extrinsics, together_lines
 from lce_rig.cli.options import (
     cameras_option,
     event_image_option,
-    require_cameras,
+    require_sensors,
     session_argument,
     split_names,
 )
@@ -119,7 +119,7 @@ def calibrate(
 
     opened = Session.open(session)
     rig = opened.rig
-    require_cameras(cameras, rig.cameras)
+    require_sensors("camera", cameras, rig.cameras)
     if weights == "profile":
         settings = rig.calibration
         switches |= {"plane_weight": settings.plane_weight, "edge_weight": settings.edge_weight}
@@ -174,13 +174,7 @@ def _exit(
     calibrations: Sequence[Calibration], wanted: Sequence[str], seen: Collection[str], *, are_told: bool
 ) -> None:
     """Leave with exit code 7 where a result must not be used, else 6 where a camera has none."""
-    from lce_rig.core.errors import NotEnoughDataError
-
-    lacking: NotEnoughDataError | None = None
-    try:
-        require_extrinsics(wanted, seen, calibrations)
-    except NotEnoughDataError as error:
-        lacking = error
+    lacking = lacking_extrinsics(wanted, seen, calibrations)
     if lacking is not None and any(c.verdict == "fail" for c in calibrations):
         show.warn(str(lacking))
     exit_by_verdict(calibrations, are_told=are_told)

@@ -35,28 +35,26 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
     return lines
 
 
-def require_extrinsics(
+def lacking_extrinsics(
     wanted: Sequence[str], seen: Collection[str], calibrations: Sequence[Calibration]
-) -> None:
-    """Make sure that every camera has an extrinsic: half a rig must not pass for the whole.
+) -> NotEnoughDataError | None:
+    """Say which cameras have no extrinsic, None where all have: half a rig must not pass for the whole.
 
     Args:
         wanted: cameras that should have one.
         seen: cameras of which the session holds captures.
         calibrations: what there is, at least one.
-
-    Raises:
-        NotEnoughDataError: a camera has none.
     """
     calibrated = {calibration.camera for calibration in calibrations}
     missing = [camera for camera in wanted if camera not in calibrated]
-    if missing:
-        causes = [f"No capture holds a picture of {name} and a scan." for name in missing if name not in seen]
-        others = " ".join(f"--camera {name}" for name in wanted if name in calibrated)
-        raise NotEnoughDataError(
-            f"no extrinsic of camera {', '.join(missing)}",
-            "\n".join([*causes, f"Collect more captures; to do without: {others}"]),
-        )
+    if not missing:
+        return None
+    causes = [f"No capture holds a picture of {name} and a scan." for name in missing if name not in seen]
+    others = " ".join(f"--camera {name}" for name in wanted if name in calibrated)
+    return NotEnoughDataError(
+        f"no extrinsic of camera {', '.join(missing)}",
+        "\n".join([*causes, f"Collect more captures; to do without: {others}"]),
+    )
 
 
 def _lines(camera: str, other: OtherCamera) -> list[str]:

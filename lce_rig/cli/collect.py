@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange
+from lce_rig.cli.options import FiniteRange, require_sensors
 
 
 def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
@@ -191,10 +191,8 @@ def _one_for_each(
     """
     from lce_rig.core.errors import UsageError
 
-    for name in names:
-        if known is not None and name not in known:
-            what = option.removeprefix("--")
-            raise UsageError(f"there is no {what} {name!r}; there is {', '.join(known)}")
+    if known is not None:
+        require_sensors(option.removeprefix("--"), names, known)
     if len(names) < 2:
         return [*names, None][:1] * len(paths)
     if len(names) != len(paths):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import cameras_option, require_cameras, session_argument, split_names
+from lce_rig.cli.options import cameras_option, require_sensors, session_argument, split_names
 
 if TYPE_CHECKING:
     from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
@@ -49,14 +49,14 @@ def intrinsics(
     fit. Writes SESSION/intrinsics/: a block for the profile, camera_info and a page of pictures for each
     camera. The profile itself is not touched. Exits with 6 where the captures do not do.
     """
-    from lce_rig.core.errors import NotEnoughDataError, UsageError
+    from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
     from lce_rig.pipeline.intrinsics import measure_intrinsics
     from lce_rig.pipeline.intrinsics_files import document, write_intrinsics
     from lce_rig.pipeline.intrinsics_files import save_profile as write_profile
     from lce_rig.session import Session
 
     opened = Session.open(session)
-    require_cameras(cameras, opened.rig.cameras)
+    require_sensors("camera", cameras, opened.rig.cameras)
     if save_profile is not None and save_profile.exists():
         raise UsageError(f"{save_profile} exists already", "Name another file: nothing is written over.")
     wanted, measured, troubles = channels or [], [], []
@@ -83,8 +83,7 @@ def intrinsics(
         write_profile(opened, measured, save_profile)
         show.note(f"written: {save_profile}")
     if troubles:
-        first, *others = troubles
-        raise NotEnoughDataError(first.what, "\n".join([first.hint, *map(str, others)]).strip())
+        raise join_shortages(troubles)
 
 
 def _head(measured: "MeasuredIntrinsics") -> list[str]:

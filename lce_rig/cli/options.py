@@ -37,17 +37,17 @@ cameras_option = click.option(
 )
 
 
-def require_cameras(cameras: Sequence[str], known: Collection[str]) -> None:
-    """Make sure that cameras asked for are those of a rig.
+def require_sensors(what: str, names: Sequence[str], known: Collection[str]) -> None:
+    """Make sure that sensors asked for, such as cameras, are those of a rig.
 
     Raises:
         UsageError: one is not.
     """
     from lce_rig.core.errors import UsageError
 
-    unknown = sorted(set(cameras) - set(known))
+    unknown = sorted(set(names) - set(known))
     if unknown:
-        raise UsageError(f"there is no camera {unknown[0]!r}; there is {', '.join(known)}")
+        raise UsageError(f"there is no {what} {unknown[0]!r}; there is {', '.join(known)}")
 
 
 EVENT_IMAGES = click.Choice(["network", "map"])

@@ -1,5 +1,7 @@
 """Errors the user can repair; each says what and where, and what to do about it."""
 
+from collections.abc import Sequence
+
 
 class LceRigError(Exception):
     """Base of every error the user can repair.
@@ -54,3 +56,9 @@ class ResultRefusedError(LceRigError):
     """A result that was computed and must not be used."""
 
     exit_code = 7
+
+
+def join_shortages(errors: Sequence[NotEnoughDataError]) -> NotEnoughDataError:
+    """Make one error of at least one: the first, with the others in its hint."""
+    first, *others = errors
+    return NotEnoughDataError(first.what, "\n".join([first.hint, *map(str, others)]).strip())

@@ -8,7 +8,7 @@ from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.calibrate.reach import point_uncertainties
 from lce_rig.calibrate.shared_scans import take_apart
 from lce_rig.calibrate.verdict import judge
-from lce_rig.core.errors import NotEnoughDataError, UsageError
+from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.geometry import Array, tangent_sizes
 from lce_rig.core.results import Calibration, Refusal
 from lce_rig.detect.detection import Detections, Pair
@@ -71,8 +71,7 @@ def _nothing_solved(
         return NotEnoughDataError(
             f"the session holds no capture with a picture{of_cameras} and a scan", "Collect captures first."
         )
-    first, *others = troubles
-    return NotEnoughDataError(first.what, "\n".join([first.hint, *map(str, others)]).strip())
+    return join_shortages(troubles)
 
 
 def _pairs_by_sensors(

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.paper_plots import (
-    LABELS,
     frame_errors,
+    in_order,
     label_of,
     level_rms,
     methods_of,
@@ -65,7 +65,7 @@ def bench_paper(n_seeds: int, folder: Path, anew: Sequence[str] = (), only: str 
     if only in ("", "simulated"):
         _bench_simulated(n_seeds, folder, anew)
     if only != "simulated" and os.environ.get("LCE_RIG_DATA"):
-        _bench_recorded(open_recordings(folder, only), folder, anew or list(LABELS))
+        _bench_recorded(open_recordings(folder, only), folder, anew or in_order(METHODS))
 
 
 def _bench_simulated(n_seeds: int, folder: Path, anew: Sequence[str]) -> None:

@@ -1,6 +1,6 @@
 """The figures of the paper's experiments, as PNG for documents and PDF for papers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from benchmarks.paper_published import (
 from benchmarks.paper_runs import FRAME_COUNTS, MIDDLE_LEVEL, Run
 from benchmarks.paper_sets import LEVELS, N_CAPTURES
 from benchmarks.tables import rms
+from lce_rig.calibrate.calibrate import METHODS
 from lce_rig.core.geometry import Array
 from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M
 
@@ -107,7 +108,12 @@ def frame_errors(runs: Sequence[Run]) -> FrameErrors:
 
 def methods_of(runs: Sequence[Run]) -> list[str]:
     """Name the methods of runs in the order of `LABELS`, others after these."""
-    there = {run.method for run in runs}
+    return in_order({run.method for run in runs})
+
+
+def in_order(methods: Iterable[str]) -> list[str]:
+    """Sort names of methods as `LABELS` has them, others after these."""
+    there = set(methods)
     return [name for name in LABELS if name in there] + sorted(there - set(LABELS))
 
 
@@ -126,7 +132,7 @@ def level_rms(
 
 
 def _style(method: str) -> dict[str, Any]:
-    k = list(LABELS).index(method)
+    k = in_order(METHODS).index(method)
     return {"marker": _MARKERS[k], "color": _COLOURS[k], "label": label_of(method), **_LINE}
 
 
