@@ -16,7 +16,7 @@ MAX_POINTS = 1 << 23
 MAX_FIELDS = 256
 """Of one point, counts included: drivers write about ten."""
 MAX_CHUNK_BYTES = 1 << 27
-"""One unpacked chunk of a bag, packet of events or member of an archive; holds an image of MAX_PIXELS grey."""
+"""One unpacked chunk of a bag, packet of events or member of an archive; holds MAX_PIXELS in grey."""
 MAX_FILE_BYTES = 1 << 28
 """A file that has to be in memory as a whole."""
 MAX_DOCUMENT_BYTES = 1 << 24

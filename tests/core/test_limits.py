@@ -16,7 +16,7 @@ def test_a_file_beyond_the_limit_is_not_read(tmp_path):
     path = tmp_path / "a"
     with path.open("wb") as file:
         file.truncate(1 << 40)  # sparse: takes no disk
-    with pytest.raises(ValueError, match="1.1 TB"):
+    with pytest.raises(ValueError, match="TB"):
         read_file(path)
 
 
