@@ -1,5 +1,7 @@
 """Follow the board from one scan to the next."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from lce_rig.core.board import Board
@@ -24,7 +26,8 @@ def track_lidar_board(
     *,
     margin_m: float = 0.25,
     min_range_m: float = 0.4,
-    min_rings: int = 4,
+    min_rings: int = STANDARD.min_rings,
+    max_rms_m: float = STANDARD.rms_m,
     beam: Beam | None = None,
 ) -> LidarBoard | Refusal:
     """Find the board near its previous pose: only returns in a box about it are looked at.
@@ -38,6 +41,7 @@ def track_lidar_board(
         margin_m: by how much the box reaches beyond the board on every side.
         min_range_m: nearer returns are ignored.
         min_rings: fewest rings on the board.
+        max_rms_m: largest rms distance of the board's returns from its plane, without noise.
         beam: light spot of the LiDAR; that of a VLP-16 where None.
 
     Returns:
@@ -47,11 +51,18 @@ def track_lidar_board(
         LCE-Calib, "Checkerboard Tracking".
     """
     nearby = scan.select(_near(scan, board, previous, margin_m))
-    still = _measure_again(nearby, board, previous, min_range_m, min_rings, beam)
+    limits = Limits(STANDARD.template_m, max_rms_m, min_rings)
+    still = _measure_again(nearby, board, previous, min_range_m, limits, beam)
     if still is not None:
         return still
     found = find_lidar_boards(
-        nearby, board, min_range_m=min_range_m, max_range_m=np.inf, min_rings=min_rings, beam=beam
+        nearby,
+        board,
+        min_range_m=min_range_m,
+        max_range_m=np.inf,
+        min_rings=min_rings,
+        max_rms_m=max_rms_m,
+        beam=beam,
     )
     if isinstance(found, Refusal):
         return Refusal("lidar", f"lost near its last place: {found.cause}", found.action)
@@ -77,7 +88,7 @@ def _near(scan: Scan, board: Board, previous: LidarBoard, margin_m: float) -> In
 
 
 def _measure_again(
-    nearby: Scan, board: Board, previous: LidarBoard, min_range_m: float, min_rings: int, beam: Beam | None
+    nearby: Scan, board: Board, previous: LidarBoard, min_range_m: float, limits: Limits, beam: Beam | None
 ) -> LidarBoard | None:
     """Start from the last pose, which a board held still hardly leaves; None unless it fits as well again."""
     T = previous.T_lidar_board
@@ -91,9 +102,7 @@ def _measure_again(
     width_axis = plane_axes(previous.plane[:3]).T @ T[:3, 0]
     half_m = (board.width_m / 2, board.height_m / 2)
     start = Placement(0.0, 0.0, float(np.arctan2(width_axis[1], width_axis[0])), half_m)
-    limits = Limits(
-        min(STANDARD.template_m, previous.quality["template_m"] + WORSE_M), STANDARD.rms_m, min_rings
-    )
+    limits = replace(limits, template_m=min(limits.template_m, previous.quality["template_m"] + WORSE_M))
     measured = measure_plate(
         ordered, nearby, board, previous.plane, T[:3, 3], start, limits.widened(ordered.sigma_m), beam
     )

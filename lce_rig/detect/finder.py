@@ -1,0 +1,177 @@
+"""The board as a profile describes it: found in images and scans, and compared with the profile's limits.
+
+Everything that looks for a board asks here, live or offline, so that what one part of the program takes for
+a board the others do too.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.detect.event_board import find_in_reconstruction
+from lce_rig.detect.gates import gate_image_board, gate_lidar_boards
+from lce_rig.detect.image_board import find_image_board, region_around
+from lce_rig.detect.lidar_board import find_lidar_boards
+from lce_rig.detect.lidar_features import Beam
+from lce_rig.detect.lidar_track import track_lidar_board
+from lce_rig.rig import Rig
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSearch:
+    """What a search of one image found.
+
+    Attributes:
+        board: what can be followed into the next image; or why there is nothing.
+        usable: the same where the profile's limits admit it; else why they do not.
+    """
+
+    board: ImageBoard | Refusal
+    usable: ImageBoard | Refusal
+
+
+@dataclass(frozen=True, eq=False)
+class ScanSearch:
+    """What a search of one scan found.
+
+    Attributes:
+        boards: surfaces of the board's size, likeliest first, which can be followed into the next scan; or
+            why there are none.
+        usable: those of them that the profile's limits admit; else why they do not.
+    """
+
+    boards: list[LidarBoard] | Refusal
+    usable: list[LidarBoard] | Refusal
+
+
+class BoardFinder:
+    """Finds the board of one rig.
+
+    Attributes:
+        rig: the profile.
+        board: its board.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.board = rig.board.to_board()
+        self._intrinsics = {name: camera.to_intrinsics() for name, camera in rig.cameras.items()}
+
+    def image(self, image: Image) -> ImageBoard | Refusal:
+        """Find the board in one image, of a camera or made from events by others.
+
+        Raises:
+            ProfileError: the camera's intrinsics belong to images of another size.
+        """
+        return self.search_image(image).usable
+
+    def scan(self, scan: Scan) -> list[LidarBoard] | Refusal:
+        """Find the surfaces of the board's size in one scan, likeliest first."""
+        return self.search_scan(scan).usable
+
+    def search_image(
+        self, image: Image, last: ImageBoard | None = None, *, is_thorough: bool = True
+    ) -> ImageSearch:
+        """Find the board in one image, near its last place first.
+
+        Args:
+            image: of a camera of the rig.
+            last: the board in the image before.
+            is_thorough: see `find_image_board`.
+
+        Raises:
+            ProfileError: the camera's intrinsics belong to images of another size.
+        """
+        found = self.corners(image, self._intrinsics[image.sensor], last, is_thorough=is_thorough)
+        if isinstance(found, Refusal):
+            return ImageSearch(found, found)
+        found = replace(found, stamp_ns=image.stamp_ns)
+        return ImageSearch(found, gate_image_board(found, self.rig.quality))
+
+    def corners(
+        self,
+        image: Image,
+        intrinsics: Intrinsics,
+        last: ImageBoard | None = None,
+        *,
+        max_reprojection_px: float | None = None,
+        is_thorough: bool = True,
+    ) -> ImageBoard | Refusal:
+        """Find the board's corners by any intrinsics; the profile's limits on boards are not applied.
+
+        Args:
+            image: of a camera of the rig.
+            intrinsics: at the image's size.
+            last: the board in the image before.
+            max_reprojection_px: in place of the profile's.
+            is_thorough: see `find_image_board`.
+
+        Raises:
+            ProfileError: the intrinsics belong to images of another size.
+        """
+        region = None if last is None else region_around(last, image)
+        limits = self.rig.quality
+        if max_reprojection_px is not None:
+            limits = limits.model_copy(update={"max_reprojection_px": max_reprojection_px})
+        channel = self.rig.cameras[image.sensor].channels.get(image.channel)
+        if channel is not None and channel.kind == "events":
+            return find_in_reconstruction(image, self.board, intrinsics, limits, region)
+        return find_image_board(
+            image,
+            self.board,
+            intrinsics,
+            region=region,
+            last=last,
+            max_reprojection_px=limits.max_reprojection_px,
+            is_thorough=is_thorough,
+        )
+
+    def search_scan(self, scan: Scan) -> ScanSearch:
+        """Find the surfaces of the board's size in a whole scan."""
+        lidar, limits = self.rig.lidars[scan.sensor], self.rig.quality
+        found = find_lidar_boards(
+            scan,
+            self.board,
+            min_range_m=lidar.min_range_m,
+            max_range_m=min(lidar.max_range_m, limits.max_distance_m),
+            min_rings=limits.min_rings,
+            max_rms_m=limits.max_thickness_m,
+            beam=self._beam(scan.sensor),
+        )
+        return self._compared(found, scan)
+
+    def follow_scan(self, scan: Scan, known: Sequence[LidarBoard]) -> ScanSearch:
+        """Find surfaces near where they were in the scan before; those that are lost are left out.
+
+        Args:
+            scan: the next one of the same LiDAR.
+            known: `boards` of the search before, at least one.
+        """
+        lidar, limits = self.rig.lidars[scan.sensor], self.rig.quality
+        tracked = [
+            track_lidar_board(
+                scan,
+                self.board,
+                each,
+                min_range_m=lidar.min_range_m,
+                min_rings=limits.min_rings,
+                max_rms_m=limits.max_thickness_m,
+                beam=self._beam(scan.sensor),
+            )
+            for each in known
+        ]
+        found = [each for each in tracked if isinstance(each, LidarBoard)]
+        lost = [each for each in tracked if isinstance(each, Refusal)]
+        return self._compared(found or lost[0], scan)
+
+    def _beam(self, lidar: str) -> Beam:
+        settings = self.rig.lidars[lidar]
+        return Beam(settings.beam_aperture_m, settings.beam_divergence_rad)
+
+    def _compared(self, found: list[LidarBoard] | Refusal, scan: Scan) -> ScanSearch:
+        if isinstance(found, Refusal):
+            return ScanSearch(found, found)
+        boards = [replace(each, stamp_ns=scan.stamp_ns) for each in found]
+        return ScanSearch(boards, gate_lidar_boards(boards, self.board, self.rig.quality))
