@@ -95,6 +95,8 @@ def _judge_camera(
     rig: Rig,
     options: MotionOptions,
 ) -> Moment | Refusal | None:
+    if key in sighting.unfit:
+        return sighting.unfit[key]
     motion = _follow(key, around)
     if motion is None:
         return None

@@ -13,6 +13,7 @@ from lce_rig.collect.stillness import StillnessOptions, find_still_moments
 from lce_rig.collect.tally import Tally
 from lce_rig.collect.watching import BoardWatcher, ImageKey, Moment
 from lce_rig.core.data import Image
+from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
 from lce_rig.sources.base import Sample, Stream
 
@@ -68,14 +69,20 @@ class MomentSearch:
             samples = with_event_pictures(samples, self.rig, cameras, self._tally)
         stillness = self.stillness or StillnessOptions(max_motion_m=self.rig.quality.max_motion_m)
         interval_s = self.motion.search_interval_s if self.has_events else stillness.search_interval_s
-        watcher = BoardWatcher(self.rig, interval_s, self._counts)
+        watcher = BoardWatcher(self.rig, interval_s, self._counts, self._tally)
         frames = pair_by_time(samples, self.rig, self._pairing)
         sightings = (watcher.sight(frame) for frame in frames)
         if self.has_events:
             taken = Placements(self.min_move_m, self.min_turn_deg)
-            yield from find_moving_moments(sightings, self.rig, self.motion, taken, self._tally)
+            moments = find_moving_moments(sightings, self.rig, self.motion, taken, self._tally)
         else:
-            yield from find_still_moments(sightings, self.rig.board.to_board(), stillness)
+            moments = find_still_moments(sightings, self.rig.board.to_board(), stillness)
+        for moment in moments:
+            confirmed = watcher.confirm(moment)
+            if isinstance(confirmed, Refusal):
+                self._tally.add(confirmed)
+            else:
+                yield confirmed
 
     def kept_images(self, moment: Moment) -> list[Image]:
         """List the pictures of a moment that its capture keeps: all but those that its events give again."""

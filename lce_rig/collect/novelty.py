@@ -8,7 +8,7 @@ import numpy as np
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, rotation_angle
 from lce_rig.core.results import ImageBoard
-from lce_rig.detect.image_board import find_image_board
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.session import Capture, Session
 
 ImageKey = tuple[str, str]
@@ -91,8 +91,7 @@ def capture_poses(capture: Capture, session: Session) -> dict[ImageKey, Array]:
     for camera, channel in capture.image_keys:
         if camera not in session.rig.cameras:
             continue
-        intrinsics = session.rig.cameras[camera].to_intrinsics()
-        board = find_image_board(capture.image(camera, channel), session.rig.board.to_board(), intrinsics)
+        board = BoardFinder(session.rig).search_image(capture.image(camera, channel)).board
         if isinstance(board, ImageBoard):
             found[camera, channel] = board.T_cam_board
     return found

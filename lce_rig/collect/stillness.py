@@ -88,7 +88,7 @@ class StillnessGate:
     def _measure(self, sighting: Sighting) -> float:
         """Put a sighting into the window and measure how far the board moved in it."""
         window, options = self._window, self._options
-        is_seen = bool(sighting.images and sighting.lidars)
+        is_seen = sighting.is_usable
         if not is_seen or _is_gap(window, sighting, options):
             window.clear()
         if is_seen:

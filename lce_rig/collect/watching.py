@@ -1,16 +1,14 @@
 """The board followed from frame to frame, in every picture and scan."""
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from lce_rig.collect.pairing import Frame
-from lce_rig.core.board import Board
+from lce_rig.collect.tally import Tally
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
-from lce_rig.detect.event_board import find_in_reconstruction
-from lce_rig.detect.image_board import NOT_SEEN_AT_ONCE, find_image_board, region_around
-from lce_rig.detect.lidar_board import find_lidar_boards
-from lce_rig.detect.lidar_track import track_lidar_board
+from lce_rig.detect.finder import BoardFinder, ImageSearch
+from lce_rig.detect.image_board import NOT_SEEN_AT_ONCE
 from lce_rig.rig import Rig
 
 ImageKey = tuple[str, str]
@@ -22,9 +20,11 @@ class Sighting:
 
     Attributes:
         images: by (camera, channel), where it was found.
-        lidars: candidates by LiDAR; things of the board's size may be among them.
+        lidars: candidates that the profile's limits admit, by LiDAR; things of the board's size may be among
+            them.
         unseen: why it was not found, by (camera, channel), where it was looked for.
-        unscanned: why it was not found, by LiDAR, where it was looked for.
+        unscanned: why there is no such candidate, by LiDAR, where it was looked for.
+        unfit: why the profile's limits refuse a board of `images`, by (camera, channel).
     """
 
     frame: Frame
@@ -32,6 +32,12 @@ class Sighting:
     lidars: dict[str, list[LidarBoard]]
     unseen: dict[ImageKey, Refusal] = field(default_factory=dict)
     unscanned: dict[str, Refusal] = field(default_factory=dict)
+    unfit: dict[ImageKey, Refusal] = field(default_factory=dict)
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether a camera and a LiDAR see the board as the profile's limits want it."""
+        return bool(self.images.keys() - self.unfit.keys() and self.lidars)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +60,7 @@ class BoardWatcher:
         rig: the profile.
         search_interval_s: how often a whole picture is searched while no board is in sight.
         counts: frames in which it was not found, by sensor.
+        refusals: boards that were found and cannot be used, by cause.
         thorough_interval_s: how often such a search is thorough, which takes most of a second; 0 for always.
         rescan_interval_s: how often a whole scan is searched while all candidates are followed; 0 for as
             often as while one is lost.
@@ -62,6 +69,7 @@ class BoardWatcher:
     rig: Rig
     search_interval_s: float
     counts: Counter[str] = field(default_factory=Counter)
+    refusals: Tally = field(default_factory=Tally)
     thorough_interval_s: float = 0.0
     rescan_interval_s: float = 0.0
     _seen: dict[ImageKey, ImageBoard] = field(default_factory=dict)
@@ -71,19 +79,25 @@ class BoardWatcher:
     _thorough_ns: dict[ImageKey | str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._board: Board = self.rig.board.to_board()
+        self.finder = BoardFinder(self.rig)
 
     def sight(self, frame: Frame) -> Sighting:
         """Find the board in every picture and scan of a frame."""
         images: dict[ImageKey, ImageBoard] = {}
         unseen: dict[ImageKey, Refusal] = {}
+        unfit: dict[ImageKey, Refusal] = {}
         for image in frame.images:
             key = (image.sensor, image.channel)
             found = self._find_in_image(image, key, frame.time_ns)
-            if isinstance(found, Refusal):
-                unseen[key] = found
-            elif found is not None:
-                images[key] = found
+            if found is None:
+                continue
+            if isinstance(found.board, Refusal):
+                unseen[key] = found.board
+                continue
+            images[key] = found.board
+            if isinstance(found.usable, Refusal):
+                unfit[key] = found.usable
+                self.refusals.add(found.usable)
         lidars: dict[str, list[LidarBoard]] = {}
         unscanned: dict[str, Refusal] = {}
         # Nothing is gained from scans while no camera sees the board.
@@ -98,43 +112,57 @@ class BoardWatcher:
             self.counts["no board in any picture"] += 1
         elif not lidars:
             self.counts["no board in the scan"] += 1
-        return Sighting(frame, images, lidars, unseen, unscanned)
+        return Sighting(frame, images, lidars, unseen, unscanned, unfit)
 
-    def _find_in_image(self, image: Image, key: ImageKey, time_ns: int) -> ImageBoard | Refusal | None:
+    def confirm(self, moment: Moment) -> Moment | Refusal:
+        """Search the frame of a moment without a prior, as `check` does: what is captured can be used later.
+
+        Returns:
+            The moment with what was found; or why it cannot be used.
+        """
+        sighting = moment.sighting
+        keys = sighting.images.keys()
+        images = {
+            (image.sensor, image.channel): self.finder.image(image)
+            for image in sighting.frame.images
+            if (image.sensor, image.channel) in keys
+        }
+        scans = {scan.sensor: self.finder.scan(scan) for scan in sighting.frame.scans}
+        usable = {key: board for key, board in images.items() if isinstance(board, ImageBoard)}
+        lidars = {name: boards for name, boards in scans.items() if isinstance(boards, list)}
+        for found, refused in ((usable, images), (lidars, scans)):
+            if not found:
+                return next(why for why in refused.values() if isinstance(why, Refusal))
+        return replace(moment, sighting=Sighting(sighting.frame, usable, lidars))
+
+    def _find_in_image(self, image: Image, key: ImageKey, time_ns: int) -> ImageSearch | None:
         last = self._seen.pop(key, None)
         if last is None and not self._is_search_due(key, time_ns):
             return None
-        region = None if last is None else region_around(last, image)
-        camera = self.rig.cameras[image.sensor]
-        intrinsics = camera.to_intrinsics()
-        if camera.channels[image.channel].kind == "events":
-            found = find_in_reconstruction(image, self._board, intrinsics, self.rig.quality, region)
-        else:
-            is_thorough = self._is_thorough_due(key, time_ns, was_seen=last is not None)
-            found = find_image_board(
-                image, self._board, intrinsics, region=region, last=last, is_thorough=is_thorough
-            )
-            if found is NOT_SEEN_AT_ONCE:
-                return None
-        if isinstance(found, ImageBoard):
-            self._seen[key] = found
+        is_thorough = self._is_thorough_due(key, time_ns, was_seen=last is not None)
+        found = self.finder.search_image(image, last, is_thorough=is_thorough)
+        if found.board is NOT_SEEN_AT_ONCE:
+            return None
+        if isinstance(found.board, ImageBoard):
+            self._seen[key] = found.board
         return found
 
     def _find_in_scan(self, scan: Scan, time_ns: int) -> list[LidarBoard] | Refusal:
         known = self._candidates.get(scan.sensor, [])
-        tracked = (track_lidar_board(scan, self._board, old) for old in known)
-        found = [board for board in tracked if isinstance(board, LidarBoard)]
-        are_all_there = len(found) == self._n_candidates.get(scan.sensor)
+        followed = self.finder.follow_scan(scan, known) if known else None
+        n_found = len(followed.boards) if followed is not None and isinstance(followed.boards, list) else 0
+        are_all_there = n_found == self._n_candidates.get(scan.sensor)
         interval_s = max(self.search_interval_s, self.rescan_interval_s if are_all_there else 0.0)
-        if not _is_due(self._searched_ns, scan.sensor, time_ns, interval_s) and found:
-            self._candidates[scan.sensor] = found
-            return found
-        settings = self.rig.lidars[scan.sensor]
-        reach_m = min(settings.max_range_m, self.rig.quality.max_distance_m)
-        search = find_lidar_boards(scan, self._board, min_range_m=settings.min_range_m, max_range_m=reach_m)
-        self._candidates[scan.sensor] = [] if isinstance(search, Refusal) else search
-        self._n_candidates[scan.sensor] = len(self._candidates[scan.sensor])
-        return search
+        is_due = _is_due(self._searched_ns, scan.sensor, time_ns, interval_s)
+        search = followed
+        if search is None or not n_found or is_due:
+            search = self.finder.search_scan(scan)
+        self._candidates[scan.sensor] = search.boards if isinstance(search.boards, list) else []
+        if search is not followed:
+            self._n_candidates[scan.sensor] = len(self._candidates[scan.sensor])
+        if isinstance(search.boards, list) and isinstance(search.usable, Refusal):
+            self.refusals.add(search.usable)
+        return search.usable
 
     def _is_search_due(self, key: ImageKey | str, time_ns: int) -> bool:
         return _is_due(self._searched_ns, key, time_ns, self.search_interval_s)

@@ -4,16 +4,16 @@ import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError, SessionError
 from lce_rig.core.results import Refusal
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, from_arrays, to_arrays
-from lce_rig.detect.event_board import EventImage, find_in_reconstruction
-from lce_rig.detect.gates import gate_image_board, gate_lidar_boards
+from lce_rig.detect.event_board import EventImage
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.pipeline.event_detection import event_channels, event_digest, see_events
 from lce_rig.pipeline.progress import Progress, silent
 from lce_rig.rig import Rig
@@ -112,6 +112,7 @@ class _Finder:
     def __init__(self, session: Session, event_image: EventImage | None) -> None:
         self._session = session
         self._event_image = event_image
+        self._boards = BoardFinder(session.rig)
         self._digest = detection_digest(session.rig)
         self._event_digests: dict[Key, str] = {}
 
@@ -139,7 +140,7 @@ class _Finder:
 
         def find() -> ImageDetection:
             try:
-                return detect_image(self._session.rig, capture.image(camera, channel))
+                return self._boards.image(capture.image(camera, channel))
             except ProfileError as error:
                 return Refusal("image", error.what, error.hint)
 
@@ -150,7 +151,7 @@ class _Finder:
         """Find the surfaces of the board's size in a scan."""
 
         def find() -> LidarDetection:
-            return detect_scan(self._session.rig, capture.scan(lidar))
+            return self._boards.scan(capture.scan(lidar))
 
         found: LidarDetection = self._remembered(self._digest, capture, lidar, find)
         return found
@@ -217,43 +218,6 @@ class _Finder:
 def _cache_key(digest: str, capture: Capture, sensor: str) -> str:
     # Samples and stamps are part of the key: a capture may be removed and another take its name.
     return f"{digest}/{capture.name}-{capture.manifest_sha256[:12]}.{sensor}"
-
-
-def detect_image(rig: Rig, image: Image) -> ImageDetection:
-    """Find the board in one picture, of a camera or made from events by others."""
-    from lce_rig.detect.image_board import find_image_board
-
-    camera, limits, board = rig.cameras[image.sensor], rig.quality, rig.board.to_board()
-    channel = camera.channels.get(image.channel)
-    if channel is not None and channel.kind == "events":
-        found = find_in_reconstruction(image, board, camera.to_intrinsics(), limits)
-    else:
-        found = find_image_board(
-            image, board, camera.to_intrinsics(), max_reprojection_px=limits.max_reprojection_px
-        )
-    if isinstance(found, Refusal):
-        return found
-    return gate_image_board(replace(found, stamp_ns=image.stamp_ns), limits)
-
-
-def detect_scan(rig: Rig, scan: Scan) -> LidarDetection:
-    """Find the surfaces of the board's size in one scan, likeliest first."""
-    from lce_rig.detect.lidar_board import find_lidar_boards
-    from lce_rig.detect.lidar_features import Beam
-
-    lidar, limits, board = rig.lidars[scan.sensor], rig.quality, rig.board.to_board()
-    found = find_lidar_boards(
-        scan,
-        board,
-        min_range_m=lidar.min_range_m,
-        max_range_m=min(lidar.max_range_m, limits.max_distance_m),
-        min_rings=limits.min_rings,
-        max_rms_m=limits.max_thickness_m,
-        beam=Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad),
-    )
-    if isinstance(found, Refusal):
-        return found
-    return gate_lidar_boards([replace(each, stamp_ns=scan.stamp_ns) for each in found], board, limits)
 
 
 def detection_digest(rig: Rig) -> str:

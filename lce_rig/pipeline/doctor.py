@@ -21,7 +21,7 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.core.results import Refusal
 from lce_rig.detect.event_board import find_event_board, reconstructor_for
-from lce_rig.pipeline.detection import detect_image, detect_scan
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
 from lce_rig.sources.live.velodyne_web import WebReport
 
@@ -119,7 +119,7 @@ def look_for_boards(rig: Rig, seen: Mapping[str, Observation]) -> dict[tuple[str
 
 def _sight_in_scan(rig: Rig, seen: Observation) -> Sight:
     assert seen.scan is not None
-    found = detect_scan(rig, seen.scan)
+    found = BoardFinder(rig).scan(seen.scan)
     if isinstance(found, Refusal):
         return Sight("", found, {})
     best = found[0].quality
@@ -132,7 +132,7 @@ def _sight_in_scan(rig: Rig, seen: Observation) -> Sight:
 
 def _sight_in_picture(rig: Rig, image: Image) -> Sight:
     try:
-        found = detect_image(rig, image)
+        found = BoardFinder(rig).image(image)
     except LceRigError as error:
         found = Refusal("image", error.what, error.hint)
     if isinstance(found, Refusal):

@@ -19,7 +19,8 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError, UsageError
 from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.detect.detection import ImageDetection
-from lce_rig.detect.image_board import crop_to_intrinsics, find_image_board
+from lce_rig.detect.finder import BoardFinder
+from lce_rig.detect.image_board import crop_to_intrinsics
 from lce_rig.pipeline.detection import detect
 from lce_rig.pipeline.progress import Progress, silent
 from lce_rig.rig import Rig
@@ -159,19 +160,13 @@ class _Samples:
             for capture, channel in self._jobs
             if only is None or (capture.name, channel) in only
         ]
-        board = self._session.rig.board.to_board()
+        finder = BoardFinder(self._session.rig)
 
         def find(job: tuple[Capture, str]) -> ImageDetection:
             capture, channel = job
             try:
                 image = capture.image(self._camera, channel)
-                return find_image_board(
-                    image,
-                    board,
-                    lens,
-                    max_reprojection_px=max_reprojection_px,
-                    is_from_events=self._is_events[channel],
-                )
+                return finder.corners(image, lens, max_reprojection_px=max_reprojection_px)
             except SessionError as error:
                 return Refusal("read", error.what, error.hint or "collect this placement again")
             except ProfileError as error:

@@ -15,9 +15,9 @@ import numpy as np
 
 from benchmarks.kept import kept_folder
 from benchmarks.still_sessions import scan_held_board, with_small_pictures
-from lce_rig import pipeline
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
 from lce_rig.detect.detection import LidarDetection, from_arrays, to_arrays
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.placements import can_be_held, count_rings, seen_share
@@ -89,18 +89,17 @@ def _simulate(rig: Rig, seed: int) -> SimulatedScans:
         T_world_board = stage.place(index, rng)
         scan = scan_held_board(stage, T_world_board, rng, index)
         poses[name] = invert(stage.views[0].T_world_cam) @ T_world_board
-        scans[name] = pipeline.detect_scan(rig, scan)
+        scans[name] = BoardFinder(rig).scan(scan)
         for kind, added_m in WRONG_PLATES_M.items():
-            resized[kind][name] = pipeline.detect_scan(with_plate(rig, added_m), scan)
+            resized[kind][name] = BoardFinder(with_plate(rig, added_m)).scan(scan)
     parallel_poses: dict[str, Array] = {}
     parallel_scans: dict[str, LidarDetection] = {}
     rng = stage.rng(_PARALLEL)
     for index, T_world_board in enumerate(_nearly_parallel(stage, rng)):
         name = f"{index:06d}"
         parallel_poses[name] = invert(stage.views[0].T_world_cam) @ T_world_board
-        parallel_scans[name] = pipeline.detect_scan(
-            rig, scan_held_board(stage, T_world_board, rng, 1000 + index)
-        )
+        seen = scan_held_board(stage, T_world_board, rng, 1000 + index)
+        parallel_scans[name] = BoardFinder(rig).scan(seen)
     return SimulatedScans(seed, truth, poses, scans, resized, parallel_poses, parallel_scans)
 
 

@@ -25,6 +25,7 @@ from lce_rig.collect.guidance import (
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference, fit_plane
 from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures, truth_extrinsics
 from lce_rig.simulate.captures import capture_at
@@ -209,7 +210,7 @@ def _go(
 def _visit(rig: Rig, capture: SimulatedCapture) -> Visit:
     image, scan = capture.images[0], capture.scans[0]
     truth = capture.T_cam_board[image.sensor]
-    return Visit(pipeline.detect_image(rig, image), pipeline.detect_scan(rig, scan), truth)
+    return Visit(BoardFinder(rig).image(image), BoardFinder(rig).scan(scan), truth)
 
 
 def judge_session(name: str, seed: int, visits: list[Visit], *, is_offset: bool) -> Iterator[Outcome]:

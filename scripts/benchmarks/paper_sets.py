@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.kept import kept_folder
-from lce_rig import pipeline
 from lce_rig.core.geometry import Array, invert
 from lce_rig.detect.detection import ImageDetection, LidarDetection, from_arrays, to_arrays
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig, load_rig
 from lce_rig.session.cache import Cached, load, store
 from lce_rig.simulate import SimulationOptions
@@ -116,9 +116,9 @@ class _Maker:
         for level in LEVELS:
             noise = replace(self._options, noise_level=level).lidar_noise
             scan = measure_sweep(sweep, model, noise, stage.rng(index, SCAN, level), sensor=LIDAR)
-            scans[level] = pipeline.detect_scan(self.rig, scan)
+            scans[level] = BoardFinder(self.rig).scan(scan)
         normal = (invert(T_world_lidar) @ T_world_board)[:3, 2]
-        return Placement(pipeline.detect_image(self.rig, image), scans, normal)
+        return Placement(BoardFinder(self.rig).image(image), scans, normal)
 
 
 def _flatten(placement: Placement) -> tuple[dict[str, Array], dict[str, list[float]]]:

@@ -8,6 +8,7 @@ from benchmarks.tables import print_head, print_row, rms
 from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.geometry import difference
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import load_rig
 
 
@@ -40,8 +41,8 @@ def _simulated_runs(name: str, n_seeds: int, n_captures: int) -> Iterator[tuple[
         images: dict[str, pipeline.ImageDetection] = {}
         scans: dict[str, pipeline.LidarDetection] = {}
         for capture in simulate_captures(rig, n_captures=n_captures, seed=seed, options=options):
-            images[f"{capture.index:06d}"] = pipeline.detect_image(rig, capture.images[0])
-            scans[f"{capture.index:06d}"] = pipeline.detect_scan(rig, capture.scans[0])
+            images[f"{capture.index:06d}"] = BoardFinder(rig).image(capture.images[0])
+            scans[f"{capture.index:06d}"] = BoardFinder(rig).scan(capture.scans[0])
         camera, lidar = next(iter(rig.cameras)), next(iter(rig.lidars))
         detections = pipeline.Detections({(camera, "frames"): images}, {lidar: scans})
         calibration, estimate = pipeline.calibrate(rig, detections, CalibrateOptions(seed=seed))[0][0]

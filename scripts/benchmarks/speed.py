@@ -17,6 +17,7 @@ from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions, CaptureCandidates
 from lce_rig.calibrate import calibrate as estimate_extrinsic
 from lce_rig.core.results import ImageBoard
+from lce_rig.detect.finder import BoardFinder
 
 
 def bench_speed() -> None:
@@ -36,16 +37,16 @@ def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
     session = Session.open(path)
     rig, board = session.rig, session.rig.board.to_board()
     scans = [capture.scan("lidar") for capture in session.captures]
-    found = [pipeline.detect_scan(rig, scan) for scan in scans]
+    found = [BoardFinder(rig).scan(scan) for scan in scans]
     pictures = [capture.image("cam", "frames") for capture in session.captures]
     yield (
         "board in a full VLP-16 scan, no prior, median",
-        milliseconds(lambda k: pipeline.detect_scan(rig, scans[k])),
+        milliseconds(lambda k: BoardFinder(rig).scan(scans[k])),
     )
     yield "tracked, median", milliseconds(lambda k: track_lidar_board(scans[k], board, found[k][0]))  # type: ignore[index]
     yield (
         "board in a 1280x720 picture, median",
-        milliseconds(lambda k: pipeline.detect_image(rig, pictures[k])),
+        milliseconds(lambda k: BoardFinder(rig).image(pictures[k])),
     )
     detections = pipeline.detect(session)
     pair = detections.pairs[0]

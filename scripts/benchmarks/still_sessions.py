@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.kept import kept_folder
-from lce_rig import pipeline
 from lce_rig.calibrate import CaptureCandidates
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import from_arrays, to_arrays
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image_board import board_from_pose
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
@@ -106,7 +106,7 @@ def _simulate(rig: Rig, seed: int, options: SimulationOptions, n_captures: int) 
         scan = scan_held_board(stage, T_world_board, rng, index)
         name = f"{index:06d}"
         arrays[f"pose/{name}"] = invert(view.T_world_cam) @ T_world_board
-        found = to_arrays(pipeline.detect_scan(rig, scan))
+        found = to_arrays(BoardFinder(rig).scan(scan))
         arrays |= {f"scan/{name}/{key}": value for key, value in found.items()}
     return arrays
 

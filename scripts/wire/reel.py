@@ -8,10 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lce_rig import pipeline
 from lce_rig.core import velodyne
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.results import Refusal
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
@@ -114,8 +114,8 @@ def _placements(scene: LiveScene, rig: Rig, n: int) -> Iterator[tuple[list[Scan]
         taken = [list(scene.take(_T0_NS)) for _ in range(_N_PICTURES)]
         scans = [sample for turn in taken[:SCANS_PER_LOOP] for sample in turn if isinstance(sample, Scan)]
         images = [sample for turn in taken for sample in turn if isinstance(sample, Image)]
-        found = [pipeline.detect_image(rig, image) for image in images]
-        seen = [pipeline.detect_scan(rig, scan) for scan in scans]
+        found = [BoardFinder(rig).image(image) for image in images]
+        seen = [BoardFinder(rig).scan(scan) for scan in scans]
         if not any(isinstance(each, Refusal) for each in [*found, *seen]):
             n_found += 1
             yield scans, images

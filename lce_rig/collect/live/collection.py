@@ -229,8 +229,11 @@ class _Loop:
         present = sighting.images[guide.key].T_cam_board
         refusal = guide.adds_nothing(present)
         if refusal is None:
-            self._capture(moment)
-            return Narration("saving", "captured")
+            confirmed = self._watcher.confirm(moment)
+            if isinstance(confirmed, Moment):
+                self._capture(confirmed)
+                return Narration("saving", "captured")
+            refusal = confirmed
         self._monitor.cue("refused", f"not captured: {refusal.cause}")
         guide.note_refusal(present)
         guide.plan(present, _time_s(sighting))
@@ -260,10 +263,18 @@ class _Loop:
             guide.give_up()
             self._monitor.log("another placement was asked for")
         if key == "capture" and guide is not None and self._last is not None:
-            if self._seeing_guide(self._last) is not None:
-                self._capture(Moment(self._last, {"by_hand": 1.0}))
-            else:
-                self._monitor.cue("refused", "not captured: not every sensor sees the board")
+            self._capture_by_hand(self._last)
+
+    def _capture_by_hand(self, sighting: Sighting) -> None:
+        """Capture what is seen now, however it moves."""
+        if self._seeing_guide(sighting) is None:
+            self._monitor.cue("refused", "not captured: not every sensor sees the board")
+            return
+        confirmed = self._watcher.confirm(Moment(sighting, {"by_hand": 1.0}))
+        if isinstance(confirmed, Moment):
+            self._capture(confirmed)
+        else:
+            self._monitor.cue("refused", f"not captured: {confirmed.cause}: {confirmed.action}")
 
     def _find_ending(self, key: Key | None) -> Ending | None:
         options, elapsed_s = self._options, time.monotonic() - self._began_s

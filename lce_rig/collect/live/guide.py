@@ -110,8 +110,8 @@ class Guide:
         return None if self.guidance is None else self.guidance.T_cam_board
 
     def sees(self, sighting: Sighting) -> bool:
-        """Tell whether both of its sensors see the board in a sighting."""
-        return self.key in sighting.images and self.lidar in sighting.lidars
+        """Tell whether both of its sensors see the board in a sighting as the profile's limits want it."""
+        return self.key in sighting.images.keys() - sighting.unfit.keys() and self.lidar in sighting.lidars
 
     def locate(self, sighting: Sighting) -> Array | None:
         """Give T_cam_board (4, 4) as its camera sees it; None where it does not."""

@@ -64,6 +64,8 @@ class Monitor:
         self.reasons.update(sighting.unscanned)
         for key in sighting.images:
             self.reasons.pop(stream_name(key), None)
+        for key, why in sighting.unfit.items():
+            self.reasons[stream_name(key)] = why
         for lidar in sighting.lidars:
             self.reasons.pop(lidar, None)
 
@@ -214,7 +216,7 @@ class Monitor:
         if sighting is None or (camera, channel) not in pictures:
             return StreamState(name, rate_hz, n_lost, None, self._trouble(camera) if is_framed else "")
         board = sighting.images.get((camera, channel))
-        if board is None:
+        if board is None or (camera, channel) in sighting.unfit:
             why = self.reasons.get(name)
             reason = self._trouble(camera) or (f"{why.cause}: {why.action}" if why else "no board")
             return StreamState(name, rate_hz, n_lost, False, reason)

@@ -33,7 +33,7 @@ def narrate_unseen(sighting: Sighting, guide: Guide, reasons: dict[str, Refusal]
     """Say what keeps a board out of sight.
 
     Args:
-        sighting: in which the guide's camera or LiDAR does not see the board.
+        sighting: in which the guide's camera or LiDAR does not see the board, or not well enough.
         guide: whose sensors they are.
         reasons: the last refusal of each stream, by its name.
     """
@@ -42,6 +42,10 @@ def narrate_unseen(sighting: Sighting, guide: Guide, reasons: dict[str, Refusal]
         # A picture without a board hardly tells why; one with half a board does.
         headline = f"show the board to {guide.key[0]}" if sighting.images else _SHOW
         return Narration("searching", headline, f"{why.cause}: {why.action}" if why else "")
+    if guide.key in sighting.unfit:
+        why = sighting.unfit[guide.key]
+        headline = _next(guide, sighting.images[guide.key].T_cam_board, why.action)
+        return Narration("moving", headline, f"cannot be used here: {why.cause}")
     why = reasons.get(guide.lidar)
     headline = why.action if why else "the LiDAR does not see the board"
     return Narration("searching", headline, f"{guide.lidar}: {why.cause}" if why else "")

@@ -11,7 +11,7 @@ from lce_rig.collect.pairing import Frame
 from lce_rig.collect.watching import Sighting
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard
-from lce_rig.pipeline import detect_image, detect_scan
+from lce_rig.detect.finder import BoardFinder
 from tests.collect.live.replay import PERIOD_NS, placements, rig
 
 HOLD_S = 0.6
@@ -20,7 +20,10 @@ KEY = ("davis", "frames")
 
 @cache
 def boards(k: int = 0) -> tuple[ImageBoard, list[LidarBoard]]:
-    image, scan = detect_image(rig(), placements()[k].images[0]), detect_scan(rig(), placements()[k].scans[0])
+    image, scan = (
+        BoardFinder(rig()).image(placements()[k].images[0]),
+        BoardFinder(rig()).scan(placements()[k].scans[0]),
+    )
     assert isinstance(image, ImageBoard) and isinstance(scan, list)
     return image, scan
 
