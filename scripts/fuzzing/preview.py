@@ -77,8 +77,8 @@ class PreviewReport:
 def fuzz_preview(n: int, seed: int) -> PreviewReport:
     """Make n hostile connections to the page of a collection that may have 1,024 descriptors open.
 
-    Up to 2,000 from eight addresses are held at once; honest pages are opened meanwhile from one of these. The
-    sensors send over UDP and a pipe.
+    Up to 2,000 from eight addresses are held at once; honest pages are opened meanwhile from one of these.
+    The sensors send over UDP and a pipe.
 
     Args:
         n: how many.
