@@ -1,5 +1,6 @@
 """Ctrl-C: the program ends soon, whatever it is doing, in one line and with one exit code."""
 
+import atexit
 import os
 import select
 import signal
@@ -81,6 +82,8 @@ def watch_for_interrupts() -> None:
     global _watch
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN and _watch is None:
         sys.unraisablehook = _without_interrupts(sys.unraisablehook)
+        # Python's last steps go without handlers, and Ctrl-C would hide how the program went.
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
         _watch = _Watch()
 
 

@@ -82,8 +82,10 @@ class _Bench:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.session, self.recording = folder / "simulated", folder / "recording"
+        self.session, self.second = folder / "simulated", folder / "second"
+        self.recording = folder / "recording"
         _run("simulate", "--rig", "rlfs", self.session, "--captures", "6")
+        _run("simulate", "--rig", "rlfs", self.second, "--captures", "6", "--seed", "1")
         _run("simulate", "--rig", "rles", "--recording", self.recording, "--duration", "2")
         _run("calibrate", self.session)
         self.result = folder / "result.json"
@@ -111,7 +113,7 @@ _VERBS: dict[str, Callable[[_Bench], list[object]]] = {
     "calibrate paper": lambda bench: ["calibrate", bench.fresh(), "--method", "paper"],
     "intrinsics": lambda bench: ["intrinsics", bench.fresh()],
     "verify": lambda bench: ["verify", bench.fresh(), "--result", bench.result],
-    "repeat": lambda bench: ["repeat", bench.fresh(), bench.session],
+    "repeat": lambda bench: ["repeat", bench.fresh(), bench.second],
     "simulate": lambda bench: ["simulate", "--rig", "rlfs", bench.new(), "--captures", "3"],
     "collect --from": lambda bench: [
         "collect", "--rig", "rles", bench.new(), "--from", bench.recording / "recording.bag"

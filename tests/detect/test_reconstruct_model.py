@@ -192,7 +192,7 @@ def test_a_pipe_and_a_file_beyond_all_networks_are_refused_at_once(tmp_path):
     ("channels", "scale", "said"),
     [
         (10**9, "2", "a step declares"),
-        (3, "997", "padded to multiples of 1994 px"),
+        (3, "997", "multiples of 1994 px"),
         (3, "9" * 30, "has the shape"),
     ],
 )
