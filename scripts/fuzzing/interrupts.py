@@ -18,7 +18,7 @@ from wire.rig import ENVIRONMENT
 
 WITHIN_S = 2.0
 _PATIENCE_S = 30.0
-_LONGEST_S = 15.0
+_LONGEST_S = 30.0
 _SAID = "interrupted; what was written so far is whole"
 
 
@@ -119,7 +119,8 @@ _VERBS: dict[str, Callable[[_Bench], list[object]]] = {
         "collect", "--rig", "rles", bench.new(), "--from", bench.recording / "recording.bag"
     ],
     "collect --simulated": lambda bench: [
-        "collect", "--rig", "rlfs", bench.new(), "--simulated", "--plain", "--timeout", "10"
+        "collect", "--rig", "rlfs", bench.new(), "--simulated", "--plain", "--timeout", "20",
+        "--preview", "127.0.0.1:0",
     ],
     "reconstruct": lambda bench: ["reconstruct", bench.recording / "events.aedat4", "-o", bench.new()],
     "doctor": lambda bench: ["doctor", "--rig", "rlfs"],
