@@ -3,6 +3,7 @@
 import asyncio
 import socket
 import threading
+from contextlib import suppress
 from types import TracebackType
 
 from aiohttp import web
@@ -85,7 +86,8 @@ class Preview:
         if self._thread is None or self._loop is None or self._stop is None:
             return
         if self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._stop.set)
+            with suppress(RuntimeError):  # its loop has just ended by itself
+                self._loop.call_soon_threadsafe(self._stop.set)
             self._thread.join(_STOP_S)
         self._thread = None
 
