@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from lce_rig.collect.live.recorder import SampleRecorder
     from lce_rig.collect.live.simulated import SimulatedRig
     from lce_rig.collect.live.state import LiveState
+    from lce_rig.collect.preview import Preview
     from lce_rig.rig import Rig
     from lce_rig.session import Session
     from lce_rig.sources.live.base import LiveSource
@@ -150,10 +151,17 @@ def _open_preview(
     from lce_rig.collect.preview import Preview, parse_address
 
     host, port = parse_address(given.preview)
-    preview = stack.enter_context(Preview(host, port))
+    preview = Preview(host, port)
+    stack.callback(_tell_troubles, preview)
+    stack.enter_context(preview)
     for url in preview.urls:
         show.note(f"preview: {url}")
     return [preview.publish], preview.urls
+
+
+def _tell_troubles(preview: "Preview") -> None:
+    for text in preview.notes():
+        show.note(text)
 
 
 @contextmanager

@@ -25,6 +25,8 @@ MAX_LINE_BYTES = 1 << 12
 """One line of text with figures."""
 MAX_EVENTS = 1 << 26
 """Of one file or stretch that has to be in memory as a whole: half a minute at two million a second."""
+MAX_NETWORK_BYTES = 1 << 29
+"""Voxels and states of one step of a network: E2VID's at 1280 x 720 take 220 MB."""
 
 _PIECE_BYTES = 1 << 20
 
