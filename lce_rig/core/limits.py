@@ -112,15 +112,17 @@ def decompress(decompressor: _Decompressor, data: bytes, max_bytes: int = MAX_CH
         Exception: it is damaged, as the library says.
     """
     parts: list[bytes] = []
-    n_left, rest = max_bytes, data
+    n_left, n_fed = max_bytes, 0
     while not decompressor.eof:
-        part = decompressor.decompress(rest, min(_PIECE_BYTES, n_left + 1))
-        rest = b""
+        # Some libraries copy what they have not come to at every call.
+        fed = data[n_fed : n_fed + _PIECE_BYTES] if decompressor.needs_input else b""
+        n_fed += len(fed)
+        part = decompressor.decompress(fed, min(_PIECE_BYTES, n_left + 1))
         n_left -= len(part)
         parts.append(part)
         if n_left < 0:
             raise ValueError(f"it unpacks to more than {_megabytes(max_bytes)}")
-        if not part and decompressor.needs_input and not decompressor.eof:
+        if not (part or fed) and decompressor.needs_input and not decompressor.eof:
             raise ValueError("it is truncated")
     return b"".join(parts)
 

@@ -24,7 +24,7 @@ from lce_rig.sources.events.stream import Findings, open_recorded
 MAGIC = b"#!AER-DAT4.0\r\n"
 _LZ4_MAGIC, _ZSTD_MAGIC = b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd"
 # Recorders write a kilobyte a stream.
-_MAX_HEAD_BYTES = 1 << 21
+_MAX_HEAD_BYTES = 1 << 20
 # A smaller flatbuffer has no room for what it is; zeros, as power cuts leave, are no row of empty packets.
 _MIN_PACKET_BYTES = 8
 _SEARCH_BYTES = 1 << 24
