@@ -6,8 +6,9 @@ them. A reader reports a limit as it reports damage, by a ValueError with words 
 
 import os
 import stat
+import zipfile
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import IO, Any, BinaryIO, Protocol, cast
 
 MAX_PIXELS = 1 << 26
 """Of one image: 67 megapixels."""
@@ -27,8 +28,17 @@ MAX_EVENTS = 1 << 26
 """Of one file or stretch that has to be in memory as a whole: half a minute at two million a second."""
 MAX_NETWORK_BYTES = 1 << 29
 """Voxels and states of one step of a network: E2VID's at 1280 x 720 take 220 MB."""
+MAX_EVENT_PIXELS = 1 << 22
+"""Of one event camera: four times the largest on sale."""
+MAX_TIME_NS = 1 << 62
+"""No timestamp is so far from zero: the year 2116 by clocks that count from 1970. Differences fit 64 bits."""
+MAX_RATIO = 100
+"""Of what is unpacked to what is stored. A hundredth of an event's usual 13 bytes is one bit, and its pixel
+alone is more; sensors' recordings shrink to a third or a tenth."""
 
 _PIECE_BYTES = 1 << 20
+# What is unpacked in no time, whatever the ratio: short, black, or of one value all over.
+_FREE_BYTES = 1 << 24
 
 
 class _Decompressor(Protocol):
@@ -104,15 +114,17 @@ def decompress(decompressor: _Decompressor, data: bytes, max_bytes: int = MAX_CH
         Exception: it is damaged, as the library says.
     """
     parts: list[bytes] = []
-    n_left, rest = max_bytes, data
+    n_left, n_fed = max_bytes, 0
     while not decompressor.eof:
-        part = decompressor.decompress(rest, min(_PIECE_BYTES, n_left + 1))
-        rest = b""
+        # Some libraries copy what they have not come to at every call.
+        fed = data[n_fed : n_fed + _PIECE_BYTES] if decompressor.needs_input else b""
+        n_fed += len(fed)
+        part = decompressor.decompress(fed, min(_PIECE_BYTES, n_left + 1))
         n_left -= len(part)
         parts.append(part)
         if n_left < 0:
             raise ValueError(f"it unpacks to more than {_megabytes(max_bytes)}")
-        if not part and decompressor.needs_input and not decompressor.eof:
+        if not (part or fed) and decompressor.needs_input and not decompressor.eof:
             raise ValueError("it is truncated")
     return b"".join(parts)
 
@@ -125,3 +137,58 @@ def describe(value: Any) -> str:
     """Show a value of a file in a message, cut to a length that fits on a screen."""
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def unpacked_limit(n_stored: int) -> int:
+    """Tell how many bytes of a recording so many stored ones may unpack to."""
+    return MAX_RATIO * n_stored + _FREE_BYTES
+
+
+def open_archive(file: BinaryIO) -> zipfile.ZipFile:
+    """Open a zip whose list of members is of a sane size.
+
+    Raises:
+        ValueError: the list is too long.
+        Exception: it is damaged, as zipfile says.
+    """
+    return zipfile.ZipFile(cast(BinaryIO, _InPieces(file)))
+
+
+def open_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, max_bytes: int) -> IO[bytes]:
+    """Open a member of `open_archive`, to be read in pieces of at most a megabyte; it ends where it declares.
+
+    Raises:
+        ValueError: it declares more than the limit, or is packed in an unusual way.
+        Exception: it is damaged, as zipfile says.
+    """
+    # Python unpacks the other methods without a limit.
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{member.filename} is compressed by method {member.compress_type}, not by deflate")
+    check_size(member.file_size, describe(member.filename), max_bytes)
+    return archive.open(member)
+
+
+def read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, max_bytes: int = MAX_CHUNK_BYTES) -> bytes:
+    """Read a member of `open_archive` whole.
+
+    Raises:
+        ValueError, Exception: as `open_member` does.
+    """
+    with open_member(archive, member, max_bytes) as file:
+        return b"".join(iter(lambda: file.read(_PIECE_BYTES), b""))
+
+
+class _InPieces:
+    """A file that is read in pieces only: zipfile reads a list of members, however long, at once."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+
+    def read(self, n_bytes: int = -1) -> bytes:
+        data = self._file.read(min(n_bytes, _PIECE_BYTES + 1) if n_bytes >= 0 else _PIECE_BYTES + 1)
+        if len(data) > _PIECE_BYTES:
+            raise ValueError(f"its list of members is longer than {_megabytes(_PIECE_BYTES)}")
+        return data
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)

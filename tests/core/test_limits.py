@@ -1,9 +1,20 @@
 import bz2
 import os
+import zipfile
 
 import pytest
 
-from lce_rig.core.limits import MAX_CHUNK_BYTES, check_size, decompress, describe, open_regular, read_file
+from lce_rig.core.limits import (
+    MAX_CHUNK_BYTES,
+    check_size,
+    decompress,
+    describe,
+    open_archive,
+    open_regular,
+    read_file,
+    read_member,
+    unpacked_limit,
+)
 
 
 def test_a_file_is_read_whole(tmp_path):
@@ -66,3 +77,30 @@ def test_declared_sizes_beyond_reach_are_refused(n_bytes):
 
 def test_values_in_messages_are_short():
     assert len(describe("x" * 10**6)) == 60 and describe(7) == "7"
+
+
+def test_members_of_an_archive_are_read_up_to_the_limit(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("a", bytes(3_000_000))
+    with open_regular(tmp_path / "a.zip") as file:
+        archive = open_archive(file)
+        (member,) = archive.infolist()
+        assert read_member(archive, member, 3_000_000) == bytes(3_000_000)
+        with pytest.raises(ValueError, match="'a' declares 3 MB"):
+            read_member(archive, member, 2_999_999)
+
+
+def test_a_member_that_declares_less_than_it_packs_gives_no_more_than_it_declares(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("a", bytes(50_000_000))
+    with open_regular(tmp_path / "a.zip") as file:
+        archive = open_archive(file)
+        (member,) = archive.infolist()
+        member.file_size = 1000
+        with pytest.raises(zipfile.BadZipFile):  # The checksum is of all of it.
+            read_member(archive, member)
+
+
+def test_what_may_be_unpacked_grows_with_what_is_stored():
+    assert unpacked_limit(0) == 1 << 24
+    assert unpacked_limit(10**6) - unpacked_limit(0) == 10**8
