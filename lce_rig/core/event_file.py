@@ -15,6 +15,8 @@ from lce_rig.core.data import Events
 
 FORMAT_VERSION = 1
 _NS_PER_US = 1000
+# Columns of a sensor shrink to a tenth at best.
+_USUAL_RATIO = 20
 # The same events, the same bytes: no time of writing goes into the archive.
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 # By the columns' names in archives of other programs.
@@ -111,7 +113,10 @@ class _Columns:
             ValueError: it is damaged, too large, or no array of numbers.
         """
         with _damage_in_words():
-            data = limits.read_member(self._archive, self._members[name])
+            member = self._members[name]
+            # A long recording is large in the file, too; what is small there stays small.
+            stored = min(_USUAL_RATIO * member.compress_size, 8 * limits.MAX_EVENTS)
+            data = limits.read_member(self._archive, member, max(stored, limits.MAX_CHUNK_BYTES))
             shape, dtype, begin = _npy_header(data, name)
         n_numbers = math.prod(shape)
         if dtype.kind not in "biuf" or len(shape) > 1:
