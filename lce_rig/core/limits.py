@@ -7,6 +7,7 @@ them. A reader reports a limit as it reports damage, by a ValueError with words 
 import os
 import stat
 from contextlib import suppress
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, cast
@@ -29,10 +30,13 @@ MAX_EVENTS = 1 << 26
 """Of one file or stretch that has to be in memory as a whole: half a minute at two million a second."""
 MAX_TOPICS = 1 << 14
 """Of one bag, with every publisher of each counted."""
+MAX_RECORDS = 1 << 18
+"""Of one chunk of a bag."""
 MAX_RATIO = 256
 """Of what a whole recording unpacks to and its size: pictures of a dark room shrink to a hundredth."""
 
-_PIECE_BYTES = 1 << 20
+# Larger than most chunks, which then are not copied once more.
+_PIECE_BYTES = 1 << 23
 
 
 class _Decompressor(Protocol):
@@ -148,11 +152,16 @@ def new_decompressor(kind: str) -> _Decompressor:
     """
     if kind not in _DECOMPRESSORS:
         raise ValueError(f"compression {describe(kind)} is not known; known are {', '.join(_DECOMPRESSORS)}")
+    return cast(_Decompressor, _decompressor_type(kind)())
+
+
+@cache
+def _decompressor_type(kind: str) -> Any:
     names, attribute = _DECOMPRESSORS[kind]
     for name in names[:-1]:
         with suppress(ImportError):
-            return cast(_Decompressor, getattr(import_module(name), attribute)())
-    return cast(_Decompressor, getattr(import_module(names[-1]), attribute)())
+            return getattr(import_module(name), attribute)
+    return getattr(import_module(names[-1]), attribute)
 
 
 def unpack_file(kind: str, packed: BinaryIO, into: BinaryIO) -> None:

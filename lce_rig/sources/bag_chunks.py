@@ -17,6 +17,8 @@ from typing import BinaryIO
 from lce_rig.core import limits
 from lce_rig.sources.bag_storage import Contents, Damages, RawMessage, unpack
 
+# What a message takes of a file at least, packed as well as can be.
+_MIN_RECORD_BYTES = 4
 # Recorders write chunks one after the other: so much may wait for a chunk that begins earlier than it ends.
 _MAX_WAITING_BYTES = 1 << 23
 BAD_RECORD = (ValueError, KeyError, struct.error)
@@ -71,6 +73,7 @@ class Pass:
         self.file = file
         self.n_bytes = os.fstat(file.fileno()).st_size
         self.wanted = wanted
+        self._n_records_left = self.n_bytes // _MIN_RECORD_BYTES + limits.MAX_RECORDS
         self._n_left = limits.MAX_RATIO * self.n_bytes + 2 * limits.MAX_CHUNK_BYTES
 
     def take(self, n_bytes: int, max_bytes: int = limits.MAX_CHUNK_BYTES) -> bytes:
@@ -83,6 +86,18 @@ class Pass:
             raise ValueError(f"it ends within a record at byte {self.file.tell()}")
         limits.check_size(n_bytes, "a record", max_bytes)
         return self.file.read(n_bytes)
+
+    def records(self) -> Iterator[int]:
+        """Count the records of a chunk while they are read.
+
+        Raises:
+            ValueError: they are more than a chunk, or all chunks of such a file, can hold.
+        """
+        n_allowed = min(limits.MAX_RECORDS, self._n_records_left)
+        for n in range(n_allowed):
+            self._n_records_left -= 1
+            yield n
+        raise ValueError(f"a chunk holds more than {n_allowed} records")
 
     def unpack(self, compression: str, data: bytes, n_bytes: int) -> bytes:
         """Unpack a chunk that says how large it is.

@@ -3,7 +3,9 @@
 import re
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from shutil import rmtree
+from tempfile import mkdtemp
+from weakref import finalize
 
 from lce_rig.core import limits
 from lce_rig.core.errors import SourceError
@@ -39,7 +41,6 @@ class BagFile:
         self._ends_ns: dict[str, int | None] = {}
         self._damages = Damages()
         self._readable: list[Path] = []
-        self._unpacked: list[TemporaryDirectory[str]] = []
         self._parts = self._open_parts()
         for part in self._parts:
             for number, (topic, msgtype, _) in part.contents.connections.items():
@@ -126,8 +127,9 @@ class BagFile:
 
     def _unpack(self, file: Path) -> Path:
         """Unpack a file that was compressed as a whole, for as long as the bag is open."""
-        self._unpacked.append(TemporaryDirectory(prefix="lce-rig-"))
-        unpacked = Path(self._unpacked[-1].name) / file.stem
+        folder = mkdtemp(prefix="lce-rig-")
+        finalize(self, rmtree, folder, ignore_errors=True)
+        unpacked = Path(folder) / file.stem
         with limits.open_regular(file) as packed, unpacked.open("wb") as into:
             limits.unpack_file("zstd", packed, into)
         return unpacked

@@ -16,7 +16,8 @@ _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _CHUNK_INDEX, _STATISTICS, _DATA_E
 _HEAD = struct.Struct("<BQ")
 _FOOTER_BYTES = _HEAD.size + 20 + len(_MAGIC)
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
-_CHUNK_HEAD = struct.Struct("<QQQI")
+_CHUNK_HEAD = struct.Struct("<QQQII")
+_MAX_NAME_BYTES = 64
 # So many bytes of messages that lie outside of chunks are read at once.
 _RUN_BYTES = 1 << 20
 
@@ -78,46 +79,56 @@ class McapBag(ChunkedBag):
     def _read(self, reading: Pass, position: int) -> Block:
         """Read a chunk; or a run of messages that lie outside of chunks."""
         block = Block(position)
-        reading.file.seek(position)
-        while block.end is not None:
-            kind, n_bytes = _HEAD.unpack(reading.take(_HEAD.size))
-            begin = reading.file.tell()
-            if kind == _CHUNK and block.end > position:
+        at = position
+        while at - position <= _RUN_BYTES and at < reading.n_bytes:
+            try:
+                kind = self._read_record(reading, at, block)
+            except BAD_RECORD:
+                if at == position:
+                    raise
+                # The next block says what is wrong, and this one keeps what it has.
+                block.end = at
                 break
-            block.end = begin + n_bytes
-            if kind == _CHUNK:
-                try:
-                    self._read_chunk(reading, reading.take(n_bytes), block)
-                except BAD_RECORD as error:
-                    block.damages.add(str(error))
+            if kind == _CHUNK or block.end is None:
                 break
-            if kind in (_FOOTER, _DATA_END):
-                block.end = None
-            elif kind in (_SCHEMA, _CHANNEL, _MESSAGE):
-                limit = limits.MAX_CHUNK_BYTES if kind == _MESSAGE else limits.MAX_DOCUMENT_BYTES
-                record = reading.take(n_bytes, limit)
-                if kind == _MESSAGE:
-                    self._add_message(reading, record, 0, len(record), block)
-                else:
-                    self._describe(kind, record)
-            elif block.end > reading.n_bytes:
-                raise ValueError(f"it ends within a record at byte {begin}")
-            else:
-                reading.file.seek(block.end)
-            if block.end is not None and (block.end - position > _RUN_BYTES or block.end >= reading.n_bytes):
-                break
+            at = block.end
         return block
 
-    def _read_chunk(self, reading: Pass, record: bytes, block: Block) -> None:
-        fields = _Fields(record)
-        *_, n_bytes, crc = fields.unpack(_CHUNK_HEAD.format)
-        compression, packed = fields.text(), fields.block("<Q")
-        del record, fields
-        raw = reading.unpack(compression, packed, n_bytes)
+    def _read_record(self, reading: Pass, at: int, block: Block) -> int:
+        reading.file.seek(at)
+        kind, n_bytes = _HEAD.unpack(reading.take(_HEAD.size))
+        begin = at + _HEAD.size
+        if begin + n_bytes > reading.n_bytes:
+            raise ValueError(f"it ends within a record at byte {begin}")
+        if kind == _CHUNK:
+            if block.messages:
+                return int(kind)  # A block of its own.
+            block.end = begin + n_bytes
+            try:
+                self._read_chunk(reading, block)
+            except BAD_RECORD as error:
+                block.damages.add(str(error))
+        elif kind == _MESSAGE:
+            record = reading.take(n_bytes)
+            self._add_message(reading, record, 0, len(record), block)
+        elif kind in (_SCHEMA, _CHANNEL):
+            self._describe(kind, reading.take(n_bytes, limits.MAX_DOCUMENT_BYTES))
+        block.end = None if kind in (_FOOTER, _DATA_END) else begin + n_bytes
+        return int(kind)
+
+    def _read_chunk(self, reading: Pass, block: Block) -> None:
+        *_, n_bytes, crc, n_name = _CHUNK_HEAD.unpack(reading.take(_CHUNK_HEAD.size))
+        compression = reading.take(n_name, _MAX_NAME_BYTES).decode()
+        n_packed = int.from_bytes(reading.take(8), "little")
+        if reading.file.tell() + n_packed > (block.end or 0):
+            raise ValueError("a chunk ends behind its record")
+        raw = reading.unpack(compression, reading.take(n_packed), n_bytes)
         if crc and crc32(raw) != crc:
             raise ValueError("a chunk's checksum is wrong")
         at = 0
-        while at < len(raw):
+        for _ in reading.records():
+            if at == len(raw):
+                break
             kind, n_record = _HEAD.unpack_from(raw, at)
             begin = at + _HEAD.size
             at = begin + n_record
@@ -127,6 +138,8 @@ class McapBag(ChunkedBag):
                 self._add_message(reading, raw, begin, at, block)
             elif kind in (_SCHEMA, _CHANNEL):
                 self._describe(kind, raw[begin:at])
+            else:
+                raise ValueError(f"a chunk holds a record of kind {kind}")
 
     def _add_message(self, reading: Pass, raw: bytes, begin: int, end: int, block: Block) -> None:
         if end - begin < _MESSAGE_HEAD.size:

@@ -88,7 +88,9 @@ class Ros1Bag(ChunkedBag):
 
     def _read_chunk(self, reading: Pass, raw: bytes, block: Block) -> None:
         at = 0
-        while at < len(raw):
+        for _ in reading.records():
+            if at == len(raw):
+                break
             n_head = _SIZE.unpack_from(raw, at)[0]
             fields = _fields(raw[at + 4 : at + 4 + min(n_head, _MAX_HEADER_BYTES)])
             begin = at + 8 + n_head
@@ -100,6 +102,8 @@ class Ros1Bag(ChunkedBag):
                 self._add_message(reading, fields, raw, begin, at, block)
             elif kind == _CONNECTION:
                 self._add_connection(fields, raw[begin:at])
+            else:
+                raise ValueError(f"a chunk holds a record of kind {kind}")
 
     def _add_message(
         self, reading: Pass, fields: dict[bytes, bytes], raw: bytes, begin: int, end: int, block: Block

@@ -112,7 +112,5 @@ def unpack(compression: str, data: bytes, max_bytes: int) -> bytes:
         return limits.decompress(decompressor, data, max_bytes)
     except ValueError:
         raise
-    except (
-        Exception
-    ) as error:  # Each library has its own: OSError, RuntimeError, ZstdError.
+    except Exception as error:  # Each library has its own: OSError, RuntimeError, ZstdError.
         raise ValueError(f"{compression} data are damaged ({error})") from None

@@ -38,6 +38,8 @@ class CloudReading:
     notes: tuple[str, ...]
 
 
+# What is no number, or beyond a type's range, is looked for where it matters.
+@np.errstate(over="ignore", invalid="ignore")
 def to_scan(
     cloud: NDArray[Any],
     lidar: str,
@@ -65,8 +67,7 @@ def to_scan(
     if missing:
         have = ", ".join(cloud.dtype.names or ()) or "none"
         raise SourceError(f"{where}: the cloud has no field {missing[0]!r}; its fields are {have}")
-    with np.errstate(over="ignore"):
-        points = np.stack([cloud[fields[axis]].astype(np.float32) for axis in "xyz"], axis=1)
+    points = np.stack([cloud[fields[axis]].astype(np.float32) for axis in "xyz"], axis=1)
     is_finite = np.isfinite(points).all(axis=1)
     range_m = np.zeros(len(points))
     range_m[is_finite] = np.linalg.norm(points[is_finite].astype(np.float64), axis=1)
