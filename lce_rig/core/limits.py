@@ -28,6 +28,8 @@ MAX_LINE_BYTES = 1 << 12
 """One line of text with figures."""
 MAX_EVENTS = 1 << 26
 """Of one file or stretch that has to be in memory as a whole: half a minute at two million a second."""
+MAX_PACKET_BYTES = 1 << 24
+"""Of events in one message: drivers send some ms at a time."""
 MAX_TOPICS = 1 << 14
 """Of one bag, with every publisher of each counted."""
 MAX_RECORDS = 1 << 18

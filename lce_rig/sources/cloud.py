@@ -62,7 +62,9 @@ def to_scan(
         SourceError: no coordinates, no valid point, coordinates that are no metres, or no rings and none that
             could be told from elevations.
     """
-    fields = {name.lower(): name for name in reversed(cloud.dtype.names or ())}
+    # A field that holds several values a point is none of those that are looked for.
+    names = [name for name in reversed(cloud.dtype.names or ()) if not cloud.dtype[name].shape]
+    fields = {name.lower(): name for name in names}
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:
         have = ", ".join(cloud.dtype.names or ()) or "none"

@@ -11,6 +11,8 @@ from lce_rig.sources.events.stream import NS_PER_US, EventColumns, Findings, joi
 
 # Recorders with several threads, and readout that is not in order, mix stamps by this much at most.
 REORDER_NS = 20_000_000
+# That is more than any camera sends in this time: where time stands still not everything is held.
+_MAX_HELD = 1 << 21
 # Counters of 31 and 32 bits of microseconds are common; they wrap after 36 and 72 minutes.
 _WRAPS_NS = tuple((1 << bits) * NS_PER_US for bits in (31, 32))
 _MAX_GAP_NS = 60_000_000_000
@@ -64,7 +66,7 @@ class _Sorter:
             self._delivered_ns, together = int(self.held.t_ns[-1]), current
         else:
             together = join([self.held, current])
-        if _never_falls(together.t_ns):
+        if _never_falls(together.t_ns) and len(together) <= _MAX_HELD:
             self.held = together
             return
         reset = _find_reset(together.t_ns)
@@ -72,6 +74,7 @@ class _Sorter:
             together = yield from self._begin_anew(together, reset)
         mixed = self._tidied(together)
         cut = int(np.searchsorted(mixed.t_ns, mixed.t_ns[-1] - REORDER_NS)) if len(mixed) else 0
+        cut = max(cut, len(mixed) - _MAX_HELD)
         if cut:
             yield mixed.select(slice(0, cut))
             self._delivered_ns = int(mixed.t_ns[cut - 1])
