@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core import limits
+from lce_rig.core import limits, unpacking
 from lce_rig.core.data import Events
 
 FORMAT_VERSION = 1
@@ -94,7 +94,7 @@ class _Columns:
 
     def __init__(self, file: BinaryIO) -> None:
         with _damage_in_words():
-            self._archive = limits.open_archive(file)
+            self._archive = unpacking.open_archive(file)
         members = self._archive.infolist()
         self._members = {member.filename.removesuffix(".npy"): member for member in members}
         if len(self._members) != len(members):
@@ -116,7 +116,7 @@ class _Columns:
             member = self._members[name]
             # A long recording is large in the file, too; what is small there stays small.
             stored = min(_USUAL_RATIO * member.compress_size, 8 * limits.MAX_EVENTS)
-            data = limits.read_member(self._archive, member, max(stored, limits.MAX_CHUNK_BYTES))
+            data = unpacking.read_member(self._archive, member, max(stored, limits.MAX_CHUNK_BYTES))
             shape, dtype, begin = _npy_header(data, name)
         n_numbers = math.prod(shape)
         if dtype.kind not in "biuf" or len(shape) > 1:

@@ -38,6 +38,8 @@ class CloudReading:
     notes: tuple[str, ...]
 
 
+# What is no number, or beyond a type's range, is looked for where it matters.
+@np.errstate(over="ignore", invalid="ignore")
 def to_scan(
     cloud: NDArray[Any],
     lidar: str,
@@ -60,13 +62,14 @@ def to_scan(
         SourceError: no coordinates, no valid point, coordinates that are no metres, or no rings and none that
             could be told from elevations.
     """
-    fields = {name.lower(): name for name in reversed(cloud.dtype.names or ())}
+    # A field that holds several values a point is none of those that are looked for.
+    names = [name for name in reversed(cloud.dtype.names or ()) if not cloud.dtype[name].shape]
+    fields = {name.lower(): name for name in names}
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:
         have = ", ".join(cloud.dtype.names or ()) or "none"
         raise SourceError(f"{where}: the cloud has no field {missing[0]!r}; its fields are {have}")
-    with np.errstate(over="ignore"):
-        points = np.stack([cloud[fields[axis]].astype(np.float32) for axis in "xyz"], axis=1)
+    points = np.stack([cloud[fields[axis]].astype(np.float32) for axis in "xyz"], axis=1)
     is_finite = np.isfinite(points).all(axis=1)
     range_m = np.zeros(len(points))
     range_m[is_finite] = np.linalg.norm(points[is_finite].astype(np.float64), axis=1)

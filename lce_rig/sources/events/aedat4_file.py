@@ -13,11 +13,10 @@ import struct
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
-from lce_rig.core import limits
+from lce_rig.core import limits, unpacking
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.events.stream import Findings, open_recorded
 
@@ -228,19 +227,8 @@ def _parse_header(file: BinaryIO) -> Aedat4Header:
 
 
 def _decompress(data: bytes) -> bytes:
-    max_bytes = min(limits.MAX_CHUNK_BYTES, limits.unpacked_limit(len(data)))
-    if data[:4] == _LZ4_MAGIC:
-        from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
-
-        return limits.decompress(LZ4FrameDecompressor(), data, max_bytes)
-    if data[:4] == _ZSTD_MAGIC:
-        return limits.decompress(_zstd().ZstdDecompressor(), data, max_bytes)
-    return data
-
-
-def _zstd() -> Any:
-    """Import the Zstandard that this Python or rosbags brings."""
-    try:
-        return import_module("compression.zstd")
-    except ImportError:
-        return import_module("backports.zstd")
+    kind = {_LZ4_MAGIC: "lz4", _ZSTD_MAGIC: "zstd"}.get(data[:4])
+    if kind is None:
+        return data
+    max_bytes = min(limits.MAX_CHUNK_BYTES, unpacking.unpacked_limit(len(data)))
+    return unpacking.decompress(unpacking.new_decompressor(kind), data, max_bytes)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core import limits
+from lce_rig.core import limits, unpacking
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.events.stream import EventColumns, Findings, open_recorded, to_ns
 
@@ -62,7 +62,7 @@ class Hdf5Events:
             self.notes.append(f"{self._path.name}: columns of unequal length ({said}); the shortest is taken")
         n_stored = min(sum(column.id.get_storage_size() for column in columns.values()), _n_bytes(self._path))
         n_bytes = self._n_events * sum(column.dtype.itemsize for column in columns.values())
-        if n_bytes > limits.unpacked_limit(n_stored):
+        if n_bytes > unpacking.unpacked_limit(n_stored):
             raise ValueError(
                 f"it declares {self._n_events:.3g} events, and stores {n_stored / 1e6:.3g} MB of them"
             )
@@ -144,7 +144,7 @@ class _Column:
         """Unpack a chunk; deflate carries a checksum of its own, so that HDF5's is passed over."""
         dtype, (length,) = self._dataset.dtype, self._dataset.chunks
         skipped, packed = self._dataset.id.read_direct_chunk((start,))
-        data = limits.decompress(_Inflater(), packed, dtype.itemsize * length + _CHECKSUM_BYTES)
+        data = unpacking.decompress(_Inflater(), packed, dtype.itemsize * length + _CHECKSUM_BYTES)
         if _SHUFFLE in self._filters and not skipped >> self._filters.index(_SHUFFLE) & 1:
             by_byte = np.frombuffer(data, np.uint8, dtype.itemsize * length).reshape(dtype.itemsize, length)
             numbers = np.empty(length, dtype)

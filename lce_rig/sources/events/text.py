@@ -14,7 +14,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core import limits
+from lce_rig.core import limits, unpacking
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.events.stream import EventColumns, Findings, open_recorded, parse_size, to_ns
 
@@ -92,12 +92,12 @@ def _open(path: Path) -> Iterator[IO[bytes]]:
             yield file
             return
         try:
-            archive = limits.open_archive(file)
+            archive = unpacking.open_archive(file)
             texts = [m for m in archive.infolist() if m.filename.lower().endswith((".txt", ".csv"))]
             if len(texts) != 1:
                 raise SourceError(f"{path} holds {len(texts)} texts, not one of events")
             n_stored = min(texts[0].compress_size, path.stat().st_size)
-            member = limits.open_member(archive, texts[0], limits.unpacked_limit(n_stored))
+            member = unpacking.open_member(archive, texts[0], unpacking.unpacked_limit(n_stored))
         except _ZIP_DAMAGE as error:
             raise SourceError(f"{path} is damaged: {error}") from None
         with archive, member:
