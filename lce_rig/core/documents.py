@@ -24,11 +24,15 @@ def read_json(path: Path, max_bytes: int = MAX_DOCUMENT_BYTES) -> Any:
     return parse_json(read_file(path, max_bytes))
 
 
-def parse_json(data: bytes) -> Any:
+def parse_json(data: bytes, *, is_finite: bool = True) -> Any:
     """Parse a JSON document of any size that is in memory.
 
     Numbers are finite and fit a float, no key is given twice, and every text can be printed: what is read can
     be computed with, shown and written again.
+
+    Args:
+        data: the document, in UTF-8.
+        is_finite: whether NaN and Infinity, which are no JSON, are refused.
 
     Raises:
         ValueError: what is wrong with it, in words that follow the file's name.
@@ -40,7 +44,7 @@ def parse_json(data: bytes) -> Any:
     if text.count("[") + text.count("{") > MAX_BLOCKS:
         raise ValueError(f"it has more than {MAX_BLOCKS} lists and mappings")
     try:
-        document = _DECODER.decode(text)
+        document = (_STRICT if is_finite else _WITH_NAN).decode(text)
     except RecursionError:
         raise ValueError("it is too deeply nested") from None
     except ValueError as error:
@@ -99,6 +103,7 @@ def _constant(name: str) -> float:
     raise ValueError(f"{name} is no number")
 
 
-_DECODER = json.JSONDecoder(
+_WITH_NAN = json.JSONDecoder(object_pairs_hook=_unique, parse_int=_integer, parse_float=_float)
+_STRICT = json.JSONDecoder(
     object_pairs_hook=_unique, parse_int=_integer, parse_float=_float, parse_constant=_constant
 )
