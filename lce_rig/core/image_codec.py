@@ -61,7 +61,7 @@ def _check_declared(data: bytes) -> None:
         raise ValueError("it is damaged, or no picture this program reads")
     try:
         declared = reader(data)
-    except (struct.error, IndexError, KeyError, ValueError):
+    except (struct.error, IndexError, KeyError, OverflowError, ValueError):
         raise ValueError("it is damaged: its header declares no size") from None
     width, height, depth = declared
     if width < 1 or height < 1:
