@@ -15,8 +15,8 @@ BAD_SCALARS = (ValueError, ArithmeticError, LookupError, AttributeError, TypeErr
 _MAX_INTEGER = 1 << 53
 KeyPath = tuple[str | int, ...]
 
-# A profile is a page or two; more is an attack by nested aliases or the wrong file. It takes a second to parse
-# 100 kB of YAML.
+# A profile is a page or two; more is an attack by nested aliases or the wrong file.
+# It takes a second to parse 100 kB of YAML.
 _MAX_BYTES = 1 << 18
 _MAX_NODES = 20_000
 _MAX_DEPTH = 20

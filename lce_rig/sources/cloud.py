@@ -69,7 +69,7 @@ def to_scan(
     if missing:
         have = ", ".join(_shown(cloud.dtype, name) for name in cloud.dtype.names or ()) or "none"
         raise SourceError(f"{where}: the cloud has no field {missing[0]!r}; its fields are {have}")
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         points = np.stack([cloud[fields[axis]].astype(np.float32) for axis in "xyz"], axis=1)
     is_finite = np.isfinite(points).all(axis=1)
     range_m = np.zeros(len(points))
@@ -111,7 +111,7 @@ def _intensity(cloud: NDArray[Any], fields: dict[str, str], notes: list[str]) ->
     if name is None:
         notes.append("no intensity")
         return np.zeros(len(cloud), dtype=np.float32)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         return np.nan_to_num(cloud[name].astype(np.float32), posinf=0.0, neginf=0.0)
 
 
@@ -119,7 +119,8 @@ def _ring(
     cloud: NDArray[Any], fields: dict[str, str], points: NDArray[np.float32], where: str, notes: list[str]
 ) -> NDArray[np.int16]:
     name = _find(fields, RING_FIELDS)
-    values = np.zeros(len(cloud)) if name is None else cloud[name].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of NaN that signals
+        values = np.zeros(len(cloud)) if name is None else cloud[name].astype(np.float64)
     ids, ring_of_point = np.unique(values, return_inverse=True)
     is_constant = len(cloud) > 100 and len(ids) == 1
     if name is None or is_constant or not np.isfinite(values).all() or len(ids) > _MOST_RINGS:
@@ -190,7 +191,8 @@ def _ticks(values: NDArray[Any]) -> NDArray[Any] | None:
     if values.dtype.kind in "iu":
         ticks: NDArray[Any] = values.astype(np.int64)
         return ticks if np.ptp(ticks) > 0 else None
-    ticks = values.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of NaN that signals
+        ticks = values.astype(np.float64)
     # Beyond a century of nanoseconds it is no time in any unit.
     if not np.isfinite(ticks).all() or np.abs(ticks).max() > _LATEST or np.ptp(ticks) == 0:
         return None
