@@ -74,6 +74,16 @@ def _check_declared(data: bytes) -> None:
 
 
 def _png(data: bytes) -> _Declared:
+    # OpenCV takes memory for what a chunk declares, too.
+    position, kinds = 8, list[bytes]()
+    while position < len(data):
+        length, kind = struct.unpack_from(">I4s", data, position)
+        kinds.append(kind)
+        position += 12 + length
+        if kind == b"IEND":
+            break
+    if position > len(data) or kinds[0] != b"IHDR" or kinds.count(b"IHDR") > 1 or b"acTL" in kinds:
+        raise ValueError
     width, height, bits, colour = struct.unpack_from(">IIBB", data, 16)
     samples = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}[colour]
     return _Declared(width, height, samples * (2 if bits == 16 else 1))

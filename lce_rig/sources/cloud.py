@@ -130,7 +130,7 @@ def _ring(
             raise SourceError(f"{where}: {error.what}", error.hint) from None
         notes.append("no ring field: rings told from elevations")
         return ring
-    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0].astype(np.float64), points[:, 1]))
     mean = np.bincount(ring_of_point, elevation) / np.bincount(ring_of_point)
     rank = np.argsort(np.argsort(mean, kind="stable"), kind="stable")
     is_whole = ids[0] >= 0 and ids[-1] < 2**15 and bool((ids == np.rint(ids)).all())
