@@ -87,6 +87,17 @@ def check_size(n_bytes: int, what: str = "it", max_bytes: int = MAX_CHUNK_BYTES)
     return n_bytes
 
 
+def check_points(n_points: int) -> int:
+    """Pass a declared number of points through where a scan can have as many.
+
+    Raises:
+        ValueError: it is negative, or beyond the limit.
+    """
+    if not 0 <= n_points <= MAX_POINTS:
+        raise ValueError(f"it declares {n_points} points, at most {MAX_POINTS} are read")
+    return n_points
+
+
 def megabytes(n_bytes: int) -> str:
     """Write a size as messages show it."""
     return f"{n_bytes / 1e6:.0f} MB" if abs(n_bytes) < 1e12 else f"{n_bytes / 1e12:.3g} TB"
