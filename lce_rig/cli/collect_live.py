@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 #: A run that nobody looks after ends after so long without a capture. The simulated person never rests;
 #: before a rig without a terminal somebody may have gone to fetch something.
-SIMULATED_IDLE_S, UNATTENDED_IDLE_S = 300.0, 1800.0
+SIMULATED_IDLE_S, UNATTENDED_IDLE_S = 600.0, 1800.0
 _ENDINGS = {
     "enough": "the target is predicted to be met",
     "frames": "as many captures as wanted",
