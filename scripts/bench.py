@@ -8,7 +8,7 @@
     scripts/bench.py guidance    a person who follows the guidance against random placements
     scripts/bench.py paper       the experiments of the LCE-Calib paper: tables and figures, every method
     scripts/bench.py faults      sessions with faults: how many wrong results pass
-    scripts/bench.py goes_on     collections of --captures on the simulated rig: do all of them end with as many?
+    scripts/bench.py goes_on     collections on the simulated rig: do all end with --captures?
     scripts/bench.py live        live collection under load, over real transports, for --seconds
     scripts/bench.py uncertainty  the joint estimate: errors against their bound, truth of its claim
     scripts/bench.py speed       detection, Algorithm 1, the command line

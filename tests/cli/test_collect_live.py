@@ -168,9 +168,8 @@ def test_a_run_that_nobody_looks_after_ends_and_says_that_too_little_was_shown(
     monkeypatch.setattr("lce_rig.cli.collect_live.SIMULATED_IDLE_S", 15.0)
     session = tmp_path / "session"
     # Nobody holds a board still for half a minute.
-    result = lce_rig(
-        "collect", "--rig", "rles", session, "--simulated", "--plain", "--hold", "30", "--frames", "2"
-    )
+    wanted = "--hold", "30", "--frames", "2"
+    result = lce_rig("collect", "--rig", "rles", session, "--simulated", "--plain", *wanted)
     assert result.code == 6, result.err
     assert "ended: no new placement was shown; 0 of 2 captures" in result.err
     assert "no capture in the last" in result.err and "last said" in result.err
