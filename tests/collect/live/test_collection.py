@@ -14,7 +14,7 @@ from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.session import Session
 from tests.collect.live.replay import Show, placements, rig
 
-QUICK = LiveOptions(n_wanted=3, timeout_s=40.0, hold_s=0.3)
+QUICK = LiveOptions(n_wanted=3, timeout_s=120.0, hold_s=0.3)
 
 
 def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path: Path) -> None:
@@ -27,16 +27,21 @@ def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path: Pat
             == report.captured
             == ["000000", "000001", "000002"]
         )
-        for k, capture in enumerate(session.captures):
+        shown = []
+        for capture in session.captures:
             capture.check()
+            # A computer that is busy may be late for a placement, and see it when it comes again.
+            stamp_ns = capture.scan("lidar").stamp_ns
+            (k,) = (k for k, stamps in enumerate(show.stamps) if stamp_ns in stamps)
+            shown.append(k)
             sent = placements()[k]
             assert np.array_equal(capture.image("davis", "frames").pixels, sent.images[0].pixels)
             assert np.array_equal(capture.scan("lidar").points, sent.scans[0].points)
-            assert capture.scan("lidar").stamp_ns in show.stamps[k]
             (pair,) = capture.meta["pairs"]
             assert abs(pair["difference_s"]) < 0.02 and pair["stream"] == "davis.frames"
             assert capture.meta["still_boards_only"] is True
             assert capture.meta["motion_m"] < rig().quality.max_motion_m
+        assert len(set(shown)) == 3
     assert states[-1].phase == "ended" and states[-1].n_captures == 3
     phases = {state.phase for state in states}
     assert {"holding", "moving"} <= phases
@@ -176,8 +181,7 @@ def met(tmp_path: Path) -> Path:
 def test_who_wants_more_than_enough_goes_on_being_guided_and_captured(met: Path) -> None:
     show, states = Show(placements(), each_s=2.0), list[LiveState]()
     with show.running(), Session.open(met, writable=True) as session:
-        options = replace(QUICK, n_wanted=14, timeout_s=120.0)
-        report = collect_live(session, show.sources, options, states.append)
+        report = collect_live(session, show.sources, replace(QUICK, n_wanted=14), states.append)
     assert report.ending == "frames" and report.is_enough
     assert len(report.captured) == 2
     assert "enough" not in {state.phase for state in states}
