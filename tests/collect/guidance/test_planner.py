@@ -10,6 +10,7 @@ from lce_rig.collect.guidance import (
     Planner,
     View,
     is_reachable,
+    is_there,
     model_sensors,
     outline_px,
     predict_covariance,
@@ -168,6 +169,18 @@ def test_nearer_placements_are_asked_for_when_no_others_are_left(planner):
     index = int(np.argmin(np.linalg.norm(planner.candidates[:, :3, 3] - guidance.T_cam_board[:3, 3], axis=1)))
     assert 0.5 * 0.15 <= lonely[index].min() < 0.15
     assert planner.adds_nothing(everywhere, guidance.T_cam_board) is None
+
+
+def test_who_stands_at_a_capture_is_always_told_to_move(planner, guided):
+    for k in range(1, len(guided)):
+        present = guided[k - 1]
+        wanted = planner.guide(guided[:k], present).T_cam_board
+        assert not is_there(planner.view, present, wanted)
+    # A board beside the first candidate, and no other place to go: better that one than none.
+    present = perturb(planner.candidates[0], np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.2]))
+    far = np.linalg.norm(planner.candidates[:, :3, 3] - present[:3, 3], axis=1) > 0.4
+    guidance = planner.guide(present[None], present, avoid=planner.candidates[far])
+    assert guidance.T_cam_board is not None
 
 
 def test_where_nothing_is_left_a_refusal_says_so(planner):
