@@ -25,10 +25,14 @@ if TYPE_CHECKING:
     from lce_rig.session import Session
     from lce_rig.sources.live.base import LiveSource
 
+#: A run that nobody looks after ends after so long without a capture. The simulated person never rests;
+#: before a rig without a terminal somebody may have gone to fetch something.
+SIMULATED_IDLE_S, UNATTENDED_IDLE_S = 600.0, 1800.0
 _ENDINGS = {
     "enough": "the target is predicted to be met",
     "frames": "as many captures as wanted",
     "timeout": "the time is over",
+    "exhausted": "no new placement was shown",
     "stopped": "stopped",
     "lost": "a sensor was lost",
 }
@@ -66,7 +70,6 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
     rig = load_rig(rig_name)
     require_kind(path, (given.seed or 0) if given.simulated else None)
     hold_s = HOLD_S if given.hold is None else given.hold
-    options = LiveOptions(given.frames, given.timeout, hold_s, goes_on=given.keep_going)
     with ExitStack() as stack:
         # The page first: an address that cannot be served is said before anything is made or started.
         listeners, links = _open_preview(stack, given)
@@ -76,6 +79,8 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
         sources, simulated = _open_rig(stack, rig, path, given)
         listeners += [simulated.watch] if simulated else []
         asked = stack.enter_context(controls())
+        idle_s = _idle_s(given, asked)
+        options = LiveOptions(given.frames, given.timeout, hold_s, goes_on=given.keep_going, idle_s=idle_s)
         with open_view(is_plain=given.plain, has_keys=asked.is_interactive, links=links) as view:
             listeners.append(_until_gone(view.show))
             is_begun = threading.Event()
@@ -92,7 +97,14 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
                 if n_captures or is_begun.is_set():
                     saved = f"{path}: {show.counted(n_captures, 'capture')} ({n_captures - n_before} new)"
                     stack.callback(show.note, saved)
-    _tell(report, n_captures, asked, simulated)
+    _tell(report, n_captures, asked, simulated, given)
+
+
+def _idle_s(given: LiveArguments, asked: Controls) -> float | None:
+    """Choose after how long without a capture nobody is thought to come back; None where somebody may."""
+    if given.simulated:
+        return SIMULATED_IDLE_S
+    return None if asked.is_interactive else UNATTENDED_IDLE_S
 
 
 def _until_gone(show_state: "Callable[[LiveState], None]") -> "Callable[[LiveState], None]":
@@ -180,12 +192,18 @@ def _recorder(given: LiveArguments, rig: "Rig") -> "Iterator[SampleRecorder | No
     show.note(f"{given.record}: {recorder.n_written} samples recorded")
 
 
-def _tell(report: "LiveReport", n_captures: int, asked: Controls, simulated: "SimulatedRig | None") -> None:
+def _tell(
+    report: "LiveReport",
+    n_captures: int,
+    asked: Controls,
+    simulated: "SimulatedRig | None",
+    given: LiveArguments,
+) -> None:
     """Say how it went.
 
     Raises:
         SourceError: a sensor was lost for good; what was captured is safe.
-        NotEnoughDataError: there is not one capture.
+        NotEnoughDataError: there is not one capture, or too few are all that could be shown.
     """
     from lce_rig.core.errors import NotEnoughDataError
 
@@ -196,21 +214,38 @@ def _tell(report: "LiveReport", n_captures: int, asked: Controls, simulated: "Si
         show.note("lost on the way: " + ", ".join(f"{name} {n}" for name, n in sorted(lost.items())))
     if simulated is not None and simulated.pace.problem():
         show.warn(f"the rig was {simulated.pace.problem()}")
-    show.note(f"ended: {_ENDINGS[report.ending]}")
+    show.note(f"ended: {_ending(report, n_captures, given)}")
     if report.error is not None:
         raise report.error
     if asked.signal == signal.SIGINT:
         raise click.exceptions.Exit(130)
     if n_captures == 0:
         raise NotEnoughDataError("nothing was captured", _remedy(report, simulated))
+    if report.ending == "exhausted" and not report.is_enough:
+        raise NotEnoughDataError(
+            f"{show.counted(n_captures, 'capture')} are not enough: the target is not predicted to be met",
+            _remedy(report, simulated),
+        )
+
+
+def _ending(report: "LiveReport", n_captures: int, given: LiveArguments) -> str:
+    """Say why it ended, and how to go on where the target alone ended it."""
+    said = _ENDINGS[report.ending]
+    if report.ending == "enough":
+        return f"{said} (--keep-going or --frames N collect more)"
+    if report.ending == "exhausted" and given.frames is not None:
+        return f"{said}; {n_captures} of {given.frames} captures"
+    return said
 
 
 def _remedy(report: "LiveReport", simulated: "SimulatedRig | None") -> str:
-    """Say what to do where nothing was captured."""
+    """Say what to do where too little was captured."""
     if report.lost:
         return "\n".join(f"{name} is lost: {error.what}. {error.hint}" for name, error in report.lost.items())
     if simulated is None:
         return "The board must be seen by every sensor at once; `lce-rig doctor` says what is in the way."
     if simulated.pace.problem():
         return "This computer is too busy, or too slow: end other programs, or take `lce-rig simulate`."
+    if report.ending == "exhausted":
+        return "Run the same command again to continue."
     return "The simulated person needs longer: a longer --timeout."

@@ -1,6 +1,7 @@
 """A camera of any lens model: board and carrier before the backdrop, anti-aliased, blurred and noisy."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from lce_rig.simulate.light import irradiance, reached
 from lce_rig.simulate.options import CameraNoise
 from lce_rig.simulate.scene import Hits, Scene
 
-_SUBPIXELS = 5  # samples a pixel along each axis wherever an edge runs through it
+SUBPIXELS = 5
 _GAMMA = 1 / 2.2
 
 
@@ -41,11 +42,17 @@ def render_image(
     return Image(sensor, channel, stamp_ns, expose(radiance, noise, rng), stamp_ns)
 
 
-def render_radiance(scene: Scene, backdrop: Backdrop) -> Array:
-    """Compute what reaches the lens: linear (H, W, 3)."""
+def render_radiance(scene: Scene, backdrop: Backdrop, n_subpixels: int = SUBPIXELS) -> Array:
+    """Compute what reaches the lens: linear (H, W, 3).
+
+    Args:
+        scene: the room of the backdrop, with the board and its carrier.
+        backdrop: the camera and what it sees of the standing room.
+        n_subpixels: samples a pixel along each axis wherever an edge runs through it.
+    """
     radiance = backdrop.radiance * _shadow(scene, backdrop)[..., None]
     _paint_mirror_images(radiance, scene, backdrop)
-    _paint_moving(radiance, scene, backdrop)
+    _paint_moving(radiance, scene, backdrop, n_subpixels)
     return radiance
 
 
@@ -123,7 +130,7 @@ class _Window:
     backdrop_range_m: Array
 
 
-def _paint_moving(radiance: Array, scene: Scene, backdrop: Backdrop) -> None:
+def _paint_moving(radiance: Array, scene: Scene, backdrop: Backdrop, n_subpixels: int) -> None:
     """Paint board and carrier over the backdrop (H, W, 3), in place, anti-aliased where an edge runs."""
     rows, cols = _region(scene, backdrop)
     if rows.stop <= rows.start or cols.stop <= cols.start:
@@ -141,7 +148,7 @@ def _paint_moving(radiance: Array, scene: Scene, backdrop: Backdrop) -> None:
     for with_carrier in (False, True):
         v, u = np.nonzero(is_edge & (near_carrier == with_carrier))
         if len(v):
-            rays = sub_rays(corners, v, u, _SUBPIXELS)
+            rays = sub_rays(corners, v, u, n_subpixels)
             painted[v, u] = _look_through(scene, backdrop.origin, window, lights, (v, u), rays, with_carrier)
     radiance[rows, cols] = painted
 
@@ -209,17 +216,32 @@ def _spread(light: Array, mask: NDArray[np.bool_]) -> Array:
     return np.asarray(summed / np.maximum(total, 1e-9)[..., None])
 
 
+@lru_cache(maxsize=8)
 def sensor_gain(height_px: int, width_px: int, noise: CameraNoise) -> Array:
-    """Compute by what radiance is multiplied on its way to each pixel (H, W): exposure and vignetting."""
+    """Compute by what radiance is multiplied on its way to each pixel (H, W): exposure and vignetting.
+
+    It is the same for all pictures of a camera, and not to be changed.
+    """
     v, u = np.mgrid[0:height_px, 0:width_px]
     radius2 = ((u - (width_px - 1) / 2) ** 2 + (v - (height_px - 1) / 2) ** 2) / (
         ((width_px - 1) ** 2 + (height_px - 1) ** 2) / 4
     )
-    return np.asarray(noise.exposure * (1 - noise.vignetting * radius2))
+    gain = np.asarray(noise.exposure * (1 - noise.vignetting * radius2))
+    gain.setflags(write=False)
+    return gain
 
 
 def expose(radiance: Array, noise: CameraNoise, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Turn linear radiance (H, W, 3) into a picture: vignetting, point spread, shot and read noise, gamma."""
+    linear = focus(radiance, noise)
+    if np.isfinite(noise.full_well_e):
+        normals = rng.standard_normal(linear.shape, dtype=np.float32)
+        return develop(linear + shot_noise_e(linear, noise) * normals / noise.full_well_e)
+    return develop(linear)
+
+
+def focus(radiance: Array, noise: CameraNoise) -> NDArray[np.float32]:
+    """Bring radiance (H, W, 3) onto the sensor, where its white is 1: vignetting and point spread."""
     import cv2
 
     height, width = radiance.shape[:2]
@@ -227,9 +249,16 @@ def expose(radiance: Array, noise: CameraNoise, rng: np.random.Generator) -> NDA
     if noise.blur_px > 0:
         soft = cv2.GaussianBlur(linear, (0, 0), noise.blur_px, borderType=cv2.BORDER_REPLICATE)
         linear = np.asarray(soft, dtype=np.float32)
-    if np.isfinite(noise.full_well_e):
-        electrons = np.clip(linear, 0, None) * noise.full_well_e
-        sigma = np.sqrt(electrons + noise.read_noise_e**2)
-        linear = linear + sigma * rng.standard_normal(linear.shape, dtype=np.float32) / noise.full_well_e
+    return linear
+
+
+def shot_noise_e(linear: NDArray[np.float32], noise: CameraNoise) -> NDArray[np.float32]:
+    """Compute the standard deviation of shot and read noise, electrons, where light (H, W, 3) falls."""
+    electrons = np.clip(linear, 0, None) * noise.full_well_e
+    return np.asarray(np.sqrt(electrons + noise.read_noise_e**2))
+
+
+def develop(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Turn what a sensor measured (H, W, 3) into a picture."""
     tone = 255.0 * np.clip(linear, 0.0, 1.0) ** _GAMMA
     return np.asarray(np.rint(tone), dtype=np.uint8)

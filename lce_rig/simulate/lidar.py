@@ -1,7 +1,7 @@
 """A spinning LiDAR: beam table, firing times, finite beams with mixed pixels, and the errors of real ones."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ _RANGE_STEP_M = 0.002
 _AZIMUTH_STEP_RAD = np.radians(0.01)
 # 16 sequences of a VLP-16 take 0.9 ms: a board at 0.3 m/s is seen within 0.14 mm of where it is.
 _FIRINGS_PER_INSTANT = 256
+# No beam is wider than this, half its width, at the nearest that a body may be.
+_MARGIN_RAD, _NEAREST_M = 0.04, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,10 +142,7 @@ def sweep_scene(
 ) -> Sweep:
     """Send the beams of one revolution; for the arguments see `simulate_scan`."""
     laser, offset_ns, azimuth_rad = _firings(model, rng)
-    origins = np.zeros((len(laser), 3))
-    origins[:, 2] = model.vertical_offsets_m[laser]
-    directions = _directions(model.elevations_rad[laser], azimuth_rad)
-    origins_world, directions_world = transform(T_world_lidar, origins), directions @ T_world_lidar[:3, :3].T
+    origins_world, directions_world = _beams(model, T_world_lidar, laser, azimuth_rad)
     if board_at is None:
         returns = receive(scene, origins_world, directions_world, noise)
         is_rim = _near_border(scene, origins_world, directions_world, returns, noise)
@@ -151,6 +150,43 @@ def sweep_scene(
         instants = _instants(scene, board_at, stamp_ns + offset_ns)
         returns, is_rim = _receive_moving(instants, origins_world, directions_world, noise)
     return Sweep(laser, offset_ns, azimuth_rad, returns, is_rim)
+
+
+def sweep_again(
+    empty: Sweep, scene: Scene, T_world_lidar: Array, model: LidarModel, noise: LidarNoise
+) -> Sweep:
+    """Send the beams of a sweep of the standing room once more, with the board and its carrier in it.
+
+    Only those that may meet them are traced: all others bring back what they did.
+
+    Args:
+        empty: what the beams met without the board and its carrier.
+        scene: the same room with them.
+        T_world_lidar, model, noise: as for the sweep.
+    """
+    near = np.flatnonzero(_may_meet(scene, T_world_lidar, empty.azimuth_rad))
+    origins, directions = _beams(model, T_world_lidar, empty.laser[near], empty.azimuth_rad[near])
+    part = receive(scene, origins, directions, noise)
+    whole = [getattr(empty.returns, each.name).copy() for each in fields(Returns)]
+    for values, each in zip(whole, fields(Returns), strict=True):
+        values[near] = getattr(part, each.name)
+    is_rim = empty.is_rim.copy()
+    is_rim[near] = _near_border(scene, origins, directions, part, noise)
+    return replace(empty, returns=Returns(*whole), is_rim=is_rim)
+
+
+def _may_meet(scene: Scene, T_world_lidar: Array, azimuth_rad: Array) -> NDArray[np.bool_]:
+    """Tell which beams at azimuths (N,) may meet the board or its carrier."""
+    bodies = [surface.mesh.vertices for surface in scene.moving.surfaces]
+    bodies.append(transform(scene.T_world_board, scene.board.outline()))
+    points = transform(invert(T_world_lidar), np.concatenate(bodies))
+    if np.hypot(points[:, 0], points[:, 1]).min() < _NEAREST_M:
+        return np.ones(len(azimuth_rad), dtype=np.bool_)
+    x, y = points[:, :2].mean(axis=0)
+    middle_rad = np.arctan2(y, x)
+    spread = np.angle(np.exp(1j * (np.arctan2(points[:, 1], points[:, 0]) - middle_rad)))
+    around = np.angle(np.exp(1j * (azimuth_rad - middle_rad)))
+    return np.asarray((around > spread.min() - _MARGIN_RAD) & (around < spread.max() + _MARGIN_RAD))
 
 
 def measure_sweep(
@@ -227,6 +263,16 @@ def _measure(
     if noise.is_quantised:
         return np.rint(range_m / _RANGE_STEP_M) * _RANGE_STEP_M, np.rint(intensity)
     return range_m, intensity
+
+
+def _beams(
+    model: LidarModel, T_world_lidar: Array, laser: NDArray[np.intp], azimuth_rad: Array
+) -> tuple[Array, Array]:
+    """Find where beams (N,) begin and where they go, (N, 3) each, world."""
+    origins = np.zeros((len(laser), 3))
+    origins[:, 2] = model.vertical_offsets_m[laser]
+    directions = _directions(model.elevations_rad[laser], azimuth_rad)
+    return transform(T_world_lidar, origins), directions @ T_world_lidar[:3, :3].T
 
 
 def _firings(

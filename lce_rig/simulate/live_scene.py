@@ -1,21 +1,39 @@
 """A board before the simulated sensors, now held and now on its way, whenever somebody looks."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3, log_so3, pose
 from lce_rig.rig import Rig
-from lce_rig.simulate.camera import expose, render_radiance
+from lce_rig.simulate.camera import SUBPIXELS, develop, focus, render_radiance, shot_noise_e
 from lce_rig.simulate.carriers import build_carrier
-from lce_rig.simulate.lidar import Sweep, measure_sweep, sweep_scene
+from lce_rig.simulate.lidar import Sweep, measure_sweep, sweep_again, sweep_scene
 from lce_rig.simulate.options import SimulationOptions
 from lce_rig.simulate.placements import can_be_held, count_rings
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import CARRIER, OF_SESSION, set_stage
 
 _NOISE_STREAM = 102
+# Where no beam goes.
+_NOWHERE = pose(np.eye(3), np.array([0.0, 0.0, -1e6]))
+_SUBPIXELS_ON_THE_WAY = 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Light:
+    """What falls onto a sensor, and its noise.
+
+    Attributes:
+        linear: (H, W, 3), white is 1.
+        sigma: (H, W, 3) standard deviation of the noise; None without.
+    """
+
+    linear: NDArray[np.float32]
+    sigma: NDArray[np.float32] | None
 
 
 class LiveScene:
@@ -38,22 +56,21 @@ class LiveScene:
         self.stage = set_stage(rig, seed, options)
         self.T_world_board: Array = np.eye(4)
         self._noise = self.stage.rng(OF_SESSION, _NOISE_STREAM)
+        self._is_held = True
         self._scene: Scene | None = None
-        self._radiance: dict[str, Array] = {}
+        self._light: dict[str, _Light] = {}
         self._sweeps: dict[str, Sweep] = {}
+        self._rooms: dict[str, Sweep] = {}
 
     def hold(self, T_world_board: Array) -> None:
         """Hold the board still at (4, 4)."""
-        self.T_world_board = T_world_board
-        self._scene = None
-        self._radiance.clear()
-        self._sweeps.clear()
+        self._show(T_world_board, is_held=True)
+        # The rotor is not synchronised with anything: elsewhere the beams fall otherwise.
+        self._rooms.clear()
 
     def pass_by(self, start: Array, end: Array, share: float) -> None:
         """Put the board on its way between two poses (4, 4)."""
-        turn = log_so3(start[:3, :3].T @ end[:3, :3])
-        place = (1 - share) * start[:3, 3] + share * end[:3, 3]
-        self.hold(pose(start[:3, :3] @ exp_so3(share * turn), place))
+        self._show(between(start, end, share), is_held=False)
 
     def can_be_held(self, camera: str, T_world_board: Array) -> bool:
         """Tell whether nothing is in the way at a pose (4, 4), and enough rings of the LiDAR meet it."""
@@ -71,20 +88,52 @@ class LiveScene:
         for lidar in stage.models:
             yield self._take_scan(lidar, stamp_ns)
 
+    def _show(self, T_world_board: Array, *, is_held: bool) -> None:
+        self.T_world_board, self._is_held = T_world_board, is_held
+        self._scene = None
+        self._light.clear()
+        self._sweeps.clear()
+
     def _take_image(self, camera: str, stamp_ns: int) -> Image:
         stage = self.stage
-        if camera not in self._radiance:
-            self._radiance[camera] = render_radiance(self._render(), stage.backdrops[camera])
-        pixels = expose(self._radiance[camera], stage.options.camera, self._noise)
+        if camera not in self._light:
+            self._light[camera] = self._look(camera)
+        light = self._light[camera]
+        pixels = develop(self._with_noise(light))
         channel = stage.rig.cameras[camera].first_channel("frames") or "frames"
         return Image(camera, channel, stamp_ns, pixels, stamp_ns)
+
+    def _look(self, camera: str) -> _Light:
+        """Render what falls on a camera's sensor; coarsely on the way, as nothing is captured there."""
+        noise, n_subpixels = self.stage.options.camera, SUBPIXELS if self._is_held else _SUBPIXELS_ON_THE_WAY
+        linear = focus(render_radiance(self._render(), self.stage.backdrops[camera], n_subpixels), noise)
+        if not np.isfinite(noise.full_well_e):
+            return _Light(linear, None)
+        return _Light(linear, np.asarray(shot_noise_e(linear, noise) / np.float32(noise.full_well_e)))
+
+    def _with_noise(self, light: _Light) -> NDArray[np.float32]:
+        """Add noise, which OpenCV draws three times as fast as NumPy."""
+        import cv2
+
+        if light.sigma is None:
+            return light.linear
+        cv2.setRNGSeed(int(self._noise.integers(1 << 31)))
+        noisy = np.empty(light.linear.shape, dtype=np.float32)
+        cv2.randn(noisy, np.zeros(1), np.ones(1))
+        noisy *= light.sigma
+        noisy += light.linear
+        return noisy
 
     def _take_scan(self, lidar: str, stamp_ns: int) -> Scan:
         stage, settings = self.stage, self.stage.rig.lidars[lidar]
         model, noise = stage.models[lidar], stage.options.lidar_noise
         if lidar not in self._sweeps:
             T_world_lidar = stage.T_world_sensor[lidar]
-            self._sweeps[lidar] = sweep_scene(self._render(), T_world_lidar, model, noise, self._noise)
+            if lidar not in self._rooms:
+                empty = Scene(stage.room.raycaster, (), stage.board, _NOWHERE)
+                self._rooms[lidar] = sweep_scene(empty, T_world_lidar, model, noise, self._noise)
+            room = self._rooms[lidar]
+            self._sweeps[lidar] = sweep_again(room, self._render(), T_world_lidar, model, noise)
         return measure_sweep(
             self._sweeps[lidar],
             model,
@@ -105,3 +154,10 @@ class LiveScene:
             raycaster, reflectivity = stage.room.raycaster, options.print_reflectivity
             self._scene = Scene(raycaster, carrier, stage.board, self.T_world_board, reflectivity)
         return self._scene
+
+
+def between(start: Array, end: Array, share: float) -> Array:
+    """Find the pose (4, 4) a share of the way from one (4, 4) to another, turning evenly."""
+    turn = log_so3(start[:3, :3].T @ end[:3, :3])
+    place = (1 - share) * start[:3, 3] + share * end[:3, 3]
+    return pose(start[:3, :3] @ exp_so3(share * turn), place)

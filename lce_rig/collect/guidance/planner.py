@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lce_rig.collect.guidance.candidates import View, spread_candidates
 from lce_rig.collect.guidance.evidence import Evidence, weigh_placements
 from lce_rig.collect.guidance.precision import Precision, combine, combine_with_each, shortfall, sigmas
-from lce_rig.collect.guidance.words import instruct, say
+from lce_rig.collect.guidance.words import NOWHERE_ELSE, instruct, is_there, say
 from lce_rig.core.geometry import Array, rotation_angle
 from lce_rig.core.results import Refusal
 
@@ -19,6 +19,10 @@ FEWEST_FOR_ENOUGH = 11
 ENOUGH_SHARE = 0.9
 #: A placement that brings less than this share of what the best one would adds nothing.
 LEAST_SHARE = 0.1
+#: Where even the best placement brings less than this share, any new one is welcome.
+LEAST_GAIN = 0.02
+#: How far apart placements are, in units of `Novelty`: nearer ones are asked for when no others are left.
+SPACINGS = (1.0, 0.5)
 #: Around a place that cannot be reached.
 AVOIDED_M = 0.4
 # A metre of way, or a turn by a radian, costs as much as an answer that is so much worse.
@@ -44,6 +48,7 @@ class Guidance:
         next_rotation_deg, next_translation_m: the same after the wanted placement.
         is_enough: whether the calibration is predicted to meet the profile's target, with a margin.
         T_cam_board: (4, 4) wanted; None where no reachable placement is new.
+        spacing: of `SPACINGS`, how far a board must be from every capture to count as new.
     """
 
     n_captures: int
@@ -53,6 +58,7 @@ class Guidance:
     next_translation_m: float
     is_enough: bool
     T_cam_board: Array | None
+    spacing: float = SPACINGS[0]
 
 
 class Planner:
@@ -91,14 +97,12 @@ class Planner:
         cost = shortfall(model, after.improvable)
         if present is not None:
             cost = cost * (1 + _EFFORT * _effort(present, self.candidates))
-        is_taken = self._is_like(held, self.candidates).any(axis=0)
         if avoid is not None:
-            is_taken |= _way_m(avoid, self.candidates).min(axis=0, initial=np.inf) < AVOIDED_M
-        cost[is_taken] = np.inf
-        best = int(np.argmin(cost)) if len(cost) else 0
-        wanted = self.candidates[best] if len(cost) and np.isfinite(cost[best]) else None
+            cost[_way_m(avoid, self.candidates).min(axis=0, initial=np.inf) < AVOIDED_M] = np.inf
+        best, spacing = self._choose(cost, held, present)
+        wanted = None if best is None else self.candidates[best]
         rotation, translation = sigmas(now.cov)
-        then = now.cov if wanted is None else after.cov[best]
+        then = now.cov if best is None else after.cov[best]
         next_rotation, next_translation = sigmas(then)
         return Guidance(
             n_captures=len(held),
@@ -108,30 +112,44 @@ class Planner:
             next_translation_m=float(next_translation),
             is_enough=self._is_enough(now, len(held)),
             T_cam_board=wanted,
+            spacing=spacing,
         )
 
-    def adds_nothing(self, held: Array, present: Array, names: Sequence[str] | None = None) -> Refusal | None:
+    def adds_nothing(
+        self,
+        held: Array,
+        present: Array,
+        names: Sequence[str] | None = None,
+        avoid: Array | None = None,
+        asked: Array | None = None,
+    ) -> Refusal | None:
         """Refuse a placement that would hardly shrink the predicted covariance.
+
+        Once the target is predicted to be met, and where nothing brings much any more, only a placement that
+        was captured before is refused: whoever goes on wants more captures.
 
         Args:
             held: (N, 4, 4) T_cam_board of the captures so far.
             present: (4, 4) where the board is.
             names: of the captures held; numbers from 1 by default.
+            avoid: (M, 4, 4) as `guide` takes them: no board is refused for a better place out of reach.
+            asked: (4, 4) where the board was sent; there it is refused only where it was captured before.
 
         Returns:
             Why not to capture it and where to go instead; None where it adds something.
         """
-        guidance = self.guide(held, present)
+        guidance = self.guide(held, present, avoid)
         wanted = guidance.T_cam_board
-        action = "you may stop" if wanted is None else say(instruct(self.view, present, wanted))
-        alike = np.flatnonzero(self._is_like(held, present[None])[:, 0])
+        action = NOWHERE_ELSE if wanted is None else say(instruct(self.view, present, wanted))
+        alike = np.flatnonzero(self._is_like(held, present[None], guidance.spacing)[:, 0])
         if len(alike):
             name = str(alike[0] + 1) if names is None else names[alike[0]]
             return Refusal("calibrate", f"the board stands where capture {name} shows it", action)
-        if wanted is None:
+        is_asked = asked is not None and is_there(self.view, present, asked)
+        if wanted is None or guidance.is_enough or is_asked:
             return None
         own, best = self._gains(held, np.stack([present, wanted]))
-        if own >= LEAST_SHARE * best:
+        if best < LEAST_GAIN or own >= LEAST_SHARE * best:
             return None
         cause = (
             f"this placement makes the result {max(100 * own, 0.0):.1f} % better, another {100 * best:.0f} %"
@@ -156,13 +174,31 @@ class Planner:
         worse = max(rotation / model.target_sigma_rad, translation / model.target_sigma_m)
         return bool(worse <= ENOUGH_SHARE)
 
-    def _is_like(self, held: Array, others: Array) -> NDArray[np.bool_]:
+    def _choose(self, cost: Array, held: Array, present: Array | None) -> tuple[int | None, float]:
+        """Choose the candidate of the least finite cost that is new, the farther from all held the better.
+
+        Returns:
+            Its index, None where there is none; and the spacing at which it is new.
+        """
+        for spacing in SPACINGS:
+            is_taken = self._is_like(held, self.candidates, spacing).any(axis=0)
+            new = np.flatnonzero(~is_taken & np.isfinite(cost))
+            if len(new):
+                ranked = new[np.argsort(cost[new], kind="stable")]
+                if present is None or not self._is_like(held, present[None], spacing).any():
+                    return int(ranked[0]), spacing
+                # Who stands at a capture has to be moved on: not to where "hold still" would be said.
+                away = (k for k in ranked if not is_there(self.view, present, self.candidates[k]))
+                return int(next(away, ranked[0])), spacing
+        return None, SPACINGS[-1]
+
+    def _is_like(self, held: Array, others: Array, spacing: float) -> NDArray[np.bool_]:
         """Tell which of others (M, 4, 4) stand where one of those held (N, 4, 4) does, (N, M)."""
         # The print may be read from either end.
         R, R_others = held[:, None, :3, :3], others[None, :, :3, :3]
         turn = np.minimum(rotation_angle(R, R_others), rotation_angle(R @ _HALF_TURN, R_others))
-        is_turned = turn >= np.radians(self.novelty.min_turn_deg)
-        return np.asarray((_way_m(held, others) < self.novelty.min_move_m) & ~is_turned)
+        is_turned = turn >= np.radians(spacing * self.novelty.min_turn_deg)
+        return np.asarray((_way_m(held, others) < spacing * self.novelty.min_move_m) & ~is_turned)
 
 
 def _way_m(held: Array, others: Array) -> Array:

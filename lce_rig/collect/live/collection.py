@@ -11,10 +11,10 @@ from contextlib import contextmanager
 
 from lce_rig.collect.live.frame_feed import FrameFeed
 from lce_rig.collect.live.gates import LiveGate, SlowBoards, StillBoards
-from lce_rig.collect.live.guide import Guide
+from lce_rig.collect.live.guide import GIVE_UP_S, Guide
 from lce_rig.collect.live.keeper import Keeper, Task
 from lce_rig.collect.live.monitor import Monitor
-from lce_rig.collect.live.narration import Narration, narrate_unseen
+from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_unseen
 from lce_rig.collect.live.options import Ending, Key, LiveOptions, LiveReport
 from lce_rig.collect.live.pumps import Pumps
 from lce_rig.collect.live.recorder import SampleRecorder
@@ -115,6 +115,11 @@ def _count_in(capture: Capture, session: Session, guides: Sequence[Guide]) -> No
             guide.add(capture.name, poses[guide.key])
 
 
+def _time_s(sighting: Sighting) -> float:
+    """Tell the sensors' time: patience is measured by what they have seen, however slow this computer is."""
+    return sighting.frame.time_ns * 1e-9
+
+
 class _Loop:
     def __init__(
         self,
@@ -143,7 +148,8 @@ class _Loop:
         names = [capture.name for capture in session.captures]
         self._first_number = int(names[-1]) + 1 if names else 0
         self._n_asked = 0
-        self._monitor = Monitor(session, options.n_wanted, pumps, clock)
+        self._captured_s = self._began_s
+        self._monitor = Monitor(session, options, pumps, clock)
         self._last: Sighting | None = None
 
     def run(self, keys: Callable[[], Key | None]) -> LiveReport:
@@ -160,6 +166,7 @@ class _Loop:
             self._tell(has_frame=frame is not None, ending=ending)
             if ending is not None:
                 self.report.ending = ending
+                self.report.is_enough = all(guide.is_usable for guide in self._guides)
                 return self.report
 
     def take_kept(self) -> None:
@@ -177,6 +184,9 @@ class _Loop:
         report.lost = {name: error for name, (error, _) in self._pumps.lost().items()}
         for name, status in self._pumps.statuses().items():
             report.n_lost[name] = status.n_lost + status.n_dropped
+        if report.ending == "exhausted":
+            waited_s = time.monotonic() - self._captured_s
+            report.notes.append(f"no capture in the last {waited_s:.0f} s, {self._monitor.last_words()}")
         report.notes += self._keeper.notes() + self._clock.problems() + self._clock.account()
         if self._recorder is not None:
             report.notes += self._recorder.problems()
@@ -196,31 +206,35 @@ class _Loop:
         gate = self._find_gate()
         moments = gate.take(sighting)
         guide = self._active_guide(sighting)
-        board = sighting.images.get(guide.key)
-        present = None if board is None else board.T_cam_board
-        guide.plan(present, time.monotonic())
+        for each in self._guides:
+            each.plan(each.locate(sighting), _time_s(sighting), is_asked=each is guide)
+        present = guide.locate(sighting)
         if present is not None and guide.sees(sighting):
             narration = gate.narrate(guide, present)
         else:
             narration = narrate_unseen(sighting, guide, self._monitor.reasons)
         for moment in moments:
-            narration = self._decide(moment, guide, narration)
+            narration = self._decide(moment, narration)
         self._monitor.narrate(narration, guide, present)
 
-    def _decide(self, moment: Moment, guide: Guide, narration: Narration) -> Narration:
+    def _decide(self, moment: Moment, narration: Narration) -> Narration:
         """Capture a moment, unless it adds nothing."""
         sighting = moment.sighting
-        if not guide.sees(sighting):
+        guide = self._seeing_guide(sighting)
+        if guide is None:
             return narration
         n_wanted, n_waiting = self._options.n_wanted, self._n_asked - len(self.report.captured)
         if n_wanted is not None and self._n_captures + n_waiting >= n_wanted:
             return narration  # A slow disk still writes the last ones.
-        refusal = guide.adds_nothing(sighting.images[guide.key].T_cam_board)
+        present = sighting.images[guide.key].T_cam_board
+        refusal = guide.adds_nothing(present)
         if refusal is None:
             self._capture(moment)
             return Narration("saving", "captured")
         self._monitor.cue("refused", f"not captured: {refusal.cause}")
-        return Narration("refused", refusal.action, f"not here: {refusal.cause}")
+        guide.note_refusal(present)
+        guide.plan(present, _time_s(sighting))
+        return narrate_refused(guide, present, refusal)
 
     def _capture(self, moment: Moment) -> None:
         sighting, gate = moment.sighting, self._find_gate()
@@ -235,6 +249,7 @@ class _Loop:
         self._keeper.keep(Task(moment, frame.images, gate.events_of(moment), meta, time.monotonic()))
         name = f"{self._first_number + self._n_asked:06d}"
         self._n_asked += 1
+        self._captured_s = time.monotonic()
         for guide in self._guides:
             if guide.sees(sighting):
                 guide.add(name, sighting.images[guide.key].T_cam_board)
@@ -245,7 +260,7 @@ class _Loop:
             guide.give_up()
             self._monitor.log("another placement was asked for")
         if key == "capture" and guide is not None and self._last is not None:
-            if guide.sees(self._last):
+            if self._seeing_guide(self._last) is not None:
                 self._capture(Moment(self._last, {"by_hand": 1.0}))
             else:
                 self._monitor.cue("refused", "not captured: not every sensor sees the board")
@@ -264,12 +279,23 @@ class _Loop:
             return "frames"
         if options.timeout_s is not None and elapsed_s > options.timeout_s:
             return "timeout"
-        is_open = options.n_wanted is not None or options.goes_on or self._keeper.is_busy
-        return "enough" if self._is_enough() and not is_open else None
+        if self._keeper.is_busy:
+            return None
+        if self._is_enough() and not options.is_open:
+            return "enough"
+        return "exhausted" if self._is_exhausted() else None
 
     def _is_enough(self) -> bool:
-        guided = [guide for guide in self._guides if guide.guidance is not None]
-        return len(guided) == len(self._guides) and all(g.guidance and g.guidance.is_enough for g in guided)
+        return all(guide.is_enough for guide in self._guides)
+
+    def _is_exhausted(self) -> bool:
+        """Tell whether nobody is there to show anything new, or nothing new is left to be shown."""
+        idle_s = self._options.idle_s
+        if idle_s is None:
+            return False
+        has_nothing_left = all(guide.is_exhausted for guide in self._guides)
+        patience_s = min(idle_s, GIVE_UP_S) if has_nothing_left else idle_s
+        return time.monotonic() - self._captured_s > patience_s
 
     def _tell(self, *, has_frame: bool, ending: Ending | None) -> None:
         if has_frame or ending is not None or self._monitor.is_due():
@@ -277,9 +303,19 @@ class _Loop:
             self._show(self._monitor.state(self._n_captures, is_enough=is_enough, has_ended=has_ended))
 
     def _active_guide(self, sighting: Sighting) -> Guide:
-        """Choose the guide that has the fewest captures, among those whose camera sees the board."""
+        """Choose whose words are said: of the guides whose camera sees the board that of fewest captures.
+
+        Where they all have enough, the board goes before a camera whose guide has not.
+        """
         seeing = [g for g in self._guides if g.key in sighting.images]
+        if seeing and all(guide.is_enough for guide in seeing):
+            seeing += [guide for guide in self._guides if not guide.is_enough]
+            return min(seeing, key=lambda guide: (guide.is_enough, guide.n_held))
         return min(seeing or self._guides, key=lambda guide: guide.n_held)
+
+    def _seeing_guide(self, sighting: Sighting) -> Guide | None:
+        """Choose who judges a placement: of the guides whose sensors see it that of fewest captures."""
+        return min((g for g in self._guides if g.sees(sighting)), key=lambda g: g.n_held, default=None)
 
     def _find_gate(self) -> LiveGate:
         """Choose how boards are captured: moving where events come and clocks are tied, else still."""

@@ -64,6 +64,8 @@ class StillBoards:
         # Weighing a placement takes long: once a stretch of stillness is enough.
         if held_s is not None and not self._is_judged:
             self._is_judged, self._refusal = True, guide.adds_nothing(present)
+            if self._refusal is not None:
+                guide.note_refusal(present)
         if self._is_decided:
             return narrate_still(guide, present, None, self._hold_s, None)
         return narrate_still(guide, present, held_s, self._hold_s, self._refusal)

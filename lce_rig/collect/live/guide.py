@@ -62,6 +62,7 @@ class Guide:
         self.lidar = lidar
         self.problem = ""
         self.guidance: Guidance | None = None
+        self._min_captures = rig.quality.min_captures
         self._names: list[str] = []
         self._held: list[Array] = []
         self._avoid: list[Array] = []
@@ -89,6 +90,21 @@ class Guide:
         return len(self._held)
 
     @property
+    def is_enough(self) -> bool:
+        """Whether the target is predicted to be met."""
+        return self.guidance is not None and self.guidance.is_enough
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether the captures are enough as far as is known: by their number where nothing is predicted."""
+        return self.n_held >= self._min_captures if self._planner is None else self.is_enough
+
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether no placement is known that would be new."""
+        return self.guidance is not None and self.guidance.T_cam_board is None
+
+    @property
     def wanted(self) -> Array | None:
         """Where the board should go, T_cam_board (4, 4); None where nothing new can be reached."""
         return None if self.guidance is None else self.guidance.T_cam_board
@@ -96,6 +112,11 @@ class Guide:
     def sees(self, sighting: Sighting) -> bool:
         """Tell whether both of its sensors see the board in a sighting."""
         return self.key in sighting.images and self.lidar in sighting.lidars
+
+    def locate(self, sighting: Sighting) -> Array | None:
+        """Give T_cam_board (4, 4) as its camera sees it; None where it does not."""
+        board = sighting.images.get(self.key)
+        return None if board is None else board.T_cam_board
 
     def add(self, name: str, T_cam_board: Array) -> None:
         """Take a capture into account; the next placement is chosen by `plan`."""
@@ -116,22 +137,34 @@ class Guide:
         self.problem = ""
         self.guidance = self._coverage = None
 
-    def plan(self, present: Array | None, now_s: float) -> None:
+    def plan(self, present: Array | None, now_s: float, *, is_asked: bool = True) -> None:
         """Choose the next placement where none is chosen, or the last was not reached for long.
 
         Args:
             present: (4, 4) where the board is; None where it is not seen.
-            now_s: by any steady clock.
+            now_s: by the sensors' clock.
+            is_asked: whether this guide is the one that is followed.
         """
         if self._planner is None:
             return
+        if not is_asked or now_s < self._wanted_since_s:  # Clocks may be set back.
+            self._wanted_since_s = now_s
         if self.guidance is not None and now_s - self._wanted_since_s < GIVE_UP_S:
             return
         if self.guidance is not None:
             self.give_up()
-        avoid = np.stack(self._avoid) if self._avoid else None
-        self.guidance = self._planner.guide(self._held_poses(), present, avoid)
+        guidance = self._planner.guide(self._held_poses(), present, self._avoided())
+        if guidance.T_cam_board is None and self._avoid:
+            # What was in the way may be gone: better to ask again than to ask for nothing.
+            del self._avoid[:-1]
+            guidance = self._planner.guide(self._held_poses(), present, self._avoided())
+        self.guidance = guidance
         self._wanted_since_s = now_s
+
+    def note_refusal(self, present: Array) -> None:
+        """Ask for another placement where a board (4, 4) was refused though it is as wanted."""
+        if self.is_there(present):
+            self.give_up()
 
     def give_up(self) -> None:
         """Ask for another placement: something is in the way of this one."""
@@ -143,7 +176,8 @@ class Guide:
         """Say why a board (4, 4) need not be captured where it is; None where it adds something."""
         if self._planner is None:
             return None
-        return self._planner.adds_nothing(self._held_poses(), present, self._names)
+        held, avoid = self._held_poses(), self._avoided()
+        return self._planner.adds_nothing(held, present, self._names, avoid, self.wanted)
 
     def instruct(self, present: Array) -> list[Instruction]:
         """Say what to do with a board (4, 4)."""
@@ -167,6 +201,9 @@ class Guide:
             held, reachable = self._held_poses(), self._planner.candidates
             self._coverage = measure_coverage(self._planner.view, held, reachable)
         return self._coverage
+
+    def _avoided(self) -> Array | None:
+        return np.stack(self._avoid) if self._avoid else None
 
     def _held_poses(self) -> Array:
         return np.stack(self._held) if self._held else np.zeros((0, 4, 4))

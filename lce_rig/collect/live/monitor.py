@@ -7,6 +7,7 @@ import numpy as np
 
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.narration import Narration, image_figures, scan_figures, stream_name
+from lce_rig.collect.live.options import LiveOptions
 from lce_rig.collect.live.pumps import Pumps
 from lce_rig.collect.live.rig_clock import RigClock
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, Phase, Sound, StreamState
@@ -20,6 +21,7 @@ _EVERY_S = 0.5
 _N_CUES, _N_LOG = 8, 40
 _TICK_S = 0.5
 _ENOUGH = "enough: you may stop"
+_MET = "the target is predicted to be met"
 _WAIT = "waiting for the sensors"
 # Without a frame for so long, what was seen before says nothing about the board any more.
 _STALE_S = 2.0
@@ -32,11 +34,11 @@ class Monitor:
         reasons: why the board is not seen, by the stream's name.
     """
 
-    def __init__(self, session: Session, n_wanted: int | None, pumps: Pumps, clock: RigClock) -> None:
+    def __init__(self, session: Session, options: LiveOptions, pumps: Pumps, clock: RigClock) -> None:
         """Begin with nothing seen."""
         self.reasons: dict[str, Refusal] = {}
         self._session = session
-        self._n_wanted = n_wanted
+        self._options = options
         self._pumps = pumps
         self._clock = clock
         self._began_s = self._told_s = self._asked_s = time.monotonic()
@@ -97,6 +99,11 @@ class Monitor:
         self._n_logged += 1
         self._log.append(f"{elapsed_s // 60:02d}:{elapsed_s % 60:02d} {text}")
 
+    def last_words(self) -> str:
+        """Repeat what was said last, for a report."""
+        said = self._narration
+        return f"last said: {said.headline}" + (f" ({said.detail})" if said.detail else "")
+
     def is_due(self) -> bool:
         """Tell whether views have not been told anything for long."""
         return time.monotonic() - self._told_s > _EVERY_S
@@ -106,8 +113,8 @@ class Monitor:
         self._told_s = now_s = time.monotonic()
         self._watch_sensors()
         if is_enough and not self._was_enough:
-            self.cue("enough", "the target is predicted to be met: you may stop")
-        self._was_enough = is_enough
+            self.cue("enough", f"{_MET}: {self._what_now()}")
+            self._was_enough = True
         phase, headline, detail = self._phase(is_enough=is_enough, has_ended=has_ended)
         rig, guidance = self._session.rig, self._guide.guidance if self._guide else None
         # Before the first capture there is nothing but wide priors.
@@ -121,7 +128,7 @@ class Monitor:
             detail=detail,
             hold_s=self._narration.hold_s if phase == "holding" else None,
             n_captures=n_captures,
-            n_wanted=self._n_wanted,
+            n_wanted=self._options.n_wanted,
             streams=self._streams(),
             drawing=self._drawing,
             coverage=self._guide.coverage() if self._guide else None,
@@ -143,12 +150,16 @@ class Monitor:
             name = sorted(self._lost)[0]
             error = self._pumps.lost().get(name)
             return "lost", f"{name} is lost", "" if error is None else f"{error[0].what} {error[0].hint}"
-        if is_enough:
+        if is_enough and not self._options.is_open:
             return "enough", _ENOUGH, said.headline
         if self._is_stale():
             waited_s = time.monotonic() - self._seen_s
             return "searching", _WAIT, f"no picture with a scan of its time for {waited_s:.0f} s"
-        return said.phase, said.headline, said.detail
+        return said.phase, said.headline, said.detail or (_MET if is_enough else "")
+
+    def _what_now(self) -> str:
+        n_wanted = self._options.n_wanted
+        return "you may stop" if n_wanted is None else f"going on to {n_wanted} captures"
 
     def _tick(self, narration: Narration) -> None:
         """Tick every half second while a board is held."""

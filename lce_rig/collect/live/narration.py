@@ -12,6 +12,7 @@ from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 
 _HOLD = "hold still"
 _SHOW = "show the board to the camera"
+_ELSEWHERE = "hold it somewhere else, tilted otherwise"
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,8 @@ def narrate_unseen(sighting: Sighting, guide: Guide, reasons: dict[str, Refusal]
     if guide.key not in sighting.images:
         why = reasons.get(stream_name(guide.key))
         # A picture without a board hardly tells why; one with half a board does.
-        return Narration("searching", _SHOW, f"{why.cause}: {why.action}" if why else "")
+        headline = f"show the board to {guide.key[0]}" if sighting.images else _SHOW
+        return Narration("searching", headline, f"{why.cause}: {why.action}" if why else "")
     why = reasons.get(guide.lidar)
     headline = why.action if why else "the LiDAR does not see the board"
     return Narration("searching", headline, f"{guide.lidar}: {why.cause}" if why else "")
@@ -58,10 +60,15 @@ def narrate_still(
         refusal: why it need not be captured here; None where it adds something.
     """
     if held_s is not None and refusal is not None:
-        return Narration("refused", _next(guide, present, refusal.action), f"not here: {refusal.cause}")
+        return narrate_refused(guide, present, refusal)
     if held_s is not None:
         return Narration("holding", _HOLD, "", max(hold_s - held_s, 0.0))
     return Narration("moving", _next(guide, present, _HOLD), guide.problem)
+
+
+def narrate_refused(guide: Guide, present: Array, refusal: Refusal) -> Narration:
+    """Say why a board is not captured where it is, and where it goes instead."""
+    return Narration("refused", _next(guide, present, refusal.action), f"not here: {refusal.cause}")
 
 
 def narrate_moving(
@@ -96,6 +103,6 @@ def scan_figures(board: LidarBoard) -> str:
 def _next(guide: Guide, present: Array, otherwise: str) -> str:
     """Say how to go on to the wanted placement; something else where the board is there, or none is known."""
     if guide.wanted is None:
-        return "hold it somewhere else, tilted otherwise" if guide.guidance is None else otherwise
+        return _ELSEWHERE if guide.guidance is None else otherwise
     instructions = guide.instruct(present)
     return say(instructions) if instructions else otherwise

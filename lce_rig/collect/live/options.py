@@ -5,7 +5,10 @@ from typing import Literal
 
 from lce_rig.core.errors import SourceError
 
-Ending = Literal["enough", "frames", "timeout", "stopped", "lost"]
+Ending = Literal["enough", "frames", "timeout", "exhausted", "stopped", "lost"]
+"""enough: the target is predicted to be met; frames: as many captures as wanted; timeout: the time is over;
+exhausted: nothing new was shown for `LiveOptions.idle_s`; stopped: by the user; lost: a sensor is gone."""
+
 Key = Literal["stop", "capture", "next"]
 """stop: end; capture: take what is seen now; next: propose another placement."""
 
@@ -23,6 +26,7 @@ class LiveOptions:
         hold_s: how long a board stands still before it is captured, beyond the first half second.
         lost_s: how long a lost sensor is waited for.
         goes_on: whether to go on when the target is met, until told to stop.
+        idle_s: ends after so long without a capture, for runs that nobody looks after; None never.
         search_interval_s: how often a whole picture is searched while no board is in sight.
     """
 
@@ -31,7 +35,13 @@ class LiveOptions:
     hold_s: float = HOLD_S
     lost_s: float = 60.0
     goes_on: bool = False
+    idle_s: float | None = None
     search_interval_s: float = 0.3
+
+    @property
+    def is_open(self) -> bool:
+        """Whether to go on when the target is predicted to be met."""
+        return self.goes_on or self.n_wanted is not None
 
 
 @dataclass
@@ -40,6 +50,7 @@ class LiveReport:
 
     Attributes:
         ending: why it ended.
+        is_enough: whether the session holds enough for the profile's target, as far as is known.
         captured: names of the new captures, in order.
         latencies_s: from each decision until its capture was safe on the disk.
         n_frames: frames looked at.
@@ -51,6 +62,7 @@ class LiveReport:
     """
 
     ending: Ending = "stopped"
+    is_enough: bool = False
     captured: list[str] = field(default_factory=list)
     latencies_s: list[float] = field(default_factory=list)
     n_frames: int = 0

@@ -1,8 +1,8 @@
 """The simulated rig in real time: its sensors as live sources, and a person who follows the guidance.
 
 The simulation runs in a process of its own, as sensors do. While the board is held, its scene is rendered
-once and measured anew for each picture and scan; on its way it is rendered every time, and samples come as
-fast as that goes.
+once and measured anew for each picture and scan; on its way it is rendered every time. Where the computer
+is too slow for that, all of it goes in slow motion: sensors, stamps and the person keep one simulated time.
 """
 
 import multiprocessing
@@ -24,7 +24,7 @@ from lce_rig.core.errors import LceRigError, ProfileError, SourceError
 from lce_rig.core.geometry import Array, invert
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
-from lce_rig.simulate.live_scene import LiveScene
+from lce_rig.simulate.live_scene import LiveScene, between
 from lce_rig.sources.live.base import LiveSource, Mailbox, SourceStatus
 from lce_rig.sources.live.reading import RateMeter
 
@@ -35,6 +35,8 @@ REACTION_S = 0.7
 WALK_MPS = 0.6
 AGAIN_S = 7.0
 _TRIES = 8
+# Where something is in the way they go as far as they can.
+_SHARES = (1.0, 0.75, 0.5, 0.25)
 _START = HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0)
 _PERSON_STREAM = 101
 _WAIT_S, _N_SLOTS = 0.2, 32
@@ -174,9 +176,9 @@ class SimulatedRig:
     def watch(self, state: LiveState) -> None:
         """Let the person see a state of the collection: where the board is wanted, and what was captured."""
         drawing = state.drawing
-        if drawing is None or drawing.wanted is None or state.phase in ("holding", "saving", "enough"):
+        if drawing is None or drawing.wanted is None or state.phase in ("holding", "saving"):
             return
-        wanted, now_s = (state.n_captures, drawing.wanted.tobytes()), time.monotonic()
+        wanted, now_s = (state.n_captures, drawing.wanted.tobytes()), self.pace.simulated_s
         if wanted != self._last:
             self._last, self._changed_s = wanted, now_s
             self._sent_s = -1e9
@@ -239,23 +241,26 @@ def _simulate(connection: Connection, rig: Rig, seed: int, person: Person, views
         return  # Whoever started this was ended meanwhile.
     if isinstance(answer, LceRigError):
         return
-    walker = _Walker(scene, person, views)
+    walker = Walker(scene, person, views)
     period_ns = max(model.period_ns for model in scene.stage.models.values())
-    due_ns = time.time_ns()
+    stamp_ns, due_s = time.time_ns(), time.monotonic()
     try:
         while True:
             while connection.poll():
-                walker.hear(*connection.recv())
-            walker.walk(time.monotonic())
-            due_ns = max(due_ns + period_ns, time.time_ns() - period_ns)
-            for sample in scene.take(due_ns - period_ns):
+                camera, wanted = connection.recv()
+                walker.hear(camera, wanted, stamp_ns * 1e-9)
+            walker.walk(stamp_ns * 1e-9)
+            for sample in scene.take(stamp_ns):
                 connection.send(sample)
-            time.sleep(max(0.0, (due_ns - time.time_ns()) * 1e-9))
+            stamp_ns += period_ns
+            # Late is late: a turn that took long is not made up for by short ones.
+            due_s = max(due_s + period_ns * 1e-9, time.monotonic())
+            time.sleep(max(0.0, due_s - time.monotonic()))
     except (EOFError, OSError, KeyboardInterrupt):
         return
 
 
-class _Walker:
+class Walker:
     """Carries the board to where it is wanted, as far as the room lets it."""
 
     def __init__(self, scene: LiveScene, person: Person, views: Mapping[str, View]) -> None:
@@ -265,15 +270,26 @@ class _Walker:
         self._rng = scene.stage.rng(_PERSON_STREAM)
         self._way: tuple[Array, Array, float, float] | None = None
 
-    def hear(self, camera: str, wanted: Array) -> None:
-        """Set out for a placement T_cam_board (4, 4)."""
+    @property
+    def is_walking(self) -> bool:
+        """Whether the board is on its way."""
+        return self._way is not None
+
+    def hear(self, camera: str, wanted: Array, now_s: float) -> None:
+        """Set out for a placement T_cam_board (4, 4), or as far towards it as the board can be held.
+
+        Args:
+            camera: by which it is wanted.
+            wanted: (4, 4).
+            now_s: simulated time.
+        """
         view, T_world_cam = self._views[camera], self._scene.stage.T_world_sensor[camera]
         present = invert(T_world_cam) @ self._scene.T_world_board
-        for _ in range(_TRIES):
-            reached = T_world_cam @ self._person.follow(view, present, wanted, self._rng)
+        for share in np.repeat(_SHARES, _TRIES):
+            aim = wanted if share == 1 else between(present, wanted, share)
+            reached = T_world_cam @ self._person.follow(view, present, aim, self._rng)
             if self._scene.can_be_held(camera, reached):
                 way_m = float(np.linalg.norm(reached[:3, 3] - self._scene.T_world_board[:3, 3]))
-                now_s = time.monotonic()
                 self._way = self._scene.T_world_board, reached, now_s, now_s + max(way_m / WALK_MPS, 0.5)
                 return
 

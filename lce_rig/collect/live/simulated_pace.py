@@ -26,6 +26,7 @@ class SimulatedPace:
         self._now_s = now_s
         self._began_s: float | None = None
         self._turns_s: deque[float] = deque()
+        self._n_turns = 0
         self._lock = threading.Lock()
 
     def begin(self) -> None:
@@ -37,6 +38,13 @@ class SimulatedPace:
         """Count a turn that has just come."""
         with self._lock:
             self._turns_s.append(self._now_s())
+            self._n_turns += 1
+
+    @property
+    def simulated_s(self) -> float:
+        """Simulated time since the beginning."""
+        with self._lock:
+            return self._n_turns * self._period_s
 
     @property
     def slowness(self) -> float:
