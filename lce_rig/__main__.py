@@ -1,5 +1,5 @@
 """`python -m lce_rig` is `lce-rig`."""
 
-from lce_rig.cli.main import main
+from lce_rig.cli.entry import main
 
 main()

@@ -8,6 +8,7 @@
     scripts/bench.py guidance    a person who follows the guidance against random placements
     scripts/bench.py paper       the experiments of the LCE-Calib paper: tables and figures, every method
     scripts/bench.py faults      sessions with faults: how many wrong results pass
+    scripts/bench.py goes_on     collections on the simulated rig: do all end with --captures?
     scripts/bench.py live        live collection under load, over real transports, for --seconds
     scripts/bench.py uncertainty  the joint estimate: errors against their bound, truth of its claim
     scripts/bench.py speed       detection, Algorithm 1, the command line
@@ -30,6 +31,7 @@ PARTS = {
     "paper": 20,
     "faults": 100,
     "uncertainty": 100,
+    "goes_on": 10,
     "live": 0,
     "speed": 0,
 }
@@ -53,7 +55,10 @@ def main() -> None:
         default=Path("build/paper"),
         help="folder of `paper`, and of what `uncertainty` keeps",
     )
-    parser.add_argument("--captures", type=int, default=30, help="of each session of `uncertainty` (30)")
+    parser.add_argument(
+        "--captures", type=int, help="of each session of `uncertainty` (default 30) and `goes_on` (20)"
+    )
+    parser.add_argument("--first-seed", type=int, default=0, help="of `goes_on` (default 0)")
     parser.add_argument(
         "--methods", default="", help="those `paper` runs anew (default: what is not kept); that of `real`"
     )
@@ -69,7 +74,15 @@ def main() -> None:
         methods = arguments.methods.split(",") if arguments.methods else ()
         bench(arguments.seeds or PARTS["paper"], arguments.output, methods, arguments.only)
     elif arguments.part == "uncertainty":
-        bench(arguments.seeds or PARTS["uncertainty"], arguments.output, arguments.only, arguments.captures)
+        bench(
+            arguments.seeds or PARTS["uncertainty"],
+            arguments.output,
+            arguments.only,
+            arguments.captures or 30,
+        )
+    elif arguments.part == "goes_on":
+        seeds = arguments.seeds or PARTS["goes_on"]
+        bench(seeds, arguments.captures or 20, arguments.only, arguments.first_seed)
     elif arguments.part == "faults":
         bench(arguments.seeds or PARTS["faults"], n_sessions=arguments.scans)
     elif arguments.part == "live":

@@ -74,7 +74,10 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     help="Stop reading once the session has N captures; say so where it stays short.",
 )
 @click.option(
-    "--frames", type=click.IntRange(1), metavar="N", help="Live: stop at N captures, not when enough."
+    "--frames",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Live: stop when the session holds N captures, not when the target is met.",
 )
 @click.option("--timeout", type=FiniteRange(0, min_open=True), metavar="S", help="Live: stop after so long.")
 @click.option("--keep-going", is_flag=True, help="Live: go on when the target is met, until told to stop.")
@@ -116,7 +119,8 @@ def collect(
     Without --from the rig's attached sensors are read. One person holds the board and is told where to go;
     captures are taken when it stands still there, or moves slowly before an event camera. No key has to be
     pressed. Collection ends when the calibration is predicted to meet the profile's target, and can be
-    continued any time. `lce-rig doctor` checks the rig first.
+    continued any time. Without a terminal it also ends after 30 minutes without a capture, with --simulated
+    after 10. `lce-rig doctor` checks the rig first.
 
     With --from, every pair of a folder becomes a capture; pictures of several cameras lie in img/CAMERA/, and
     go with the same cloud. Bags are cut where the board stands still in both

@@ -20,13 +20,14 @@ if TYPE_CHECKING:
     from lce_rig.collect.live.recorder import SampleRecorder
     from lce_rig.collect.live.simulated import SimulatedRig
     from lce_rig.collect.live.state import LiveState
+    from lce_rig.collect.preview import Preview
     from lce_rig.rig import Rig
     from lce_rig.session import Session
     from lce_rig.sources.live.base import LiveSource
 
 #: A run that nobody looks after ends after so long without a capture. The simulated person never rests;
 #: before a rig without a terminal somebody may have gone to fetch something.
-SIMULATED_IDLE_S, UNATTENDED_IDLE_S = 300.0, 1800.0
+SIMULATED_IDLE_S, UNATTENDED_IDLE_S = 600.0, 1800.0
 _ENDINGS = {
     "enough": "the target is predicted to be met",
     "frames": "as many captures as wanted",
@@ -162,10 +163,17 @@ def _open_preview(
     from lce_rig.collect.preview import Preview, parse_address
 
     host, port = parse_address(given.preview)
-    preview = stack.enter_context(Preview(host, port))
+    preview = Preview(host, port)
+    stack.callback(_tell_troubles, preview)
+    stack.enter_context(preview)
     for url in preview.urls:
         show.note(f"preview: {url}")
     return [preview.publish], preview.urls
+
+
+def _tell_troubles(preview: "Preview") -> None:
+    for text in preview.notes():
+        show.note(text)
 
 
 @contextmanager

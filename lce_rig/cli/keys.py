@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from lce_rig.collect.live.options import Key
+from lce_rig.core.interrupts import patience
 
 _KEYS: dict[str, Key] = {"q": "stop", "\x03": "stop", " ": "capture", "n": "next"}
+_ENDING_S = 10.0
 HELP = "q stop   space capture now   n another place"
 
 
@@ -55,7 +57,9 @@ def controls() -> Iterator[Controls]:
     try:
         if is_interactive:
             tty.setcbreak(sys.stdin)
-        yield asked
+        # The first request ends it in good order: captures that were decided on are written first.
+        with patience(_ENDING_S):
+            yield asked
     finally:
         if settings is not None:
             with suppress(termios.error):  # The terminal may be gone.

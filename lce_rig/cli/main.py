@@ -9,7 +9,11 @@ from typing import Any
 import click
 
 from lce_rig import __version__
+from lce_rig.cli.entry import main
 from lce_rig.core.errors import LceRigError
+from lce_rig.core.interrupts import EXIT_INTERRUPTED, INTERRUPTED
+
+__all__ = ["COMMANDS", "main", "run"]
 
 # Verb -> (module with a click command of the verb's name, help line). Modules are imported when the verb
 # runs, so that `lce-rig --help` stays instant.
@@ -26,7 +30,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of independent sessions."),
 }
 EXIT_BUG = 70
-EXIT_INTERRUPTED = 130
 
 EPILOG = """\b
 Exit codes: 0 done · 1 other error · 2 usage · 3 rig profile · 4 session ·
@@ -101,7 +104,7 @@ def _comes_of_interrupt(error: BaseException | None) -> bool:
 
 
 def _interrupted() -> int:
-    click.echo("interrupted; what was written so far is whole", err=True)
+    click.echo(INTERRUPTED, err=True)
     return EXIT_INTERRUPTED
 
 
@@ -147,16 +150,3 @@ def run(arguments: list[str]) -> int:
         traceback.print_exc()
         click.secho("this is a bug in lce-rig: please report it with these lines", fg="red", err=True)
         return EXIT_BUG
-
-
-def _open_closed_streams() -> None:
-    """Stand /dev/null in for standard streams that were closed (`lce-rig collect <&-`), as services start."""
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115, PTH123
-
-
-def main() -> None:
-    """Entry point of the installed command."""
-    _open_closed_streams()
-    sys.exit(run(sys.argv[1:]))

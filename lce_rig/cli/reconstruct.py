@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from lce_rig.sources.events.recording import EventRecording
 
 STAMPS = "stamps.csv"
+# Fourteen hours at the default period; one wild stamp makes a recording centuries long.
+_MAX_PICTURES = 1_000_000
 # Enough for the network to settle before the first picture wanted.
 _WARM_UP_NS = 1_500_000_000
 
@@ -133,7 +135,7 @@ def _stamps(
     """List when pictures are wanted.
 
     Raises:
-        UsageError: all of them after the recording's end.
+        UsageError: all of them after the recording's end, or more than a million.
     """
     from lce_rig.core.errors import UsageError
 
@@ -144,7 +146,14 @@ def _stamps(
         raise UsageError(
             f"--start {start_s:g}: {recording} ends {1e-9 * (last_ns - first_ns):.3f} s after its first event"
         )
-    return range(begin_ns + every_ns, max(end_ns, begin_ns + every_ns) + 1, every_ns)
+    wanted = range(begin_ns + every_ns, max(end_ns, begin_ns + every_ns) + 1, every_ns)
+    n_wanted = (wanted.stop - wanted.start - 1) // every_ns + 1
+    if n_wanted > _MAX_PICTURES:
+        raise UsageError(
+            f"{recording} lasts {1e-9 * (last_ns - first_ns):.3g} s: {n_wanted:.3g} images, "
+            f"maximum {_MAX_PICTURES}. Set --duration or a longer --every."
+        )
+    return wanted
 
 
 def _write(

@@ -196,7 +196,7 @@ def _warn_of_doubts(rig: "Rig") -> None:
 def new_profile(name: str, origin: str, settings: tuple[str, ...], output: str | None) -> None:
     """Derive a profile NAME from another; its comments stay."""
     from lce_rig.core.errors import UsageError
-    from lce_rig.rig import derive_text, find_profile, load_rig
+    from lce_rig.rig import derive_text, find_profile, load_rig, read_profile
 
     pairs = [setting.partition("=") for setting in settings]
     for key, equals, value in pairs:
@@ -206,7 +206,7 @@ def new_profile(name: str, origin: str, settings: tuple[str, ...], output: str |
             )
     parent = load_rig(origin)
     path = Path(output or f"{name}.yaml")
-    original = find_profile(origin).read_text(encoding="utf-8")
+    original = read_profile(find_profile(origin))
     values = [(key.strip(), value.strip()) for key, _, value in pairs]
     target = name if output == "-" else str(path)
     text = derive_text(original, name, values, f"{target} (not written)", parent.name)

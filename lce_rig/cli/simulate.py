@@ -226,6 +226,7 @@ def require_kind(session: Path, seed: int | None) -> None:
     Raises:
         SessionError: the session holds captures of another kind.
     """
+    from lce_rig.core.documents import read_json
     from lce_rig.core.errors import SessionError
 
     truth = session / TRUTH
@@ -237,8 +238,8 @@ def require_kind(session: Path, seed: int | None) -> None:
     if seed is None:
         raise SessionError(f"{session} is a simulated session ({TRUTH} is in it)", hint)
     try:
-        held = json.loads(truth.read_text(encoding="utf-8")).get("seed")
-    except (ValueError, AttributeError) as error:
+        held = read_json(truth).get("seed")
+    except (OSError, ValueError, AttributeError) as error:
         raise SessionError(f"{truth} is damaged", hint) from error
     if held != seed:
         raise SessionError(f"{session} was simulated with seed {held}, not {seed}", f"Add --seed {held}.")

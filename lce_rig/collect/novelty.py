@@ -1,15 +1,17 @@
 """Whether the board stands differently from every capture before."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from lce_rig.core.errors import LceRigError
-from lce_rig.core.geometry import Array, rotation_angle
+from lce_rig.core.geometry import Array, parse_pose, rotation_angle
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.session import Capture, Session
+from lce_rig.rig import Rig
+from lce_rig.session import Capture, Session, check_capture
 
 ImageKey = tuple[str, str]
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
@@ -81,17 +83,24 @@ def capture_poses(capture: Capture, session: Session) -> dict[ImageKey, Array]:
     """Find where each camera saw the board, T_cam_board (4, 4), by (camera, channel).
 
     Raises:
-        SessionError: the capture is damaged.
+        SessionError: the capture is damaged, or of another rig.
     """
+    check_capture(session.rig, capture)
     stored = capture.meta.get("T_cam_board")
     if isinstance(stored, dict):
-        poses = {tuple(key.split(".", 1)): np.array(pose, dtype=np.float64) for key, pose in stored.items()}
-        return {(key[0], key[-1]): pose for key, pose in poses.items() if pose.shape == (4, 4)}
+        return dict(_stored_poses(stored, session.rig))
     found = {}
     for camera, channel in capture.image_keys:
-        if camera not in session.rig.cameras:
-            continue
         board = BoardFinder(session.rig).search_image(capture.image(camera, channel)).board
         if isinstance(board, ImageBoard):
             found[camera, channel] = board.T_cam_board
     return found
+
+
+def _stored_poses(stored: Mapping[str, Any], rig: Rig) -> Iterator[tuple[ImageKey, Array]]:
+    """Read the poses of a capture's meta data; what is no pose of a camera of the rig is skipped."""
+    for name, value in stored.items():
+        camera, _, channel = name.partition(".")
+        if camera in rig.cameras and channel in rig.cameras[camera].channels:
+            with suppress(ValueError):
+                yield (camera, channel), parse_pose(value)

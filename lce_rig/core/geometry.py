@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+_FARTHEST_M = 1e6
 
 
 def skew(v: Array) -> Array:
@@ -86,6 +87,34 @@ def pose(R: Array, t: Array) -> Array:
     shape = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
     T = np.zeros((*shape, 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
+
+
+def parse_pose(value: Any, rounding: float = 1e-6) -> Array:
+    """Build a pose from what a document holds: four lists of four numbers.
+
+    Args:
+        value: whatever was read.
+        rounding: how far its rotation may be off one for having been printed with few digits.
+
+    Returns:
+        (4, 4), its rotation made exact.
+
+    Raises:
+        ValueError: it is none; in words that follow its name.
+    """
+    is_matrix = isinstance(value, list) and len(value) == 4
+    if not is_matrix or not all(isinstance(row, list) and len(row) == 4 for row in value):
+        raise ValueError("is missing or no 4x4 matrix of numbers")
+    if not all(
+        type(figure) in (int, float) and abs(figure) <= _FARTHEST_M for row in value for figure in row
+    ):
+        raise ValueError("is missing or no 4x4 matrix of numbers")
+    T = np.array(value, dtype=np.float64)
+    R = project_to_so3(T[:3, :3])
+    if np.abs(R - T[:3, :3]).max() > rounding or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
+        raise ValueError("is no rigid transform")
+    T[:3, :3] = R
     return T
 
 

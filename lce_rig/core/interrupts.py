@@ -1,9 +1,119 @@
-"""Ctrl-C while compiled libraries initialise."""
+"""Ctrl-C: the program ends soon, whatever it is doing, in one line and with one exit code."""
 
+import atexit
+import os
+import select
 import signal
+import sys
+import termios
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import Any
+
+EXIT_INTERRUPTED = 130
+INTERRUPTED = "interrupted; what was written so far is whole"
+#: So long the program may take to end in good order; compiled code, and threads, may not notice at all.
+GRACE_S = 1.2
+# One key press can arrive twice, from the terminal and from a program that passes it on.
+_SAME_PRESS_S = 0.1
+# Leaves the alternate screen and shows the cursor, whichever of these a view has changed.
+_SCREEN_AS_BEFORE = b"\x1b[?1049l\x1b[?25h"
+
+
+class _Watch:
+    """Ends the process where Ctrl-C has not, after a grace or at the second press."""
+
+    def __init__(self) -> None:
+        self.grace_s = GRACE_S
+        self.is_raising = True
+        self._pressed_s: float | None = None
+        self._settings: list[Any] | None = None
+        with suppress(termios.error, OSError, ValueError, AttributeError):
+            self._settings = termios.tcgetattr(sys.stdin)
+        # Python runs its handlers between two steps of the main thread only; this is written at once.
+        self._pressed, told = os.pipe()
+        os.set_blocking(told, False)
+        signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+        signal.signal(signal.SIGINT, self._interrupt)
+        threading.Thread(target=self._run, name="watch for Ctrl-C", daemon=True).start()
+
+    def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
+        if self.is_raising:
+            self.is_raising = False  # A second one would reach what cleans up after the first.
+            raise KeyboardInterrupt
+
+    def _run(self) -> None:
+        while True:
+            left_s = None
+            if self._pressed_s is not None:
+                left_s = max(0.0, self._pressed_s + self.grace_s - time.monotonic())
+            if not select.select([self._pressed], [], [], left_s)[0]:
+                self.end()
+            elif signal.SIGINT in os.read(self._pressed, 64):
+                now_s = time.monotonic()
+                if self._pressed_s is None:
+                    self._pressed_s = now_s
+                elif now_s - self._pressed_s > _SAME_PRESS_S:
+                    self.end()
+
+    def end(self) -> None:
+        """Say so and end; threads, and whoever waits for them, are left behind."""
+        with suppress(termios.error, OSError):
+            if self._settings is not None:
+                termios.tcsetattr(sys.stdin, termios.TCSANOW, self._settings)
+            if os.isatty(2):
+                os.write(2, _SCREEN_AS_BEFORE)
+            os.write(2, f"{INTERRUPTED}\n".encode())
+        os._exit(EXIT_INTERRUPTED)
+
+
+_watch: _Watch | None = None
+
+
+def watch_for_interrupts() -> None:
+    """Let Ctrl-C raise KeyboardInterrupt, and end the process where that takes too long.
+
+    Call it once, from the main thread, before anything heavy is imported. Where Ctrl-C is ignored, as in
+    what a shell runs in the background, it stays so.
+    """
+    global _watch
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN and _watch is None:
+        sys.unraisablehook = _without_interrupts(sys.unraisablehook)
+        # Python's last steps go without handlers, and Ctrl-C would hide how the program went.
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
+        _watch = _Watch()
+
+
+def interrupt_no_more() -> None:
+    """Let the program end as it is about to; the watch goes on."""
+    if _watch is not None:
+        _watch.is_raising = False
+
+
+@contextmanager
+def patience(grace_s: float) -> Iterator[None]:
+    """Give the program longer to end in good order, while the block lasts."""
+    if _watch is None:
+        yield
+        return
+    before_s, _watch.grace_s = _watch.grace_s, grace_s
+    try:
+        yield
+    finally:
+        _watch.grace_s = before_s
+
+
+def _without_interrupts(hook: Any) -> Any:
+    """Leave out interrupts that reached code which cannot raise them; the watch ends the program then."""
+
+    def tell(unraisable: Any) -> None:
+        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+            hook(unraisable)
+
+    return tell
 
 
 @contextmanager

@@ -1,13 +1,13 @@
 """How much a file may ask for: one place for what a real sensor can reach.
 
-Sizes that a file declares are checked against these limits before memory is taken, and decompression stops at
+Sizes that a file declares are checked against these limits before memory is taken, and unpacking stops at
 them. A reader reports a limit as it reports damage, by a ValueError with words that follow the file's name.
 """
 
 import os
 import stat
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 MAX_PIXELS = 1 << 26
 """Of one image: 67 megapixels."""
@@ -25,20 +25,18 @@ MAX_LINE_BYTES = 1 << 12
 """One line of text with figures."""
 MAX_EVENTS = 1 << 26
 """Of one file or stretch that has to be in memory as a whole: half a minute at two million a second."""
-
-_PIECE_BYTES = 1 << 20
-
-
-class _Decompressor(Protocol):
-    """What bz2, lzma, zlib's like, zstd and lz4.frame have in common."""
-
-    @property
-    def eof(self) -> bool: ...
-
-    @property
-    def needs_input(self) -> bool: ...
-
-    def decompress(self, data: bytes, max_length: int = -1) -> bytes: ...
+MAX_NETWORK_BYTES = 1 << 29
+"""Voxels and states of one step of a network: E2VID's at 1280 x 720 take 220 MB."""
+MAX_EVENT_PIXELS = 1 << 22
+"""Of one event camera: four times the largest on sale."""
+MAX_TIME_NS = 1 << 62
+"""No timestamp is so far from zero: the year 2116 by clocks that count from 1970. Differences fit 64 bits."""
+MAX_PACKET_BYTES = 1 << 24
+"""Of events in one message: drivers send some ms at a time."""
+MAX_TOPICS = 1 << 14
+"""Of one bag, with every publisher of each counted."""
+MAX_RECORDS = 1 << 18
+"""Of one chunk of a bag."""
 
 
 def open_regular(path: Path) -> BinaryIO:
@@ -73,7 +71,7 @@ def read_file(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
         n_bytes = os.fstat(file.fileno()).st_size
         if n_bytes > max_bytes:
             raise ValueError(
-                f"it is too large: {_megabytes(n_bytes)}, at most {_megabytes(max_bytes)} are read"
+                f"it is too large: {megabytes(n_bytes)}, at most {megabytes(max_bytes)} are read"
             )
         return file.read(max_bytes)
 
@@ -85,37 +83,23 @@ def check_size(n_bytes: int, what: str = "it", max_bytes: int = MAX_CHUNK_BYTES)
         ValueError: it is negative, or beyond the limit.
     """
     if not 0 <= n_bytes <= max_bytes:
-        raise ValueError(f"{what} declares {_megabytes(n_bytes)}, at most {_megabytes(max_bytes)} are read")
+        raise ValueError(f"{what} declares {megabytes(n_bytes)}, at most {megabytes(max_bytes)} are read")
     return n_bytes
 
 
-def decompress(decompressor: _Decompressor, data: bytes, max_bytes: int = MAX_CHUNK_BYTES) -> bytes:
-    """Unpack one stream, bit by bit, and stop where it grows beyond a limit.
-
-    Args:
-        decompressor: a new one of bz2, lzma, zstd or lz4.frame.
-        data: the whole stream.
-        max_bytes: of what it unpacks to.
+def check_points(n_points: int) -> int:
+    """Pass a declared number of points through where a scan can have as many.
 
     Raises:
-        ValueError: it is larger, or ends before its end.
-        Exception: it is damaged, as the library says.
+        ValueError: it is negative, or beyond the limit.
     """
-    parts: list[bytes] = []
-    n_left, rest = max_bytes, data
-    while not decompressor.eof:
-        part = decompressor.decompress(rest, min(_PIECE_BYTES, n_left + 1))
-        rest = b""
-        n_left -= len(part)
-        parts.append(part)
-        if n_left < 0:
-            raise ValueError(f"it unpacks to more than {_megabytes(max_bytes)}")
-        if not part and decompressor.needs_input and not decompressor.eof:
-            raise ValueError("it is truncated")
-    return b"".join(parts)
+    if not 0 <= n_points <= MAX_POINTS:
+        raise ValueError(f"it declares {n_points} points, at most {MAX_POINTS} are read")
+    return n_points
 
 
-def _megabytes(n_bytes: int) -> str:
+def megabytes(n_bytes: int) -> str:
+    """Write a size as messages show it."""
     return f"{n_bytes / 1e6:.0f} MB" if abs(n_bytes) < 1e12 else f"{n_bytes / 1e12:.3g} TB"
 
 
@@ -123,3 +107,8 @@ def describe(value: Any) -> str:
     """Show a value of a file in a message, cut to a length that fits on a screen."""
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def shorten(text: str) -> str:
+    """Cut a name that a file gives to a length that fits on a screen."""
+    return text if len(text) <= 120 else text[:117] + "..."

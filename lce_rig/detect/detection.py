@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.data import Image
+from lce_rig.core.documents import parse_json
 from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, Refusal
+from lce_rig.detect.detection_fields import check_fields
 
 Arrays = dict[str, NDArray[Any]]
 LidarDetection = list[LidarBoard] | Refusal
@@ -48,10 +50,10 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> ImageDetection | LidarDet
         ValueError: the arrays are not a detection.
     """
     try:
-        document = json.loads(bytes(arrays["head"]).decode())
+        document = parse_json(arrays["head"].tobytes(), is_finite=False)
         items = [_rebuild(index, head, arrays) for index, head in enumerate(document["items"])]
         return items if document["is_list"] else items[0]
-    except (KeyError, TypeError, IndexError, UnicodeDecodeError) as error:
+    except (KeyError, TypeError, IndexError, AttributeError, ValueError) as error:
         raise ValueError(f"not a detection: {error!r}") from error
 
 
@@ -63,6 +65,7 @@ def _rebuild(index: int, head: dict[str, Any], arrays: Mapping[str, NDArray[Any]
     kind = _KINDS[head.pop("kind")]
     prefix = f"{index}."
     own = {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)}
+    check_fields(kind, {**head, **own})
     return kind(**head, **own)
 
 

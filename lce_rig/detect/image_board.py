@@ -31,6 +31,8 @@ NOT_SEEN_AT_ONCE = Refusal("image", "no board at first sight", "search the pictu
 _AMBIGUOUS_CHI2 = 9.0
 # A part of the picture may be missing at its end (a cut-off readout); a larger difference is another mode.
 _CUT_FRACTION = 0.02
+# A canvas is larger than the sensor by as much at most; to look at more than that takes memory.
+_CANVAS_FRACTION = 3.0
 # Corners that the finder misplaced, or that an artefact covers, at most.
 _MAX_MISPLACED = 0.08
 # A quarter of a full fit's time; corners are then known to 0.03 px, plenty for stillness and guidance.
@@ -154,16 +156,17 @@ def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8
     Raises:
         ProfileError: any other size, naming both.
     """
-    grey = image.grey
-    height, width = grey.shape
+    height, width = image.pixels.shape[:2]
     wanted_width, wanted_height = intrinsics.width_px, intrinsics.height_px
     if (width, height) == (wanted_width, wanted_height):
-        return grey
+        return image.grey
     missing_u, missing_v = 1 - width / wanted_width, 1 - height / wanted_height
     if 0 <= missing_u <= _CUT_FRACTION and 0 <= missing_v <= _CUT_FRACTION:
-        return grey
-    if missing_u <= 0 and missing_v <= 0 and _is_blank_beyond(grey, wanted_width, wanted_height):
-        return grey[:wanted_height, :wanted_width]
+        return image.grey
+    if -_CANVAS_FRACTION <= missing_u <= 0 and -_CANVAS_FRACTION <= missing_v <= 0:
+        grey = image.grey
+        if _is_blank_beyond(grey, wanted_width, wanted_height):
+            return grey[:wanted_height, :wanted_width]
     hint = "use the intrinsics of this mode, or record in the mode the intrinsics were calibrated in"
     if abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width:
         hint += f"; if the picture is only scaled, multiply fx, fy, cx, cy by {width / wanted_width:.4g}"
@@ -179,6 +182,8 @@ def _is_blank_beyond(grey: NDArray[np.uint8], width_px: int, height_px: int) -> 
     steps = np.abs(np.diff(grey.astype(np.int16), axis=1))
     inside = np.percentile(steps[:height_px, : width_px - 1], 99)
     beyond = np.concatenate([steps[height_px:].ravel(), steps[:height_px, width_px + 8 :].ravel()])
+    if not len(beyond):
+        return False  # Columns next to the sensor's are not judged, and there are no others.
     return bool(np.percentile(beyond, 99) <= max(0.3 * inside, 2.0))
 
 

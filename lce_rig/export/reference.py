@@ -1,15 +1,13 @@
 """A reference extrinsic from outside, to report errors against."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from lce_rig.core.documents import read_json
 from lce_rig.core.errors import SessionError
-from lce_rig.core.geometry import Array, project_to_so3
+from lce_rig.core.geometry import Array, parse_pose
 
 # References are often printed with four digits.
 _ROUNDING = 5e-3
@@ -34,11 +32,11 @@ def read_reference(path: Path) -> Reference:
         SessionError: there is none, or it is no rigid transform.
     """
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = read_json(path)
     except OSError as error:
         raise SessionError(f"{path} cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise SessionError(f"{path} is not JSON: {error}") from error
+    except ValueError as error:
+        raise SessionError(f"{path}: {error}") from error
     if not isinstance(document, dict):
         raise SessionError(f"{path}: holds no T_cam_lidar")
     pairs = document.get("pairs")
@@ -53,15 +51,8 @@ def read_reference(path: Path) -> Reference:
 
 def _pose(path: Path, key: str, holder: Mapping[str, Any]) -> Array:
     try:
-        T = np.array(holder["T_cam_lidar"], dtype=np.float64)
-    except (KeyError, TypeError, ValueError):
-        T = np.zeros(0)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise SessionError(f"{path}: {key} is missing or no 4x4 matrix of numbers")
-    R = project_to_so3(T[:3, :3])
-    if np.abs(R - T[:3, :3]).max() > _ROUNDING or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
+        return parse_pose(holder.get("T_cam_lidar"), _ROUNDING)
+    except ValueError as error:
         raise SessionError(
-            f"{path}: {key} is no rigid transform", "It takes points from the LiDAR to the camera."
-        )
-    T[:3, :3] = R
-    return T
+            f"{path}: {key} {error}", "It takes points from the LiDAR to the camera."
+        ) from error

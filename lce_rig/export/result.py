@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from lce_rig.core.documents import read_json
 from lce_rig.core.errors import ResultRefusedError, SessionError
 from lce_rig.core.geometry import Array
+from lce_rig.core.limits import describe
 from lce_rig.core.results import Calibration, ChannelResult, OtherCamera, PointUncertainty
 from lce_rig.export.result_schema import ChannelRecord, OtherCameraRecord, PairRecord, ResultRecord
 from lce_rig.export.writing import MADE_BY, write_atomically
@@ -182,19 +184,19 @@ def read_result(path: Path) -> SavedResult:
         SessionError: no such file, or not a result that can be trusted; with the key at fault.
     """
     try:
-        data = json.loads(path.read_bytes(), parse_constant=_refuse_constant)
+        data = read_json(path)
     except FileNotFoundError as error:
         raise SessionError(
             f"{path}: there is no such file", "`lce-rig calibrate SESSION` writes it"
         ) from error
     except OSError as error:
         raise SessionError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise SessionError(f"{path}: not JSON: {error}", "run `lce-rig calibrate SESSION` again") from error
+    except ValueError as error:
+        raise SessionError(f"{path}: {error}", "run `lce-rig calibrate SESSION` again") from error
     version = data.get("format_version") if isinstance(data, dict) else None
     if version != FORMAT_VERSION or isinstance(version, bool):
         raise SessionError(
-            f"{path}: format_version is {version!r}, this lce-rig reads {FORMAT_VERSION}",
+            f"{path}: format_version is {describe(version)}, this lce-rig reads {FORMAT_VERSION}",
             "run `lce-rig calibrate SESSION` again",
         )
     try:
@@ -202,14 +204,12 @@ def read_result(path: Path) -> SavedResult:
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
-        what = f"{path}: {key + ': ' if key else ''}{first['msg'].removeprefix('Value error, ')}"
+        what = (
+            f"{path}: {describe(key)[1:-1] + ': ' if key else ''}{first['msg'].removeprefix('Value error, ')}"
+        )
         raise SessionError(what, "run `lce-rig calibrate SESSION` again") from error
     calibrations = tuple(_calibration(pair) for pair in record.pairs)
     return SavedResult(record.rig, record.made_by, calibrations, record.inputs_sha256)
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is no number")
 
 
 def _calibration(pair: PairRecord) -> Calibration:

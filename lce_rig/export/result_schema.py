@@ -3,12 +3,40 @@
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-_Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
-_Row6 = Annotated[list[float], Field(min_length=6, max_length=6)]
-_NotNegative = Annotated[float, Field(ge=0)]
-_Count = Annotated[int, Field(ge=0)]
+_FARTHEST_M = 1e6
+
+
+def _check_pose(rows: list[list[float]]) -> list[list[float]]:
+    T = np.array(rows)
+    R = T[:3, :3]
+    if not np.array_equal(T[3], [0, 0, 0, 1]):
+        raise ValueError("the last row is not 0 0 0 1")
+    if np.abs(R).max() > 2 or not (np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0):
+        raise ValueError("not a rotation")
+    if np.abs(T[:3, 3]).max() > _FARTHEST_M:
+        raise ValueError(f"a translation beyond {_FARTHEST_M:g} m")
+    return rows
+
+
+def _check_cov(rows: list[list[float]]) -> list[list[float]]:
+    cov = np.array(rows)
+    if not np.allclose(cov, cov.T, rtol=1e-6, atol=1e-18):
+        raise ValueError("not symmetric")
+    if np.diag(cov).min() < 0:
+        raise ValueError("a variance is negative")
+    return rows
+
+
+# Products of such figures stay far from overflow; a direction that is open has a variance beyond a million.
+_Figure = Annotated[float, Field(ge=-1e100, le=1e100)]
+_Row4 = Annotated[list[_Figure], Field(min_length=4, max_length=4)]
+_Row6 = Annotated[list[_Figure], Field(min_length=6, max_length=6)]
+_Pose = Annotated[list[_Row4], Field(min_length=4, max_length=4), AfterValidator(_check_pose)]
+_Cov = Annotated[list[_Row6], Field(min_length=6, max_length=6), AfterValidator(_check_cov)]
+_NotNegative = Annotated[float, Field(ge=0, le=1e100)]
+_Count = Annotated[int, Field(ge=0, le=10**9)]
 
 
 class _Record(BaseModel):
@@ -36,8 +64,8 @@ class ChannelRecord(_Record):
     channel: str
     n_captures: _Count
     noise_px: _NotNegative
-    T_cam_lidar: Annotated[list[_Row4], Field(min_length=4, max_length=4)]
-    cov: Annotated[list[_Row6], Field(min_length=6, max_length=6)]
+    T_cam_lidar: _Pose
+    cov: _Cov
     depth_scatter_m: _NotNegative
     depth_scatter_still_m: _NotNegative
     time_offset_s: float | None = None
@@ -59,9 +87,9 @@ class OtherCameraRecord(_Record):
 
     camera: str
     n_captures: _Count
-    T_cam_other: Annotated[list[_Row4], Field(min_length=4, max_length=4)]
-    cov: Annotated[list[_Row6], Field(min_length=6, max_length=6)] | None
-    T_cam_other_pictures: Annotated[list[_Row4], Field(min_length=4, max_length=4)] | None
+    T_cam_other: _Pose
+    cov: _Cov | None
+    T_cam_other_pictures: _Pose | None
     apart_rotation_deg: _NotNegative | None
     apart_translation_m: _NotNegative | None
     board_rms_m: _NotNegative
@@ -73,8 +101,8 @@ class PairRecord(_Record):
     camera: str
     channel: str
     lidar: str
-    T_cam_lidar: Annotated[list[_Row4], Field(min_length=4, max_length=4)]
-    cov: Annotated[list[_Row6], Field(min_length=6, max_length=6)]
+    T_cam_lidar: _Pose
+    cov: _Cov
     sigma_rotation_deg: _NotNegative
     sigma_translation_m: _NotNegative
     n_captures: _Count
@@ -99,17 +127,7 @@ class PairRecord(_Record):
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "PairRecord":
-        T, cov = np.array(self.T_cam_lidar), np.array(self.cov)
-        R = T[:3, :3]
-        if not np.array_equal(T[3], [0, 0, 0, 1]):
-            raise ValueError("T_cam_lidar: the last row is not 0 0 0 1")
-        if not (np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0):
-            raise ValueError("T_cam_lidar: not a rotation")
-        if not np.allclose(cov, cov.T, rtol=1e-6, atol=1e-18):
-            raise ValueError("cov: not symmetric")
-        variances = np.diag(cov)
-        if variances.min() < 0:
-            raise ValueError("cov: a variance is negative")
+        variances = np.diag(np.array(self.cov))
         sigma_t, sigma_r = np.sqrt(variances[:3].sum()), np.degrees(np.sqrt(variances[3:].sum()))
         for name, value, wanted in (
             ("sigma_translation_m", self.sigma_translation_m, sigma_t),

@@ -10,14 +10,14 @@ from typing import Any
 
 from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError, SessionError
-from lce_rig.core.results import Refusal
+from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, from_arrays, to_arrays
 from lce_rig.detect.event_board import EventImage
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.pipeline.event_detection import event_channels, event_digest, see_events
 from lce_rig.pipeline.progress import Progress, silent
 from lce_rig.rig import Rig
-from lce_rig.session import Capture, Session
+from lce_rig.session import Capture, Session, check_capture
 
 Key = tuple[str, str]
 
@@ -119,7 +119,8 @@ class _Finder:
     def held(self, captures: list[Capture]) -> list[_Held]:
         """List what each capture holds.
 
-        A capture whose manifest is damaged is asked for what the others hold, so that every pair says so.
+        A capture whose manifest is damaged, or names sensors that the rig lacks, is asked for what the others
+        hold, so that every pair says so.
         """
         known: dict[str, _Held] = {}
         for capture in captures:
@@ -128,7 +129,7 @@ class _Finder:
                 stored = [key for key in capture.image_keys if key not in made_here]
                 known[capture.name] = _Held(capture, stored, made_here, capture.lidars)
         if captures and not known:
-            captures[0].image_keys  # noqa: B018  raises what is wrong with it
+            check_capture(self._session.rig, captures[0])  # raises what is wrong with it
         every = list(known.values())
         images = sorted({key for each in every for key in each.images})
         events = sorted({key for each in every for key in each.events} - set(images))
@@ -144,7 +145,9 @@ class _Finder:
             except ProfileError as error:
                 return Refusal("image", error.what, error.hint)
 
-        found: ImageDetection = self._remembered(self._digest, capture, f"{camera}.{channel}", find)
+        found: ImageDetection = self._remembered(
+            self._digest, capture, f"{camera}.{channel}", ImageBoard, find
+        )
         return found
 
     def scan(self, capture: Capture, lidar: str) -> LidarDetection:
@@ -153,7 +156,7 @@ class _Finder:
         def find() -> LidarDetection:
             return self._boards.scan(capture.scan(lidar))
 
-        found: LidarDetection = self._remembered(self._digest, capture, lidar, find)
+        found: LidarDetection = self._remembered(self._digest, capture, lidar, list, find)
         return found
 
     def events(
@@ -167,7 +170,7 @@ class _Finder:
             self._keep(_cache_key(digest, capture, f"{camera}.{channel}.picture"), seen.picture)
             return seen.board
 
-        found: ImageDetection = self._remembered(digest, capture, f"{camera}.{channel}", find)
+        found: ImageDetection = self._remembered(digest, capture, f"{camera}.{channel}", ImageBoard, find)
         return found
 
     def picture(
@@ -180,7 +183,7 @@ class _Finder:
             return seen.picture
 
         digest = self._event_digest(camera, channel)
-        found: Image | Refusal = self._remembered(digest, capture, f"{camera}.{channel}.picture", find)
+        found: Image | Refusal = self._remembered(digest, capture, f"{camera}.{channel}.picture", Image, find)
         return found
 
     def _event_digest(self, camera: str, channel: str) -> str:
@@ -195,20 +198,31 @@ class _Finder:
         digest: str,
         capture: Capture,
         sensor: str,
+        kind: type,
         find: Callable[[], ImageDetection | LidarDetection | Image],
     ) -> Any:
         """Look a detection up in the session's cache, or make and keep it; a damaged sample is a refusal."""
         try:
+            check_capture(self._session.rig, capture)
             capture.check()
             key = _cache_key(digest, capture, sensor)
             cached = self._session.load_cached(key)
             if cached is not None:
                 with suppress(ValueError):
-                    return from_arrays(cached.arrays)
+                    return self._require(from_arrays(cached.arrays), kind)
             detection = find()
         except SessionError as error:
             return Refusal("read", error.what, error.hint or "collect this placement again")
         self._keep(key, detection)
+        return detection
+
+    def _require(self, detection: Any, kind: type) -> Any:
+        """Refuse what is kept of another kind of sample, or of another board, by a ValueError."""
+        if not isinstance(detection, (kind, Refusal)):
+            raise ValueError(f"not a detection of kind {kind.__name__}")
+        board = self._session.rig.board.to_board()
+        if isinstance(detection, ImageBoard) and len(detection.corners_px) != board.cols * board.rows:
+            raise ValueError("a detection of another board")
         return detection
 
     def _keep(self, key: str, detection: ImageDetection | LidarDetection | Image) -> None:

@@ -10,7 +10,7 @@ from lce_rig.core.errors import ProfileError
 from lce_rig.detect.detection import LidarDetection
 from lce_rig.detect.event_board import EventImage, EventSighting, find_event_board, reconstructor_for
 from lce_rig.rig import ReconstructionSettings, Rig
-from lce_rig.session import Capture, Session
+from lce_rig.session import Capture, Session, check_capture
 
 
 def event_channels(rig: Rig, capture: Capture, event_image: EventImage | None) -> list[tuple[str, str]]:
@@ -18,7 +18,11 @@ def event_channels(rig: Rig, capture: Capture, event_image: EventImage | None) -
 
     A picture that a capture holds already, made by others, is taken in place of one made here, unless a way
     of making it is asked for.
+
+    Raises:
+        SessionError: the capture is damaged, or names sensors that the rig lacks.
     """
+    check_capture(rig, capture)
     return [
         (camera, name)
         for camera in capture.event_cameras

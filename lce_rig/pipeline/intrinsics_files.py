@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.documents import read_json
 from lce_rig.core.errors import LceRigError, UsageError
-from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
 from lce_rig.core.results import Refusal
 from lce_rig.export.camera_info import camera_info_text, read_camera_info, ros_distortion
 from lce_rig.export.writing import MADE_BY, number, numbers, write_atomically
@@ -84,9 +84,9 @@ def _file_names(camera: str) -> tuple[str, str, str]:
 def _other_cameras(path: Path, measured: Collection[str]) -> dict[str, dict[str, Any]]:
     """Read what an earlier run says of cameras that were not measured again; nothing where it is damaged."""
     try:
-        cameras = json.loads(read_file(path, MAX_DOCUMENT_BYTES))["cameras"]
+        cameras = read_json(path)["cameras"]
         return {str(each["camera"]): each for each in cameras if each["camera"] not in measured}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError):
         return {}
 
 

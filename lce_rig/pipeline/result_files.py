@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lce_rig.core.errors import LceRigError
+from lce_rig.core.limits import read_file
 from lce_rig.core.results import Calibration
 from lce_rig.session import Session
 from lce_rig.session.replacing import copy_over
@@ -82,7 +83,7 @@ def inputs_sha256(session: Session, calibrations: Sequence[Calibration]) -> dict
         SessionError: a capture that was used is no longer there.
     """
     used = sorted({name for calibration in calibrations for name in calibration.captures_used})
-    profile = hashlib.sha256((session.path / PROFILE).read_bytes()).hexdigest()
+    profile = hashlib.sha256(read_file(session.path / PROFILE)).hexdigest()
     manifests = {f"{CAPTURES}/{name}/{MANIFEST}": session.capture(name).manifest_sha256 for name in used}
     return {PROFILE: profile, **manifests}
 
@@ -162,4 +163,7 @@ def _is_of_a_result(path: Path) -> bool:
 
 
 def _content(path: Path) -> bytes | None:
-    return path.read_bytes() if path.is_file() else None
+    """Read a file; None where there is none, or nothing that lce-rig wrote: a pipe, or too large."""
+    with suppress(FileNotFoundError, ValueError):
+        return read_file(path)
+    return None

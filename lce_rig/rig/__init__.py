@@ -3,7 +3,7 @@
 from lce_rig.rig.board import BoardSettings
 from lce_rig.rig.editing import derive_text, set_value
 from lce_rig.rig.extrinsics import NominalExtrinsic
-from lce_rig.rig.loading import dump_rig, find_profile, load_rig, parse_rig, shipped_profiles
+from lce_rig.rig.loading import dump_rig, find_profile, load_rig, parse_rig, read_profile, shipped_profiles
 from lce_rig.rig.profile import Rig
 from lce_rig.rig.reconstruction import ReconstructionSettings
 from lce_rig.rig.sensors import (
@@ -40,6 +40,7 @@ __all__ = [
     "find_profile",
     "load_rig",
     "parse_rig",
+    "read_profile",
     "set_value",
     "shipped_profiles",
 ]

@@ -5,7 +5,7 @@ from typing import Annotated
 from pydantic import Field, field_validator, model_validator
 
 from lce_rig.core.board import Board
-from lce_rig.rig.settings import Positive, Settings, problem
+from lce_rig.rig.settings import Figure, Positive, Settings, problem
 
 _MAX_SQUARE_M = 1.0
 _MAX_PLATE_M = 5.0
@@ -26,7 +26,7 @@ class BoardSettings(Settings):
     square_m: Positive
     width_m: Positive
     height_m: Positive
-    pattern_offset_m: tuple[float, float] = (0.0, 0.0)
+    pattern_offset_m: tuple[Figure, Figure] = (0.0, 0.0)
 
     @field_validator("square_m")
     @classmethod
@@ -66,8 +66,10 @@ class BoardSettings(Settings):
 
 
 def _require_metres(value: float, limit: float) -> float:
-    if value <= limit:
+    if limit / 1000 <= value <= limit:
         return value
+    if value < limit:
+        raise problem(f"{value:g} m is smaller than any board (at least {limit / 1000:g} m)")
     for unit, factor in (("centimetres", 1e-2), ("millimetres", 1e-3)):
         # A square is never below 5 mm and a plate never below 5 cm, which tells 70 mm from 7 cm.
         if limit / 200 <= value * factor <= limit and (unit == "millimetres" or value < 10):

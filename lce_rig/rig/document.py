@@ -6,11 +6,18 @@ from typing import Any
 
 import yaml
 
+from lce_rig.core.documents import is_printable
 from lce_rig.core.errors import ProfileError
+from lce_rig.core.limits import describe
 
+BAD_SCALARS = (ValueError, ArithmeticError, LookupError, AttributeError, TypeError)
+"""What PyYAML raises of a scalar that is not what its tag says: `!!bool x`, `!!int ""`, `!!timestamp x`."""
+_MAX_INTEGER = 1 << 53
 KeyPath = tuple[str | int, ...]
 
 # A profile is a page or two; more is an attack by nested aliases or the wrong file.
+# It takes a second to parse 100 kB of YAML.
+_MAX_BYTES = 1 << 18
 _MAX_NODES = 20_000
 _MAX_DEPTH = 20
 _PLAIN_TAGS = ("tag:yaml.org,2002:map", "tag:yaml.org,2002:seq")
@@ -44,6 +51,8 @@ def read_document(text: str, source: str) -> Document:
     Raises:
         ProfileError: not YAML, not a mapping, or a key given twice; with file and line.
     """
+    if len(text) > _MAX_BYTES:
+        raise ProfileError(f"{source}: is too large to be a rig profile: {len(text)} characters")
     try:
         loader = yaml.SafeLoader(text)
         node = loader.get_single_node()
@@ -116,10 +125,18 @@ class _Reader:
 
     def _construct(self, node: yaml.Node) -> Any:
         try:
-            return self._loader.construct_object(node, deep=True)
-        except ValueError as error:
+            value = self._loader.construct_object(node, deep=True)
+        except BAD_SCALARS as error:
             line = node.start_mark.line + 1
-            raise ProfileError(f"{self._source}:{line}: {node.value!r} cannot be read: {error}") from error
+            raise ProfileError(
+                f"{self._source}:{line}: {describe(node.value)} cannot be read: {error}"
+            ) from error
+        is_large = isinstance(value, int) and abs(value) > _MAX_INTEGER
+        if is_large or (isinstance(value, str) and not is_printable(value)):
+            line = node.start_mark.line + 1
+            what = "is too large a number" if is_large else "holds half a character"
+            raise ProfileError(f"{self._source}:{line}: {describe(node.value)} {what}")
+        return value
 
 
 def _kind(data: Any) -> str:

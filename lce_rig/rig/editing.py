@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import yaml
 
 from lce_rig.core.errors import UsageError
-from lce_rig.rig.document import read_document
+from lce_rig.rig.document import BAD_SCALARS, read_document
 from lce_rig.rig.loading import rig_from_document
 
 
@@ -29,7 +29,7 @@ def derive_text(text: str, name: str, settings: Sequence[tuple[str, str]], sourc
     """
     head = f"# {name}: made from {origin} by `lce-rig rigs new`; the comments below are {origin}'s.\n"
     # A name such as 346 is a text only in quotes.
-    text = head + set_value(text, "name", name if yaml.safe_load(name) == name else json.dumps(name))
+    text = head + set_value(text, "name", name if _is_plain(name) else json.dumps(name))
     for path, value in settings:
         text = set_value(text, path, value)
     rig_from_document(read_document(text, source))
@@ -64,10 +64,18 @@ def set_value(text: str, path: str, value: str) -> str:
     return new
 
 
+def _is_plain(name: str) -> bool:
+    """Tell whether a text is read as that text without quotes."""
+    try:
+        return bool(yaml.safe_load(name) == name)
+    except (yaml.YAMLError, RecursionError, *BAD_SCALARS):
+        return False
+
+
 def _parsed(path: str, value: str) -> object:
     try:
         parsed: object = yaml.safe_load(value)
-    except (yaml.YAMLError, ValueError) as error:
+    except (yaml.YAMLError, RecursionError, *BAD_SCALARS) as error:
         raise UsageError(f"--set {path}: {value!r} is no YAML value") from error
     if "\n" in value or not value.strip() or not all(path.split(".")):
         raise UsageError(f"--set {path}={value}: KEY=VALUE is expected, such as board.square_m=0.08")
@@ -120,6 +128,6 @@ def _holds(text: str, keys: Sequence[str], wanted: object) -> bool:
         data = yaml.safe_load(text)
         for key in keys:
             data = data[int(key)] if isinstance(data, list) else data[key]
-    except (yaml.YAMLError, ValueError, LookupError, TypeError):
+    except (yaml.YAMLError, RecursionError, *BAD_SCALARS):
         return False
     return bool(data == wanted)

@@ -14,6 +14,9 @@ from lce_rig.rig.document import Document, KeyPath
 from lce_rig.rig.profile import Rig
 from lce_rig.rig.settings import PATTERNS
 
+# To look for the key that was meant takes a millisecond each; nobody reads as many.
+_MOST_SHOWN = 100
+
 
 @dataclass(frozen=True)
 class _Problem:
@@ -25,8 +28,9 @@ class _Problem:
 
 def explain(error: ValidationError, document: Document) -> ProfileError:
     """Build the error for the user: each problem once, in the order of the file's lines."""
+    details = error.errors()
     problems = {
-        problem.path: problem for problem in reversed([_problem(detail) for detail in error.errors()])
+        problem.path: problem for problem in reversed([_problem(detail) for detail in details[:_MOST_SHOWN]])
     }
     meant = {problem.meant for problem in problems.values()}
     lines = [
@@ -37,7 +41,9 @@ def explain(error: ValidationError, document: Document) -> ProfileError:
     sentences = [f"{document.source}:{line}: {text}" for line, text in sorted(lines)]
     if len(sentences) == 1:
         return ProfileError(sentences[0])
-    return ProfileError(f"{document.source}: {len(sentences)} problems", "\n".join(sentences))
+    n_more = max(len(details) - _MOST_SHOWN, 0)
+    what = f"{document.source}: {len(sentences) + n_more} problems"
+    return ProfileError(what, "\n".join([*sentences, *([f"and {n_more} more"] if n_more else [])]))
 
 
 def _problem(detail: ErrorDetails) -> _Problem:

@@ -4,9 +4,9 @@ import numpy as np
 from pydantic import model_validator
 
 from lce_rig.core.geometry import Array, pose, project_to_so3
-from lce_rig.rig.settings import Name, Positive, Settings, problem
+from lce_rig.rig.settings import Figure, Name, Positive, Settings, problem
 
-Row = tuple[float, float, float]
+Row = tuple[Figure, Figure, Figure]
 # Drawings and papers round to three digits: a unit quaternion's norm is then off by up to about 1e-3.
 _ROUNDING = 5e-3
 
@@ -28,7 +28,7 @@ class NominalExtrinsic(Settings):
 
     camera: Name
     lidar: Name
-    quaternion_wxyz: tuple[float, float, float, float] | None = None
+    quaternion_wxyz: tuple[Figure, Figure, Figure, Figure] | None = None
     rpy_deg: Row | None = None
     matrix: tuple[Row, Row, Row] | None = None
     translation_m: Row

@@ -9,6 +9,7 @@ import yaml
 from pydantic import ValidationError
 
 from lce_rig.core.errors import ProfileError
+from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
 from lce_rig.rig.document import Document, read_document
 from lce_rig.rig.explaining import explain
 from lce_rig.rig.profile import Rig
@@ -60,13 +61,23 @@ def load_rig(name_or_path: str | Path) -> Rig:
         ProfileError: no such profile, or one that cannot be used; every problem with file, line and key.
     """
     path = find_profile(name_or_path)
+    return parse_rig(read_profile(path), str(path)).located(path.parent)
+
+
+def read_profile(path: Path) -> str:
+    """Read the text of a profile's file.
+
+    Raises:
+        ProfileError: it cannot be read, or is no text of a profile's size.
+    """
     try:
-        text = path.read_text(encoding="utf-8")
+        return read_file(path, MAX_DOCUMENT_BYTES).decode()
     except OSError as error:
         raise ProfileError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ProfileError(f"{path}: is not UTF-8 text (byte {error.start})") from error
-    return parse_rig(text, str(path)).located(path.parent)
+    except ValueError as error:
+        raise ProfileError(f"{path}: {error}") from error
 
 
 def parse_rig(text: str, source: str = "profile") -> Rig:

@@ -9,9 +9,11 @@ from pydantic import Field, model_validator
 from lce_rig.rig.board import BoardSettings
 from lce_rig.rig.extrinsics import NominalExtrinsic
 from lce_rig.rig.sensors import CameraSettings, LidarSettings
-from lce_rig.rig.settings import FrameName, Name, RigName, Settings, problem
+from lce_rig.rig.settings import FrameName, Name, RigName, Settings, Text, problem
 from lce_rig.rig.sync import SyncSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
+
+_MOST_SENSORS = 64
 
 
 class Rig(Settings):
@@ -30,11 +32,11 @@ class Rig(Settings):
 
     format_version: Literal[1]
     name: RigName
-    description: str = ""
+    description: Text = ""
     base_frame: FrameName | None = None
     board: BoardSettings
-    lidars: Annotated[dict[Name, LidarSettings], Field(min_length=1)]
-    cameras: Annotated[dict[Name, CameraSettings], Field(min_length=1)]
+    lidars: Annotated[dict[Name, LidarSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
+    cameras: Annotated[dict[Name, CameraSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
     nominal_extrinsics: tuple[NominalExtrinsic, ...] = ()
     sync: SyncSettings | None = None
     quality: QualitySettings = QualitySettings()

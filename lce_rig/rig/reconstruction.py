@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from lce_rig.core.limits import MAX_EVENTS
 from lce_rig.rig.settings import Settings, problem
 
 
@@ -19,9 +20,9 @@ class ReconstructionSettings(Settings):
     """
 
     method: Literal["network", "map"] = "network"
-    model: Annotated[str, Field(min_length=1)] | None = None
+    model: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
     window_s: Annotated[float, Field(ge=0.001, le=10)] | None = None
-    window_events: Annotated[int, Field(ge=1)] | None = None
+    window_events: Annotated[int, Field(ge=1, le=MAX_EVENTS)] | None = None
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "ReconstructionSettings":

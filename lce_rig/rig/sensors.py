@@ -6,8 +6,20 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.limits import MAX_PIXELS
 from lce_rig.rig.reconstruction import ReconstructionSettings
-from lce_rig.rig.settings import FrameName, Name, NotNegative, Positive, Settings, TopicName, problem
+from lce_rig.rig.settings import (
+    Figure,
+    FrameName,
+    Name,
+    NotNegative,
+    Positive,
+    Rate,
+    Settings,
+    Text,
+    TopicName,
+    problem,
+)
 
 # Beyond this the figure is in millimetres, or the sensor is broken.
 RangeError = Annotated[float, Field(ge=0, le=0.2)]
@@ -68,13 +80,13 @@ class DriverSettings(Settings):
 
     type: Name | None = None
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    address: str | None = None
-    device: str | None = None
-    command: tuple[str, ...] = ()
-    pixel_format: str | None = None
-    frame_rate_hz: Positive | None = None
+    address: Text | None = None
+    device: Text | None = None
+    command: Annotated[tuple[Text, ...], Field(max_length=1000)] = ()
+    pixel_format: Text | None = None
+    frame_rate_hz: Rate | None = None
     frame_timing: FrameTimingSettings = FrameTimingSettings()
-    controls: dict[str, bool | int | float | str] = Field(default_factory=dict)
+    controls: dict[Text, bool | int | float | Text] = Field(default_factory=dict)
 
 
 class LidarSettings(Settings):
@@ -92,10 +104,10 @@ class LidarSettings(Settings):
         range_offset_sigma_m: standard deviation of that mean, the range error common to all lasers.
     """
 
-    model: str = "VLP-16"
+    model: Text = "VLP-16"
     frame: FrameName = "lidar_link"
     topic: TopicName | None = None
-    rate_hz: Positive = 10.0
+    rate_hz: Rate = 10.0
     min_range_m: NotNegative = 0.4
     max_range_m: Positive = 100.0
     beam_aperture_m: NotNegative = 0.0127
@@ -128,8 +140,8 @@ class IntrinsicsSettings(Settings):
     model: Literal["radtan", "equidistant"] = "radtan"
     fx_px: Positive
     fy_px: Positive
-    cx_px: float
-    cy_px: float
+    cx_px: Figure
+    cy_px: Figure
     distortion: tuple[Coefficient, ...] = ()
 
     @model_validator(mode="after")
@@ -185,12 +197,12 @@ class CameraSettings(Settings):
         resolution_px: (width, height) of the pictures.
     """
 
-    model: str = ""
+    model: Text = ""
     frame: FrameName = "camera_link"
     optical_frame: FrameName = "camera_optical_frame"
     resolution_px: tuple[Annotated[int, Field(ge=16, le=65535)], Annotated[int, Field(ge=16, le=65535)]]
     intrinsics: IntrinsicsSettings
-    channels: Annotated[dict[Name, ChannelSettings], Field(min_length=1)] = Field(
+    channels: Annotated[dict[Name, ChannelSettings], Field(min_length=1, max_length=64)] = Field(
         default_factory=lambda: {"frames": ChannelSettings()}
     )
     driver: DriverSettings = DriverSettings()
@@ -198,6 +210,10 @@ class CameraSettings(Settings):
     @model_validator(mode="after")
     def _intrinsics_belong_to_resolution(self) -> "CameraSettings":
         given, size = self.intrinsics, self.resolution_px
+        if size[0] * size[1] > MAX_PIXELS:
+            raise problem(
+                f"{size[0]}x{size[1]} px are more than a camera has ({MAX_PIXELS})", "resolution_px"
+            )
         sides = (
             ("x", "width", given.cx_px, given.fx_px, size[0]),
             ("y", "height", given.cy_px, given.fy_px, size[1]),

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 _NAME = r"^[a-z][a-z0-9_]*$"
@@ -22,8 +22,21 @@ Name = Annotated[str, Field(pattern=_NAME, max_length=64)]
 RigName = Annotated[str, Field(pattern=_RIG_NAME, max_length=64)]
 FrameName = Annotated[str, Field(pattern=_FRAME, max_length=128)]
 TopicName = Annotated[str, Field(pattern=_TOPIC, max_length=256)]
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+# Whatever is measured on a rig lies within; squares and quotients of such figures stay far from overflow.
+_SMALLEST, _LARGEST = 1e-6, 1e6
+Text = Annotated[str, Field(max_length=1000)]
+
+
+def _not_tiny(value: float) -> float:
+    if value < _SMALLEST:
+        raise problem(f"{value:g} is too small (at least {_SMALLEST:g})")
+    return value
+
+
+Positive = Annotated[float, Field(gt=0, le=_LARGEST), AfterValidator(_not_tiny)]
+NotNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
+Figure = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
+Rate = Annotated[float, Field(ge=0.1, le=10_000)]
 
 
 class Settings(BaseModel):

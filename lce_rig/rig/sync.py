@@ -49,7 +49,7 @@ class SyncSettings(Settings):
     """
 
     type: Literal["lce1", "nmea", "simplesensorsync", "tline"] = "lce1"
-    device: Annotated[str, Field(min_length=1)]
+    device: Annotated[str, Field(min_length=1, max_length=4096)]
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] | None = None
     triggers: dict[Name, TriggerSettings] = Field(default_factory=dict)
 

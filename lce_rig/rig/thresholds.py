@@ -42,7 +42,7 @@ class QualitySettings(Settings):
     max_tilt_deg: Annotated[float, Field(gt=0, lt=90)] = 70.0
     max_reprojection_px: Positive = 1.0
     min_rings: Annotated[int, Field(ge=2, le=128)] = 4
-    min_points: Annotated[int, Field(ge=6)] = 40
+    min_points: Annotated[int, Field(ge=6, le=1_000_000)] = 40
     max_thickness_m: Positive = 0.012
     max_size_error: Fraction = 0.15
     max_edge_rms_m: Positive = 0.06
@@ -55,7 +55,7 @@ class QualitySettings(Settings):
     max_board_speed_mps: Positive = 0.5
     max_turn_deg_s: Positive = 60.0
     max_smear_m: Positive = 0.01
-    min_captures: Annotated[int, Field(ge=3)] = 6
+    min_captures: Annotated[int, Field(ge=3, le=10_000)] = 6
     min_detected_fraction: Fraction = 0.5
     max_mpe_m: Positive = 0.03
     max_mee_m: Positive = 0.04
@@ -104,15 +104,15 @@ class VerdictSettings(Settings):
             deviations, the claim is widened.
     """
 
-    fail_factor: Annotated[float, Field(gt=1)] = 3.0
+    fail_factor: Annotated[float, Field(gt=1, le=1e6)] = 3.0
     max_scale_error: Positive = 0.008
     max_edge_shift_m: Positive = 0.03
     max_plane_misfit_m: Positive = 0.012
-    max_held_out_ratio: Annotated[float, Field(gt=1)] = 1.6
+    max_held_out_ratio: Annotated[float, Field(gt=1, le=1e6)] = 1.6
     max_prior_sigmas: Positive = 4.0
     max_change: Positive = 1.5
     max_contrast: Positive = 2.5
     max_camera_difference: Positive = 1.0
     least_chance: Annotated[float, Field(gt=0, lt=0.5)] = 0.001
     control_sigmas: Positive = 3.0
-    max_spread_ratio: Annotated[float, Field(ge=1)] = 1.2
+    max_spread_ratio: Annotated[float, Field(ge=1, le=1e6)] = 1.2

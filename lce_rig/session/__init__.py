@@ -2,7 +2,8 @@
 
 from lce_rig.session.capture import Capture
 from lce_rig.session.discarding import discard_if_empty
+from lce_rig.session.membership import check_capture
 from lce_rig.session.session import Session
 from lce_rig.session.writing import content_hash
 
-__all__ = ["Capture", "Session", "content_hash", "discard_if_empty"]
+__all__ = ["Capture", "Session", "check_capture", "content_hash", "discard_if_empty"]

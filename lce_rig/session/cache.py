@@ -1,9 +1,9 @@
 """Arrays and figures kept between runs; a damaged entry is one that is not there."""
 
+import hashlib
 import io
 import json
 import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.documents import parse_json
+from lce_rig.core.limits import MAX_CHUNK_BYTES, check_size, read_file
 from lce_rig.session.durable import replace_file
 
 _VALUES = "values_json"
+_MAX_MEMBERS = 4096
+# Behind the archive, where NumPy and other programs pass over it: a bit that flips in a zip may go unnoticed.
+_SEAL = b"sha256:"
+_SEAL_BYTES = len(_SEAL) + 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +44,10 @@ def store(path: Path, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, A
     np.savez_compressed(
         buffer, allow_pickle=False, **{_VALUES: np.frombuffer(text, np.uint8)}, **dict(sorted(arrays.items()))
     )
+    archive = buffer.getvalue()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, buffer.getvalue())
+        replace_file(path, archive + _seal(path, archive))
     except OSError:
         return False
     return True
@@ -49,10 +56,37 @@ def store(path: Path, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, A
 def load(path: Path) -> Cached | None:
     """Read one entry; None where there is none or it is damaged."""
     try:
-        # From memory: numpy leaves a file that turns out to be no zip open.
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        values = json.loads(arrays.pop(_VALUES).tobytes())
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, AttributeError):
+        data = read_file(path, MAX_CHUNK_BYTES)
+    except (OSError, ValueError):
+        return None
+    archive, seal = data[:-_SEAL_BYTES], data[-_SEAL_BYTES:]
+    if seal != _seal(path, archive):
+        return None
+    try:
+        arrays = _unpack(archive)
+        values = parse_json(arrays.pop(_VALUES).tobytes())
+    except Exception:  # What somebody else made fails in any way: zip, zlib, encryption, sizes, syntax.
         return None
     return Cached(arrays, values) if isinstance(values, dict) else None
+
+
+def _seal(path: Path, archive: bytes) -> bytes:
+    """Fingerprint an entry together with its place: of another capture it is not there."""
+    place = "/".join(path.parts[-2:]).encode()
+    return _SEAL + hashlib.sha256(place + b"\0" + archive).hexdigest().encode()
+
+
+def _unpack(archive: bytes) -> dict[str, NDArray[Any]]:
+    arrays = {}
+    n_left = MAX_CHUNK_BYTES
+    with zipfile.ZipFile(io.BytesIO(archive)) as file:
+        if len(file.infolist()) > _MAX_MEMBERS:
+            raise ValueError(f"it has more than {_MAX_MEMBERS} members")
+        for member in file.infolist():
+            # What is declared is what zipfile stops at; of deflate only, as other methods unpack at once.
+            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError("it is compressed by another method")
+            n_left -= check_size(member.file_size, max_bytes=n_left)
+            array = np.lib.format.read_array(io.BytesIO(file.read(member)), allow_pickle=False)
+            arrays[member.filename.removesuffix(".npy")] = array
+    return arrays

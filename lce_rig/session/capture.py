@@ -1,30 +1,31 @@
 """One capture of a session: a folder of plain files and the manifest that vouches for them."""
 
 import hashlib
-import json
+import os
 import re
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.documents import read_json
 from lce_rig.core.errors import SessionError
 from lce_rig.core.event_file import decode_events
+from lce_rig.core.image_codec import decode_pixels
+from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
 from lce_rig.core.pcd import decode_pcd
+from lce_rig.session.manifest import Entry, EventsEntry, ImageEntry, Manifest, ScanEntry, parse_manifest
 from lce_rig.session.writing import EVENTS_VERSION, MANIFEST, check_events, stamps_of
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
-# What an entry of each kind names besides its file: sensors, and stamps in ns or null.
-_SENSORS = {"image": ("camera", "channel"), "scan": ("lidar",), "events": ("camera", "channel")}
-_STAMPS = {
-    "image": ("stamp_ns", "host_ns"),
-    "scan": ("stamp_ns", "host_ns"),
-    "events": ("first_ns", "last_ns", "host_ns"),
-}
+_SOME_ENTRY = TypeVar("_SOME_ENTRY", bound=Entry)
+# A firing lies so far from a scan's first at most.
+_MAX_OFFSET_NS = 3600 * 10**9
 
 
 @dataclass(frozen=True)
@@ -45,17 +46,17 @@ class Capture:
     @property
     def meta(self) -> dict[str, Any]:
         """What the collector wrote about this capture (source, duplicates, board poses)."""
-        return dict(self._manifest["meta"])
+        return dict(self._manifest.meta)
 
     @property
     def content_sha256(self) -> str:
         """The fingerprint `content_hash` gave when the capture was written."""
-        return str(self._manifest["content_sha256"])
+        return self._manifest.content_sha256
 
     @property
     def file_hashes(self) -> frozenset[str]:
         """SHA-256 of every picture, scan and stretch of events in it."""
-        return frozenset(str(entry["sha256"]) for entry in self._manifest["files"])
+        return frozenset(entry.sha256 for entry in self._manifest.files)
 
     @property
     def manifest_sha256(self) -> str:
@@ -65,24 +66,26 @@ class Capture:
             SessionError: there is none.
         """
         try:
-            return hashlib.sha256((self.path / MANIFEST).read_bytes()).hexdigest()
+            return hashlib.sha256(read_file(self.path / MANIFEST, MAX_DOCUMENT_BYTES)).hexdigest()
         except OSError as error:
             raise self._damaged(f"{MANIFEST} cannot be read: {error.strerror}") from None
+        except ValueError as error:
+            raise self._damaged(f"{MANIFEST}: {error}") from None
 
     @property
     def image_keys(self) -> list[tuple[str, str]]:
         """(camera, channel) of every picture, sorted."""
-        return sorted((e["camera"], e["channel"]) for e in self._manifest["files"] if e["kind"] == "image")
+        return sorted((entry.camera, entry.channel) for entry in self._manifest.images)
 
     @property
     def lidars(self) -> list[str]:
         """Names of the LiDARs with a scan, sorted."""
-        return sorted(e["lidar"] for e in self._manifest["files"] if e["kind"] == "scan")
+        return sorted(entry.lidar for entry in self._manifest.scans)
 
     @property
     def event_cameras(self) -> list[str]:
         """Names of the cameras with events, sorted."""
-        return sorted(e["camera"] for e in self._manifest["files"] if e["kind"] == "events")
+        return sorted(entry.camera for entry in self._manifest.events)
 
     def has_image(self, camera: str, channel: str) -> bool:
         """Tell whether this capture has a picture of that camera and channel."""
@@ -96,12 +99,15 @@ class Capture:
         """
         import cv2
 
-        entry = self._entry(kind="image", camera=camera, channel=channel)
-        data = np.frombuffer(self._read(entry), dtype=np.uint8)
-        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-        if pixels is None:
-            raise self._damaged(f"{entry['file']} is no picture")
-        return Image(camera, channel, entry["stamp_ns"], np.asarray(pixels, dtype=np.uint8), entry["host_ns"])
+        entries = [e for e in self._manifest.images if (e.camera, e.channel) == (camera, channel)]
+        entry: ImageEntry = self._only(entries, f"nothing from {camera}.{channel}")
+        try:
+            pixels = decode_pixels(self._read(entry), cv2.IMREAD_UNCHANGED)
+        except ValueError as error:
+            raise self._damaged(f"{entry.file}: {error}") from None
+        if pixels.dtype != np.uint8 or not (pixels.ndim == 2 or pixels.shape[2:] == (3,)):
+            raise self._damaged(f"{entry.file} is {pixels.dtype} {pixels.shape}, not 8-bit grey or BGR")
+        return Image(camera, channel, entry.stamp_ns, pixels, entry.host_ns)
 
     def scan(self, lidar: str) -> Scan:
         """Read a scan exactly as it was captured.
@@ -109,23 +115,22 @@ class Capture:
         Raises:
             SessionError: there is none, or it is damaged.
         """
-        entry = self._entry(kind="scan", lidar=lidar)
+        entries = [e for e in self._manifest.scans if e.lidar == lidar]
+        entry: ScanEntry = self._only(entries, f"nothing from {lidar}")
         try:
             cloud = decode_pcd(self._read(entry))
-            points = np.stack([cloud["x"], cloud["y"], cloud["z"]], axis=1)
             has_time = "time" in (cloud.dtype.names or ())
-            offset_ns = cloud["time"].astype(np.int64) if has_time else None
             return Scan(
                 lidar,
-                entry["stamp_ns"],
-                points,
-                np.ascontiguousarray(cloud["intensity"]),
-                np.ascontiguousarray(cloud["ring"]),
-                offset_ns,
-                entry["host_ns"],
+                entry.stamp_ns,
+                np.stack([_lengths(cloud, axis) for axis in "xyz"], axis=1),
+                _lengths(cloud, "intensity"),
+                _whole(cloud, "ring", 0, np.iinfo(np.int16).max).astype(np.int16),
+                _whole(cloud, "time", -_MAX_OFFSET_NS, _MAX_OFFSET_NS) if has_time else None,
+                entry.host_ns,
             )
         except ValueError as error:
-            raise self._damaged(f"{entry['file']}: {error}") from None
+            raise self._damaged(f"{entry.file}: {error}") from None
 
     def events(self, camera: str) -> Events:
         """Read the events about this capture exactly as they were recorded, stamps to the microsecond.
@@ -133,14 +138,15 @@ class Capture:
         Raises:
             SessionError: there are none, or they are damaged.
         """
-        entry = self._entry(kind="events", camera=camera)
+        entries = [e for e in self._manifest.events if e.camera == camera]
+        entry: EventsEntry = self._only(entries, f"no events from {camera}")
         try:
             events = decode_events(self._read(entry), camera)
             check_events(events)
         except ValueError as error:
-            raise self._damaged(f"{entry['file']}: {error}") from None
-        if any(entry[name] != stamp for name, stamp in stamps_of(events).items()):
-            raise self._damaged(f"{entry['file']} holds other stamps than {MANIFEST} says")
+            raise self._damaged(f"{entry.file}: {error}") from None
+        if stamps_of(events) != {"first_ns": entry.first_ns, "last_ns": entry.last_ns}:
+            raise self._damaged(f"{entry.file} holds other stamps than {MANIFEST} says")
         return events
 
     def check(self) -> None:
@@ -149,66 +155,82 @@ class Capture:
         Raises:
             SessionError: the first thing found wrong.
         """
-        for entry in self._manifest["files"]:
+        for entry in self._manifest.files:
             self._read(entry)
 
     @cached_property
-    def _manifest(self) -> dict[str, Any]:
+    def _manifest(self) -> Manifest:
         try:
-            manifest = json.loads((self.path / MANIFEST).read_text(encoding="utf-8"))
+            document = read_json(self.path / MANIFEST)
+            version = document.get("format_version") if isinstance(document, dict) else None
+            if isinstance(version, int) and version > EVENTS_VERSION:
+                raise SessionError(f"capture {self.name} was written by a newer lce-rig", "Update lce-rig.")
+            manifest = parse_manifest(document)
         except FileNotFoundError:
             raise self._damaged(f"it has no {MANIFEST}") from None
-        except (OSError, ValueError, RecursionError) as error:
-            raise self._damaged(f"{MANIFEST} cannot be read: {error}") from None
-        try:
-            if manifest["format_version"] > EVENTS_VERSION:
-                raise SessionError(f"capture {self.name} was written by a newer lce-rig", "Update lce-rig.")
-            if not isinstance(manifest["meta"], dict) or not isinstance(manifest["content_sha256"], str):
-                raise TypeError
-            for entry in manifest["files"]:
-                self._check_entry(entry)
-        except (KeyError, TypeError):
-            raise self._damaged(f"{MANIFEST} lacks what a manifest needs") from None
-        return dict(manifest)
+        except OSError as error:
+            raise self._damaged(f"{MANIFEST} cannot be read: {error.strerror}") from None
+        except ValueError as error:
+            raise self._damaged(f"{MANIFEST}: {error}") from None
+        for entry in manifest.files:
+            self._require_here(entry.file)
+        return manifest
 
-    def _check_entry(self, entry: Mapping[str, Any]) -> None:
-        name = str(entry["file"])
+    def _require_here(self, name: str) -> None:
         # The manifest is input like any other: it must not make us read, or show, files elsewhere.
-        if not SAFE_NAME.fullmatch(name) or (self.path / name).resolve().parent != self.path.resolve():
+        # Unlike Path.resolve, realpath has an answer where links run in a circle.
+        folder, file = (Path(os.path.realpath(path)) for path in (self.path, self.path / name))
+        if not SAFE_NAME.fullmatch(name) or file.parent != folder:
             raise SessionError(
                 f"capture {self.name}: {MANIFEST} names the file {name!r} outside the capture's folder",
                 f"Nothing outside {self.path} is read. Remove this capture if you did not make it yourself.",
             )
-        sensors = [entry[key] for key in _SENSORS[entry["kind"]]]
-        stamps = [entry[key] for key in _STAMPS[entry["kind"]]]
-        if not all(isinstance(sensor, str) for sensor in [*sensors, entry["sha256"]]):
-            raise TypeError
-        if not all(stamp is None or isinstance(stamp, int) for stamp in [*stamps, entry["bytes"]]):
-            raise TypeError
 
-    def _entry(self, **wanted: str) -> dict[str, Any]:
-        for entry in self._manifest["files"]:
-            if all(entry.get(key) == value for key, value in wanted.items()):
-                return dict(entry)
-        sensor = ".".join(value for key, value in wanted.items() if key != "kind")
-        what = "no events" if wanted["kind"] == "events" else "nothing"
+    def _only(self, entries: Sequence[_SOME_ENTRY], lacking: str) -> _SOME_ENTRY:
+        """Take the entry of a sensor, of which there is one at most."""
+        if entries:
+            return entries[0]
         have = [".".join(key) for key in self.image_keys] + self.lidars
         have += [f"events of {camera}" for camera in self.event_cameras]
-        raise SessionError(
-            f"capture {self.name} has {what} from {sensor}; it has {', '.join(have) or 'nothing'}"
-        )
+        raise SessionError(f"capture {self.name} has {lacking}; it has {', '.join(have) or 'nothing'}")
 
-    def _read(self, entry: Mapping[str, Any]) -> bytes:
+    def _read(self, entry: Entry) -> bytes:
         try:
-            data = (self.path / entry["file"]).read_bytes()
+            data = read_file(self.path / entry.file)
         except OSError as error:
-            raise self._damaged(f"{entry['file']}: {error.strerror}") from None
-        if len(data) != entry["bytes"]:
-            raise self._damaged(f"{entry['file']} has {len(data)} of {entry['bytes']} bytes")
-        if hashlib.sha256(data).hexdigest() != entry["sha256"]:
-            raise self._damaged(f"{entry['file']} is not what was captured (checksum)")
-        return bytes(data)
+            raise self._damaged(f"{entry.file}: {error.strerror}") from None
+        except ValueError as error:
+            raise self._damaged(f"{entry.file}: {error}") from None
+        if len(data) != entry.bytes:
+            raise self._damaged(f"{entry.file} has {len(data)} of {entry.bytes} bytes")
+        if hashlib.sha256(data).hexdigest() != entry.sha256:
+            raise self._damaged(f"{entry.file} is not what was captured (checksum)")
+        return data
 
     def _damaged(self, what: str) -> SessionError:
         hint = f"Remove {self.path} and collect again; the other captures are not affected."
         return SessionError(f"capture {self.name} is damaged: {what}", hint)
+
+
+def _lengths(cloud: NDArray[Any], name: str) -> NDArray[np.float32]:
+    """Take a field of finite figures out of a scan's cloud; raise a ValueError where it holds others."""
+    values = _field(cloud, name, "f")
+    if not np.isfinite(values).all() or np.abs(values).max(initial=0) > np.finfo(np.float32).max:
+        raise ValueError(f"its field {name} is not finite everywhere")
+    return values.astype(np.float32)
+
+
+def _whole(cloud: NDArray[Any], name: str, lowest: int, highest: int) -> NDArray[np.int64]:
+    """Take a field of whole numbers out of a scan's cloud; raise a ValueError where it holds others."""
+    values = _field(cloud, name, "iu")
+    if len(values) and (int(values.min()) < lowest or int(values.max()) > highest):
+        raise ValueError(f"its field {name} runs from {values.min()} to {values.max()} (limit {highest})")
+    return values.astype(np.int64)
+
+
+def _field(cloud: NDArray[Any], name: str, kinds: str) -> NDArray[Any]:
+    if name not in (cloud.dtype.names or ()):
+        raise ValueError(f"it has no field {name}; it has {', '.join(cloud.dtype.names or ())}")
+    if cloud[name].ndim != 1 or cloud[name].dtype.kind not in kinds:
+        raise ValueError(f"its field {name} is of type {cloud.dtype[name]}")
+    return cloud[name]

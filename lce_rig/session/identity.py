@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from lce_rig import __version__
+from lce_rig.core.documents import read_json
 from lce_rig.core.errors import SessionError
 from lce_rig.rig import Rig, dump_rig
 
@@ -31,18 +32,29 @@ def check_marker(path: Path) -> None:
     if path.is_file():
         hint = "Name the session's folder; `lce-rig collect --from FILE` makes one of a recording."
         raise SessionError(f"{path} is a file, a session is a folder", hint)
+    version = read_marker(path)["format_version"]
+    if version > FORMAT_VERSION:
+        raise SessionError(f"{path} was made by a newer lce-rig (format {version})", "Update lce-rig.")
+
+
+def read_marker(path: Path) -> dict[str, Any]:
+    """Read session.json in a session's folder; its `format_version` is a whole number.
+
+    Raises:
+        SessionError: there is none, or it is damaged.
+    """
     try:
-        marker = json.loads((path / MARKER).read_text(encoding="utf-8"))
-        version = int(marker["format_version"])
+        marker = read_json(path / MARKER)
     except FileNotFoundError:
         hint = "Make one with `lce-rig collect` or `lce-rig simulate`."
         raise SessionError(f"{path} is no session: it has no {MARKER}", hint) from None
     except OSError as error:
         raise SessionError(f"{path / MARKER} cannot be read: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError) as error:
+    except ValueError as error:
         raise SessionError(f"{path / MARKER} cannot be read: {error}") from None
-    if version > FORMAT_VERSION:
-        raise SessionError(f"{path} was made by a newer lce-rig (format {version})", "Update lce-rig.")
+    if not isinstance(marker, dict) or type(marker.get("format_version")) is not int:
+        raise SessionError(f"{path / MARKER} cannot be read: it has no format_version")
+    return marker
 
 
 def differing_keys(theirs: Rig, ours: Rig) -> list[str]:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SessionError
 from lce_rig.rig import Rig
+from lce_rig.session.capture import Capture
 
 
 def check_samples(rig: Rig, images: Sequence[Image], scans: Sequence[Scan], events: Sequence[Events]) -> None:
@@ -21,13 +22,7 @@ def check_samples(rig: Rig, images: Sequence[Image], scans: Sequence[Scan], even
             "a capture needs one picture a camera channel, one scan a lidar and one stretch of events "
             "a camera at most, and not nothing"
         )
-    for image in images:
-        camera = rig.cameras.get(image.sensor)
-        if camera is None or image.channel not in camera.channels:
-            raise SessionError(f"rig {rig.name!r} has no camera channel {image.sensor}.{image.channel}")
-    for scan in scans:
-        if scan.sensor not in rig.lidars:
-            raise SessionError(f"rig {rig.name!r} has no lidar {scan.sensor!r}")
+    _check_sensors(rig, [(i.sensor, i.channel) for i in images], [s.sensor for s in scans])
     for stretch in events:
         event_channel(rig, stretch.sensor)
         size, wanted = (stretch.width_px, stretch.height_px), rig.cameras[stretch.sensor].resolution_px
@@ -37,6 +32,34 @@ def check_samples(rig: Rig, images: Sequence[Image], scans: Sequence[Scan], even
                 f"rig {rig.name!r} gives it {wanted[0]}x{wanted[1]}",
                 "Is it another camera's recording? Else correct resolution_px in the profile.",
             )
+
+
+def check_capture(rig: Rig, capture: Capture) -> None:
+    """Make sure that a capture that was read names sensors of its rig only.
+
+    Raises:
+        SessionError: it does not, or its manifest is damaged.
+    """
+    images, lidars, event_cameras = capture.image_keys, capture.lidars, capture.event_cameras
+    try:
+        _check_sensors(rig, images, lidars)
+        for camera in event_cameras:
+            event_channel(rig, camera)
+    except SessionError as error:
+        raise SessionError(
+            f"capture {capture.name} is of another rig: {error.what}",
+            f"Remove {capture.path} and collect again; the other captures are not affected.",
+        ) from None
+
+
+def _check_sensors(rig: Rig, images: Sequence[tuple[str, str]], lidars: Sequence[str]) -> None:
+    for name, channel in images:
+        camera = rig.cameras.get(name)
+        if camera is None or channel not in camera.channels:
+            raise SessionError(f"rig {rig.name!r} has no camera channel {name}.{channel}")
+    for name in lidars:
+        if name not in rig.lidars:
+            raise SessionError(f"rig {rig.name!r} has no lidar {name!r}")
 
 
 def event_channel(rig: Rig, camera: str) -> str:

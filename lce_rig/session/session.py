@@ -25,7 +25,8 @@ from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import cache
 from lce_rig.session.capture import SAFE_NAME, Capture
 from lce_rig.session.durable import WriterLock, append_line, flush_folder, own_path, replace_file
-from lce_rig.session.identity import MARKER, check_marker, differing_keys, marker_of
+from lce_rig.session.identity import MARKER, check_marker, differing_keys, marker_of, read_marker
+from lce_rig.session.journal import read_entries
 from lce_rig.session.membership import check_samples, event_channel
 from lce_rig.session.replacing import recover, replacing
 from lce_rig.session.writing import content_hash, write_capture
@@ -169,7 +170,7 @@ class Session:
         """Every whole capture, by name."""
         folder = self.path / CAPTURES
         names = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
-        return [Capture(folder / name) for name in names if re.fullmatch(r"\d{6,}", name)]
+        return [Capture(folder / name) for name in names if re.fullmatch(r"[0-9]{6,}", name)]
 
     def capture(self, name: str) -> Capture:
         """Find one capture.
@@ -248,17 +249,16 @@ class Session:
             raise _not_writable(self.path / JOURNAL, error, len(self.captures)) from error
 
     def read_journal(self) -> list[dict[str, Any]]:
-        """List what happened; a line torn by a crash is left out."""
+        """List what happened; a line torn by a crash is skipped.
+
+        Raises:
+            SessionError: the journal cannot be read.
+        """
         path = self.path / JOURNAL
-        entries = []
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
-            try:
-                entry = json.loads(line)
-            except ValueError:
-                continue
-            if isinstance(entry, dict):
-                entries.append(entry)
-        return entries
+        try:
+            return read_entries(path)
+        except (OSError, ValueError) as error:
+            raise SessionError(f"{path} cannot be read: {error}") from None
 
     def store_cached(self, key: str, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, Any]) -> bool:
         """Keep arrays and JSON values under a key such as "3f9a1c/000012" for `load_cached`.
@@ -327,7 +327,7 @@ class Session:
 
 def _check_rig(path: Path, rig: Rig) -> None:
     """Refuse a session whose marker names another rig than its profile."""
-    named = json.loads((path / MARKER).read_text(encoding="utf-8")).get("rig")
+    named = read_marker(path).get("rig")
     if named != rig.name:
         raise SessionError(
             f"{path}: {MARKER} is of rig {named!r}, {PROFILE} of rig {rig.name!r}",

@@ -9,7 +9,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core import limits
+from lce_rig.sources.events.message import MessageReader, read_header
+
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+def check_field_count(data: bytes, encoding: str) -> None:
+    """Make sure that a message does not declare more fields than points have, before it is deserialised.
+
+    Args:
+        data: sensor_msgs/PointCloud2 as it lies in the bag.
+        encoding: "ros1" or "cdr".
+
+    Raises:
+        ValueError: it does, or it is damaged.
+    """
+    reader = MessageReader(data, encoding)
+    read_header(reader)  # Height and width stand behind the header as they do in messages of events.
+    n_fields = reader.number("I")
+    if n_fields > limits.MAX_FIELDS:
+        raise ValueError(f"it declares {n_fields} fields a point, at most {limits.MAX_FIELDS} are read")
 
 
 def decode_pointcloud2(message: Any) -> NDArray[Any]:
@@ -41,6 +61,8 @@ def decode_pointcloud2(message: Any) -> NDArray[Any]:
             formats.append(kind if count == 1 else (kind, (count,)))
             offsets.append(int(field.offset))
     width, height, step = int(message.width), int(message.height), int(message.point_step)
+    if width * height > limits.MAX_POINTS:
+        raise ValueError(f"it declares {width * height} points, at most {limits.MAX_POINTS} are read")
     # Some drivers leave row_step at zero in clouds of one row.
     row_step = int(message.row_step) or width * step
     if row_step < width * step:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core import limits
 from lce_rig.sources.image_file import decode_image, to_8_bit
 
 # Encoding: bytes of one channel, channels, name of OpenCV's conversion to BGR ("" where none is needed).
@@ -48,6 +49,8 @@ def decode_ros_image(message: Any) -> NDArray[np.uint8]:
         raise ValueError(f"its encoding {message.encoding!r} is not known; known are {', '.join(_ENCODINGS)}")
     n_bytes, n_channels, conversion = _ENCODINGS[encoding]
     width, height = int(message.width), int(message.height)
+    if width * height > limits.MAX_PIXELS:
+        raise ValueError(f"it declares {width}x{height} pixels, at most {limits.MAX_PIXELS} are read")
     n_row = width * n_channels * n_bytes
     step = int(message.step) or n_row
     data = np.ascontiguousarray(message.data, dtype=np.uint8)

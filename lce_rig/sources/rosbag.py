@@ -12,7 +12,8 @@ from typing import Any
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
-from lce_rig.sources.bag_file import BagFile, RawMessage
+from lce_rig.sources.bag_file import BagFile, list_topics
+from lce_rig.sources.bag_storage import RawMessage
 from lce_rig.sources.base import Sample, SourceOptions, Span, Stream
 from lce_rig.sources.cloud import to_scan
 from lce_rig.sources.events.bag import BagEvents
@@ -21,9 +22,9 @@ from lce_rig.sources.events.recording import EventRecording
 from lce_rig.sources.events.stream import NoEventsError
 from lce_rig.sources.merging import merge_by_time
 from lce_rig.sources.overlap import check_overlap
-from lce_rig.sources.pointcloud2 import decode_pointcloud2
+from lce_rig.sources.pointcloud2 import check_field_count, decode_pointcloud2
 from lce_rig.sources.ros_image import decode_ros_compressed_image, decode_ros_image
-from lce_rig.sources.topics import Target, choose_topics, list_topics
+from lce_rig.sources.topics import CLOUD_TYPES, Target, choose_topics
 
 # A stamp this much earlier than the one before is a clock that was set, not a message that came late.
 CLOCK_JUMP_NS = 1_000_000_000
@@ -212,6 +213,8 @@ def _header_stamp_ns(content: Any) -> int:
 def _deserialize(message: RawMessage) -> Any:
     """Deserialise by ROS's own definitions; those in a bag may be missing, or beyond what rosbags parses."""
     is_ros1 = message.encoding == "ros1"
+    if message.msgtype in CLOUD_TYPES:
+        check_field_count(message.data, message.encoding)
     store = _typestore(is_ros1)
     msgtype = message.msgtype.replace("/", "/msg/")
     try:

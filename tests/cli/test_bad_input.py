@@ -133,3 +133,29 @@ def test_a_manifest_that_points_outside_the_session_is_refused(lce_rig, session,
     assert outcome.code == 0
     assert "000002: read:" in outcome.out
     assert "outside the capture's folder" in outcome.out
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"file": True}, {"camera": "other"}, {"channel": "a b"}, {"channel": "none"}, {"bytes": -1}],
+)
+def test_a_capture_with_a_bad_manifest_is_refused_alone(lce_rig, session, changes):
+    keep(session, 3)
+    manifest = session / "captures" / "000002" / "meta.json"
+    document = json.loads(manifest.read_text())
+    entry = next(entry for entry in document["files"] if entry["kind"] == "image")
+    entry.update(changes)
+    manifest.write_text(json.dumps(document))
+    outcome = lce_rig("check", session)
+    assert outcome.code == 0
+    assert "2 of 3 captures can be used" in outcome.out and "000002: read:" in outcome.out
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 100_000, '{"T_cam_lidar": [[' + "9" * 401 + "]]}", '{"T_cam_lidar": [[1e999]]}', "\ufeff{}"],
+)
+def test_a_reference_that_cannot_be_read_is_a_session_error(lce_rig, session, tmp_path, text):
+    (tmp_path / "ref.json").write_text(text, encoding="utf-8")
+    outcome = lce_rig("calibrate", session, "--reference", tmp_path / "ref.json")
+    assert outcome.code == 4 and "ref.json" in outcome.err

@@ -159,3 +159,17 @@ def test_a_terminal_that_is_closed_ends_the_collection_in_good_order(tmp_path: P
     assert (b"\x1b[" in said) == (term == "xterm")
     entries = [json.loads(line) for line in (path / "journal.jsonl").read_text().splitlines()]
     assert entries[-1]["event"] == "collected live" and entries[-1]["ending"] == "stopped"
+
+
+@pytest.mark.long
+def test_a_run_that_nobody_looks_after_ends_and_says_that_too_little_was_shown(
+    lce_rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lce_rig.cli.collect_live.SIMULATED_IDLE_S", 15.0)
+    session = tmp_path / "session"
+    # Nobody holds a board still for half a minute.
+    wanted = "--hold", "30", "--frames", "2"
+    result = lce_rig("collect", "--rig", "rles", session, "--simulated", "--plain", *wanted)
+    assert result.code == 6, result.err
+    assert "ended: no new placement was shown; 0 of 2 captures" in result.err
+    assert "no capture in the last" in result.err and "last said" in result.err

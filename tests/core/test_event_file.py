@@ -1,6 +1,7 @@
 """Events as one file: exact, repeatable, readable by numpy alone."""
 
 import io
+import zipfile
 
 import numpy as np
 import pytest
@@ -47,9 +48,9 @@ def test_whole_microseconds_are_stored_as_such() -> None:
         ({"t": [1], "x": [1], "y": [1]}, "no column polarity"),
         ({"t": [1, 2], "x": [1], "y": [1], "p": [1]}, "unequal length"),
         ({"t": [1], "x": [-1], "y": [1], "p": [1]}, "beyond any sensor"),
-        ({"t": np.array([None]), "x": [1], "y": [1], "p": [1]}, "archive of events"),
+        ({"t": np.array([None]), "x": [1], "y": [1], "p": [1]}, "column t is no list of numbers"),
         ({"t": [1], "x": 1, "y": [1], "p": [1]}, "column x is no list of numbers"),
-        ({"t": [1], "x": [1], "y": [1], "p": ["on"]}, "column polarity is no list of numbers"),
+        ({"t": [1], "x": [1], "y": [1], "p": ["on"]}, "column p is no list of numbers"),
         ({"t": [1], "x": [1], "y": [1], "p": [1], "resolution_px": 346}, "no width and height"),
     ],
 )
@@ -74,3 +75,93 @@ def test_damage_is_an_error_in_words_or_changes_nothing(cut: int, flip: int) -> 
         else:
             assert np.array_equal(found.t_ns, events.t_ns)
             assert np.array_equal(found.x, events.x)
+
+
+def archive(**members: bytes) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
+        for name, content in members.items():
+            file.writestr(f"{name}.npy", content)
+    return buffer.getvalue()
+
+
+def npy(shape: tuple[int, ...], content: bytes, descr: object = "<i8") -> bytes:
+    buffer = io.BytesIO()
+    header = {"descr": descr, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(buffer, header)
+    return buffer.getvalue() + content
+
+
+@pytest.mark.parametrize(
+    ("column", "cause"),
+    [
+        (b"hello", "column t is no array"),
+        (b"", "column t is no array"),
+        (npy((1 << 40,), bytes(80)), "declares 1099511627776 numbers"),
+        (npy((1 << 70, 0), b""), "no list of numbers"),
+        (npy((9,), bytes(80)), "declares 9 numbers"),
+        (npy((10,), bytes(160), "<c16"), "no list of numbers"),
+        (npy((10,), bytes(80), [("a", "<i4"), ("b", "<i4")]), "no list of numbers"),
+        (npy((10,), bytes(80), "|S8"), "no list of numbers"),
+        (npy((10,), bytes(80), "|O"), "no list of numbers"),
+        (b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + bytes(80), "damaged"),
+        (b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 65_535, "damaged"),
+        (bytes(140_000_000), "declares 140 MB"),
+    ],
+)
+def test_members_that_are_not_what_they_say_are_refused_in_words(column: bytes, cause: str) -> None:
+    whole = npy((10,), bytes(80))
+    with pytest.raises(ValueError, match=cause):
+        decode_events(archive(t=column, x=whole, y=whole, p=whole), "cam")
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        np.array([0.0, np.nan]),
+        np.array([0.0, np.inf]),
+        np.array([0.0, 1e300]),
+        np.array([0.0, -1e300]),
+        np.array([0.0, np.inf], np.float16),
+        np.array([0, np.finfo(np.longdouble).max], np.longdouble),
+        np.array([0, 2**64 - 1], np.uint64),
+        np.array([-(2**63), 0]),
+    ],
+)
+def test_times_beyond_any_clock_are_refused_without_a_warning(times: np.ndarray) -> None:
+    buffer = io.BytesIO()
+    with np.errstate(all="ignore"):
+        np.savez(buffer, t=times, x=[1, 2], y=[1, 2], p=[0, 1])
+    with pytest.raises(ValueError, match="times beyond any clock"):
+        decode_events(buffer.getvalue(), "cam")
+
+
+@pytest.mark.parametrize("pixels", [[0, np.nan], [0, np.inf], [0, -1], [0, 65_536], [0, 1e300]])
+def test_pixels_that_no_sensor_has_are_refused_without_a_warning(pixels: list[float]) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, t=[1, 2], x=pixels, y=[1, 2], p=[0, 1])
+    with pytest.raises(ValueError, match="beyond any sensor"):
+        decode_events(buffer.getvalue(), "cam")
+
+
+@pytest.mark.parametrize("size", [[40_000, 40_000], [2**62, 2**62]])
+def test_resolutions_that_no_sensor_has_are_refused(size: list[int]) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, t=[1, 2], x=[1, 2], y=[1, 2], p=[0, 1], resolution_px=size)
+    with pytest.raises(ValueError, match="beyond any sensor"):
+        decode_events(buffer.getvalue(), "cam")
+
+
+def test_two_columns_of_one_name_are_refused() -> None:
+    column = npy((10,), bytes(80))
+    buffer = io.BytesIO(archive(t=column, x=column, y=column, p=column))
+    with zipfile.ZipFile(buffer, "a") as file:
+        file.writestr("t", column)
+    with pytest.raises(ValueError, match="several columns of one name"):
+        decode_events(buffer.getvalue(), "cam")
+
+
+def test_an_archive_of_very_many_members_is_not_listed() -> None:
+    data = archive(**{f"{i:0250d}": b"" for i in range(4000)})
+    with pytest.raises(ValueError, match="list of members is longer"):
+        decode_events(data, "cam")

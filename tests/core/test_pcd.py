@@ -175,7 +175,7 @@ def test_numbers_that_are_not_there_are_read_in_text():
         (MATLAB.replace(b"SIZE 4 4 4 4", b"SIZE 4 4 4 3"), "type F of 3 bytes"),
         (MATLAB.replace(b"COUNT 1 1 1 1", b"COUNT 1 1 1 -1"), "COUNT of '-1'"),
         (MATLAB.replace(b"POINTS 2", b"POINTS two"), "how many points"),
-        (MATLAB.replace(b"POINTS 2", b"POINTS 99999999999"), "of 99999999999 points"),
+        (MATLAB.replace(b"POINTS 2", b"POINTS 99999999999"), "declares 99999999999 points, at most"),
         (MATLAB.replace(b"binary", b"binary_compressed") + bytes(3), "compressed part is not there"),
         (MATLAB.replace(b"binary", b"binary_compressed") + struct.pack("<II", 9, 31), "says 31 bytes"),
         (MATLAB.replace(b"binary", b"binary_compressed") + struct.pack("<II", 9, 32), "0 of 9 compressed"),
@@ -183,5 +183,34 @@ def test_numbers_that_are_not_there_are_read_in_text():
     ],
 )  # fmt: skip
 def test_damage_is_named(data, cause):
+    with pytest.raises(ValueError, match=cause):
+        decode_pcd(data)
+
+
+def _with_fields(n_fields: int, count: int, n_points: int, encoding: str = "binary") -> bytes:
+    ones = " ".join(["4"] * n_fields)
+    return (
+        f"FIELDS {' '.join(f'f{k}' for k in range(n_fields))}\nSIZE {ones}\nTYPE {ones.replace('4', 'F')}\n"
+        f"COUNT {ones.replace('4', str(count))}\nPOINTS {n_points}\nDATA {encoding}\n"
+    ).encode()
+
+
+@pytest.mark.parametrize(
+    ("data", "cause"),
+    [
+        (_with_fields(1500, 65536, 10), "more than 256 values"),
+        (_with_fields(3, 1, 10**12), "declares 1000000000000 points"),
+        (_with_fields(200, 1, 8_000_000), "declares 6400 MB"),
+        (_with_fields(3, 1, 8_000_000, "binary_compressed") + struct.pack("<II", 3, 96_000_000), "96 MB"),
+        (
+            _with_fields(3, 1, 1, "binary_compressed") + struct.pack("<II", 200, 12) + bytes(200),
+            "larger than",
+        ),
+        (_with_fields(3, 1, 2, "ascii") + b"1 " * 5000, "longer than 4096"),
+        (_with_fields(3, 1, 5000, "ascii") + b"\n" * 10_000, "are empty"),
+        (_with_fields(3, 1, 8_000_000, "ascii") + b"1 2 3\n", "truncated"),
+    ],
+)
+def test_what_no_lidar_measures_is_refused_before_memory_is_taken(data, cause):
     with pytest.raises(ValueError, match=cause):
         decode_pcd(data)

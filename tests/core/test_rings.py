@@ -89,3 +89,13 @@ def test_a_cloud_without_rings_is_named_as_such():
     points = rng.uniform(-3, 3, size=(20000, 3))
     with pytest.raises(SourceError, match="no rings in the cloud"):
         rings_from_elevation(points)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_a_cloud_of_hardly_any_points_has_no_rings_to_tell(n):
+    with pytest.raises(SourceError, match="too few or too scattered"):
+        rings_from_elevation(np.array([[3.0, 1.0, 0.2], [5.0, 2.0, 1.9]])[:n])
+
+
+def test_points_that_are_all_equal_are_of_one_ring():
+    assert (rings_from_elevation(np.tile([3.0, 1.0, 0.2], (200, 1))) == 0).all()

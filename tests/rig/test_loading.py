@@ -1,6 +1,7 @@
 """Profiles from and to files."""
 
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -139,3 +140,30 @@ def test_any_damage_is_a_profile_error_or_harmless(start: int, length: int, inse
         assert str(error)
     else:
         assert parse_rig(dump_rig(rig)) == rig
+
+
+@pytest.mark.parametrize(
+    ("value", "cause"),
+    [
+        ("!!bool x", "cannot be read"),
+        ('!!int ""', "cannot be read"),
+        ("!!timestamp x", "cannot be read"),
+        ("0x" + "f" * 5000, "too large a number"),
+        ('"\\ud800"', "half a character"),
+        ("1.0e+308", "less than or equal to"),
+        ("&a [*a]", "deeply nested"),
+    ],
+)
+def test_a_scalar_that_is_no_figure_is_named_with_its_line(value: str, cause: str) -> None:
+    text = re.sub(r"cy_px: [\d.]+", lambda _: f"cy_px: {value}", find_profile("rlfs").read_text(), count=1)
+    with pytest.raises(ProfileError, match=rf"mine\.yaml.*{cause}"):
+        parse_rig(text, "mine.yaml")
+
+
+def test_what_is_far_too_long_for_a_profile_is_not_parsed() -> None:
+    with pytest.raises(ProfileError, match="too large to be a rig profile"):
+        parse_rig("a: 1\n" * 200_000)
+    many = "".join(f"k{k}: 1\n" for k in range(3000))
+    with pytest.raises(ProfileError, match="problems") as caught:
+        parse_rig(many)
+    assert "more" in caught.value.hint

@@ -1,5 +1,7 @@
 """Pictures and clouds from files, whole and damaged."""
 
+import os
+
 import cv2
 import numpy as np
 import pytest
@@ -75,7 +77,7 @@ def test_missing_and_foreign_files_are_named(tmp_path):
     with pytest.raises(SourceError, match=r"gone\.pcd: cannot be read: No such file"):
         read_cloud(tmp_path / "gone.pcd")
     (tmp_path / "folder.ply").mkdir()
-    with pytest.raises(SourceError, match=r"folder\.ply: cannot be read: Is a directory"):
+    with pytest.raises(SourceError, match=r"folder\.ply: cannot be read: it is a folder"):
         read_cloud(tmp_path / "folder.ply")
 
 
@@ -132,3 +134,33 @@ def test_damaged_pcd_is_named(tmp_path):
     (tmp_path / "a.pcd").write_bytes(encode_pcd(POINTS)[:-1])
     with pytest.raises(SourceError, match=r"a\.pcd: it is truncated: 1 of 2 points are there"):
         read_cloud(tmp_path / "a.pcd")
+
+
+@pytest.mark.parametrize(
+    ("changed", "cause"),
+    [
+        (("vertex 2", "vertex 1000000000000"), "declares 1000000000000 points"),
+        (("element vertex", "element nothing 5\nelement vertex"), "'nothing' has 0 properties"),
+        (("element vertex", "element much 1000000000000\nproperty int a\nelement vertex"), "0 of 2 points"),
+        (("property ushort ring", "property ushort x"), "cannot be told apart"),
+    ],
+)
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_ply_that_declares_what_cannot_be_is_refused(changed, cause, form):
+    with pytest.raises(ValueError, match=cause):
+        decode_ply(HEADER.format(form).replace(*changed).encode() + b"1 2 3 4\n" * 8)
+
+
+def test_pipes_in_place_of_files_are_refused(tmp_path):
+    for name, read in (("a.png", read_image), ("a.pcd", read_cloud)):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(SourceError, match="a pipe or device"):
+            read(tmp_path / name)
+
+
+def test_deep_pixels_that_are_not_finite_are_no_reason_to_stop():
+    pixels = np.linspace(-3e38, 3e38, 64, dtype=np.float32).reshape(8, 8)
+    pixels[0, 0] = np.nan
+    assert to_8_bit(pixels)[0, 0] == 0 and to_8_bit(pixels).max() == 255
+    with pytest.raises(ValueError, match="none of its pixels"):
+        to_8_bit(np.full((4, 4), np.nan, np.float32))

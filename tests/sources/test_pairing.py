@@ -87,3 +87,8 @@ def test_pairs_by_time_are_one_to_one_and_within_the_tolerance(left, right, tole
     assert len({i for i, _ in pairing.pairs}) == len({j for _, j in pairing.pairs}) == len(pairing.pairs)
     assert all(abs(left[i] - right[j] - 0.25) <= tolerance_s for i, j in pairing.pairs)
     assert len(pairing.pairs) + len(pairing.lone_images) == len(left)
+
+
+def test_names_beyond_any_time_are_no_times():
+    assert parse_times(["9999999999999999999"]) is None
+    assert parse_times(["9999999999.5"]) is None

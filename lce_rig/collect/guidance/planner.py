@@ -99,7 +99,7 @@ class Planner:
             cost = cost * (1 + _EFFORT * _effort(present, self.candidates))
         if avoid is not None:
             cost[_way_m(avoid, self.candidates).min(axis=0, initial=np.inf) < AVOIDED_M] = np.inf
-        best, spacing = self._choose(cost, held)
+        best, spacing = self._choose(cost, held, present)
         wanted = None if best is None else self.candidates[best]
         rotation, translation = sigmas(now.cov)
         then = now.cov if best is None else after.cov[best]
@@ -174,7 +174,7 @@ class Planner:
         worse = max(rotation / model.target_sigma_rad, translation / model.target_sigma_m)
         return bool(worse <= ENOUGH_SHARE)
 
-    def _choose(self, cost: Array, held: Array) -> tuple[int | None, float]:
+    def _choose(self, cost: Array, held: Array, present: Array | None) -> tuple[int | None, float]:
         """Choose the candidate of the least finite cost that is new, the farther from all held the better.
 
         Returns:
@@ -182,9 +182,14 @@ class Planner:
         """
         for spacing in SPACINGS:
             is_taken = self._is_like(held, self.candidates, spacing).any(axis=0)
-            open_to = np.where(is_taken, np.inf, cost)
-            if np.isfinite(open_to).any():
-                return int(np.argmin(open_to)), spacing
+            new = np.flatnonzero(~is_taken & np.isfinite(cost))
+            if len(new):
+                ranked = new[np.argsort(cost[new], kind="stable")]
+                if present is None or not self._is_like(held, present[None], spacing).any():
+                    return int(ranked[0]), spacing
+                # Who stands at a capture has to be moved on: not to where "hold still" would be said.
+                away = (k for k in ranked if not is_there(self.view, present, self.candidates[k]))
+                return int(next(away, ranked[0])), spacing
         return None, SPACINGS[-1]
 
     def _is_like(self, held: Array, others: Array, spacing: float) -> NDArray[np.bool_]:

@@ -241,7 +241,7 @@ def _simulate(connection: Connection, rig: Rig, seed: int, person: Person, views
         return  # Whoever started this was ended meanwhile.
     if isinstance(answer, LceRigError):
         return
-    walker = _Walker(scene, person, views)
+    walker = Walker(scene, person, views)
     period_ns = max(model.period_ns for model in scene.stage.models.values())
     stamp_ns, due_s = time.time_ns(), time.monotonic()
     try:
@@ -260,7 +260,7 @@ def _simulate(connection: Connection, rig: Rig, seed: int, person: Person, views
         return
 
 
-class _Walker:
+class Walker:
     """Carries the board to where it is wanted, as far as the room lets it."""
 
     def __init__(self, scene: LiveScene, person: Person, views: Mapping[str, View]) -> None:
@@ -269,6 +269,11 @@ class _Walker:
         self._views = views
         self._rng = scene.stage.rng(_PERSON_STREAM)
         self._way: tuple[Array, Array, float, float] | None = None
+
+    @property
+    def is_walking(self) -> bool:
+        """Whether the board is on its way."""
+        return self._way is not None
 
     def hear(self, camera: str, wanted: Array, now_s: float) -> None:
         """Set out for a placement T_cam_board (4, 4), or as far towards it as the board can be held.

@@ -5,6 +5,7 @@ import ipaddress
 import re
 import secrets
 import socket
+from collections.abc import Callable
 
 from aiohttp import web
 from aiohttp.typedefs import Handler, Middleware
@@ -87,14 +88,23 @@ class Gate:
         return True
 
 
-def guarded(gate: Gate) -> Middleware:
-    """Build the middleware that puts a gate before every request, unknown paths included."""
+def guarded(gate: Gate, welcome: Callable[[web.Request], None]) -> Middleware:
+    """Build the middleware that puts a gate before every request, unknown paths included.
+
+    Args:
+        gate: refuses requests.
+        welcome: told of every request that it lets in.
+    """
 
     @web.middleware
     async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
         refusal = gate.refusal(request)
         if refusal is not None:
-            return web.Response(status=403, text=refusal + "\n")
+            answer = web.Response(status=403, text=refusal + "\n")
+            # Without the connection, strangers ask no faster than they are accepted.
+            answer.force_close()
+            return answer
+        welcome(request)
         return await handler(request)
 
     return guard

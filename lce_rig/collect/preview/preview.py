@@ -3,6 +3,7 @@
 import asyncio
 import socket
 import threading
+from contextlib import suppress
 from types import TracebackType
 
 from aiohttp import web
@@ -10,10 +11,15 @@ from aiohttp import web
 from lce_rig.collect.live.state import LiveState
 from lce_rig.collect.preview.access import Gate, check_token, new_token
 from lce_rig.collect.preview.address import DEFAULT_PORT, LOOPBACK, is_loopback, links, listen
+from lce_rig.collect.preview.connections import REQUEST_S, Connections
 from lce_rig.collect.preview.feed import Feed
-from lce_rig.collect.preview.server import Server, failures_log
+from lce_rig.collect.preview.server import Server
+from lce_rig.collect.preview.troubles import Troubles
 
-_STOP_S = 3.0
+_STOP_S = 1.5
+_SHUTDOWN_S = 0.5
+# For the rest of a request that was answered before its end.
+_LINGERING_S = 1.0
 
 
 class Preview:
@@ -42,6 +48,7 @@ class Preview:
         self._thread: threading.Thread | None = None
         self._is_ready = threading.Event()
         self._feed = Feed()
+        self._troubles = Troubles()
         self._server: Server | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop: asyncio.Event | None = None
@@ -70,12 +77,17 @@ class Preview:
         """Pictures that were compressed, 0 while nobody watches."""
         return 0 if self._server is None else self._server.encoder.n_encoded
 
+    def notes(self) -> list[str]:
+        """Report what went wrong with the page, and how often; a collection goes on whatever it is."""
+        return self._troubles.notes()
+
     def close(self) -> None:
         """Let open pages have the last state, and end."""
         if self._thread is None or self._loop is None or self._stop is None:
             return
         if self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._stop.set)
+            with suppress(RuntimeError):  # its loop has just ended by itself
+                self._loop.call_soon_threadsafe(self._stop.set)
             self._thread.join(_STOP_S)
         self._thread = None
 
@@ -91,11 +103,13 @@ class Preview:
         self.close()
 
     def _run(self, opened: socket.socket) -> None:
-        try:
-            asyncio.run(self._serve(opened))
-        finally:
-            opened.close()
-            self._is_ready.set()
+        with self._troubles, opened:
+            try:
+                asyncio.run(self._serve(opened))
+            except Exception:  # Whatever ends the page, the collection goes on.
+                self._troubles.log.exception("the page has ended, the collection goes on")
+            finally:
+                self._is_ready.set()
 
     async def _serve(self, opened: socket.socket) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
@@ -105,16 +119,17 @@ class Preview:
             self._server.application(),
             handle_signals=False,
             access_log=None,
-            logger=failures_log(),
-            shutdown_timeout=1.0,
+            logger=self._troubles.log,
+            shutdown_timeout=_SHUTDOWN_S,
+            keepalive_timeout=REQUEST_S,
+            lingering_time=_LINGERING_S,
         )
         await runner.setup()
-        await web.SockSite(runner, opened).start()
+        assert runner.server is not None
+        connections = self._server.connections = Connections(opened, runner.server, self._troubles)
+        connections.begin()
         self._is_ready.set()
         await self._stop.wait()
         await self._server.say_goodbye()
-        # What a stuck page has not taken by now would keep its connection, and this thread, open.
-        for each in [] if runner.server is None else runner.server.connections:
-            if each.transport is not None:
-                each.transport.abort()
+        connections.close()
         await runner.cleanup()

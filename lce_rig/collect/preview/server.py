@@ -2,13 +2,12 @@
 
 import asyncio
 import contextlib
-import logging
 from importlib import resources
 
 from aiohttp import web
-from aiohttp.http_exceptions import HttpProcessingError
 
 from lce_rig.collect.preview.access import Gate, guarded
+from lce_rig.collect.preview.connections import Connections
 from lce_rig.collect.preview.feed import Feed
 from lce_rig.collect.preview.message import Encoder
 from lce_rig.collect.preview.viewer import MAX_MESSAGE_BYTES, Viewer
@@ -36,22 +35,17 @@ _HEADERS = {
 }
 
 
-def failures_log() -> logging.Logger:
-    """Give the log of what goes wrong in the server itself; what strangers send wrongly is no news."""
-    log = logging.getLogger("lce_rig.preview")
-    log.addFilter(_is_own_failure)
-    return log
-
-
 class Server:
     """What answers requests.
 
     Attributes:
         encoder: compresses the pictures.
+        connections: through which requests come; None before it serves.
     """
 
     def __init__(self, gate: Gate, feed: Feed) -> None:
         self.encoder = Encoder()
+        self.connections: Connections | None = None
         self._gate = gate
         self._feed = feed
         self._viewers: dict[Viewer, web.WebSocketResponse] = {}
@@ -59,7 +53,7 @@ class Server:
 
     def application(self) -> web.Application:
         """Build the application."""
-        app = web.Application(middlewares=[guarded(self._gate)], client_max_size=1024)
+        app = web.Application(middlewares=[guarded(self._gate, self._welcome)], client_max_size=1024)
         app.on_response_prepare.append(_add_headers)
         app.router.add_get("/live", self._live, allow_head=False)
         app.router.add_get("/", self._file)
@@ -77,6 +71,10 @@ class Server:
         with contextlib.suppress(asyncio.TimeoutError):
             await asyncio.wait_for(asyncio.gather(*closing, return_exceptions=True), _GOODBYE_S)
         self.encoder.close()
+
+    def _welcome(self, request: web.Request) -> None:
+        if self.connections is not None:
+            self.connections.welcome(request)
 
     async def _file(self, request: web.Request) -> web.Response:
         name = request.match_info.get("name", "index.html")
@@ -97,14 +95,11 @@ class Server:
         viewer = Viewer(socket, self._feed, self.encoder)
         self._viewers[viewer] = socket
         try:
-            await viewer.serve()
+            with contextlib.nullcontext() if self.connections is None else self.connections.holding(request):
+                await viewer.serve()
         finally:
             del self._viewers[viewer]
         return socket
-
-
-def _is_own_failure(record: logging.LogRecord) -> bool:
-    return not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError))
 
 
 async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:

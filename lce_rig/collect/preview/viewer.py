@@ -18,6 +18,8 @@ BEAT_S = 1.0
 #: Updates under way to a page. Two hide the time of their way; more would only grow old in buffers.
 MAX_UNDER_WAY = 2
 MAX_MESSAGE_BYTES = 256
+#: A page that shows no update for so long sleeps; it connects again when it wakes.
+ANSWER_S = 5.0
 
 
 class Viewer:
@@ -66,7 +68,10 @@ class Viewer:
     async def _write(self) -> None:
         with contextlib.suppress(ConnectionError):  # the page went away
             while True:
-                await self._has_room.wait()
+                try:
+                    await asyncio.wait_for(self._has_room.wait(), ANSWER_S)
+                except asyncio.TimeoutError:
+                    return
                 if await self._feed.wait_beyond(self._state, BEAT_S):
                     began_s = time.monotonic()
                     await self._send_newest()

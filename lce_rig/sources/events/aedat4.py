@@ -6,7 +6,14 @@ from pathlib import Path
 import numpy as np
 
 from lce_rig.sources.events.aedat4_file import MAGIC, Aedat4File, add_broken, read_header, vector_at
-from lce_rig.sources.events.stream import NS_PER_US, EventColumns, Findings, NoEventsError, join_small
+from lce_rig.sources.events.stream import (
+    EventColumns,
+    Findings,
+    NoEventsError,
+    join_small,
+    parse_size,
+    to_ns,
+)
 
 __all__ = ["EVENT", "MAGIC", "Aedat4Events", "read_header"]
 
@@ -32,9 +39,7 @@ class Aedat4Events:
         self._number = number
         self.notes = self._file.notes
         _, attributes = self._file.header.streams[number]
-        size = attributes.get("sizeX", ""), attributes.get("sizeY", "")
-        is_sized = size[0].isdigit() and size[1].isdigit()
-        self.resolution_px = (int(size[0]), int(size[1])) if is_sized else None
+        self.resolution_px = parse_size(attributes.get("sizeX", ""), attributes.get("sizeY", ""))
 
     def stretches(self, findings: Findings) -> Iterator[EventColumns]:
         """Yield the events, some packets at a time."""
@@ -48,7 +53,7 @@ class Aedat4Events:
         except Exception:  # As below.
             return None
         first = next((packet for packet in self._packets(Findings()) if len(packet)), None)
-        return int(last.t_ns[-1] - first.t_ns[0]) if first is not None and last else None
+        return int(last.t_ns[-1]) - int(first.t_ns[0]) if first is not None and last else None
 
     def _packets(self, findings: Findings) -> Iterator[EventColumns]:
         for where, table in self._file.packets(self._number, findings):
@@ -71,4 +76,4 @@ def _decode_packet(table: bytes) -> EventColumns:
     at, n_events = vector_at(table, 0)
     events = np.frombuffer(table, EVENT, n_events, at) if n_events else np.empty(0, EVENT)
     x, y = events["x"].astype(np.uint16), events["y"].astype(np.uint16)
-    return EventColumns(events["t"] * NS_PER_US, x, y, events["on"].copy())
+    return EventColumns(to_ns(events["t"]), x, y, events["on"].view(np.uint8) != 0)

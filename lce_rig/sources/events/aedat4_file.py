@@ -13,17 +13,22 @@ import struct
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
+from lce_rig.core import limits, unpacking
 from lce_rig.core.errors import SourceError
-from lce_rig.sources.events.stream import Findings
+from lce_rig.sources.events.stream import Findings, open_recorded
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 _LZ4_MAGIC, _ZSTD_MAGIC = b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd"
-_MAX_PACKET_BYTES = 1 << 30
+# Recorders write a kilobyte a stream.
+_MAX_HEAD_BYTES = 1 << 20
+# A smaller flatbuffer has no room for what it is; zeros, as power cuts leave, are no row of empty packets.
+_MIN_PACKET_BYTES = 8
 _SEARCH_BYTES = 1 << 24
+_SEARCH_STEP_BYTES = 1 << 16
+_STREAM_NUMBER = re.compile("[0-9]{1,9}")
 
 
 @dataclass(frozen=True)
@@ -88,7 +93,7 @@ class Aedat4File:
 
     def packets(self, stream: int, findings: Findings) -> Iterator[tuple[str, bytes]]:
         """Yield the packets of a stream as flatbuffers, with their place; damaged ones are left out."""
-        with self.path.open("rb") as file:
+        with open_recorded(self.path) as file:
             for place in self._places(file, findings):
                 if place.stream != stream:
                     continue
@@ -100,12 +105,12 @@ class Aedat4File:
 
     def n_packets(self, stream: int) -> int:
         """Count the packets of a stream; only their heads are read."""
-        with self.path.open("rb") as file:
+        with open_recorded(self.path) as file:
             return sum(place.stream == stream for place in self._places(file, Findings()))
 
     def last_packet(self, stream: int) -> bytes | None:
         """Read the last whole packet of a stream, not those before it; None where there is none."""
-        with self.path.open("rb") as file:
+        with open_recorded(self.path) as file:
             places = [place for place in self._places(file, Findings()) if place.stream == stream]
             for place in reversed(places):
                 file.seek(place.at)
@@ -139,17 +144,20 @@ class Aedat4File:
         file.seek(position)
         head = file.read(8)
         number, size = struct.unpack("<ii", head) if len(head) == 8 else (-1, -1)
-        is_whole = 0 <= size <= _MAX_PACKET_BYTES and position + 8 + size <= end
+        is_whole = _MIN_PACKET_BYTES <= size <= limits.MAX_CHUNK_BYTES and position + 8 + size <= end
         return number, size if is_whole and number in self.header.streams else None
 
     def _next_packet(self, file: BinaryIO, position: int, end: int) -> int | None:
         """Find the next packet behind a damaged head by what compressed data begins with."""
-        file.seek(position)
-        data = file.read(min(end - position, _SEARCH_BYTES))
-        for match in re.finditer(re.escape(_LZ4_MAGIC) + b"|" + re.escape(_ZSTD_MAGIC), data):
-            found = position + match.start() - 8
-            if match.start() >= 8 and self._packet_head(file, found, end)[1] is not None:
-                return found
+        end_search = min(end, position + _SEARCH_BYTES)
+        # In steps, that overlap by a head and a magic: most often the next packet is near.
+        for begin in range(position, end_search, _SEARCH_STEP_BYTES):
+            file.seek(begin)
+            data = file.read(min(end_search - begin, _SEARCH_STEP_BYTES + 11))
+            for match in re.finditer(re.escape(_LZ4_MAGIC) + b"|" + re.escape(_ZSTD_MAGIC), data):
+                found = begin + match.start() - 8
+                if match.start() >= 8 and self._packet_head(file, found, end)[1] is not None:
+                    return found
         return None
 
 
@@ -159,7 +167,7 @@ def read_header(path: Path) -> Aedat4Header:
     Raises:
         SourceError: it is no AEDAT4 file, or its head is damaged.
     """
-    with path.open("rb") as file:
+    with open_recorded(path) as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise SourceError(f"{path} is no AEDAT4 file", "Convert older files (AEDAT 2, 3) with DV first.")
         try:
@@ -196,36 +204,31 @@ def add_broken(findings: Findings, where: str, error: Exception) -> None:
 
 def _parse_header(file: BinaryIO) -> Aedat4Header:
     (size,) = struct.unpack("<I", file.read(4))
-    table = file.read(size)
+    table = file.read(limits.check_size(size, "it", _MAX_HEAD_BYTES))
     begin = file.tell()
-    if size > _MAX_PACKET_BYTES or len(table) != size or table[4:8] != b"IOHE":
+    if len(table) != size or table[4:8] != b"IOHE":
         raise ValueError("it is cut off")
     end_at, (text_at, n_text) = field_at(table, 1), vector_at(table, 2)
     end = -1 if end_at is None else struct.unpack_from("<q", table, end_at)[0]
     if not text_at:
         raise ValueError("it describes no streams")
-    root = ElementTree.fromstring(table[text_at : text_at + n_text])
+    text = table[text_at : text_at + n_text].decode("utf-8")
+    if "<!DOCTYPE" in text:
+        raise ValueError("its XML declares entities, which no recorder does")
+    root = ElementTree.fromstring(text)
     streams = {}
     for node in root.iterfind("./node[@name='outInfo']/node"):
         name, kind = node.get("name", ""), node.findtext("./attr[@key='typeIdentifier']") or ""
+        if not _STREAM_NUMBER.fullmatch(name):
+            raise ValueError(f"its stream {limits.describe(name)} has no number")
         info = {a.get("key", ""): a.text or "" for a in node.iterfind("./node[@name='info']/attr")}
         streams[int(name)] = kind, info
     return Aedat4Header(begin, None if end < begin else end, streams)
 
 
 def _decompress(data: bytes) -> bytes:
-    if data[:4] == _LZ4_MAGIC:
-        from lz4.frame import decompress as decompress_lz4  # type: ignore[import-untyped]
-
-        return bytes(decompress_lz4(data))
-    if data[:4] == _ZSTD_MAGIC:
-        return bytes(_zstd().decompress(data))
-    return data
-
-
-def _zstd() -> Any:
-    """Import the Zstandard that this Python or rosbags brings."""
-    try:
-        return import_module("compression.zstd")
-    except ImportError:
-        return import_module("backports.zstd")
+    kind = {_LZ4_MAGIC: "lz4", _ZSTD_MAGIC: "zstd"}.get(data[:4])
+    if kind is None:
+        return data
+    max_bytes = min(limits.MAX_CHUNK_BYTES, unpacking.unpacked_limit(len(data)))
+    return unpacking.decompress(unpacking.new_decompressor(kind), data, max_bytes)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core import limits
 from lce_rig.sources.events.aedat4_file import Aedat4File, add_broken, field_at, vector_at
 from lce_rig.sources.events.stream import NS_PER_US, Findings
 
@@ -100,6 +101,8 @@ def decode_frame(table: bytes) -> Frame:
         mid_ns, exposure_us = (start_us + end_us) * NS_PER_US // 2, end_us - start_us
     else:
         mid_ns = stamp_us * NS_PER_US + exposure_us * NS_PER_US // 2
+    if abs(mid_ns) >= limits.MAX_TIME_NS:
+        raise ValueError("its timestamp is beyond any clock")
     return Frame(mid_ns, exposure_us * NS_PER_US, _pixels(table))
 
 

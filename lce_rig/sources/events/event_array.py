@@ -10,6 +10,7 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core import limits
 from lce_rig.core.data import Events
 from lce_rig.sources.events.message import EventHeader, MessageReader, read_header
 from lce_rig.sources.events.stream import EventColumns
@@ -43,6 +44,7 @@ def decode_event_array(data: bytes, encoding: str) -> tuple[EventHeader, EventCo
     reader = MessageReader(data, encoding)
     header = read_header(reader)
     n_events = reader.number("I")
+    limits.check_size(n_events * _ROS1_EVENT.itemsize, "a packet", limits.MAX_PACKET_BYTES)
     raw = _ros1_events(reader, n_events) if reader.is_ros1 else _cdr_events(reader, n_events)
     t_ns = raw["sec"].astype(np.int64) * 10**9 + raw["nsec"]
     x, y = raw["x"].astype(np.uint16), raw["y"].astype(np.uint16)

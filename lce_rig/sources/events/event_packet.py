@@ -11,12 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core import limits
 from lce_rig.sources.events.message import EventHeader, MessageReader, read_header
 from lce_rig.sources.events.stream import NS_PER_US, EventColumns, Findings
 from lce_rig.sources.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
 
 ENCODINGS = ("evt3", "libcaer", "libcaer_cmp", "mono", "trigger")
 _BATCH_BYTES = 1 << 17
+# A word of two bytes may hold twelve events.
+_WORDS_AT_ONCE = 1 << 17
 _LIBCAER_WRAP_US = 1 << 31
 
 
@@ -81,7 +84,8 @@ def parse_packet(data: bytes, encoding: str) -> EventPacket:
     number, time_base_ns = reader.number("Q"), reader.number("Q")
     name = reader.text()
     is_big_endian = bool(reader.number("B"))
-    payload = reader.block(reader.number("I"))
+    n_bytes = limits.check_size(reader.number("I"), "a packet", limits.MAX_PACKET_BYTES)
+    payload = reader.block(n_bytes)
     return EventPacket(header, number, time_base_ns, name, is_big_endian, payload)
 
 
@@ -115,7 +119,8 @@ class PacketDecoder:
             yield _decode_libcaer(packet)
         elif packet.encoding == "libcaer_cmp":
             self._compressed.start_packet()
-            yield _shift(self._compressed.decode(packet.words("u2").astype(np.uint16)), packet)
+            for words in _pieces(packet.words("u2").astype(np.uint16)):
+                yield _shift(self._compressed.decode(words), packet)
         elif packet.encoding == "trigger":
             self._n_trigger_packets += 1
         else:
@@ -125,10 +130,12 @@ class PacketDecoder:
         """Yield what waits."""
         if self._waiting:
             words = [packet.words("u2").astype(np.uint16) for packet in self._waiting]
-            host_ns = self._waiting[0].header.stamp_ns
+            host_ns: int | None = self._waiting[0].header.stamp_ns
             self._waiting, self._n_waiting_bytes = [], 0
-            events = self._evt3.decode(np.concatenate(words))
-            yield EventColumns(events.t_ns, events.x, events.y, events.polarity, host_ns)
+            for piece in _pieces(np.concatenate(words)):
+                events = self._evt3.decode(piece)
+                yield EventColumns(events.t_ns, events.x, events.y, events.polarity, host_ns)
+                host_ns = None
 
     def account(self, findings: Findings) -> None:
         """Say what was passed over, and what could not be decoded inside packets."""
@@ -139,6 +146,10 @@ class PacketDecoder:
         findings.add(
             "words of no known code passed over", n=self._evt3.n_unknown + self._compressed.n_unknown
         )
+
+
+def _pieces(words: NDArray[np.uint16]) -> Iterator[NDArray[np.uint16]]:
+    return (words[at : at + _WORDS_AT_ONCE] for at in range(0, len(words), _WORDS_AT_ONCE))
 
 
 def _shift(events: EventColumns, packet: EventPacket) -> EventColumns:

@@ -3,13 +3,12 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from lce_rig.core.errors import SourceError
-from lce_rig.core.event_file import decode_events
-from lce_rig.sources.events.stream import EventColumns, Findings
+from lce_rig.core.event_file import read_events
+from lce_rig.sources.events.stream import EventColumns, Findings, open_recorded
 
 _STRETCH_EVENTS = 1 << 20
+_UNKNOWN_PX = (0, 0)
 
 
 class NpzEvents:
@@ -22,14 +21,13 @@ class NpzEvents:
             SourceError: it is damaged, or no archive of events.
         """
         self.notes: list[str] = []
-        data = path.read_bytes()
-        try:
-            events = decode_events(data, sensor="")
-        except ValueError as error:
-            raise SourceError(f"{path}: {error}", "Expected columns t_us, x, y, polarity.") from None
-        with np.load(path, allow_pickle=False) as archive:
-            is_sized = "resolution_px" in archive.files
-        self.resolution_px = (events.width_px, events.height_px) if is_sized else None
+        with open_recorded(path) as file:
+            try:
+                events = read_events(file, sensor="", resolution_px=_UNKNOWN_PX)
+            except ValueError as error:
+                raise SourceError(f"{path}: {error}", "Expected columns t_us, x, y, polarity.") from None
+        size_px = events.width_px, events.height_px
+        self.resolution_px = None if size_px == _UNKNOWN_PX else size_px
         self._events = EventColumns(events.t_ns, events.x, events.y, events.polarity, events.host_ns)
 
     def stretches(self, findings: Findings) -> Iterator[EventColumns]:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core import limits
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.events.stream import NS_PER_US, EventColumns, Findings, join, seconds_in
 
@@ -13,7 +14,11 @@ from lce_rig.sources.events.stream import NS_PER_US, EventColumns, Findings, joi
 REORDER_NS = 20_000_000
 # Counters of 31 and 32 bits of microseconds are common; they wrap after 36 and 72 minutes.
 _WRAPS_NS = tuple((1 << bits) * NS_PER_US for bits in (31, 32))
+# Eight months.
+_MAX_WRAPS = 10_000
 _MAX_GAP_NS = 60_000_000_000
+# Within 20 ms, a hundred million a second: more than cameras send.
+_MAX_HELD_EVENTS = 1 << 21
 # Cameras may send a little before their clock is set at the start.
 _MAX_LEAD_NS = 1_000_000_000
 # More stray stamps than this are no damage here and there but a clock that was set.
@@ -31,13 +36,25 @@ def in_time_order(
     Raises:
         SourceError: the stamps run back for good; everything before has been yielded.
     """
-    clock = _Clock()
+    clock = _Clock(path)
     sorter = _Sorter(path, findings)
     for stretch in stretches:
-        if len(stretch):
-            yield from sorter.push(clock.unwrap(stretch, findings))
+        sound = _on_any_clock(stretch, findings)
+        if len(sound):
+            yield from sorter.push(clock.unwrap(sound, findings))
     if sorter.held is not None:
         yield sorter.held
+
+
+def _on_any_clock(stretch: EventColumns, findings: Findings) -> EventColumns:
+    """Leave out stamps so far from zero that their differences overflow."""
+    t_ns = stretch.t_ns
+    limit = limits.MAX_TIME_NS
+    if not len(t_ns) or (t_ns.min() > -limit and t_ns.max() < limit):
+        return stretch
+    is_sound = (t_ns > -limit) & (t_ns < limit)
+    findings.add("events with stamps beyond any clock left out", n=int(np.count_nonzero(~is_sound)))
+    return stretch.select(is_sound)
 
 
 class _Sorter:
@@ -76,6 +93,10 @@ class _Sorter:
             yield mixed.select(slice(0, cut))
             self._delivered_ns = int(mixed.t_ns[cut - 1])
         self.held = mixed.select(slice(cut, None)) if cut < len(mixed) else None
+        if len(mixed) - cut > _MAX_HELD_EVENTS:
+            raise SourceError(
+                f"{self._path}: {len(mixed) - cut} events within 20 ms, out of order", "It is damaged."
+            )
 
     def _begin_anew(self, together: EventColumns, reset: int) -> Generator[EventColumns, None, EventColumns]:
         """Drop what came before the clock was set, if that is next to nothing; else yield it and give up."""
@@ -116,11 +137,18 @@ class _Sorter:
 class _Clock:
     """Counts the wraps of a counter of microseconds."""
 
-    def __init__(self) -> None:
+    def __init__(self, path: Path) -> None:
+        self._path = path
         self._last_ns: int | None = None
         self._shift_ns = 0
+        self._n_wraps = 0
 
     def unwrap(self, stretch: EventColumns, findings: Findings) -> EventColumns:
+        """Undo the wraps of the next stretch.
+
+        Raises:
+            SourceError: it wraps more often than any recording is long.
+        """
         raw = stretch.t_ns
         steps = np.diff(raw, prepend=raw[0] if self._last_ns is None else self._last_ns)
         self._last_ns = int(raw[-1])
@@ -130,7 +158,13 @@ class _Clock:
             for wrap_ns in _WRAPS_NS:
                 wrapped = (steps < _MAX_GAP_NS - wrap_ns) & (steps >= -wrap_ns)
                 shifts[wrapped] = wrap_ns
-                findings.add(f"wraps of a {wrap_ns * 1e-9 / 60:.1f} min clock undone", n=int(wrapped.sum()))
+                n_wraps = int(np.count_nonzero(wrapped))
+                self._n_wraps += n_wraps
+                findings.add(f"wraps of a {wrap_ns * 1e-9 / 60:.1f} min clock undone", n=n_wraps)
+            if self._n_wraps > _MAX_WRAPS:
+                raise SourceError(
+                    f"{self._path}: its clock wraps more than {_MAX_WRAPS} times", "It is damaged."
+                )
             shifts = np.cumsum(shifts)
         if not len(shifts) and not self._shift_ns:
             return stretch

@@ -12,12 +12,14 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core import limits
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.events.evt2 import Evt2Decoder
-from lce_rig.sources.events.stream import EventColumns, Findings
+from lce_rig.sources.events.stream import EventColumns, Findings, open_recorded, parse_size
 from lce_rig.sources.events.word_codec import EVT3, WordDecoder
 
 _BLOCK_BYTES = 1 << 18
+_MAX_HEADER_BYTES = 1 << 18
 _WORDS = {"2": "<u4", "21": "<u8", "3": "<u2"}
 # Where a file names its sensor but not its resolution.
 _RESOLUTION_PX = {
@@ -41,8 +43,8 @@ class PropheseeEvents:
         """
         self._path = path
         self.notes: list[str] = []
-        with path.open("rb") as file:
-            header = _read_header(file)
+        with open_recorded(path) as file:
+            header = _read_header(path, file)
             self._begin = file.tell()
         self._version = _version(path, header)
         order = _field(header, "endianness")
@@ -50,12 +52,18 @@ class PropheseeEvents:
             order == "legacy" or (not order and _looks_swapped(path, self._begin))
         )
         self.resolution_px = _resolution(header)
+        said = _field(header, "width"), _field(header, "height")
+        if self.resolution_px is None and (any(said) or "geometry" in header):
+            size = header.get("geometry") or "x".join(said)
+            self.notes.append(
+                f"{path.name}: its header's size {limits.describe(size)} is not a sensor's; ignored"
+            )
 
     def stretches(self, findings: Findings) -> Iterator[EventColumns]:
         """Yield the events of the file, block by block."""
         dtype = np.dtype(_WORDS[self._version])
         decoder: Any = WordDecoder(EVT3) if self._version == "3" else Evt2Decoder(self._version == "21")
-        with self._path.open("rb") as file:
+        with open_recorded(self._path) as file:
             file.seek(self._begin)
             while block := file.read(_BLOCK_BYTES):
                 n_torn = len(block) % dtype.itemsize
@@ -68,12 +76,18 @@ class PropheseeEvents:
         findings.add(f"words of no EVT{self._version} code passed over", n=decoder.n_unknown)
 
 
-def _read_header(file: BinaryIO) -> dict[str, str]:
-    """Read "% key value" lines, up to the first that is none or says "% end"."""
+def _read_header(path: Path, file: BinaryIO) -> dict[str, str]:
+    """Read "% key value" lines, up to the first that is none or says "% end".
+
+    Raises:
+        SourceError: there is no end to them.
+    """
     header: dict[str, str] = {}
     while True:
         begin = file.tell()
-        line = file.readline(4096)
+        if begin > _MAX_HEADER_BYTES:
+            raise SourceError(f"{path}: its header is longer than {_MAX_HEADER_BYTES >> 10} kB")
+        line = file.readline(limits.MAX_LINE_BYTES)
         if not line.startswith(b"% ") or not line.endswith(b"\n"):
             file.seek(begin)
             return header
@@ -90,7 +104,7 @@ def _swapped(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 def _looks_swapped(path: Path, begin: int) -> bool:
     """Tell the order of EVT2.1's halves by the stamps, which rise in the right one."""
-    with path.open("rb") as file:
+    with open_recorded(path) as file:
         file.seek(begin)
         block = file.read(_BLOCK_BYTES)
     words = np.frombuffer(block, "<u8", len(block) // 8)
@@ -108,7 +122,7 @@ def _version(path: Path, header: dict[str, str]) -> str:
     named = header.get("evt") or header.get("format", "").split(";")[0].upper().removeprefix("EVT")
     version = named.replace(".0", "").replace(".", "").strip()
     if version not in _WORDS:
-        said = f"encoding {named!r}" if named else "no encoding in its header"
+        said = f"encoding {limits.describe(named)}" if named else "no encoding in its header"
         raise SourceError(f"{path} has {said}, not EVT2, EVT2.1 or EVT3", "Is it a Prophesee .raw file?")
     return version
 
@@ -121,9 +135,10 @@ def _field(header: dict[str, str], key: str) -> str:
 
 def _resolution(header: dict[str, str]) -> tuple[int, int] | None:
     if _field(header, "width") and _field(header, "height"):
-        return int(_field(header, "width")), int(_field(header, "height"))
-    if found := re.fullmatch(r"(\d+)x(\d+)", header.get("geometry", "")):
-        return int(found[1]), int(found[2])
+        return parse_size(_field(header, "width"), _field(header, "height"))
+    if "geometry" in header:
+        width, _, height = header["geometry"].partition("x")
+        return parse_size(width, height)
     generation = header.get("sensor_generation", "").replace(".", "")
     sensor = f"{header.get('plugin_name', '')} {header.get('sensor_name', '')} gen{generation}".lower()
     return next((size for name, size in _RESOLUTION_PX.items() if name in sensor), None)

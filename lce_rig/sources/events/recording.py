@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lce_rig.core import limits
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.events.order import in_time_order
@@ -59,7 +60,7 @@ class EventRecording:
         self._assumed: list[str] = []
         self._span_ns: tuple[int, int] | None = None
         self._window = _Window(self)
-        if not any(len(stretch) for stretch in stream.stretches(self._findings)):
+        if not any(len(stretch) for stretch in self._stretches(self._findings)):
             said = "; ".join(self._findings.lines())
             raise NoEventsError(f"{path} holds no events" + (f": {said}" if said else ""))
         self.resolution_px = self._settle_resolution(resolution_px)
@@ -73,7 +74,10 @@ class EventRecording:
     @property
     def start_ns(self) -> int:
         """First stamp, device time; only the beginning is read."""
-        return int(next(iter(self)).t_ns[0])
+        first = next(iter(self), None)
+        if first is None:
+            raise self._unordered()
+        return int(first.t_ns[0])
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -82,8 +86,13 @@ class EventRecording:
             for _ in self:
                 pass
         if self._span_ns is None:
-            raise SourceError(f"{self.path} holds no events that could be put in order")
+            raise self._unordered()
         return self._span_ns
+
+    def _unordered(self) -> SourceError:
+        said = "; ".join(self._findings.lines())
+        what = f"{self.path} holds no events that could be put in order"
+        return SourceError(what + (f": {said}" if said else ""))
 
     def extent_ns(self) -> tuple[int, int]:
         """First and last stamp; the last may be off by some ms where that saves reading the recording."""
@@ -120,7 +129,7 @@ class EventRecording:
         findings = Findings()
         first_ns = last_ns = None
         try:
-            for stretch in in_time_order(self.path, self._stream.stretches(findings), findings):
+            for stretch in in_time_order(self.path, self._stretches(findings), findings):
                 on_sensor = self._on_sensor(stretch, findings)
                 if len(on_sensor):
                     first_ns = int(on_sensor.t_ns[0]) if first_ns is None else first_ns
@@ -138,6 +147,13 @@ class EventRecording:
             SourceError: as iterating does.
         """
         return self._window.read(start_ns, end_ns)
+
+    def _stretches(self, findings: Findings) -> Iterator[EventColumns]:
+        """Read the stream; a disk that fails is an error the user can repair."""
+        try:
+            yield from self._stream.stretches(findings)
+        except OSError as error:
+            raise SourceError(f"{self.path} cannot be read: {error.strerror or error}") from None
 
     def to_events(self, columns: EventColumns) -> Events:
         """Say whose events they are."""
@@ -162,10 +178,15 @@ class EventRecording:
         if profile_px or file_px:
             return profile_px or file_px or (0, 0)
         width = height = 0
-        for stretch in self._stream.stretches(Findings()):
+        for stretch in self._stretches(Findings()):
             if len(stretch):
                 width = max(width, int(stretch.x.max()) + 1)
                 height = max(height, int(stretch.y.max()) + 1)
+        if width * height > limits.MAX_EVENT_PIXELS:
+            raise SourceError(
+                f"{self.path} declares no resolution; its events reach column {width - 1}, row {height - 1}",
+                "No event camera has so many pixels: the file is damaged.",
+            )
         self._assumed.append(f"declares no resolution; {width}x{height}, the extent of its events, is taken")
         return width, height
 

@@ -1,15 +1,19 @@
 """What the readers of event files share: columns of events, and the account of what was lost on the way."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core import limits
 from lce_rig.core.errors import SourceError
 
 NS_PER_US = 1000
+_PIXELS = re.compile("[0-9]{1,9}")
 
 
 class NoEventsError(SourceError):
@@ -145,3 +149,48 @@ class KnowsItsLength(Protocol):
 def seconds_in(t_ns: int, first_ns: int) -> str:
     """Say how far into a recording a stamp lies: "2.125 s in"."""
     return f"{(t_ns - first_ns) * 1e-9:.3f} s in"
+
+
+def open_recorded(path: Path) -> BinaryIO:
+    """Open a file of a recording.
+
+    Raises:
+        SourceError: it is no regular file, or may not be read.
+    """
+    try:
+        return limits.open_regular(path)
+    except ValueError as error:
+        raise SourceError(f"{path}: {error}") from None
+    except OSError as error:
+        raise SourceError(f"{path} cannot be read: {error.strerror}") from None
+
+
+def parse_size(width: str, height: str) -> tuple[int, int] | None:
+    """Read a resolution from a file's text, px; None where it is none that a camera has."""
+    # Longer ones are no pixels, and take Python long to read.
+    if not (_PIXELS.fullmatch(width) and _PIXELS.fullmatch(height)):
+        return None
+    size = int(width), int(height)
+    return size if 0 < size[0] * size[1] <= limits.MAX_EVENT_PIXELS else None
+
+
+def to_ns(times_us: NDArray[Any], offset_us: int = 0) -> NDArray[np.int64]:
+    """Convert whole microseconds; times beyond any clock become MAX_TIME_NS, for `in_time_order` to skip.
+
+    Args:
+        times_us: (N,) integers of any type, or finite numbers.
+        offset_us: added to each.
+    """
+    least_us, limit_us = (sign * limits.MAX_TIME_NS // NS_PER_US - offset_us for sign in (-1, 1))
+    t_us = np.array(times_us)
+    is_beyond = None
+    if len(t_us) and not (least_us < t_us.min() and t_us.max() < limit_us):
+        is_beyond = ~((t_us > least_us) & (t_us < limit_us))
+        t_us[is_beyond] = 0
+    t_ns = t_us.astype(np.int64, copy=False)
+    if offset_us:
+        t_ns += offset_us
+    t_ns *= NS_PER_US
+    if is_beyond is not None:
+        t_ns[is_beyond] = limits.MAX_TIME_NS
+    return t_ns

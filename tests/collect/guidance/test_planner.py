@@ -10,11 +10,14 @@ from lce_rig.collect.guidance import (
     Planner,
     View,
     is_reachable,
+    is_there,
     model_sensors,
     outline_px,
     predict_covariance,
     sigmas,
 )
+from lce_rig.collect.guidance.planner import SPACINGS
+from lce_rig.collect.guidance.words import NOWHERE_ELSE
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import perturb
 from lce_rig.rig import load_rig
@@ -153,3 +156,62 @@ def test_a_lidar_whose_beams_are_not_known_is_named():
     lidar = rig.lidars["lidar"].model_copy(update={"model": "Unknown-9"})
     with pytest.raises(ProfileError, match="Unknown-9"):
         model_sensors(rig.model_copy(update={"lidars": {"lidar": lidar}}), "cam", "lidar")
+
+
+def test_nearer_placements_are_asked_for_when_no_others_are_left(planner):
+    everywhere = planner.candidates.copy()
+    assert planner.guide(everywhere).T_cam_board is None
+    # 12 cm beside each candidate: closer than placements are apart, and farther than half of that.
+    everywhere[:, 0, 3] += 0.12
+    lonely = np.linalg.norm(planner.candidates[:, None, :3, 3] - everywhere[None, :, :3, 3], axis=-1)
+    guidance = planner.guide(everywhere)
+    assert guidance.T_cam_board is not None and guidance.spacing == SPACINGS[-1]
+    index = int(np.argmin(np.linalg.norm(planner.candidates[:, :3, 3] - guidance.T_cam_board[:3, 3], axis=1)))
+    assert 0.5 * 0.15 <= lonely[index].min() < 0.15
+    assert planner.adds_nothing(everywhere, guidance.T_cam_board) is None
+
+
+def test_who_stands_at_a_capture_is_always_told_to_move(planner, guided):
+    for k in range(1, len(guided)):
+        present = guided[k - 1]
+        wanted = planner.guide(guided[:k], present).T_cam_board
+        assert not is_there(planner.view, present, wanted)
+    # A board beside the first candidate, and no other place to go: better that one than none.
+    present = perturb(planner.candidates[0], np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.2]))
+    far = np.linalg.norm(planner.candidates[:, :3, 3] - present[:3, 3], axis=1) > 0.4
+    guidance = planner.guide(present[None], present, avoid=planner.candidates[far])
+    assert guidance.T_cam_board is not None
+
+
+def test_where_nothing_is_left_a_refusal_says_so(planner):
+    refusal = planner.adds_nothing(planner.candidates, planner.candidates[7])
+    assert "stands where capture 8 shows it" in refusal.cause and refusal.action == NOWHERE_ELSE
+
+
+def crowded():
+    """Captures that crowd about one place, and a board among them that tells little."""
+    bold = Planner(view(), Novelty(0.001, 0.05), n_places=100)
+    near = bold.guide(NONE).T_cam_board
+    crowd = np.array([perturb(near, np.r_[0.02 * k, 0, 0, 0, 0, 0.01 * k]) for k in range(-6, 7)])
+    return bold, crowd, perturb(near, np.array([0.012, 0.0, 0.0, 0.0, 0.0, 0.015]))
+
+
+def test_beyond_the_target_only_what_was_captured_is_refused():
+    bold, crowd, present = crowded()
+    assert "% better" in bold.adds_nothing(crowd, present).cause
+    modest = replace(model(), target_sigma_rad=np.radians(20.0), target_sigma_m=1.0)
+    met = Planner(View.upright(modest, T_FORWARD), Novelty(0.001, 0.05), n_places=100)
+    assert met.guide(crowd).is_enough
+    assert met.adds_nothing(crowd, present) is None
+    assert "capture 3 shows it" in met.adds_nothing(crowd, crowd[2]).cause
+
+
+def test_where_it_was_sent_a_board_is_refused_only_if_it_was_captured_there():
+    bold, crowd, present = crowded()
+    assert bold.adds_nothing(crowd, present, asked=present) is None
+    assert "capture 3 shows it" in bold.adds_nothing(crowd, crowd[2], asked=crowd[2]).cause
+
+
+def test_no_board_is_refused_for_a_better_place_out_of_reach():
+    bold, crowd, present = crowded()
+    assert bold.adds_nothing(crowd, present, avoid=bold.candidates) is None

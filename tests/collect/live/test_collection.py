@@ -14,7 +14,7 @@ from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.session import Session
 from tests.collect.live.replay import Show, placements, rig
 
-QUICK = LiveOptions(n_wanted=3, timeout_s=40.0, hold_s=0.3)
+QUICK = LiveOptions(n_wanted=3, timeout_s=120.0, hold_s=0.3)
 
 
 def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path: Path) -> None:
@@ -27,16 +27,21 @@ def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path: Pat
             == report.captured
             == ["000000", "000001", "000002"]
         )
-        for k, capture in enumerate(session.captures):
+        shown = []
+        for capture in session.captures:
             capture.check()
+            # A computer that is busy may be late for a placement, and see it when it comes again.
+            stamp_ns = capture.scan("lidar").stamp_ns
+            (k,) = (k for k, stamps in enumerate(show.stamps) if stamp_ns in stamps)
+            shown.append(k)
             sent = placements()[k]
             assert np.array_equal(capture.image("davis", "frames").pixels, sent.images[0].pixels)
             assert np.array_equal(capture.scan("lidar").points, sent.scans[0].points)
-            assert capture.scan("lidar").stamp_ns in show.stamps[k]
             (pair,) = capture.meta["pairs"]
             assert abs(pair["difference_s"]) < 0.02 and pair["stream"] == "davis.frames"
             assert capture.meta["still_boards_only"] is True
             assert capture.meta["motion_m"] < rig().quality.max_motion_m
+        assert len(set(shown)) == 3
     assert states[-1].phase == "ended" and states[-1].n_captures == 3
     phases = {state.phase for state in states}
     assert {"holding", "moving"} <= phases
@@ -145,3 +150,65 @@ def test_a_session_that_cannot_be_written_ends_with_its_error_and_keeps_the_rest
 def test_every_camera_with_every_lidar_gets_a_guide() -> None:
     (guide,) = make_guides(rig())
     assert guide.key == ("davis", "frames") and guide.lidar == "lidar"
+
+
+def test_a_run_that_nobody_looks_after_ends_when_nothing_new_is_shown(tmp_path: Path) -> None:
+    show = Show(placements()[:1], each_s=100.0)
+    options = replace(QUICK, n_wanted=5, idle_s=3.0)
+    with show.running(), Session.create(tmp_path / "session", rig()) as session:
+        report = collect_live(session, show.sources, options)
+    assert report.ending == "exhausted" and not report.is_enough
+    assert len(report.captured) == 1
+    assert any("no capture in the last" in note for note in report.notes)
+
+
+@pytest.fixture
+def met(tmp_path: Path) -> Path:
+    """A session whose captures meet a modest target, wherever its pictures were taken."""
+    modest = rig().calibration.model_copy(update={"target_sigma_deg": 5.0, "target_sigma_m": 0.5})
+    profile = rig().model_copy(update={"calibration": modest})
+    (guide,) = make_guides(profile)
+    with Session.create(tmp_path / "met", profile) as session:
+        for k in range(12):
+            guide.plan(None, float(k))
+            assert guide.wanted is not None
+            meta = {"T_cam_board": {"davis.frames": guide.wanted.tolist()}}
+            guide.add(str(k), guide.wanted)
+            session.add_capture(placements()[0].images, placements()[0].scans, meta)
+    return tmp_path / "met"
+
+
+def test_who_wants_more_than_enough_goes_on_being_guided_and_captured(met: Path) -> None:
+    show, states = Show(placements(), each_s=2.0), list[LiveState]()
+    with show.running(), Session.open(met, writable=True) as session:
+        report = collect_live(session, show.sources, replace(QUICK, n_wanted=14), states.append)
+    assert report.ending == "frames" and report.is_enough
+    assert len(report.captured) == 2
+    assert "enough" not in {state.phase for state in states}
+    assert any(s.drawing is not None and s.drawing.wanted is not None for s in states)
+    (said,) = {line.split(" ", 1)[1] for line in states[-1].log if "target" in line}
+    assert said == "the target is predicted to be met: going on to 14 captures"
+
+
+def test_who_wants_no_more_than_enough_is_done_at_once(met: Path) -> None:
+    show = Show(placements()[:1], each_s=2.0)
+    with show.running(), Session.open(met, writable=True) as session:
+        report = collect_live(session, show.sources, replace(QUICK, n_wanted=None))
+    assert report.ending == "enough" and not report.captured
+
+
+def test_a_board_that_one_camera_has_seen_enough_of_is_sent_before_the_other(met: Path) -> None:
+    profile = Session.open(met).rig
+    right = {"davis": profile.cameras["davis"], "right": profile.cameras["davis"]}
+    nominal = profile.nominal_extrinsics[0]
+    both = (nominal, nominal.model_copy(update={"camera": "right"}))
+    two = profile.model_copy(update={"cameras": right, "nominal_extrinsics": both})
+    show, states = Show(placements()[:1], each_s=100.0), list[LiveState]()
+    with Session.create(met.parent / "two", two) as session, show.running():
+        for capture in Session.open(met).captures:
+            images = [capture.image("davis", "frames")]
+            session.add_capture(images, [capture.scan("lidar")], dict(capture.meta))
+        options = replace(QUICK, n_wanted=None, idle_s=3.0)
+        report = collect_live(session, show.sources, options, states.append)
+    assert report.ending == "exhausted" and not report.is_enough
+    assert "show the board to right" in {state.headline for state in states}

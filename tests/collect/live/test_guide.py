@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from benchmarks.goes_on import NEW_DEG, NEW_M, follow_guide
 
+from lce_rig.collect.guidance import Person
 from lce_rig.collect.live.collection import make_guides
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, Learned
-from lce_rig.rig import Rig
+from lce_rig.core.geometry import Array
+from lce_rig.rig import Rig, load_rig
 from tests.collect.live.replay import rig
 
 
@@ -87,3 +90,62 @@ def test_a_lidar_whose_beams_are_not_known_is_collected_without_guidance() -> No
     guide.plan(None, 0.0)
     assert guide.wanted is None and "HDL-64" in guide.problem
     assert guide.outline_px(np.eye(4)) is None
+
+
+def test_where_a_board_is_as_wanted_and_refused_another_placement_is_wanted(guide: Guide) -> None:
+    guide.plan(None, 0.0)
+    first = guide.wanted
+    assert first is not None
+    guide.note_refusal(first + np.array([[0, 0, 0, 0.5], *np.zeros((3, 4))]))
+    assert guide.wanted is first, "the board is not there yet"
+    guide.note_refusal(first)
+    guide.plan(None, 1.0)
+    assert guide.wanted is not None and not np.array_equal(guide.wanted, first)
+
+
+def test_patience_is_not_lost_with_a_guide_that_is_not_followed(guide: Guide) -> None:
+    guide.plan(None, 0.0)
+    first = guide.wanted
+    for now_s in (10.0, 50.0, 90.0):
+        guide.plan(None, now_s, is_asked=False)
+    guide.plan(None, 90.0 + GIVE_UP_S - 1)
+    assert guide.wanted is first
+    guide.plan(None, 90.0 + GIVE_UP_S + 1)
+    assert guide.wanted is not first
+
+
+def is_new(walk_apart: list[tuple[float, float]]) -> bool:
+    return all(way_m >= NEW_M or turn_deg >= NEW_DEG for way_m, turn_deg in walk_apart)
+
+
+def test_a_person_who_goes_on_is_sent_to_new_places_until_there_are_as_many_captures_as_wanted() -> None:
+    walk = follow_guide(rig(), 20)
+    assert len(walk.captured) == 20
+    assert len(walk.proposed) >= 20 and is_new(walk.nearest())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["rlfs", "rles"])
+def test_forty_placements_are_as_new_as_twenty(name: str) -> None:
+    for seed in range(2):
+        walk = follow_guide(load_rig(name), 40, seed)
+        assert len(walk.captured) == 40 and is_new(walk.nearest())
+
+
+def test_half_a_room_and_a_careless_person_will_do() -> None:
+    careless = Person(place_sigma_m=0.2, turn_sigma_deg=15.0, ignored_share=0.5)
+
+    def is_left(T_cam_board: Array) -> bool:
+        return bool(T_cam_board[0, 3] < 0)
+
+    walk = follow_guide(rig(), 16, person=careless, can_be_held=is_left)
+    assert len(walk.captured) == 16
+    assert all(is_left(T_cam_board) for T_cam_board in walk.captured)
+
+
+def test_who_reaches_nothing_is_asked_for_other_places_until_patience_ends() -> None:
+    walk = follow_guide(rig(), 3, can_be_held=lambda _T_cam_board: False, patience_s=900.0)
+    assert not walk.captured and walk.simulated_s == pytest.approx(900.0, abs=10.0)
+    places = np.array([T_cam_board[:3, 3] for T_cam_board, _ in walk.proposed])
+    assert len(places) >= 20
+    assert np.linalg.norm(np.diff(places, axis=0), axis=1).min() > 0.3, "one after the other elsewhere"

@@ -1,0 +1,35 @@
+"""Where the installed command begins: Ctrl-C is provided for before anything else is imported."""
+
+import os
+import sys
+from contextlib import suppress
+
+from lce_rig.core.interrupts import EXIT_INTERRUPTED, INTERRUPTED, interrupt_no_more, watch_for_interrupts
+
+
+def main() -> None:
+    """Run the command line, and end with its exit code."""
+    _open_closed_streams()
+    try:
+        watch_for_interrupts()
+        from lce_rig.cli.main import run
+
+        code = run(sys.argv[1:])
+        interrupt_no_more()
+    except KeyboardInterrupt:  # during the import
+        sys.stderr.write(f"{INTERRUPTED}\n")
+        code = EXIT_INTERRUPTED
+    if code == EXIT_INTERRUPTED:
+        # Python's own end would wait for threads that still work.
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError, AttributeError):
+                stream.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
+def _open_closed_streams() -> None:
+    """Stand /dev/null in for standard streams that were closed (`lce-rig collect <&-`), as services start."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115, PTH123

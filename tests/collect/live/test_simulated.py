@@ -1,0 +1,50 @@
+"""The simulated person goes where the room lets them."""
+
+import numpy as np
+import pytest
+
+from lce_rig.collect.guidance import HeldPose, Person, View, build_pose, model_sensors
+from lce_rig.collect.live.simulated import WALK_MPS, Walker
+from lce_rig.core.geometry import Array, invert
+from lce_rig.simulate import SimulationOptions
+from lce_rig.simulate.live_scene import LiveScene
+from tests.collect.live.replay import rig
+
+
+@pytest.fixture(scope="module")
+def scene() -> LiveScene:
+    return LiveScene(rig(), 0, SimulationOptions.for_rig("rles"))
+
+
+@pytest.fixture
+def view() -> View:
+    nominal = rig().nominal("davis", "lidar")
+    assert nominal is not None
+    return View.upright(model_sensors(rig(), "davis", "lidar"), nominal.to_matrix())
+
+
+def walk(scene: LiveScene, view: View, wanted: HeldPose) -> tuple[Array, float]:
+    """Stand in front, be sent somewhere and go: T_cam_board then, and how long it took."""
+    T_world_cam = scene.stage.T_world_sensor["davis"]
+    scene.hold(T_world_cam @ build_pose(view, HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0)))
+    walker = Walker(scene, Person(0.02, 1.0, 0.0), {"davis": view})
+    walker.hear("davis", build_pose(view, wanted), 100.0)
+    now_s = 100.0
+    while walker.is_walking:
+        now_s += 0.1
+        walker.walk(now_s)
+    return invert(T_world_cam) @ scene.T_world_board, now_s - 100.0
+
+
+def test_the_person_walks_to_where_the_board_is_wanted(scene: LiveScene, view: View) -> None:
+    reached, took_s = walk(scene, view, HeldPose(0.3, 3.0, 0.0, 10.0, 0.0, 45.0))
+    wanted = build_pose(view, HeldPose(0.3, 3.0, 0.0, 10.0, 0.0, 45.0))
+    assert np.linalg.norm(reached[:3, 3] - wanted[:3, 3]) < 0.15
+    way_m = np.linalg.norm(wanted[:3, 3] - [0.0, 0.0, 2.5])
+    assert took_s == pytest.approx(way_m / WALK_MPS, abs=0.4)
+
+
+def test_where_a_wall_is_in_the_way_the_person_goes_as_far_as_they_can(scene: LiveScene, view: View) -> None:
+    reached, _ = walk(scene, view, HeldPose(0.0, 12.0, 0.0, 0.0, 0.0, 45.0))
+    # The room ends nine metres ahead.
+    assert 3.0 < reached[2, 3] < 9.0

@@ -1,0 +1,68 @@
+"""A cache entry is what was stored, or not there."""
+
+import io
+import shutil
+import warnings
+import zipfile
+
+import numpy as np
+import pytest
+
+from lce_rig.session import cache
+
+
+@pytest.fixture
+def entry(tmp_path):
+    path = tmp_path / "digest" / "000000.cam.npz"
+    assert cache.store(path, {"a": np.arange(40.0), "b": np.eye(3)}, {"n": 1})
+    return path
+
+
+def test_every_flipped_bit_is_noticed(entry):
+    whole = entry.read_bytes()
+    for k in range(0, 8 * len(whole), 7):
+        damaged = bytearray(whole)
+        damaged[k // 8] ^= 1 << k % 8
+        entry.write_bytes(damaged)
+        assert cache.load(entry) is None
+    entry.write_bytes(whole)
+    assert np.array_equal(cache.load(entry).arrays["a"], np.arange(40.0))
+
+
+def test_an_entry_of_another_place_is_not_there(entry):
+    shutil.copy(entry, entry.with_name("000001.cam.npz"))
+    assert cache.load(entry.with_name("000001.cam.npz")) is None
+
+
+def test_numpy_reads_an_entry_as_it_is(entry):
+    with np.load(entry) as plain:
+        assert np.array_equal(plain["b"], np.eye(3))
+
+
+def _archive(data: bytes, how: int = zipfile.ZIP_DEFLATED, name: str = "a.npy") -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", how) as file:
+        file.writestr(name, data)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    "archive",
+    [
+        b"",
+        b"no zip",
+        _archive(bytes(200 << 20)),
+        _archive(b"x", zipfile.ZIP_LZMA),
+        _archive(
+            b"\x93NUMPY\x01\0v\0{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(
+                128
+            )
+        ),
+        _archive(b"\x93NUMPY\x01\0v\0{'descr': '|O', 'fortran_order': False, 'shape': (1,), }".ljust(128)),
+    ],
+)
+def test_an_archive_made_to_hurt_is_not_there(entry, archive):
+    entry.write_bytes(archive + cache._seal(entry, archive))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert cache.load(entry) is None

@@ -1,0 +1,74 @@
+"""A board held or carried before the simulated sensors: what is spared changes nothing that is measured."""
+
+import numpy as np
+import pytest
+
+from lce_rig.core.board import Board
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.geometry import Array, pose, rotation_angle
+from lce_rig.simulate.camera import expose, render_radiance
+from lce_rig.simulate.carriers import build_carrier
+from lce_rig.simulate.lidar import VLP16, sweep_again, sweep_scene
+from lce_rig.simulate.live_scene import LiveScene, between
+from lce_rig.simulate.options import LidarNoise, SimulationOptions
+from lce_rig.simulate.room import Room
+from lce_rig.simulate.scene import Scene
+
+from .conftest import board_before_lidar, make_rig
+
+FAR_BELOW = pose(np.eye(3), np.array([0.0, 0.0, -1e6]))
+
+
+@pytest.mark.parametrize(("distance_m", "yaw_deg", "carrier"), [(1.3, 20.0, "person"), (3.5, -25.0, "stand")])
+def test_beams_that_cannot_meet_the_board_need_not_be_sent_again(
+    room: Room, board: Board, T_world_lidar: Array, distance_m: float, yaw_deg: float, carrier: str
+) -> None:
+    T = board_before_lidar(distance_m, yaw_deg=yaw_deg)
+    bodies = build_carrier(carrier, board, T, np.random.default_rng(3))  # type: ignore[arg-type]
+    scene, noise = Scene(room.raycaster, bodies, board, T), LidarNoise()
+    empty = Scene(room.raycaster, (), board, FAR_BELOW)
+    at_once = sweep_scene(scene, T_world_lidar, VLP16, noise, np.random.default_rng(5))
+    of_room = sweep_scene(empty, T_world_lidar, VLP16, noise, np.random.default_rng(5))
+    again = sweep_again(of_room, scene, T_world_lidar, VLP16, noise)
+    assert np.count_nonzero(again.returns.surface == scene.board_index) > 100
+    assert np.array_equal(again.azimuth_rad, at_once.azimuth_rad)
+    assert np.array_equal(again.is_rim, at_once.is_rim) and again.is_rim.any()
+    for name in ("range_m", "energy", "reflectivity", "surface"):
+        assert np.array_equal(getattr(again.returns, name), getattr(at_once.returns, name))
+
+
+@pytest.fixture(scope="module")
+def live() -> LiveScene:
+    scene = LiveScene(make_rig(), 3, SimulationOptions())
+    scene.hold(board_before_lidar(2.2, yaw_deg=20.0))
+    return scene
+
+
+def samples(live: LiveScene, stamp_ns: int) -> tuple[Image, Scan]:
+    image, scan = live.take(stamp_ns)
+    assert isinstance(image, Image) and isinstance(scan, Scan)
+    return image, scan
+
+
+def test_pictures_of_a_held_board_differ_by_the_sensor_s_noise_alone(live: LiveScene) -> None:
+    taken = np.array([samples(live, k)[0].pixels for k in range(16)], dtype=np.float64)
+    assert not np.array_equal(taken[0], taken[1])
+    backdrop, noise = live.stage.backdrops["cam"], live.stage.options.camera
+    radiance = render_radiance(live._render(), backdrop)
+    at_once = np.array([expose(radiance, noise, np.random.default_rng(k)) for k in range(16)], np.float64)
+    assert np.abs(taken.mean(axis=0) - at_once.mean(axis=0)).mean() < 0.6
+    assert taken.std(axis=0).mean() == pytest.approx(at_once.std(axis=0).mean(), rel=0.02)
+
+
+def test_a_board_on_its_way_is_seen_where_it_is(live: LiveScene) -> None:
+    start, end = board_before_lidar(2.2, yaw_deg=20.0), board_before_lidar(2.6, yaw_deg=-10.0)
+    live.pass_by(start, end, 0.5)
+    on_its_way, _ = samples(live, 0)
+    middle = live.T_world_board
+    live.hold(middle)
+    held, scan = samples(live, 0)
+    difference = np.abs(on_its_way.pixels.astype(float) - held.pixels.astype(float))
+    assert difference.mean() < 3.0, "edges alone are drawn more coarsely"
+    assert len(scan.points) > 10_000
+    assert np.allclose(middle[:3, 3], (start[:3, 3] + end[:3, 3]) / 2)
+    assert np.degrees(rotation_angle(middle[:3, :3], between(start, end, 1.0)[:3, :3])) == pytest.approx(15.0)
