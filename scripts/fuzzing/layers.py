@@ -22,7 +22,7 @@ from fuzzing.mutations import Form
 
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _ROS1_MAGIC, _MCAP_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n"
-_ROS1_CHUNK, _ROS1_HEADER = 5, 3
+_ROS1_CHUNK = 5
 _MCAP_FOOTER, _MCAP_CHUNK, _MCAP_CHUNK_INDEX = 2, 6, 8
 _LZ4_MAGIC, _ZSTD_MAGIC = b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd"
 _VALUES = "values_json.npy"
@@ -169,7 +169,7 @@ def aedat4_packets(data: bytes) -> Iterator[tuple[int, bytes]]:
 
     at = len(MAGIC) + 4 + int(struct.unpack_from("<I", data, len(MAGIC))[0])
     while at + 8 <= len(data):
-        stream, size = struct.unpack_from("<ii", data, at)
+        _stream, size = struct.unpack_from("<ii", data, at)
         if size < 0 or at + 8 + size > len(data):
             return
         yield at, data[at + 8 : at + 8 + size]
@@ -268,15 +268,27 @@ def _ros1_chunks(data: bytes) -> list[bytes]:
 
 
 def _ros1_of(data: bytes, parts: list[bytes]) -> bytes:
-    """Put chunks back; the index behind the last moves along, which is right for bags of one chunk."""
-    records, left, grown = _ros1_records(data), list(parts), 0
-    for number, record in enumerate(records):
-        if record.kind == _ROS1_CHUNK:
-            part = left.pop(0)
-            size = struct.pack("<I", len(part))
-            header = _with_field(record.header, b"size", lambda _, size=size: size)  # type: ignore[misc]
-            records[number] = _Record(header, _ros1_codec(record.header)[1](part))
-            grown += len(records[number].data) - len(record.data)
+    """Put the chunk of a bag of one chunk back."""
+    if len(parts) != 1:
+        raise ValueError(f"{len(parts)} chunks, not one")
+    header = next(r.header for r in _ros1_records(data) if r.kind == _ROS1_CHUNK)
+    return ros1_with_chunk(data, _ros1_codec(header)[1](parts[0]), len(parts[0]))
+
+
+def ros1_with_chunk(data: bytes, packed: bytes, n_raw: int) -> bytes:
+    """Replace the chunk of a bag of one chunk; the index behind it moves along.
+
+    Args:
+        data: the bag.
+        packed: the chunk's compressed content.
+        n_raw: its size as it is declared.
+    """
+    records = _ros1_records(data)
+    at = next(number for number, record in enumerate(records) if record.kind == _ROS1_CHUNK)
+    grown = len(packed) - len(records[at].data)
+    records[at] = _Record(
+        _with_field(records[at].header, b"size", lambda _: struct.pack("<I", n_raw)), packed
+    )
     moved = _with_field(
         records[0].header, b"index_pos", lambda old: struct.pack("<Q", struct.unpack("<Q", old)[0] + grown)
     )
@@ -329,23 +341,35 @@ def _mcap_chunks(data: bytes) -> list[bytes]:
 
 
 def _mcap_of(data: bytes, parts: list[bytes], compression: bytes | None = None) -> bytes:
-    """Put chunks back with their index; right for files of one chunk."""
-    records, left, grown, n_raw, n_packed, old = _mcap_records(data), list(parts), 0, 0, 0, b""
+    """Put the chunk of a file of one chunk back, and its index."""
+    if len(parts) != 1:
+        raise ValueError(f"{len(parts)} chunks, not one")
+    old = next(_mcap_text(record, 28)[0] for kind, record in _mcap_records(data) if kind == _MCAP_CHUNK)
+    name = old if compression is None else compression
+    return mcap_with_chunk(data, _mcap_codec(name)[1](parts[0]), len(parts[0]), zlib.crc32(parts[0]), name)
+
+
+def mcap_with_chunk(data: bytes, packed: bytes, n_raw: int, crc: int, compression: bytes) -> bytes:
+    """Replace the chunk of a file of one chunk.
+
+    Args:
+        data: the file.
+        packed: the chunk's compressed content.
+        n_raw: its size as it is declared.
+        crc: its checksum; 0 for none.
+        compression: its name.
+    """
+    records, grown = _mcap_records(data), 0
     for number, (kind, record) in enumerate(records):
         if kind == _MCAP_CHUNK:
-            part = left.pop(0)
-            old, _ = _mcap_text(record, 28)
-            name = old if compression is None else compression
-            packed = _mcap_codec(name)[1](part)
-            start_end = record[:16]
-            new = start_end + struct.pack("<QI", len(part), zlib.crc32(part))
-            new += struct.pack("<I", len(name)) + name + struct.pack("<Q", len(packed)) + packed
-            grown, n_raw, n_packed = grown + len(new) - len(record), len(part), len(packed)
+            new = record[:16] + struct.pack("<QI", n_raw, crc)
+            new += struct.pack("<I", len(compression)) + compression + struct.pack("<Q", len(packed)) + packed
+            grown = len(new) - len(record)
             records[number] = kind, new
     grown_before_footer = grown
     for number, (kind, record) in enumerate(records):
         if kind == _MCAP_CHUNK_INDEX:
-            new = _moved_chunk_index(record, grown, n_raw, n_packed, compression)
+            new = _moved_chunk_index(record, grown, n_raw, len(packed), compression)
             grown_before_footer += len(new) - len(record)
             records[number] = kind, new
     for number, (kind, record) in enumerate(records):
@@ -357,9 +381,7 @@ def _mcap_of(data: bytes, parts: list[bytes], compression: bytes | None = None) 
     return _MCAP_MAGIC + body + _MCAP_MAGIC
 
 
-def _moved_chunk_index(
-    record: bytes, grown: int, n_raw: int, n_packed: int, compression: bytes | None
-) -> bytes:
+def _moved_chunk_index(record: bytes, grown: int, n_raw: int, n_packed: int, name: bytes) -> bytes:
     start, end, at, length = struct.unpack_from("<4Q", record)
     (n_map,) = struct.unpack_from("<I", record, 32)
     offsets = b"".join(
@@ -368,8 +390,6 @@ def _moved_chunk_index(
     )
     rest = 36 + n_map
     index_length = record[rest : rest + 8]
-    name, _ = _mcap_text(record, rest + 8)
-    name = name if compression is None else compression
     head = struct.pack("<4Q", start, end, at, length + grown) + struct.pack("<I", n_map) + offsets
     return head + index_length + struct.pack("<I", len(name)) + name + struct.pack("<QQ", n_packed, n_raw)
 

@@ -195,7 +195,7 @@ def mcap(compression: str = "") -> Callable[[Samples], list[Files]]:
     """A single mcap file of images, scans and events."""
 
     def make(samples: Samples) -> list[Files]:
-        return [{"a.mcap": layers.mcap_recompressed(_mcap_file(samples), compression)}]
+        return [{"a.mcap": layers.mcap_recompressed(mcap_file(samples), compression)}]
 
     return make
 
@@ -207,14 +207,14 @@ def torn_mcap(samples: Samples) -> list[Files]:
 
 def db3(samples: Samples) -> list[Files]:
     """A single sqlite3 file."""
-    return [{"a.db3": layers.write_raw_messages(layers.messages_in(_mcap_file(samples), ".mcap"), ".db3")}]
+    return [{"a.db3": layers.write_raw_messages(layers.messages_in(mcap_file(samples), ".mcap"), ".db3")}]
 
 
 def ros2_folder(samples: Samples) -> list[Files]:
     """Folders of a ROS 2 bag: mcap, sqlite3, and sqlite3 with compressed messages."""
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-    messages = layers.messages_in(_mcap_file(samples), ".mcap")
+    messages = layers.messages_in(mcap_file(samples), ".mcap")
     seeds = []
     for plugin, is_packed in (
         (StoragePlugin.MCAP, False),
@@ -243,7 +243,8 @@ def _recorded(samples: Samples, name: str) -> bytes:
     return _written(write, name)
 
 
-def _mcap_file(samples: Samples) -> bytes:
+def mcap_file(samples: Samples) -> bytes:
+    """Record images, scans and events as mcap, without the folder's metadata."""
     from lce_rig.sources.bag_recorder import BagRecorder
 
     with tempfile.TemporaryDirectory() as folder:
@@ -271,7 +272,12 @@ def _ros1_recompressed(data: bytes, compression: str) -> bytes:
 
 
 def _compressed_images(samples: Samples) -> bytes:
-    """Write images as sensor_msgs/CompressedImage, and clouds as they are."""
+    encoded = [image(suffix)(samples)[0][f"a{suffix}"] for suffix in (".jpg", ".png")]
+    return bag_of_encoded(samples, encoded)
+
+
+def bag_of_encoded(samples: Samples, encoded: Sequence[bytes]) -> bytes:
+    """Write encoded images as sensor_msgs/CompressedImage into a ROS 1 bag, and clouds as they are."""
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -281,7 +287,6 @@ def _compressed_images(samples: Samples) -> bytes:
     clouds = [
         m for m in layers.messages_in(_recorded(samples, "a.bag"), ".bag") if "PointCloud2" in m[0].msgtype
     ]
-    encoded = [image(suffix)(samples)[0][f"a{suffix}"] for suffix in (".jpg", ".png")]
 
     def write(path: Path) -> None:
         with Writer(path) as writer:
