@@ -54,7 +54,7 @@ def zip_of(members: dict[str, tuple[bytes, int]]) -> bytes:
     body, directory = b"", b""
     for name, (packed, n_raw) in members.items():
         crc = zlib.crc32(zlib.decompress(packed, -15)) if n_raw <= _PIECE else 0
-        fields = struct.pack("<HHHHIII", 20, 0, 8, 0, 33, crc, len(packed), min(n_raw, 0xFFFFFFFF))
+        fields = struct.pack("<HHHHHIII", 20, 0, 8, 0, 33, crc, len(packed), min(n_raw, 0xFFFFFFFF))
         ends = struct.pack("<HH", len(name), 0)
         at = len(body)
         body += b"PK\3\4" + fields + ends + name.encode() + packed
