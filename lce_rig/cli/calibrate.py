@@ -1,9 +1,10 @@
 """`lce-rig calibrate`: the extrinsics of a session, judged and written as files."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -19,6 +20,9 @@ from lce_rig.cli.options import (
 from lce_rig.cli.uncertainty import uncertainty_lines
 from lce_rig.core.results import Calibration
 from lce_rig.detect.detection import Pair
+
+if TYPE_CHECKING:
+    from lce_rig.pipeline.result_files import WrittenResults
 
 
 @click.command()
@@ -107,7 +111,10 @@ def calibrate(
 ) -> None:
     """Estimate where the LiDAR sits relative to each camera of SESSION (default: session/).
 
-    Writes SESSION/calibration/: result.json, extrinsics.yaml, URDF, camera_info and static transforms.
+    Writes SESSION/calibration/ as a whole: result.json, extrinsics.yaml, URDF, camera_info and static
+    transforms. The earlier result moves to SESSION/calibration/previous/; it is untouched where this run ends
+    without a result.
+
     Exits with 7 where a result must not be used: that camera is then left out of the exports, unless --force
     is given. Exits with 6 where a camera has no result.
     """
@@ -137,25 +144,25 @@ def calibrate(
             f"{reference}: T_cam_lidar names no sensors, and there are several: {', '.join(wanted)}",
             'Write {"pairs": [{"camera": ..., "lidar": ..., "T_cam_lidar": ...}, ...]}, or name a --camera.',
         )
-    pipeline.remove_results(opened)
-    with show.progress_bar("detecting") as progress:
-        detections = pipeline.detect(opened, event_image=event_image, progress=progress)
-    with show.progress_bar("calibrating") as progress:
-        results, troubles = pipeline.calibrate(
-            rig,
-            detections,
-            options,
-            cameras=cameras or None,
-            channels=channels,
-            reference=truth,
-            progress=progress,
-        )
-    for trouble in troubles:
-        show.warn(str(trouble))
-    calibrations = [calibration for calibration, _ in results]
-    if truth is not None and any(c.egt_rotation_deg is None for c in calibrations):
-        show.warn(f"{reference} holds no T_cam_lidar of these sensors")
-    files = pipeline.write_results(opened, calibrations, force=force)
+    with _earlier_result_named(opened.path):
+        with show.progress_bar("detecting") as progress:
+            detections = pipeline.detect(opened, event_image=event_image, progress=progress)
+        with show.progress_bar("calibrating") as progress:
+            results, troubles = pipeline.calibrate(
+                rig,
+                detections,
+                options,
+                cameras=cameras or None,
+                channels=channels,
+                reference=truth,
+                progress=progress,
+            )
+        for trouble in troubles:
+            show.warn(str(trouble))
+        calibrations = [calibration for calibration, _ in results]
+        if truth is not None and any(c.egt_rotation_deg is None for c in calibrations):
+            show.warn(f"{reference} holds no T_cam_lidar of these sensors")
+        written = pipeline.write_results(opened, calibrations, force=force)
     if as_json:
         from lce_rig.export.result import to_json_dict
 
@@ -166,8 +173,35 @@ def calibrate(
             show.print_lines(_lines(calibration, estimate.held_out_m, estimate.weak_direction))
         for calibration in calibrations:
             show.print_lines(camera_lines(calibration, calibrations))
-        show.note("written: " + ", ".join(path.name for path in files) + f" in {files[0].parent}")
+        show.note("written: " + ", ".join(f.name for f in written.files) + f" in {written.files[0].parent}")
+    _tell_earlier(written)
     _exit(calibrations, wanted, {pair.camera for pair in detections.pairs}, are_told=not as_json)
+
+
+@contextmanager
+def _earlier_result_named(session: Path) -> Iterator[None]:
+    """Say, where a run ends without a result, that the files there are of an earlier one."""
+    from lce_rig.core.errors import LceRigError
+    from lce_rig.pipeline.result_files import RESULT
+    from lce_rig.session.session import CALIBRATION
+
+    try:
+        yield
+    except LceRigError:
+        if (session / CALIBRATION / RESULT).exists():
+            show.note(f"{session / CALIBRATION} is unchanged: it holds the result of an earlier run")
+        raise
+
+
+def _tell_earlier(written: "WrittenResults") -> None:
+    """Say where the earlier run's files are, and which may be used."""
+    has_exports = len(written.files) > 1
+    if written.previous is None:
+        return
+    if not has_exports and written.has_usable_previous:
+        show.warn(f"no exports of this result; the last usable one is in {written.previous}")
+    elif not written.is_same:
+        show.note(f"the earlier result is in {written.previous}")
 
 
 def _exit(

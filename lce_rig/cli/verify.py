@@ -25,8 +25,8 @@ from lce_rig.cli.options import event_image_option, json_option, session_argumen
 def verify(session: Path, result: Path | None, output: Path | None, as_json: bool, event_image: Any) -> None:
     """Draw the LiDAR of each capture of SESSION (default: session/) into its picture, print residuals.
 
-    Pictures and one contact sheet go to SESSION/calibration/overlays/. Exits with 7 where the verdict is fail
-    or these captures contradict the extrinsic.
+    Images and one contact sheet replace those in SESSION/calibration/overlays/, with --result FILE those in
+    SESSION/overlays/. Exits with 7 where the verdict is fail or these captures contradict the extrinsic.
     """
     from dataclasses import replace
 
@@ -35,11 +35,13 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
     from lce_rig.core.errors import ResultRefusedError, SessionError
     from lce_rig.detect.detection import Pair
     from lce_rig.export.result import read_result
-    from lce_rig.pipeline.result_files import CALIBRATION
+    from lce_rig.pipeline.result_files import RESULT, result_content
     from lce_rig.session import Session
+    from lce_rig.session.session import CALIBRATION
 
     opened = Session.open(session)
-    saved = read_result(result or session / CALIBRATION / "result.json")
+    own = None if result is not None else result_content(opened)
+    saved = read_result(result or session / CALIBRATION / RESULT)
     if saved.rig != opened.rig.name or not saved.calibrations:
         what = (
             f"the result is of rig {saved.rig!r}"
@@ -55,7 +57,13 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
         detections = pipeline.detect(opened, event_image=event_image, progress=progress)
     with show.progress_bar("drawing") as progress:
         checks = pipeline.verify(
-            opened, detections, calibrations, event_image=event_image, folder=output, progress=progress
+            opened,
+            detections,
+            calibrations,
+            event_image=event_image,
+            result=own,
+            folder=output,
+            progress=progress,
         )
     if as_json:
         show.print_json(

@@ -89,7 +89,7 @@ def remove_exports(folder: Path) -> None:
         SessionError: one cannot be removed.
     """
     for path in sorted(folder.glob("*")):
-        if path.suffix in (".yaml", ".urdf", ".txt") and path.is_file() and _is_ours(path):
+        if is_export(path):
             try:
                 path.unlink()
             except OSError as error:
@@ -98,6 +98,16 @@ def remove_exports(folder: Path) -> None:
                 ) from error
 
 
-def _is_ours(path: Path) -> bool:
-    with path.open("rb") as file:
-        return b", written by lce-rig " in file.read(300)
+def is_export(path: Path) -> bool:
+    """Tell whether a file is an export that lce-rig wrote, by its first lines.
+
+    Raises:
+        SessionError: it cannot be read.
+    """
+    if path.suffix not in (".yaml", ".urdf", ".txt") or not path.is_file() or path.is_symlink():
+        return False
+    try:
+        with path.open("rb") as file:
+            return b", written by lce-rig " in file.read(300)
+    except OSError as error:
+        raise SessionError(f"{path}: cannot be read: {error.strerror}") from error

@@ -1,7 +1,6 @@
 """Text on disk: numbers that read back exactly, files that exist whole or not at all."""
 
 import json
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from lce_rig.core.errors import ResultRefusedError, SessionError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Calibration
 from lce_rig.rig import Rig
+from lce_rig.session.durable import replace_file
 
 MADE_BY = f"lce-rig {lce_rig.__version__}"
 
@@ -83,22 +83,9 @@ def write_atomically(path: Path, text: str) -> None:
     Raises:
         SessionError: the folder cannot be written to.
     """
-    temporary = path.with_name(f".{path.name}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with temporary.open("w", encoding="utf-8", newline="\n") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        replace_file(path, text.encode())
     except OSError as error:
         raise SessionError(
             f"{path}: cannot be written: {error.strerror or error}", "free space or choose another folder"

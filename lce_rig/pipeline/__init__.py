@@ -13,7 +13,7 @@ session and the export layer touch files.
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.pipeline.calibration import calibrate
 from lce_rig.pipeline.detection import detect, detect_image, detect_scan, detection_digest, event_picture
-from lce_rig.pipeline.result_files import inputs_sha256, remove_results, write_results
+from lce_rig.pipeline.result_files import inputs_sha256, write_results
 from lce_rig.pipeline.solving import refusals
 from lce_rig.pipeline.verification import verify, write_debug_images
 
@@ -30,7 +30,6 @@ __all__ = [
     "event_picture",
     "inputs_sha256",
     "refusals",
-    "remove_results",
     "verify",
     "write_debug_images",
     "write_results",

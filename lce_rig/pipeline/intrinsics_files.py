@@ -1,7 +1,7 @@
 """Measured intrinsics as files: a block for the profile, a new profile, camera_info, a page of pictures."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -10,53 +10,84 @@ import numpy as np
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError, UsageError
+from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
 from lce_rig.core.results import Refusal
 from lce_rig.export.camera_info import camera_info_text, read_camera_info, ros_distortion
 from lce_rig.export.writing import MADE_BY, number, numbers, write_atomically
 from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
+from lce_rig.pipeline.result_files import keep_earlier
 from lce_rig.rig import Rig, dump_rig, find_profile, load_rig, parse_rig, set_value, shipped_profiles
 from lce_rig.session import Session
+from lce_rig.session.replacing import copy_over
+from lce_rig.session.session import INTRINSICS
 
-INTRINSICS = "intrinsics"
+DOCUMENT = "intrinsics.json"
 FORMAT_VERSION = 1
 _PIXEL_DIGITS, _COEFFICIENT_DIGITS = 4, 8
 
 
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
-    """Write the session's intrinsics/ anew.
+    """Write the session's intrinsics/ as a whole; an earlier run's files move to intrinsics/previous/.
 
-    For each camera a block to paste into the profile, a camera_info file and a page of pictures; and
-    intrinsics.json for machines.
+    For each camera a block to paste into the profile, a camera_info file and a page of images; and
+    intrinsics.json for machines. Cameras that an earlier run measured and this one did not stay.
 
     Returns:
-        The files.
+        The files of this run.
 
     Raises:
-        LceRigError: a file cannot be written, or does not read back as it was.
+        LceRigError: a file cannot be written, or does not read back as it was; earlier ones are untouched.
     """
+    names = [DOCUMENT]
+
+    def finish(earlier: Path, draft: Path) -> None:
+        others = _other_cameras(earlier / DOCUMENT, {one.camera for one in measured})
+        for camera in others:
+            for name in filter(lambda each: (earlier / each).is_file(), _file_names(camera)):
+                copy_over(earlier / name, draft / name)
+        content = document(session.rig, measured, list(others.values()))
+        write_atomically(draft / DOCUMENT, json.dumps(content, indent=2) + "\n")
+        known = {name for camera in session.rig.cameras for name in _file_names(camera)}
+        keep_earlier(earlier, draft, DOCUMENT, lambda path: path.name in {DOCUMENT, *known})
+
+    with session.replacing(INTRINSICS, finish=finish) as draft:
+        for one in measured:
+            names += _write_camera(draft, session.rig, one)
+    return [session.path / INTRINSICS / name for name in names]
+
+
+def _write_camera(folder: Path, rig: Rig, one: MeasuredIntrinsics) -> tuple[str, ...]:
+    """Write the files of one camera and give their names."""
     from lce_rig.verify.intrinsics_plot import draw_intrinsics
     from lce_rig.verify.writing import write_picture
 
-    folder = session.path / INTRINSICS
-    for old in sorted(folder.glob("*")) if folder.is_dir() else []:
-        old.unlink()
-    files = [folder / "intrinsics.json"]
-    write_atomically(files[0], json.dumps(document(session.rig, measured), indent=2) + "\n")
-    for one in measured:
-        block = folder / f"{one.camera}.yaml"
-        write_atomically(block, profile_block(session.rig, one))
-        info = folder / f"camera_info_{one.camera}.yaml"
-        write_atomically(info, camera_info_text(one.camera, final(one), _head(session.rig, one)))
-        _check(info, final(one))
-        page = draw_intrinsics(
-            one.estimate,
-            one.certainty,
-            one.difference,
-            title=f"Intrinsics of camera {one.camera}, rig {session.rig.name}",
-            weaknesses=one.weaknesses,
-        )
-        files += [block, info, write_picture(folder / f"{one.camera}.png", page)]
-    return files
+    names = _file_names(one.camera)
+    block, info, page = (folder / name for name in names)
+    write_atomically(block, profile_block(rig, one))
+    write_atomically(info, camera_info_text(one.camera, final(one), _head(rig, one)))
+    _check(info, final(one))
+    drawn = draw_intrinsics(
+        one.estimate,
+        one.certainty,
+        one.difference,
+        title=f"Intrinsics of camera {one.camera}, rig {rig.name}",
+        weaknesses=one.weaknesses,
+    )
+    write_picture(page, drawn)
+    return names
+
+
+def _file_names(camera: str) -> tuple[str, str, str]:
+    return f"{camera}.yaml", f"camera_info_{camera}.yaml", f"{camera}.png"
+
+
+def _other_cameras(path: Path, measured: Collection[str]) -> dict[str, dict[str, Any]]:
+    """Read what an earlier run says of cameras that were not measured again; nothing where it is damaged."""
+    try:
+        cameras = json.loads(read_file(path, MAX_DOCUMENT_BYTES))["cameras"]
+        return {str(each["camera"]): each for each in cameras if each["camera"] not in measured}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return {}
 
 
 def final(measured: MeasuredIntrinsics) -> Intrinsics:
@@ -135,13 +166,21 @@ def _check(path: Path, wanted: Intrinsics) -> None:
         raise LceRigError(f"{path}: reads back as another camera")
 
 
-def document(rig: Rig, measured: Sequence[MeasuredIntrinsics]) -> dict[str, Any]:
-    """Build the content of intrinsics.json from plain types; figures that could not be computed are null."""
+def document(
+    rig: Rig, measured: Sequence[MeasuredIntrinsics], others: Sequence[Mapping[str, Any]] = ()
+) -> dict[str, Any]:
+    """Build the content of intrinsics.json from plain types; figures that could not be computed are null.
+
+    Args:
+        rig: the profile.
+        measured: in this run.
+        others: entries of an earlier run for other cameras.
+    """
     return {
         "format_version": FORMAT_VERSION,
         "rig": rig.name,
         "made_by": MADE_BY,
-        "cameras": [_camera(one) for one in measured],
+        "cameras": [*map(_camera, measured), *others],
     }
 
 

@@ -16,9 +16,10 @@ from lce_rig.export.result import read_result
 from lce_rig.pipeline.calibration import calibrate
 from lce_rig.pipeline.detection import detect
 from lce_rig.pipeline.progress import Progress, silent
-from lce_rig.pipeline.result_files import CALIBRATION
+from lce_rig.pipeline.result_files import RESULT
 from lce_rig.session import Session
 from lce_rig.session.identity import differing_keys
+from lce_rig.session.session import CALIBRATION
 
 # What an extrinsic depends on beside the captures: another lens is another camera.
 _SAME_SENSORS = frozenset({"intrinsics", "resolution_px", "model"})
@@ -68,7 +69,7 @@ def repeat(paths: Sequence[Path], *, progress: Progress = silent) -> Repeat:
     calibrated: list[str] = []
     troubles: list[str] = []
     for done, (name, session) in enumerate(sessions.items(), start=1):
-        if (session.path / CALIBRATION / "result.json").exists():
+        if (session.path / CALIBRATION / RESULT).exists():
             results[name] = _read_calibrations(session)
         else:
             results[name], own_troubles = _calibrate(name, session)
@@ -174,7 +175,7 @@ def _calibrated_sensors(name: str, calibrations: Sequence[Calibration]) -> str:
 
 
 def _read_calibrations(session: Session) -> list[Calibration]:
-    path = session.path / CALIBRATION / "result.json"
+    path = session.path / CALIBRATION / RESULT
     saved = read_result(path)
     if saved.rig != session.rig.name:
         raise SessionError(

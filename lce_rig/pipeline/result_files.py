@@ -1,36 +1,73 @@
-"""The files of a result in its session: written, fingerprinted, removed before the next."""
+"""The files of a result in its session: written whole, fingerprinted, the last usable ones before kept."""
 
 import hashlib
-import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
+from lce_rig.core.errors import LceRigError
 from lce_rig.core.results import Calibration
 from lce_rig.session import Session
-from lce_rig.session.session import CAPTURES, PROFILE
+from lce_rig.session.replacing import copy_over
+from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE
 from lce_rig.session.writing import MANIFEST
 
-CALIBRATION, OVERLAYS = "calibration", "overlays"
+RESULT, OVERLAYS, PREVIOUS = "result.json", "overlays", "previous"
 
 
-def write_results(session: Session, calibrations: Sequence[Calibration], *, force: bool) -> list[Path]:
-    """Write result.json and, unless a verdict forbids it, every export beside it.
+@dataclass(frozen=True)
+class WrittenResults:
+    """What a run left in the session's calibration/.
 
-    Returns:
-        The files written, result.json first.
+    Attributes:
+        files: the result.json and exports of this run.
+        previous: the folder with the earlier run's files; None where there was none.
+        has_usable_previous: whether that run had a result that may be used.
+        is_same: whether this result is the same to the byte as the one that was there.
     """
-    from lce_rig.export import remove_exports, write_exports
+
+    files: tuple[Path, ...]
+    previous: Path | None
+    has_usable_previous: bool
+    is_same: bool
+
+
+def write_results(session: Session, calibrations: Sequence[Calibration], *, force: bool) -> WrittenResults:
+    """Write result.json and, unless a verdict forbids it, every export, in place of an earlier run's.
+
+    All files of a run appear together. Those of the earlier run move to calibration/previous/; a failed run
+    never takes the place of a usable one there. Where the result is the same to the byte, overlays and
+    calibration/previous/ stay. Files that lce-rig did not write stay, too.
+
+    Raises:
+        SessionError: a capture that was used is gone, or the disk is full; the earlier files are untouched.
+        ResultRefusedError: a pose or covariance is not finite; the same.
+    """
+    from lce_rig.export import write_exports
     from lce_rig.export.result import write_result
 
     folder = session.path / CALIBRATION
-    folder.mkdir(exist_ok=True)
-    result = folder / "result.json"
-    write_result(result, session.rig.name, calibrations, inputs_sha256(session, calibrations))
     usable = [c for c in calibrations if force or c.verdict != "fail"]
-    if not usable:
-        remove_exports(folder)
-        return [result]
-    return [result, *write_exports(usable, session.rig, folder, is_forced=force)]
+    names: list[str] = [RESULT]
+    inputs = inputs_sha256(session, calibrations)
+    is_same = False
+
+    def finish(earlier: Path, draft: Path) -> None:
+        nonlocal is_same
+        is_same = _keep_earlier_results(earlier, draft)
+
+    with session.replacing(CALIBRATION, finish=finish) as draft:
+        write_result(draft / RESULT, session.rig.name, calibrations, inputs)
+        if usable:
+            names += [path.name for path in write_exports(usable, session.rig, draft, is_forced=force)]
+    previous = folder / PREVIOUS
+    return WrittenResults(
+        tuple(folder / name for name in names),
+        previous if previous.is_dir() else None,
+        is_usable(previous),
+        is_same,
+    )
 
 
 def inputs_sha256(session: Session, calibrations: Sequence[Calibration]) -> dict[str, str]:
@@ -50,12 +87,79 @@ def inputs_sha256(session: Session, calibrations: Sequence[Calibration]) -> dict
     return {PROFILE: profile, **manifests}
 
 
-def remove_results(session: Session) -> None:
-    """Remove the result, exports and pictures of an earlier run: they must not pass for this one's."""
-    from lce_rig.export import remove_exports
+def is_usable(folder: Path) -> bool:
+    """Tell whether a folder holds the result of a calibration that did not fail."""
+    from lce_rig.export.result import read_result
 
-    folder = session.path / CALIBRATION
-    if folder.is_dir():
-        remove_exports(folder)
-        (folder / "result.json").unlink(missing_ok=True)
-        shutil.rmtree(folder / OVERLAYS, ignore_errors=True)
+    with suppress(LceRigError):
+        return any(c.verdict != "fail" for c in read_result(folder / RESULT).calibrations)
+    return False
+
+
+def keep_earlier(
+    earlier: Path, draft: Path, document: str, is_ours: Callable[[Path], bool], *, deserves: bool = True
+) -> bool:
+    """Take over into a draft what the folder that it replaces holds.
+
+    Args:
+        earlier: need not exist.
+        draft: with the new files.
+        document: the name of the file that tells whether the new result is another one.
+        is_ours: tells the files of a result from those of the user, which stay.
+        deserves: whether the earlier files, not those that were earlier than they, become `previous/`.
+
+    Returns:
+        Whether both results are the same to the byte: then what was previous stays so.
+
+    Raises:
+        OSError: a full disk, no permission.
+    """
+    if not earlier.is_dir():
+        return False
+    keep_foreign(earlier, draft, lambda path: path.name == PREVIOUS or is_ours(path))
+    is_same = _content(earlier / document) == _content(draft / document)
+    has_earlier = deserves and (earlier / document).exists()
+    kept = earlier if has_earlier and not is_same else earlier / PREVIOUS
+    if kept == earlier:
+        (draft / PREVIOUS).mkdir()
+        for entry in earlier.iterdir():
+            if entry.name != PREVIOUS and is_ours(entry):
+                copy_over(entry, draft / PREVIOUS / entry.name)
+    elif kept.is_dir():
+        copy_over(kept, draft / PREVIOUS)
+    return is_same
+
+
+def keep_foreign(earlier: Path, draft: Path, is_ours: Callable[[Path], bool]) -> None:
+    """Take what the user put into a folder over into the draft that replaces it.
+
+    Raises:
+        OSError: a full disk, no permission.
+    """
+    for entry in earlier.iterdir() if earlier.is_dir() else ():
+        if not is_ours(entry) and not (draft / entry.name).exists():
+            copy_over(entry, draft / entry.name)
+
+
+def result_content(session: Session) -> bytes | None:
+    """Read the session's result.json as it lies on the disk; None where there is none."""
+    return _content(session.path / CALIBRATION / RESULT)
+
+
+def _keep_earlier_results(earlier: Path, draft: Path) -> bool:
+    """Keep the last usable result, and overlays with their result; tell whether both results are the same."""
+    deserves = is_usable(earlier) or not is_usable(earlier / PREVIOUS)
+    is_same = keep_earlier(earlier, draft, RESULT, _is_of_a_result, deserves=deserves)
+    if is_same and (earlier / OVERLAYS).is_dir():
+        copy_over(earlier / OVERLAYS, draft / OVERLAYS)
+    return is_same
+
+
+def _is_of_a_result(path: Path) -> bool:
+    from lce_rig.export import is_export
+
+    return path.name in (RESULT, OVERLAYS) or is_export(path)
+
+
+def _content(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None

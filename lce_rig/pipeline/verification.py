@@ -11,13 +11,12 @@ from lce_rig.detect.event_board import EventImage
 from lce_rig.pipeline.detection import event_picture
 from lce_rig.pipeline.event_detection import event_channels
 from lce_rig.pipeline.progress import Progress, silent
-from lce_rig.pipeline.result_files import CALIBRATION, OVERLAYS
+from lce_rig.pipeline.result_files import OVERLAYS, keep_foreign, result_content
 from lce_rig.pipeline.solving import clocks_of
 from lce_rig.session import Capture, Session
+from lce_rig.session.session import CALIBRATION, DEBUG
 from lce_rig.verify.event_picture import CameraView
 from lce_rig.verify.session_check import SessionCheck, check_session
-
-DEBUG = "debug"
 
 
 def verify(
@@ -26,6 +25,7 @@ def verify(
     calibrations: Sequence[Calibration],
     *,
     event_image: EventImage | None = None,
+    result: bytes | None = None,
     folder: Path | None = None,
     progress: Progress = silent,
 ) -> list[SessionCheck]:
@@ -36,26 +36,27 @@ def verify(
         detections: of this session.
         calibrations: as a rule from its result.json.
         event_image: as the detections were made.
-        folder: for the pictures; the session's calibration/overlays/ where None. Several pairs get a
-            folder each.
+        result: content of the session's own result.json, where the calibrations come from it.
+        folder: for the images; by default the session's calibration/overlays/ where the result is its own,
+            else its overlays/, which are replaced as a whole. Several pairs get a folder each.
         progress: called with (done, total) for each pair in turn.
 
     Returns:
         A check of each channel; of sensors of which the session has no captures there is none.
 
     Raises:
-        SessionError: the session has no captures of any calibration's sensors.
+        SessionError: the session has no captures of any calibration's sensors; or its result was replaced
+            meanwhile, and the overlays there are untouched.
     """
-    base = folder or session.path / CALIBRATION / OVERLAYS
     jobs = [(c, pair) for c in calibrations for pair in _pairs_held(detections, c)]
     if not jobs:
         wanted = ", ".join(str(Pair.of(c)) for c in calibrations)
         raise SessionError(
             f"{session.path} holds no captures of {wanted}", "The result belongs to another session."
         )
-    checks = []
-    for c, pair in jobs:
-        checks.append(
+
+    def check(base: Path) -> list[SessionCheck]:
+        return [
             check_session(
                 session,
                 detections,
@@ -66,8 +67,25 @@ def verify(
                 view_of=partial(_view, session, pair.camera, pair.channel, event_image),
                 progress=progress,
             )
-        )
-    return checks
+            for c, pair in jobs
+        ]
+
+    if folder is not None:
+        return check(folder)
+
+    def finish(earlier: Path, draft: Path) -> None:
+        if result is not None and result_content(session) != result:
+            raise SessionError(
+                f"{session.path / CALIBRATION} was calibrated again while overlays were drawn",
+                "Run `lce-rig verify` again.",
+            )
+        keep_foreign(earlier, draft, lambda path: path.is_dir() or path.suffix == ".png")
+
+    parts = (OVERLAYS,) if result is None else (CALIBRATION, OVERLAYS)
+    with session.replacing(*parts, finish=finish) as draft:
+        checks = check(draft)
+    place = session.path.joinpath(*parts)
+    return [each.moved(draft, place) for each in checks]
 
 
 def _pairs_held(detections: Detections, calibration: Calibration) -> list[Pair]:
@@ -99,7 +117,7 @@ def write_debug_images(
     from lce_rig.verify.debug_image import draw_debug
     from lce_rig.verify.writing import write_picture
 
-    base = folder or session.path / DEBUG
+    base = folder or session.own(DEBUG)
     jobs = [(pair, name) for pair in detections.pairs for name in detections.captures(pair)]
     for done, (pair, name) in enumerate(jobs, start=1):
         capture, (image, lidar) = session.capture(name), detections.of(pair, name)
@@ -120,6 +138,8 @@ def write_debug_images(
             events=None if view is None else view.events,
         )
         own = base if len(detections.pairs) == 1 else base / pair.folder_name
+        if folder is None:
+            session.own(*own.relative_to(session.path).parts)
         write_picture(own / f"{name}.png", picture)
         progress(done, len(jobs))
     return base

@@ -1,8 +1,27 @@
 """Files that survive a power cut, and the lock that keeps a second writer out."""
 
+import errno
 import fcntl
 import os
 from pathlib import Path
+
+# A link that somebody put in a file's place must not lead elsewhere.
+_WRITE_OWN = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+
+
+def own_path(root: Path, path: Path) -> Path:
+    """Pass a path through that leads, links followed, to a place in a folder.
+
+    Raises:
+        OSError: it leads elsewhere; sessions come from others, and must not make us write over files of ours.
+    """
+    try:
+        is_own = path.resolve().is_relative_to(root.resolve())
+    except RuntimeError:  # a loop of links, until Python 3.13
+        is_own = False
+    if not is_own:
+        raise OSError(errno.ELOOP, "it is a link that leads out of the session", str(path))
+    return path
 
 
 def write_new_file(path: Path, data: bytes) -> None:
@@ -51,7 +70,7 @@ def append_line(path: Path, line: str) -> None:
     Raises:
         OSError: a full disk, no permission.
     """
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    descriptor = os.open(path, _WRITE_OWN, 0o644)
     try:
         size = os.lseek(descriptor, 0, os.SEEK_END)
         is_torn = size > 0 and os.pread(descriptor, 1, size - 1) != b"\n"
@@ -80,7 +99,7 @@ class WriterLock:
 
     def __init__(self, path: Path) -> None:
         self._descriptor = -1
-        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        self._descriptor = os.open(path, _WRITE_OWN, 0o644)
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

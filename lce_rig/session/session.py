@@ -10,7 +10,8 @@ import errno
 import json
 import re
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -23,13 +24,16 @@ from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import cache
 from lce_rig.session.capture import SAFE_NAME, Capture
-from lce_rig.session.durable import WriterLock, append_line, flush_folder, replace_file
+from lce_rig.session.durable import WriterLock, append_line, flush_folder, own_path, replace_file
 from lce_rig.session.identity import MARKER, check_marker, differing_keys, marker_of
 from lce_rig.session.membership import check_samples, event_channel
+from lce_rig.session.replacing import recover, replacing
 from lce_rig.session.writing import content_hash, write_capture
 
 PROFILE, JOURNAL, LOCK = "rig.yaml", "journal.jsonl", ".lock"
 CAPTURES, DETECTIONS, DRAFT_PREFIX = "captures", "detections", ".new-"
+CALIBRATION, INTRINSICS, DEBUG = "calibration", "intrinsics", "debug"
+_WRITTEN = (JOURNAL, LOCK, CAPTURES, DETECTIONS, CALIBRATION, INTRINSICS, DEBUG)
 
 
 class Session:
@@ -89,6 +93,9 @@ class Session:
         """
         path = Path(path)
         check_marker(path)
+        _check_links(path)
+        with suppress(OSError):  # without permission to write nothing was ever put aside
+            recover(path)
         try:
             rig = load_rig(path / PROFILE)
         except LceRigError as error:
@@ -102,7 +109,10 @@ class Session:
             lock = _take_lock(path)
             (path / CAPTURES).mkdir(exist_ok=True)
             for draft in sorted((path / CAPTURES).glob(f"{DRAFT_PREFIX}*")):
-                shutil.rmtree(draft)
+                if draft.is_symlink():
+                    draft.unlink()
+                else:
+                    shutil.rmtree(draft)
         except OSError as error:
             raise _not_writable(path, error) from error
         return cls(path, rig, lock)
@@ -208,7 +218,7 @@ class Session:
         contents = self._contents()
         captures = self.captures
         name = f"{int(captures[-1].name) + 1 if captures else 0:06d}"
-        folder = self.path / CAPTURES / name
+        folder = self.own(CAPTURES, name)
         draft = folder.with_name(DRAFT_PREFIX + name)
         try:
             draft.mkdir()
@@ -266,7 +276,42 @@ class Session:
         parts = key.split("/")
         if not all(SAFE_NAME.fullmatch(part) for part in parts):
             raise ValueError(f"{key!r} is no cache key")
-        return self.path.joinpath(DETECTIONS, *parts[:-1], parts[-1] + ".npz")
+        return self.own(DETECTIONS, *parts[:-1], parts[-1] + ".npz")
+
+    def own(self, *parts: str) -> Path:
+        """Give the path of a file or folder of the session that is to be written.
+
+        Raises:
+            SessionError: a link there leads out of the session.
+        """
+        path = self.path.joinpath(*parts)
+        try:
+            return own_path(self.path, path)
+        except OSError as error:
+            raise _not_writable(path, error) from None
+
+    @contextmanager
+    def replacing(
+        self, *parts: str, finish: Callable[[Path, Path], None] = lambda _old, _draft: None
+    ) -> Iterator[Path]:
+        """Yield an empty folder that takes the place of one of the session's when the block ends.
+
+        Readers find the earlier folder or the new one, whole, whatever happens in between.
+
+        Args:
+            parts: of the folder's path in the session.
+            finish: see `lce_rig.session.replacing`.
+
+        Raises:
+            SessionError: the disk is full or read-only, or a link leads out of the session; the earlier
+                folder is untouched.
+        """
+        folder = self.own(*parts)
+        try:
+            with replacing(self.path, folder, finish) as draft:
+                yield draft
+        except OSError as error:
+            raise _not_writable(folder, error) from error
 
     def _contents(self) -> dict[str, str]:
         if self._names_by_content is None:
@@ -290,6 +335,20 @@ def _check_rig(path: Path, rig: Rig) -> None:
         )
 
 
+def _check_links(path: Path) -> None:
+    """Refuse a session in which what is written here leads elsewhere, before anything is done with it.
+
+    Raises:
+        SessionError: it names the link.
+    """
+    for name in _WRITTEN:
+        if (path / name).is_symlink():
+            try:
+                own_path(path, path / name)
+            except OSError as error:
+                raise _not_writable(path / name, error) from None
+
+
 def _take_lock(path: Path) -> WriterLock:
     try:
         return WriterLock(path / LOCK)
@@ -304,6 +363,8 @@ def _not_writable(path: Path, error: OSError, n_safe: int | None = None) -> Sess
     safe = "" if not n_safe else f" The {n_safe} captures before it are safe."
     if isinstance(error, (FileExistsError, NotADirectoryError)):
         hint = "There is a file of that name: choose another folder."
+    elif error.errno == errno.ELOOP:
+        hint = "Put a folder or file of its own there: nothing outside the session is written or removed."
     elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         hint = "Choose a folder that you may write to, or see to its permissions."
     else:

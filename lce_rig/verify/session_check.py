@@ -1,7 +1,7 @@
 """An extrinsic held against every capture of a session: residuals, one picture each, one sheet for all."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,15 @@ class SessionCheck:
     used: tuple[str, ...]
     pictures: tuple[Path, ...]
     contact_sheet: Path | None
+
+    def moved(self, old: Path, new: Path) -> "SessionCheck":
+        """Name the files by the folder that theirs has become."""
+
+        def renamed(path: Path) -> Path:
+            return new / path.relative_to(old)
+
+        sheet = None if self.contact_sheet is None else renamed(self.contact_sheet)
+        return replace(self, pictures=tuple(map(renamed, self.pictures)), contact_sheet=sheet)
 
     def document(self) -> dict[str, Any]:
         """List everything as plain types for JSON."""

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from lce_rig.core.errors import SessionError
+from lce_rig.session.durable import replace_file
 from lce_rig.verify import canvas
 from lce_rig.verify.canvas import Picture
 from lce_rig.verify.contact_sheet import contact_sheet
@@ -45,7 +46,7 @@ def write_overlays(folder: Path, overlays: Iterable[tuple[str, Picture, Picture]
 
 
 def write_picture(path: Path, picture: Picture) -> Path:
-    """Write one PNG.
+    """Write one PNG, whole or not at all.
 
     Raises:
         SessionError: the file cannot be written.
@@ -55,7 +56,7 @@ def write_picture(path: Path, picture: Picture) -> Path:
         raise SessionError(f"{path}: a picture of shape {picture.shape} cannot be written as PNG")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(np.asarray(data).tobytes())
+        replace_file(path, np.asarray(data).tobytes())
     except OSError as error:
         hint = "free space on the disk or choose another folder"
         raise SessionError(f"{path}: cannot be written: {error.strerror}", hint) from error

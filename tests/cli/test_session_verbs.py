@@ -136,11 +136,44 @@ def test_nothing_to_fit_is_a_usage_error(lce_rig, session):
     assert "leave nothing to fit" in outcome.err
 
 
-def test_a_failed_calibration_leaves_no_earlier_result_behind(lce_rig, calibrated_few):
+def test_a_run_without_result_leaves_the_earlier_one_untouched_and_says_so(lce_rig, calibrated_few):
     lce_rig("verify", calibrated_few)
-    assert (calibrated_few / "calibration" / "overlays").exists()
-    assert lce_rig("calibrate", calibrated_few).code == 6
-    assert list((calibrated_few / "calibration").iterdir()) == []
+    folder = calibrated_few / "calibration"
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    outcome = lce_rig("calibrate", calibrated_few)
+    assert outcome.code == 6
+    assert "calibration is unchanged: it holds the result of an earlier run" in outcome.err
+    assert lce_rig("calibrate", calibrated_few, "--channels", "freams").code != 0
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_another_result_moves_the_earlier_one_and_its_overlays_to_previous(lce_rig, calibrated):
+    lce_rig("verify", calibrated)
+    folder = calibrated / "calibration"
+    before = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    again = lce_rig("calibrate", calibrated)
+    assert "earlier result" not in again.err
+    assert (folder / "overlays" / "contact_sheet.png").exists()
+    outcome = lce_rig("calibrate", calibrated, "--seed", "5")
+    assert f"the earlier result is in {folder / 'previous'}" in outcome.err.replace("\n", "")
+    kept = folder / "previous"
+    assert {path.relative_to(kept): path.read_bytes() for path in kept.rglob("*") if path.is_file()} == before
+    assert not (folder / "overlays").exists()
+
+
+def test_verify_of_a_result_from_elsewhere_leaves_the_sessions_own_overlays(
+    lce_rig, calibrated_few, tmp_path
+):
+    lce_rig("verify", calibrated_few)
+    own = calibrated_few / "calibration" / "overlays" / "000000.png"
+    before = own.read_bytes()
+    foreign = tmp_path / "deployed.json"
+    result = read(calibrated_few / "calibration" / "result.json")
+    result["pairs"][0]["T_cam_lidar"][0][3] += 0.02
+    foreign.write_text(json.dumps(result))
+    lce_rig("verify", calibrated_few, "--result", foreign)
+    assert own.read_bytes() == before
+    assert (calibrated_few / "overlays" / "000000.png").read_bytes() != before
 
 
 def test_a_capture_without_manifest_does_not_hinder_the_others(lce_rig, session):

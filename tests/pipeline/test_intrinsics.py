@@ -122,9 +122,6 @@ def test_unknown_channels_and_models_are_usage_errors(session):
 
 
 def test_every_file_holds_the_same_lens(session, measured, tmp_path):
-    stale = session.path / "intrinsics" / "old.yaml"
-    stale.parent.mkdir(exist_ok=True)
-    stale.write_text("of an earlier run")
     files = write_intrinsics(session, [measured])
     assert {path.name for path in (session.path / "intrinsics").iterdir()} == {path.name for path in files}
     lens = final(measured)
@@ -138,6 +135,27 @@ def test_every_file_holds_the_same_lens(session, measured, tmp_path):
     assert document["profile"]["verdict"] == "pass"
     assert document["views_used"] == [f"{k:06d}.frames" for k in range(8)]
     assert files[-1].read_bytes().startswith(b"\x89PNG")
+
+
+def test_another_run_keeps_the_earlier_files_what_is_the_users_and_other_cameras(session, measured):
+    folder = session.path / "intrinsics"
+    write_intrinsics(session, [measured])
+    (folder / "notes.txt").write_text("mine")
+    first = (folder / "intrinsics.json").read_bytes()
+    write_intrinsics(session, [measured])
+    assert not (folder / "previous").exists()
+    write_intrinsics(session, [replace(measured, weaknesses=("another",))])
+    assert (folder / "previous" / "intrinsics.json").read_bytes() == first
+    assert (folder / "previous" / "davis.png").exists()
+    assert (folder / "notes.txt").read_text() == "mine"
+    other = json.loads(first)["cameras"][0] | {"camera": "left"}
+    both = json.loads(first) | {"cameras": [other]}
+    (folder / "intrinsics.json").write_text(json.dumps(both))
+    (folder / "left.yaml").write_text("block of the other camera")
+    write_intrinsics(session, [measured])
+    cameras = json.loads((folder / "intrinsics.json").read_text())["cameras"]
+    assert [each["camera"] for each in cameras] == ["davis", "left"]
+    assert (folder / "left.yaml").read_text() == "block of the other camera"
 
 
 def test_a_new_profile_keeps_the_comments_of_the_old_and_never_replaces_a_file(session, measured, tmp_path):

@@ -1,0 +1,164 @@
+"""Folders of results, replaced whole: whoever looks finds all earlier files or all new ones, at any moment.
+
+A draft beside the session's other folders (`.new-calibration-XXXX`) is filled, then it and the folder change
+places in one step of the kernel (renameat2). A process that is killed leaves one whole folder, and a draft
+that the next one removes; a draft is locked (flock) while its maker lives.
+"""
+
+import ctypes
+import errno
+import fcntl
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+from lce_rig.session.durable import flush_folder
+
+DRAFT, ASIDE = ".new-", ".old-"
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+# What says that this kernel, C library or file system (NFS, FAT) cannot exchange.
+_NO_EXCHANGE = {errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EPERM}
+
+
+@contextmanager
+def replacing(
+    root: Path,
+    folder: Path,
+    finish: Callable[[Path, Path], None] = lambda _old, _draft: None,
+    *,
+    can_exchange: bool = True,
+) -> Iterator[Path]:
+    """Yield an empty draft; what is in it when the block ends takes the place of a folder.
+
+    Where the block raises, or anything goes wrong before the change of places, the folder stays as it was.
+
+    Args:
+        root: the session's folder, in which drafts are made.
+        folder: to be replaced, anywhere below `root`; need not exist.
+        finish: called with the folder and the draft just before they change places, while no other process
+            may replace folders of this session: what is to be kept goes into the draft here.
+        can_exchange: False takes the way of file systems that cannot exchange two folders in one step.
+
+    Raises:
+        OSError: a full disk, no permission.
+    """
+    with ExitStack() as lock:
+        draft = root / f"{DRAFT}{folder.name}-{secrets.token_hex(4)}"
+        with _locked(root):
+            _remove_drafts(root, folder.name)
+            draft.mkdir()
+            lock.enter_context(_locked(draft))
+        try:
+            yield draft
+            with _locked(root):
+                _put_back(root)
+                finish(folder, draft)
+                _flush(draft)
+                folder.parent.mkdir(exist_ok=True)
+                _change_places(draft, folder, root, can_exchange=can_exchange)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+
+
+def recover(root: Path) -> None:
+    """Put a folder back that a process was killed over, on file systems that cannot exchange two.
+
+    Raises:
+        OSError: no permission.
+    """
+    if any(root.glob(f"{ASIDE}*")):
+        with _locked(root):
+            _put_back(root)
+
+
+def copy_over(source: Path, target: Path) -> None:
+    """Copy a file or folder, its data shared with the source's where the file system has hard links.
+
+    Raises:
+        OSError: a full disk, no permission.
+    """
+    if source.is_dir() and not source.is_symlink():
+        shutil.copytree(source, target, symlinks=True, copy_function=_link_or_copy)
+    else:
+        _link_or_copy(str(source), str(target))
+
+
+def _link_or_copy(source: str, target: str) -> None:
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EMLINK, errno.EXDEV):
+            raise
+        shutil.copy2(source, target, follow_symlinks=False)
+
+
+def _change_places(draft: Path, folder: Path, root: Path, *, can_exchange: bool) -> None:
+    if not folder.exists():
+        draft.rename(folder)
+    elif not (can_exchange and _exchange(draft, folder)):
+        aside = root / (ASIDE + "+".join(folder.relative_to(root).parts))
+        folder.rename(aside)
+        # A process that is killed here has left both: `recover` puts the earlier folder back.
+        draft.rename(folder)
+        shutil.rmtree(aside, ignore_errors=True)
+    flush_folder(folder.parent)
+    if folder.parent != root:
+        flush_folder(root)
+
+
+def _exchange(a: Path, b: Path) -> bool:
+    """Let two folders change places in one step; False where the system cannot."""
+    try:
+        renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
+    except AttributeError:
+        return False
+    if renameat2(_AT_FDCWD, os.fsencode(a), _AT_FDCWD, os.fsencode(b), _RENAME_EXCHANGE) == 0:
+        return True
+    number = ctypes.get_errno()
+    if number in _NO_EXCHANGE:
+        return False
+    raise OSError(number, os.strerror(number), str(a), None, str(b))
+
+
+def _put_back(root: Path) -> None:
+    """Give each folder that stands aside its place back where nothing took it, else remove it."""
+    for aside in root.glob(f"{ASIDE}*"):
+        folder = root.joinpath(*aside.name.removeprefix(ASIDE).split("+"))
+        if folder.exists():
+            shutil.rmtree(aside, ignore_errors=True)
+        else:
+            aside.rename(folder)
+
+
+def _remove_drafts(root: Path, name: str) -> None:
+    """Remove what killed processes left; what a living one fills is locked."""
+    for draft in root.glob(f"{DRAFT}{name}-*"):
+        with suppress(OSError), _locked(draft, waits=False):
+            shutil.rmtree(draft, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: Path, *, waits: bool = True) -> Iterator[None]:
+    """Hold a folder's lock, which the kernel drops with the process; none where there is no flock (NFS).
+
+    Raises:
+        BlockingIOError: another process holds it, and this one does not wait.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
+        except OSError:
+            if not waits:
+                raise
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _flush(folder: Path) -> None:
+    for path, _, _ in os.walk(folder):
+        flush_folder(Path(path))

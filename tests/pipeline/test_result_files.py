@@ -1,0 +1,144 @@
+"""Results take an earlier one's place whole, and the last usable one is kept."""
+
+import resource
+
+import pytest
+
+from lce_rig.core.errors import ResultRefusedError, SessionError
+from lce_rig.export.result import read_result
+from lce_rig.pipeline.result_files import is_usable, keep_earlier, write_results
+from lce_rig.rig import load_rig
+from lce_rig.session import Session
+from tests.export.conftest import calibration, some_pose
+
+GOOD = calibration(captures_used=())
+OTHER = calibration(some_pose((1.2, -1.3, 1.0)), captures_used=())
+FAILED = calibration(verdict="fail", reasons=("too few",), captures_used=())
+
+
+@pytest.fixture
+def session(tmp_path):
+    with Session.create(tmp_path / "s", load_rig("rles")) as made:
+        yield made
+
+
+@pytest.fixture
+def folder(session):
+    return session.path / "calibration"
+
+
+def names(folder):
+    return {path.name for path in folder.iterdir()}
+
+
+def pose_in(folder):
+    return read_result(folder / "result.json").calibrations[0].T_cam_lidar
+
+
+def test_the_earlier_result_becomes_the_previous_one_with_its_exports(session, folder):
+    first = write_results(session, [GOOD], force=False)
+    assert first.previous is None and not first.is_same
+    (folder / "overlays").mkdir()
+    (folder / "overlays" / "000000.png").write_bytes(b"drawn")
+    exported = (folder / "extrinsics.yaml").read_bytes()
+    second = write_results(session, [OTHER], force=False)
+    assert second.has_usable_previous and second.previous == folder / "previous"
+    assert (pose_in(folder) == OTHER.T_cam_lidar).all()
+    assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
+    assert (folder / "previous" / "extrinsics.yaml").read_bytes() == exported
+    assert (folder / "extrinsics.yaml").read_bytes() != exported
+    assert (folder / "previous" / "overlays" / "000000.png").read_bytes() == b"drawn"
+    assert "overlays" not in names(folder)
+    assert "previous" not in names(folder / "previous")
+
+
+def test_no_number_of_failures_takes_the_last_usable_result_away(session, folder):
+    write_results(session, [GOOD], force=False)
+    for k in range(3):
+        failed = calibration(verdict="fail", reasons=(f"{k}",), captures_used=())
+        written = write_results(session, [failed], force=False)
+        assert written.has_usable_previous
+        assert names(folder) == {"result.json", "previous"}
+    assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
+    assert (folder / "previous" / "extrinsics.yaml").exists()
+    write_results(session, [OTHER], force=False)
+    assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
+
+
+def test_without_a_usable_result_the_last_failed_one_is_kept(session, folder):
+    write_results(session, [FAILED], force=False)
+    written = write_results(session, [calibration(verdict="fail", captures_used=())], force=True)
+    assert written.previous is not None and not written.has_usable_previous
+    assert read_result(folder / "previous" / "result.json").calibrations[0].reasons == ("too few",)
+
+
+def test_a_forced_failure_does_not_count_as_usable(session, folder):
+    write_results(session, [GOOD], force=False)
+    for k in range(2):
+        write_results(session, [calibration(verdict="fail", reasons=(f"{k}",), captures_used=())], force=True)
+    assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
+
+
+def test_the_same_result_again_keeps_overlays_and_the_previous_one(session, folder):
+    write_results(session, [GOOD], force=False)
+    write_results(session, [OTHER], force=False)
+    (folder / "overlays").mkdir()
+    (folder / "overlays" / "000000.png").write_bytes(b"drawn")
+    written = write_results(session, [OTHER], force=False)
+    assert written.is_same
+    assert (folder / "overlays" / "000000.png").read_bytes() == b"drawn"
+    assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
+
+
+def test_what_the_user_put_there_stays(session, folder):
+    write_results(session, [GOOD], force=False)
+    (folder / "notes.txt").write_text("measured on Tuesday")
+    (folder / "photos").mkdir()
+    (folder / "photos" / "rig.jpg").write_bytes(b"x")
+    write_results(session, [OTHER], force=False)
+    write_results(session, [FAILED], force=False)
+    assert (folder / "notes.txt").read_text() == "measured on Tuesday"
+    assert (folder / "photos" / "rig.jpg").read_bytes() == b"x"
+    assert "notes.txt" not in names(folder / "previous")
+
+
+def test_a_result_that_cannot_be_written_leaves_the_earlier_one(session, folder):
+    write_results(session, [GOOD], force=False)
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(ResultRefusedError, match="not finite"):
+        write_results(session, [calibration(OTHER.T_cam_lidar * float("nan"), captures_used=())], force=False)
+    with pytest.raises(SessionError, match="no capture '000000'"):
+        write_results(session, [calibration()], force=False)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(SessionError, match="cannot be written"):
+            write_results(session, [OTHER], force=False)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+    assert not list(session.path.glob(".new-*"))
+
+
+def test_a_link_in_place_of_the_folder_is_refused(session, folder, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    folder.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(SessionError, match="it is a link"):
+        write_results(session, [GOOD], force=False)
+    assert not names(tmp_path / "elsewhere")
+
+
+def test_a_damaged_result_is_not_usable(folder, session):
+    write_results(session, [GOOD], force=False)
+    assert is_usable(folder)
+    (folder / "result.json").write_text("{")
+    assert not is_usable(folder)
+    assert not is_usable(session.path / "nowhere")
+
+
+def test_nothing_becomes_previous_where_there_was_no_result(tmp_path):
+    (tmp_path / "old").mkdir()
+    (tmp_path / "draft").mkdir()
+    (tmp_path / "draft" / "a.json").write_text("{}")
+    assert not keep_earlier(tmp_path / "old", tmp_path / "draft", "a.json", lambda path: True)
+    assert names(tmp_path / "draft") == {"a.json"}

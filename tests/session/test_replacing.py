@@ -1,0 +1,202 @@
+"""Folders of results change whole, whoever dies meanwhile, and no link leads out of a session."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from lce_rig.core.errors import SessionError
+from lce_rig.session import Session
+from lce_rig.session.replacing import copy_over, recover, replacing
+
+ENDLESS = """
+import sys, pathlib
+from lce_rig.session.replacing import replacing
+root, exchanges = pathlib.Path(sys.argv[1]), sys.argv[2] == "1"
+print("started", flush=True)
+for k in range(10**6):
+    with replacing(root, root / "out", can_exchange=exchanges) as draft:
+        for name in "abc":
+            (draft / name).write_text(str(k))
+"""
+
+
+def fill(root, text, **options):
+    with replacing(root, root / "out", **options) as draft:
+        (draft / "a").write_text(text)
+        (draft / "sub").mkdir()
+        (draft / "sub" / "b").write_text(text)
+
+
+def contents(folder):
+    return {path.read_text() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("can_exchange", [True, False])
+def test_a_folder_is_made_and_then_replaced(tmp_path, can_exchange):
+    for text in ("one", "two"):
+        fill(tmp_path, text, can_exchange=can_exchange)
+        assert contents(tmp_path / "out") == {text}
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("can_exchange", [True, False])
+def test_an_error_leaves_the_earlier_folder(tmp_path, can_exchange):
+    fill(tmp_path, "one")
+    with pytest.raises(ZeroDivisionError), replacing(tmp_path, tmp_path / "out") as draft:
+        (draft / "a").write_text("two")
+        raise ZeroDivisionError
+
+    def refuse(_old, _draft):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fill(tmp_path, "two", finish=refuse, can_exchange=can_exchange)
+    assert contents(tmp_path / "out") == {"one"}
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_readers_beside_a_writer_always_find_one_whole_folder(tmp_path):
+    fill(tmp_path, "0")
+    torn, is_over = [], threading.Event()
+
+    def read():
+        while not is_over.is_set():
+            descriptor = os.open(tmp_path / "out", os.O_RDONLY)  # as a program that has changed into it
+            try:
+                texts = set()
+                for name in ("a", "sub/b"):
+                    file = os.open(name, os.O_RDONLY, dir_fd=descriptor)
+                    texts.add(os.read(file, 10))
+                    os.close(file)
+                if len(texts) != 1:
+                    torn.append(texts)
+            except FileNotFoundError:
+                pass  # the folder that was opened has been replaced and removed meanwhile
+            finally:
+                os.close(descriptor)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for k in range(100):
+        fill(tmp_path, str(k))
+    is_over.set()
+    reader.join()
+    assert torn == []
+
+
+@pytest.mark.parametrize("exchanges", ["1", "0"])
+def test_whoever_is_killed_leaves_one_whole_folder(tmp_path, exchanges):
+    fill(tmp_path, "first")
+    for k in range(8):
+        process = subprocess.Popen(
+            [sys.executable, "-c", ENDLESS, str(tmp_path), exchanges], stdout=subprocess.PIPE
+        )
+        process.stdout.readline()
+        time.sleep(0.004 * k)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+        recover(tmp_path)
+        assert len(contents(tmp_path / "out")) == 1
+    fill(tmp_path, "last")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_folder_put_aside_by_a_killed_process_comes_back(tmp_path):
+    fill(tmp_path, "one")
+    (tmp_path / "out").rename(tmp_path / ".old-out")
+    recover(tmp_path)
+    assert contents(tmp_path / "out") == {"one"}
+
+
+def test_a_draft_that_is_being_filled_is_left_alone(tmp_path):
+    with replacing(tmp_path, tmp_path / "out") as slow:
+        (slow / "a").write_text("slow")
+        fill(tmp_path, "quick")
+        assert contents(tmp_path / "out") == {"quick"}
+    assert contents(tmp_path / "out") == {"slow"}
+
+
+def test_copies_share_their_data_and_links_stay_links(tmp_path):
+    (tmp_path / "one" / "deep").mkdir(parents=True)
+    (tmp_path / "one" / "deep" / "file").write_text("x")
+    (tmp_path / "one" / "link").symlink_to("/etc/hostname")
+    copy_over(tmp_path / "one", tmp_path / "two")
+    assert (tmp_path / "two" / "deep" / "file").stat().st_nlink == 2
+    assert (tmp_path / "two" / "link").is_symlink()
+
+
+@pytest.fixture
+def elsewhere(tmp_path):
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    (folder / "precious").write_text("mine")
+    return folder
+
+
+@pytest.mark.parametrize("name", ["calibration", "intrinsics", "detections", "debug", "captures"])
+def test_a_session_whose_folder_leads_elsewhere_is_refused(tmp_path, rig, elsewhere, name):
+    Session.create(tmp_path / "s", rig).close()
+    if (tmp_path / "s" / name).exists():
+        (tmp_path / "s" / name).rmdir()
+    (tmp_path / "s" / name).symlink_to(elsewhere)
+    with pytest.raises(SessionError, match=f"s/{name} cannot be written: it is a link"):
+        Session.open(tmp_path / "s")
+    assert contents(elsewhere) == {"mine"}
+
+
+@pytest.mark.parametrize("name", [".lock", "journal.jsonl"])
+def test_a_file_that_leads_elsewhere_is_neither_emptied_nor_appended_to(tmp_path, rig, elsewhere, name):
+    Session.create(tmp_path / "s", rig).close()
+    (tmp_path / "s" / name).unlink()
+    (tmp_path / "s" / name).symlink_to(elsewhere / "precious")
+    with pytest.raises(SessionError, match="it is a link"):
+        Session.open(tmp_path / "s", writable=True)
+    assert contents(elsewhere) == {"mine"}
+
+
+def test_a_new_session_does_not_follow_a_link_to_its_lock(tmp_path, rig, elsewhere):
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / ".lock").symlink_to(elsewhere / "precious")
+    with pytest.raises(SessionError, match="cannot be written"):
+        Session.create(tmp_path / "s", rig)
+    assert contents(elsewhere) == {"mine"}
+
+
+def test_links_deeper_in_a_session_are_not_written_through(tmp_path, rig, elsewhere, samples):
+    with Session.create(tmp_path / "s", rig) as session:
+        (tmp_path / "s" / "calibration").mkdir()
+        (tmp_path / "s" / "calibration" / "overlays").symlink_to(elsewhere)
+        with pytest.raises(SessionError, match="overlays cannot be written: it is a link"):
+            session.own("calibration", "overlays")
+        (tmp_path / "s" / "detections").mkdir()
+        (tmp_path / "s" / "detections" / "abc").symlink_to(elsewhere)
+        with pytest.raises(SessionError, match="it is a link"):
+            session.store_cached("abc/000000", {}, {})
+        (tmp_path / "s" / "captures" / ".new-000000").symlink_to(elsewhere)
+        with pytest.raises(SessionError):
+            session.add_capture(*samples(0), {})
+    with Session.open(tmp_path / "s", writable=True) as session:
+        assert session.add_capture(*samples(0), {}) == "000000"
+    assert contents(elsewhere) == {"mine"}
+
+
+def test_a_loop_of_links_is_refused(tmp_path, rig):
+    Session.create(tmp_path / "s", rig).close()
+    (tmp_path / "s" / "debug").symlink_to("debug")
+    with pytest.raises(SessionError, match="debug cannot be written"):
+        Session.open(tmp_path / "s")
+
+
+def test_a_link_that_stays_in_the_session_serves(tmp_path, rig, samples):
+    Session.create(tmp_path / "s", rig).close()
+    (tmp_path / "s" / "captures").rmdir()
+    (tmp_path / "s" / "more").mkdir()
+    (tmp_path / "s" / "captures").symlink_to("more")
+    with Session.open(tmp_path / "s", writable=True) as session:
+        assert session.add_capture(*samples(0), {}) == "000000"
