@@ -123,3 +123,14 @@ def describe(value: Any) -> str:
     """Show a value of a file in a message, cut to a length that fits on a screen."""
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def check_points(n_points: int) -> int:
+    """Pass a declared number of points through where a scan can have as many.
+
+    Raises:
+        ValueError: it is negative, or beyond the limit.
+    """
+    if not 0 <= n_points <= MAX_POINTS:
+        raise ValueError(f"it declares {n_points} points, at most {MAX_POINTS} are read")
+    return n_points

@@ -5,7 +5,6 @@ References:
     LZF, the compression of binary_compressed: http://oldhome.schmorp.de/marc/liblzf.html
 """
 
-import io
 import struct
 from collections import Counter
 from collections.abc import Iterable
@@ -15,7 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.limits import MAX_FIELDS, MAX_FILE_BYTES, check_points, check_size, describe
+from lce_rig.core.text_table import read_table
+
 MAX_HEADER_BYTES = 65536
+_MAX_COMPRESSED_BYTES = 1 << 24
+"""Unpacked: half a million points of 32 bytes. It takes seconds where nothing could be compressed well."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +44,10 @@ def decode_pcd(data: bytes) -> NDArray[Any]:
     """
     if not data:
         raise ValueError("it is empty")
-    header, body = _split_header(data)
+    header, start = _split_header(data)
     if header.encoding == "ascii":
-        return _decode_ascii(body, header)
+        return _decode_ascii(data, start, header)
+    body = memoryview(data)[start:]
     if header.encoding == "binary":
         n_whole = len(body) // header.dtype.itemsize
         if n_whole < header.n_points:
@@ -82,7 +87,8 @@ def encode_pcd(cloud: NDArray[Any], comments: Iterable[str] = ()) -> bytes:
     return ("\n".join(lines) + "\n").encode("ascii") + packed.tobytes()
 
 
-def _split_header(data: bytes) -> tuple[_Header, bytes]:
+def _split_header(data: bytes) -> tuple[_Header, int]:
+    """Read the header, and where the points begin."""
     entries: dict[str, list[str]] = {}
     position = 0
     while "DATA" not in entries:
@@ -95,8 +101,12 @@ def _split_header(data: bytes) -> tuple[_Header, bytes]:
             entries[words[0].upper()] = words[1:]
     encoding = (entries["DATA"] or ["nothing"])[0].lower()
     if encoding not in ("ascii", "binary", "binary_compressed"):
-        raise ValueError(f"its encoding is {encoding!r}; known are ascii, binary and binary_compressed")
-    return _Header(_parse_dtype(entries), _parse_size(entries), encoding), data[position:]
+        raise ValueError(
+            f"its encoding is {describe(encoding)}; known are ascii, binary and binary_compressed"
+        )
+    header = _Header(_parse_dtype(entries), check_points(_parse_size(entries)), encoding)
+    check_size(header.n_points * header.dtype.itemsize, max_bytes=MAX_FILE_BYTES)
+    return header, position
 
 
 def _parse_dtype(entries: dict[str, list[str]]) -> np.dtype[Any]:
@@ -110,11 +120,16 @@ def _parse_dtype(entries: dict[str, list[str]]) -> np.dtype[Any]:
         )
     used: Counter[str] = Counter()
     columns: list[tuple[str, str, tuple[int, ...]]] = []
+    n_values = 0
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
         if f"{kind}{size}" not in {"F4", "F8", "U1", "U2", "U4", "U8", "I1", "I2", "I4", "I8"}:
-            raise ValueError(f"field {name!r} has type {kind} of {size} bytes, which PCD does not know")
-        if not count.isdigit() or not 1 <= int(count) <= 65536:
-            raise ValueError(f"field {name!r} has a COUNT of {count!r}")
+            what = f"type {kind[:8]} of {size[:8]} bytes"
+            raise ValueError(f"field {describe(name)} has {what}, which PCD does not know")
+        if not count.isdigit() or len(count) > 9 or int(count) < 1:
+            raise ValueError(f"field {describe(name)} has a COUNT of {describe(count)}")
+        n_values += int(count)
+        if n_values > MAX_FIELDS:
+            raise ValueError(f"its points have more than {MAX_FIELDS} values each")
         unique = name if not used[name] and name != "_" else f"{name}{used[name]}"
         used[name] += 1
         columns.append((unique, f"<{kind.lower()}{size}", () if count == "1" else (int(count),)))
@@ -136,56 +151,19 @@ def _parse_size(entries: dict[str, list[str]]) -> int:
 
 
 def _natural(word: str) -> int:
-    value = int(word)
-    if value < 0:
+    if not word.isdigit() or len(word) > 18:
         raise ValueError
-    return value
+    return int(word)
 
 
-def _decode_ascii(body: bytes, header: _Header) -> NDArray[Any]:
-    rows = [line for line in body.split(b"\n") if line.strip()]
-    if len(rows) < header.n_points:
-        raise ValueError(f"it is truncated: {len(rows)} of {header.n_points} points are there")
-    if header.n_points == 0:
-        return np.empty(0, dtype=header.dtype)
-    # Rows are read as the header's own types first: float64 would round 64-bit stamps. Some writers put
-    # "nan" or "3.0" into integer columns; then float64 and a cast must do.
-    cloud = np.empty(header.n_points, dtype=header.dtype)
-    columns = [column for name in header.dtype.names or () for column in _columns(cloud[name])]
-    flat = np.dtype([(f"c{k}", column.dtype) for k, column in enumerate(columns)])
-    text = io.BytesIO(b"\n".join(rows[: header.n_points]).replace(b",", b" "))
-    try:
-        table = np.loadtxt(text, dtype=flat, ndmin=1, comments=None)
-    except ValueError:
-        text.seek(0)
-        table = _read_as_floats(text, flat)
-    for k, column in enumerate(columns):
-        column[...] = table[f"c{k}"]
-    return cloud
+def _decode_ascii(data: bytes, start: int, header: _Header) -> NDArray[Any]:
+    fields = [header.dtype[name] for name in header.dtype.names or ()]
+    kinds = [field.base for field in fields for _ in range(int(np.prod(field.shape)))]
+    flat = np.dtype([(f"c{k}", kind) for k, kind in enumerate(kinds)])
+    return read_table(data, start, flat, header.n_points).view(header.dtype)
 
 
-def _columns(field: NDArray[Any]) -> list[NDArray[Any]]:
-    """View a field (N,) or (N, c) as columns (N,)."""
-    return [field] if field.ndim == 1 else [field[:, i] for i in range(field.shape[1])]
-
-
-def _read_as_floats(text: io.BytesIO, flat: np.dtype[Any]) -> NDArray[Any]:
-    try:
-        values = np.loadtxt(text, dtype=np.float64, ndmin=2, comments=None)
-    except ValueError as error:
-        raise ValueError(f"its text cannot be read as numbers: {error}") from None
-    names = flat.names or ()
-    if values.shape[1] != len(names):
-        raise ValueError(f"its rows have {values.shape[1]} numbers where the header has {len(names)}")
-    table = np.empty(len(values), dtype=flat)
-    for k, name in enumerate(names):
-        is_float = flat[name].kind == "f"
-        with np.errstate(invalid="ignore", over="ignore"):
-            table[name] = values[:, k] if is_float else np.nan_to_num(values[:, k], posinf=0.0, neginf=0.0)
-    return table
-
-
-def _decode_compressed(body: bytes, header: _Header) -> NDArray[Any]:
+def _decode_compressed(body: memoryview, header: _Header) -> NDArray[Any]:
     if len(body) < 8:
         raise ValueError("it is truncated: the compressed part is not there")
     n_packed, n_raw = struct.unpack_from("<II", body)
@@ -194,9 +172,13 @@ def _decode_compressed(body: bytes, header: _Header) -> NDArray[Any]:
         raise ValueError(
             f"its compressed part says {n_raw} bytes where {header.n_points} points need {n_wanted}"
         )
+    check_size(n_raw, "its compressed part", _MAX_COMPRESSED_BYTES)
     if len(body) - 8 < n_packed:
         raise ValueError(f"it is truncated: {len(body) - 8} of {n_packed} compressed bytes are there")
-    raw = _decompress_lzf(body[8 : 8 + n_packed], n_raw)
+    # LZF adds a byte to 32 where nothing can be compressed; more is no LZF, and takes long.
+    if n_packed > n_raw + n_raw // 16 + 64:
+        raise ValueError("its compressed part is damaged: it is larger than what it unpacks to")
+    raw = _decompress_lzf(bytes(body[8 : 8 + n_packed]), n_raw)
     cloud = np.empty(header.n_points, dtype=header.dtype)
     position = 0
     for name in header.dtype.names or ():
@@ -210,26 +192,31 @@ def _decode_compressed(body: bytes, header: _Header) -> NDArray[Any]:
 
 def _decompress_lzf(packed: bytes, n_raw: int) -> bytes:
     raw = bytearray()
-    i = 0
+    i = n = 0
+    end = len(packed)
     try:
-        while i < len(packed) and len(raw) <= n_raw:
+        while i < end and n <= n_raw:
             control = packed[i]
-            i += 1
             if control < 32:
-                raw += packed[i : i + control + 1]
-                i += control + 1
+                raw += packed[i + 1 : i + control + 2]
+                i += control + 2
+                n += control + 1
                 continue
             length = (control >> 5) + 2
             if length == 9:
-                length += packed[i]
                 i += 1
-            start = len(raw) - ((control & 31) << 8) - packed[i] - 1
-            i += 1
+                length += packed[i]
+            start = n - ((control & 31) << 8) - packed[i + 1] - 1
+            i += 2
             if start < 0:
                 raise ValueError("its compressed part is damaged")
-            period = raw[start : start + length]
-            # A reference may reach into what it is itself about to write: the period then repeats.
-            raw += (period * (length // len(period) + 1))[:length]
+            if start + length <= n:
+                raw += raw[start : start + length]
+            else:
+                # A reference may reach into what it is itself about to write: the period then repeats.
+                period = raw[start:]
+                raw += (period * (length // len(period) + 1))[:length]
+            n += length
     except IndexError:
         raise ValueError("its compressed part is damaged") from None
     if len(raw) != n_raw:

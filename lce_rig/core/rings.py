@@ -47,6 +47,11 @@ def _assign(rho: Array, z: Array) -> NDArray[np.int16]:
     for _ in range(3):
         peaks = np.tan(_elevation_peaks(np.arctan(slope[is_left])))
         lines = np.concatenate([lines, np.stack([peaks, np.zeros_like(peaks)], axis=1)])
+        if not len(lines):
+            raise SourceError(
+                f"no rings in the cloud: its {len(rho)} points are too few or too scattered to tell",
+                "give the cloud with its ring field, or as the LiDAR's driver publishes it",
+            )
         lines = _refine_lines(rho, z, lines[np.argsort(lines[:, 0])])
         ring, miss = _nearest_line(rho, z, lines)
         is_left = (miss > MAX_OFFSET_M) & (miss > 5 * BIN_RAD * rho)

@@ -19,6 +19,8 @@ MIN_RANGE_M = 1e-3
 _FARTHEST_MEDIAN = 3.0
 # A sweep lasts 0.02 to 1.5 s whatever the spinning LiDAR; the same figure in another unit is far outside.
 SWEEP_S = (0.02, 1.5)
+_LATEST = 1e19
+_MOST_RINGS = 1024
 NS_PER_UNIT = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
 
@@ -60,10 +62,12 @@ def to_scan(
         SourceError: no coordinates, no valid point, coordinates that are no metres, or no rings and none that
             could be told from elevations.
     """
-    fields = {name.lower(): name for name in reversed(cloud.dtype.names or ())}
+    fields = {
+        name.lower(): name for name in reversed(cloud.dtype.names or ()) if _is_scalar(cloud.dtype[name])
+    }
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:
-        have = ", ".join(cloud.dtype.names or ()) or "none"
+        have = ", ".join(_shown(cloud.dtype, name) for name in cloud.dtype.names or ()) or "none"
         raise SourceError(f"{where}: the cloud has no field {missing[0]!r}; its fields are {have}")
     with np.errstate(over="ignore"):
         points = np.stack([cloud[fields[axis]].astype(np.float32) for axis in "xyz"], axis=1)
@@ -81,10 +85,19 @@ def to_scan(
     return CloudReading(scan, int((~is_finite).sum()), int(is_finite.sum() - len(keep)), tuple(notes))
 
 
+def _is_scalar(field: np.dtype[Any]) -> bool:
+    """Tell a figure of each point from several, and from text."""
+    return field.shape == () and field.kind in "biuf"
+
+
+def _shown(kind: np.dtype[Any], name: str) -> str:
+    return name if _is_scalar(kind[name]) else f"{name} (not one number a point)"
+
+
 def _check_unit(median_m: float, settings: LidarSettings, where: str) -> None:
     if median_m > _FARTHEST_MEDIAN * settings.max_range_m:
         raise SourceError(
-            f"{where}: half of the points lie {median_m:.0f} m away or farther, the LiDAR reaches "
+            f"{where}: half of the points lie {round(median_m):.9g} m away or farther, the LiDAR reaches "
             f"{settings.max_range_m:g} m: are the points in millimetres? Metres are needed"
         )
 
@@ -98,7 +111,8 @@ def _intensity(cloud: NDArray[Any], fields: dict[str, str], notes: list[str]) ->
     if name is None:
         notes.append("no intensity")
         return np.zeros(len(cloud), dtype=np.float32)
-    return np.nan_to_num(cloud[name].astype(np.float32), posinf=0.0, neginf=0.0)
+    with np.errstate(over="ignore"):
+        return np.nan_to_num(cloud[name].astype(np.float32), posinf=0.0, neginf=0.0)
 
 
 def _ring(
@@ -106,14 +120,15 @@ def _ring(
 ) -> NDArray[np.int16]:
     name = _find(fields, RING_FIELDS)
     values = np.zeros(len(cloud)) if name is None else cloud[name].astype(np.float64)
-    if name is None or (len(cloud) > 100 and np.ptp(values) == 0) or not np.isfinite(values).all():
+    ids, ring_of_point = np.unique(values, return_inverse=True)
+    is_constant = len(cloud) > 100 and len(ids) == 1
+    if name is None or is_constant or not np.isfinite(values).all() or len(ids) > _MOST_RINGS:
         try:
             ring = rings_from_elevation(points)
         except SourceError as error:
             raise SourceError(f"{where}: {error.what}", error.hint) from None
         notes.append("no ring field: rings told from elevations")
         return ring
-    ids, ring_of_point = np.unique(values, return_inverse=True)
     elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
     mean = np.bincount(ring_of_point, elevation) / np.bincount(ring_of_point)
     rank = np.argsort(np.argsort(mean, kind="stable"), kind="stable")
@@ -176,7 +191,8 @@ def _ticks(values: NDArray[Any]) -> NDArray[Any] | None:
         ticks: NDArray[Any] = values.astype(np.int64)
         return ticks if np.ptp(ticks) > 0 else None
     ticks = values.astype(np.float64)
-    if not np.isfinite(ticks).all() or np.ptp(ticks) == 0:
+    # Beyond a century of nanoseconds it is no time in any unit.
+    if not np.isfinite(ticks).all() or np.abs(ticks).max() > _LATEST or np.ptp(ticks) == 0:
         return None
     # A float32 of Unix time moves in steps of two minutes.
     step = float(np.spacing(np.abs(values).max()))

@@ -7,6 +7,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from lce_rig.core.errors import SourceError
+from lce_rig.core.limits import read_file
 from lce_rig.core.pcd import decode_pcd
 from lce_rig.sources.ply import decode_ply
 
@@ -23,7 +24,7 @@ def read_cloud(path: Path) -> NDArray[Any]:
         SourceError: the file is missing, empty, truncated or damaged.
     """
     try:
-        return DECODERS[path.suffix.lower()](path.read_bytes())
+        return DECODERS[path.suffix.lower()](read_file(path))
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError
+from lce_rig.core.limits import read_file
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.sources import cloud_file, image_file
 from lce_rig.sources.base import Pair, PairMethod, SourceOptions
@@ -65,9 +66,11 @@ class PairOnDisk:
         digest = hashlib.sha256(" ".join([*sensors, self.lidar]).encode())
         for path in (*(picture.path for picture in self.pictures), self.cloud_path):
             try:
-                digest.update(hashlib.sha256(path.read_bytes()).digest())
+                digest.update(hashlib.sha256(read_file(path)).digest())
             except OSError as error:
                 raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
+            except ValueError as error:
+                raise SourceError(f"{path}: {error}") from None
         return digest.hexdigest()
 
     def read(self) -> Pair:

@@ -53,7 +53,9 @@ def parse_times(stems: Sequence[str]) -> NDArray[np.int64] | None:
             times.append(int(stem) * 10 ** (19 - len(stem)))
         else:
             return None
-    return np.array(times, dtype=np.int64) if times else None
+    if not times or max(times) > np.iinfo(np.int64).max:
+        return None
+    return np.array(times, dtype=np.int64)
 
 
 def pair_names(
@@ -132,13 +134,23 @@ def _by_order(images: Sequence[str], clouds: Sequence[str]) -> Pairing:
 
 def _by_time(image_ns: NDArray[np.int64], cloud_ns: NDArray[np.int64], tolerance_s: float) -> Pairing:
     """Pair what is nearest in time to each other, both ways."""
-    apart_ns = np.abs(image_ns[:, None] - cloud_ns[None, :])
-    nearest = apart_ns.argmin(axis=1)
-    is_mutual = apart_ns.argmin(axis=0)[nearest] == np.arange(len(image_ns))
-    is_near = apart_ns[np.arange(len(image_ns)), nearest] <= tolerance_s * 1e9
+    nearest = _nearest(image_ns, cloud_ns)
+    is_mutual = _nearest(cloud_ns, image_ns)[nearest] == np.arange(len(image_ns))
+    is_near = np.abs(image_ns - cloud_ns[nearest]) <= tolerance_s * 1e9
     pairs = [(int(i), int(nearest[i])) for i in np.flatnonzero(is_mutual & is_near)]
     reason = f"paired by nearest time within {tolerance_s:g} s"
     return _pairing("time", pairs, len(image_ns), len(cloud_ns), reason)
+
+
+def _nearest(times_ns: NDArray[np.int64], others_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Find the place of the nearest of `others_ns` to each time; of equally near ones the first."""
+    # Equal stamps are found at their first place, whatever the order they came in.
+    sorted_ns, place = np.unique(others_ns, return_index=True)
+    above = np.clip(np.searchsorted(sorted_ns, times_ns), 0, len(sorted_ns) - 1)
+    below = np.maximum(above - 1, 0)
+    to_above, to_below = np.abs(sorted_ns[above] - times_ns), np.abs(times_ns - sorted_ns[below])
+    is_below = (to_below < to_above) | ((to_below == to_above) & (place[below] < place[above]))
+    return np.where(is_below, place[below], place[above])
 
 
 def _pairing(

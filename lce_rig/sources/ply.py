@@ -4,12 +4,14 @@ References:
     http://paulbourke.net/dataformats/ply/
 """
 
-import io
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lce_rig.core.limits import MAX_FIELDS, MAX_FILE_BYTES, check_points, check_size, describe
+from lce_rig.core.text_table import read_table
 
 _KINDS = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
@@ -42,28 +44,46 @@ def decode_ply(data: bytes) -> NDArray[Any]:
     """
     if not data:
         raise ValueError("it is empty")
-    encoding, elements, body = _split_header(data)
-    order = _ORDERS[encoding]
-    n_rows_before, n_bytes_before = 0, 0
-    for element in elements:
-        if element.has_list and "vertex" in (later.name for later in elements[elements.index(element) :]):
-            raise ValueError(f"its element {element.name!r} has a list, which this program does not read")
-        dtype = np.dtype([(name, order + kind) for name, kind in element.columns])
-        if element.name == "vertex":
-            if encoding == "ascii":
-                return _decode_ascii(body, n_rows_before, element.count, dtype)
-            n_whole = max(len(body) - n_bytes_before, 0) // max(dtype.itemsize, 1)
-            if n_whole < element.count:
-                raise ValueError(f"it is truncated: {n_whole} of {element.count} points are there")
-            return np.frombuffer(body, dtype, element.count, n_bytes_before)
-        n_rows_before += element.count
-        n_bytes_before += element.count * dtype.itemsize
-    raise ValueError("it has no vertices")
+    encoding, elements, first = _split_header(data)
+    names = [element.name for element in elements]
+    if "vertex" not in names:
+        raise ValueError("it has no vertices")
+    n_rows_before, start = 0, first
+    for element in elements[: names.index("vertex") + 1]:
+        if element.has_list:
+            raise ValueError(
+                f"its element {describe(element.name)} has a list, which this program does not read"
+            )
+        dtype = _dtype(element, _ORDERS[encoding])
+        if element.name != "vertex":
+            n_rows_before += element.count
+            start += element.count * dtype.itemsize
+    n_points = check_points(element.count)
+    check_size(n_points * dtype.itemsize, max_bytes=MAX_FILE_BYTES)
+    if encoding == "ascii":
+        return read_table(data, first, dtype, n_points, n_rows_before)
+    n_whole = max(len(data) - start, 0) // dtype.itemsize
+    if n_whole < n_points:
+        raise ValueError(f"it is truncated: {n_whole} of {n_points} points are there")
+    return np.frombuffer(data, dtype, n_points, min(start, len(data)))
 
 
-def _split_header(data: bytes) -> tuple[str, list[_Element], bytes]:
+def _dtype(element: _Element, order: str) -> np.dtype[Any]:
+    if not 1 <= len(element.columns) <= MAX_FIELDS:
+        n = len(element.columns)
+        raise ValueError(
+            f"its element {describe(element.name)} has {n} properties, 1 to {MAX_FIELDS} are read"
+        )
+    try:
+        return np.dtype([(name, order + kind) for name, kind in element.columns])
+    except ValueError as error:
+        raise ValueError(f"its properties cannot be told apart: {error}") from None
+
+
+def _split_header(data: bytes) -> tuple[str, list[_Element], int]:
+    """Read the format and the elements, and where the first of them begins."""
     end = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
-    line_end = data.find(b"\n", end)
+    line_end = data.find(b"\n", end, end + 100)
     if not data.startswith(b"ply") or end < 0 or line_end < 0:
         raise ValueError("it has no PLY header")
     encoding = ""
@@ -72,7 +92,7 @@ def _split_header(data: bytes) -> tuple[str, list[_Element], bytes]:
         words = line.split()
         if words[:1] == ["format"] and len(words) > 1:
             encoding = words[1]
-        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
+        elif words[:1] == ["element"] and len(words) == 3 and _is_count(words[2]):
             elements.append(_Element(words[1], int(words[2])))
         elif words[:1] == ["property"] and elements:
             if words[1:2] == ["list"]:
@@ -80,23 +100,15 @@ def _split_header(data: bytes) -> tuple[str, list[_Element], bytes]:
             else:
                 elements[-1].columns.append(_parse_property(words))
     if encoding not in _ORDERS:
-        raise ValueError(f"its format is {encoding or 'missing'!r}; known are {', '.join(_ORDERS)}")
-    return encoding, elements, data[line_end + 1 :]
+        raise ValueError(f"its format is {describe(encoding or 'missing')}; known are {', '.join(_ORDERS)}")
+    return encoding, elements, line_end + 1
+
+
+def _is_count(word: str) -> bool:
+    return word.isdigit() and len(word) <= 18
 
 
 def _parse_property(words: list[str]) -> tuple[str, str]:
     if len(words) != 3 or words[1] not in _KINDS:
-        raise ValueError(f"its header line {' '.join(words)!r} cannot be understood")
+        raise ValueError(f"its header line {describe(' '.join(words))} cannot be understood")
     return words[2], _KINDS[words[1]]
-
-
-def _decode_ascii(body: bytes, n_before: int, n_points: int, dtype: np.dtype[Any]) -> NDArray[Any]:
-    rows = [line for line in body.split(b"\n") if line.strip()][n_before : n_before + n_points]
-    if len(rows) < n_points:
-        raise ValueError(f"it is truncated: {len(rows)} of {n_points} points are there")
-    if n_points == 0:
-        return np.empty(0, dtype=dtype)
-    try:
-        return np.loadtxt(io.BytesIO(b"\n".join(rows)), dtype=dtype, ndmin=1, comments=None)
-    except ValueError as error:
-        raise ValueError(f"its text cannot be read as numbers: {error}") from None

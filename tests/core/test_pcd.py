@@ -175,7 +175,7 @@ def test_numbers_that_are_not_there_are_read_in_text():
         (MATLAB.replace(b"SIZE 4 4 4 4", b"SIZE 4 4 4 3"), "type F of 3 bytes"),
         (MATLAB.replace(b"COUNT 1 1 1 1", b"COUNT 1 1 1 -1"), "COUNT of '-1'"),
         (MATLAB.replace(b"POINTS 2", b"POINTS two"), "how many points"),
-        (MATLAB.replace(b"POINTS 2", b"POINTS 99999999999"), "of 99999999999 points"),
+        (MATLAB.replace(b"POINTS 2", b"POINTS 99999999999"), "declares 99999999999 points, at most"),
         (MATLAB.replace(b"binary", b"binary_compressed") + bytes(3), "compressed part is not there"),
         (MATLAB.replace(b"binary", b"binary_compressed") + struct.pack("<II", 9, 31), "says 31 bytes"),
         (MATLAB.replace(b"binary", b"binary_compressed") + struct.pack("<II", 9, 32), "0 of 9 compressed"),

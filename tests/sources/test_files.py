@@ -75,7 +75,7 @@ def test_missing_and_foreign_files_are_named(tmp_path):
     with pytest.raises(SourceError, match=r"gone\.pcd: cannot be read: No such file"):
         read_cloud(tmp_path / "gone.pcd")
     (tmp_path / "folder.ply").mkdir()
-    with pytest.raises(SourceError, match=r"folder\.ply: cannot be read: Is a directory"):
+    with pytest.raises(SourceError, match=r"folder\.ply: cannot be read: it is a folder"):
         read_cloud(tmp_path / "folder.ply")
 
 
