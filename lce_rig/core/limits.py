@@ -6,8 +6,10 @@ them. A reader reports a limit as it reports damage, by a ValueError with words 
 
 import os
 import stat
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol, cast
 
 MAX_PIXELS = 1 << 26
 """Of one image: 67 megapixels."""
@@ -25,6 +27,10 @@ MAX_LINE_BYTES = 1 << 12
 """One line of text with figures."""
 MAX_EVENTS = 1 << 26
 """Of one file or stretch that has to be in memory as a whole: half a minute at two million a second."""
+MAX_TOPICS = 1 << 14
+"""Of one bag, with every publisher of each counted."""
+MAX_RATIO = 256
+"""Of what a whole recording unpacks to and its size: pictures of a dark room shrink to a hundredth."""
 
 _PIECE_BYTES = 1 << 20
 
@@ -37,6 +43,9 @@ class _Decompressor(Protocol):
 
     @property
     def needs_input(self) -> bool: ...
+
+    @property
+    def unused_data(self) -> bytes: ...
 
     def decompress(self, data: bytes, max_length: int = -1) -> bytes: ...
 
@@ -134,3 +143,59 @@ def check_points(n_points: int) -> int:
     if not 0 <= n_points <= MAX_POINTS:
         raise ValueError(f"it declares {n_points} points, at most {MAX_POINTS} are read")
     return n_points
+
+
+def shorten(text: str) -> str:
+    """Cut a name that a file gives to a length that fits on a screen."""
+    return text if len(text) <= 120 else text[:117] + "..."
+
+
+def new_decompressor(kind: str) -> _Decompressor:
+    """Begin to unpack a stream of bz2, lz4 (frames) or zstd.
+
+    Raises:
+        ValueError: another kind.
+        ImportError: this Python has no Zstandard, and nothing brought one.
+    """
+    if kind not in _DECOMPRESSORS:
+        raise ValueError(f"compression {describe(kind)} is not known; known are {', '.join(_DECOMPRESSORS)}")
+    names, attribute = _DECOMPRESSORS[kind]
+    for name in names[:-1]:
+        with suppress(ImportError):
+            return cast(_Decompressor, getattr(import_module(name), attribute)())
+    return cast(_Decompressor, getattr(import_module(names[-1]), attribute)())
+
+
+def unpack_file(kind: str, packed: BinaryIO, into: BinaryIO) -> None:
+    """Unpack a file into another, as far as a recording of its size can grow.
+
+    Raises:
+        ValueError: it is damaged, or unpacks to more.
+        OSError: a file cannot be read or written.
+    """
+    n_left = MAX_RATIO * os.fstat(packed.fileno()).st_size + MAX_CHUNK_BYTES
+    decompressor, rest = new_decompressor(kind), packed.read(_PIECE_BYTES)
+    while rest or not decompressor.needs_input:
+        try:
+            part = decompressor.decompress(rest, min(_PIECE_BYTES, n_left + 1))
+        except (OSError, MemoryError):
+            raise
+        except Exception as error:  # Each library has its own.
+            raise ValueError(f"its {kind} data are damaged ({error})") from None
+        n_left -= len(part)
+        if n_left < 0:
+            raise ValueError("it unpacks to more than a recording of its size can hold")
+        into.write(part)
+        if decompressor.eof:
+            # Some compressors write frame after frame.
+            rest = decompressor.unused_data or packed.read(_PIECE_BYTES)
+            decompressor = new_decompressor(kind)
+        else:
+            rest = packed.read(_PIECE_BYTES) if decompressor.needs_input else b""
+
+
+_DECOMPRESSORS = {
+    "bz2": (("bz2",), "BZ2Decompressor"),
+    "lz4": (("lz4.frame",), "LZ4FrameDecompressor"),
+    "zstd": (("compression.zstd", "backports.zstd"), "ZstdDecompressor"),
+}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
+from lce_rig.sources.bag_file import is_bag_file
 from lce_rig.sources.base import Recording, SourceOptions
 from lce_rig.sources.recorded_folder import list_parts
 
@@ -87,5 +88,4 @@ def _open_parts(parts: list[tuple[Path, SourceOptions]], rig: Rig) -> list[Recor
 def _kind(path: Path) -> str:
     if not path.is_dir():
         return path.suffix.lower()
-    bags = sorted(p.suffix.lower() for p in path.iterdir() if p.suffix.lower() in (".bag", ".db3", ".mcap"))
-    return bags[0] if bags else "folder"
+    return ".bag" if any(is_bag_file(file) for file in path.iterdir()) else "folder"

@@ -1,34 +1,22 @@
 """Bags as streams of raw messages: ROS 1, ROS 2 sqlite3 and mcap, whole or torn."""
 
-from collections.abc import Collection, Iterator
-from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass
+import re
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
 
+from lce_rig.core import limits
 from lce_rig.core.errors import SourceError
-from lce_rig.sources.bag_salvage import salvage
+from lce_rig.sources.bag_mcap import McapBag
+from lce_rig.sources.bag_ros1 import Ros1Bag
+from lce_rig.sources.bag_sqlite import SqliteBag
+from lce_rig.sources.bag_storage import BagStorage, Damages, RawMessage
 from lce_rig.sources.fingerprint import fingerprint
 
 SUFFIXES = (".bag", ".db3", ".mcap")
-_FIRST_LOOK_NS = 1_000_000_000
-
-
-@dataclass(frozen=True, eq=False)
-class RawMessage:
-    """A message as it lies in the bag.
-
-    Attributes:
-        msgtype: "sensor_msgs/PointCloud2", without ROS 2's "/msg".
-        encoding: "ros1" or "cdr".
-        log_ns: when the recorder received it.
-    """
-
-    topic: str
-    msgtype: str
-    encoding: str
-    log_ns: int
-    data: bytes
+_PACKED = ".zstd"
+_MAX_LISTED = 40
+_LISTED_FILE = re.compile(r"^\s*-\s*[\"']?([^\"'\n]+\.(?:db3|mcap)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE)
 
 
 class BagFile:
@@ -47,17 +35,25 @@ class BagFile:
             SourceError: nothing can be read.
         """
         self.path = path
-        self.damage = ""
         self.topics: dict[str, tuple[str, int]] = {}
-        self._ends_ns: dict[str, int] = {}
-        self._parts = self._find_parts()
-        try:
-            for part in self._parts:
-                with _reader(part) as reader:
-                    for connection in reader.connections:
-                        self._count(connection.topic, connection.msgtype, connection.msgcount)
-        except Exception as error:  # A torn file makes the reader fail in any way: struct, assert, zlib, ...
-            self._survey_damaged(error)
+        self._ends_ns: dict[str, int | None] = {}
+        self._damages = Damages()
+        self._readable: list[Path] = []
+        self._unpacked: list[TemporaryDirectory[str]] = []
+        self._parts = self._open_parts()
+        for part in self._parts:
+            for number, (topic, msgtype, _) in part.contents.connections.items():
+                n_before = self.topics.get(topic, ("", 0))[1]
+                self.topics[topic] = msgtype, n_before + part.contents.counts[number]
+        if not self.topics and self._damages.n_places:
+            raise SourceError(
+                f"{self.path} cannot be read: {self.damage}", "Record again, or try to reindex it."
+            )
+
+    @property
+    def damage(self) -> str:
+        """What is wrong with the bag, as far as it was read; "" where nothing is."""
+        return str(self._damages)
 
     @property
     def n_messages(self) -> int:
@@ -66,7 +62,7 @@ class BagFile:
 
     def fingerprint(self) -> str:
         """Hash names, sizes and both ends of the files: enough to know a recording again."""
-        return fingerprint(self._files())
+        return fingerprint(self._readable)
 
     def unmerged_journals(self) -> list[Path]:
         """List write-ahead journals of sqlite that a recorder left behind when it was killed."""
@@ -75,107 +71,115 @@ class BagFile:
 
     def end_ns(self, topic: str) -> int | None:
         """Find when the recorder received a topic's last message, from the back; None where it has none."""
-        for part in reversed(self._parts):
-            if topic not in self._ends_ns and not self.damage:
-                with suppress(Exception), _reader(part) as reader:  # Damage is said when the bag is read.
-                    self._ends_ns |= _find_end(reader, topic)
-        return self._ends_ns.get(topic)
+        if topic not in self._ends_ns:
+            ends_ns = (_end_ns(part, topic) for part in reversed(self._parts))
+            self._ends_ns[topic] = next((end_ns for end_ns in ends_ns if end_ns is not None), None)
+        return self._ends_ns[topic]
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Yield the messages of some topics in the order the recorder received them.
 
         Raises:
-            SourceError: at the place where the bag is damaged, after everything before it.
+            SourceError: the bag is damaged; after everything that can be read.
         """
-        n_read, last_ns = 0, None
-        first_ns: int | None = None
-        try:
-            for part in self._parts:
-                for message in self._part_messages(part, topics):
+        n_read, first_ns, last_ns = 0, 0, 0
+        damages = Damages(self._damages.n_places, self._damages.first)
+        for part in self._parts:
+            try:
+                for message in part.messages(topics, damages):
                     n_read, last_ns = n_read + 1, message.log_ns
-                    first_ns = message.log_ns if first_ns is None else first_ns
+                    first_ns = message.log_ns if n_read == 1 else first_ns
                     yield message
-        except SourceError:
-            raise
-        except Exception as error:  # As above: damage shows in any way.
-            self.damage = _describe(error)
-        if self.damage:
-            length_s = 0.0 if first_ns is None or last_ns is None else (last_ns - first_ns) * 1e-9
+            except (OSError, ValueError) as error:  # The file was there when the bag was opened.
+                damages.add(_describe(part.path, error))
+        if damages.n_places:
+            length_s = (last_ns - first_ns) * 1e-9
             raise SourceError(
-                f"{self.path} is damaged ({self.damage}): {n_read} messages over {length_s:.1f} s were read",
+                f"{self.path} is damaged ({damages}): {n_read} messages over {length_s:.1f} s were read",
                 "What was captured from them is kept. Reindexing with ROS's own tools may bring back more.",
             )
 
-    def _part_messages(self, part: Path, topics: Collection[str]) -> Iterator[RawMessage]:
-        if self.damage:
-            for topic, msgtype, encoding, log_ns, data in salvage(part):
-                if topic in topics:
-                    yield RawMessage(topic, _short_type(msgtype), encoding, log_ns, data)
-            return
-        with _reader(part) as reader:
-            wanted = [c for c in reader.connections if c.topic in topics]
-            if not wanted:
-                return
-            for connection, log_ns, data in reader.messages(connections=wanted):
-                encoding = getattr(connection.ext, "serialization_format", "ros1")
-                msgtype = _short_type(connection.msgtype)
-                yield RawMessage(connection.topic, msgtype, encoding, log_ns, bytes(data))
+    def _open_parts(self) -> list[BagStorage]:
+        """Open the files, in the order of time; one that cannot be read is damage."""
+        parts: list[BagStorage] = []
+        for file in self._files():
+            try:
+                part = self._open(file)
+            except (OSError, ValueError) as error:
+                self._damages.add(_describe(file, error))
+                continue
+            if part.contents.damages.n_places:
+                where = f"{file.name}: " if file != self.path else ""
+                self._damages.add(f"{where}{part.contents.damages}")
+            parts.append(part)
+            self._readable.append(file)
+        for name in self._missing():
+            self._damages.add(f"metadata.yaml lists {limits.describe(name)}, which is not there")
+        return sorted(parts, key=lambda part: part.contents.start_ns or 0)
 
-    def _survey_damaged(self, error: Exception) -> None:
-        self.damage = _describe(error)
-        self.topics.clear()
-        for part in self._parts:
-            if not part.is_dir():
-                for topic, msgtype, _, log_ns, _ in salvage(part):
-                    self._count(topic, msgtype, 1)
-                    self._ends_ns[topic] = log_ns
-        if not self.topics:
-            raise SourceError(
-                f"{self.path} cannot be read: {self.damage}", "Record again, or try to reindex it."
-            )
+    def _open(self, file: Path) -> BagStorage:
+        if file.suffix.lower() == _PACKED:
+            file = self._unpack(file)
+        if file.suffix.lower() == ".bag":
+            return Ros1Bag(file)
+        return McapBag(file) if file.suffix.lower() == ".mcap" else SqliteBag(file)
 
-    def _count(self, topic: str, msgtype: str, n: int) -> None:
-        self.topics[topic] = (_short_type(msgtype), self.topics.get(topic, ("", 0))[1] + n)
-
-    def _find_parts(self) -> list[Path]:
-        """List what readers open: the path itself, or the files in a folder whose index was never written."""
-        if not self.path.is_dir() or (self.path / "metadata.yaml").is_file():
-            return [self.path]
-        return self._files()
+    def _unpack(self, file: Path) -> Path:
+        """Unpack a file that was compressed as a whole, for as long as the bag is open."""
+        self._unpacked.append(TemporaryDirectory(prefix="lce-rig-"))
+        unpacked = Path(self._unpacked[-1].name) / file.stem
+        with limits.open_regular(file) as packed, unpacked.open("wb") as into:
+            limits.unpack_file("zstd", packed, into)
+        return unpacked
 
     def _files(self) -> list[Path]:
         if not self.path.is_dir():
             return [self.path]
-        return sorted(p for p in self.path.iterdir() if p.suffix.lower() in SUFFIXES)
+        return sorted(file for file in self.path.iterdir() if is_bag_file(file))
+
+    def _missing(self) -> list[str]:
+        """List the files that a folder's metadata.yaml names and that are not there."""
+        metadata = self.path / "metadata.yaml"
+        if not self.path.is_dir() or not metadata.exists():
+            return []
+        try:
+            text = limits.read_file(metadata, limits.MAX_DOCUMENT_BYTES).decode(errors="replace")
+        except (OSError, ValueError) as error:
+            self._damages.add(_describe(metadata, error))
+            return []
+        there = {file.name for file in self._files()}
+        return sorted({Path(name).name for name in _LISTED_FILE.findall(text)} - there)
 
 
-def _reader(part: Path) -> AbstractContextManager[Any]:
-    if part.suffix.lower() == ".bag":
-        from rosbags.rosbag1 import Reader as Ros1Reader
-
-        return Ros1Reader(part)
-    from rosbags.rosbag2 import Reader as Ros2Reader
-
-    return Ros2Reader(part)
+def is_bag_file(path: Path) -> bool:
+    """Tell whether a file's name is that of a bag, or of one that was compressed as a whole."""
+    suffixes = [suffix.lower() for suffix in path.suffixes[-2:]]
+    return suffixes[-1:] != [] and (suffixes[-1] in SUFFIXES or _is_packed(suffixes))
 
 
-def _find_end(reader: Any, topic: str) -> dict[str, int]:
-    """Look for a topic's last message in ever longer stretches of the bag's end."""
-    wanted = [connection for connection in reader.connections if connection.topic == topic]
-    length_ns, begin_ns = _FIRST_LOOK_NS, reader.end_time
-    while wanted and begin_ns > reader.start_time:
-        begin_ns = reader.end_time - length_ns
-        found = [log_ns for _, log_ns, _ in reader.messages(connections=wanted, start=begin_ns)]
-        if found:
-            return {topic: max(found)}
-        length_ns *= 4
-    return {}
+def list_topics(topics: Mapping[str, tuple[str, int]]) -> str:
+    """List the topics of a bag, for messages.
+
+    Args:
+        topics: (message type, number of messages) by topic.
+    """
+    shown = sorted(topics.items())[:_MAX_LISTED]
+    listed = [f"{limits.shorten(name)} ({limits.shorten(kind)}, {n})" for name, (kind, n) in shown]
+    listed += [f"and {len(topics) - len(shown)} more"] if len(topics) > len(shown) else []
+    return f"topics there: {', '.join(listed) or 'none'}"
 
 
-def _short_type(msgtype: str) -> str:
-    return msgtype.replace("/msg/", "/")
+def _is_packed(suffixes: list[str]) -> bool:
+    return len(suffixes) == 2 and suffixes[0] in SUFFIXES and suffixes[1] == _PACKED
 
 
-def _describe(error: Exception) -> str:
-    text = " ".join(str(error).split()).rstrip(".")
-    return text[:200] if text else type(error).__name__
+def _end_ns(part: BagStorage, topic: str) -> int | None:
+    try:
+        return part.end_ns(topic)
+    except (OSError, ValueError):
+        return None  # It is said when the bag is read.
+
+
+def _describe(path: Path, error: Exception) -> str:
+    text = (error.strerror if isinstance(error, OSError) else str(error)) or type(error).__name__
+    return f"{path.name}: {text}"

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from lce_rig.core import limits
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.datagrams import LINKS, OTHER_LINKS, Datagram, read_datagram
 
@@ -58,10 +59,12 @@ class PcapFile:
         self.damage = ""
         self.n_bytes_read = 0
         try:
-            with path.open("rb") as file:
+            with limits.open_regular(path) as file:
                 head = file.read(24)
         except OSError as error:
             raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
+        except ValueError as error:
+            raise SourceError(f"{path}: cannot be read: {error}") from None
         self._order, self._ns_per_tick, self._link = _read_head(path, head)
         if self._link is not None:
             self._check_link(self._link)
@@ -76,7 +79,7 @@ class PcapFile:
         """
         self.flaws.clear()
         self.damage = ""
-        with self.path.open("rb") as file:
+        with limits.open_regular(self.path) as file:
             frames = self._blocks(file) if self._link is None else self._records(file, self._link)
             try:
                 for link, host_ns, frame in frames:

@@ -12,7 +12,8 @@ from typing import Any
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
-from lce_rig.sources.bag_file import BagFile, RawMessage
+from lce_rig.sources.bag_file import BagFile, list_topics
+from lce_rig.sources.bag_storage import RawMessage
 from lce_rig.sources.base import Sample, SourceOptions, Span, Stream
 from lce_rig.sources.cloud import to_scan
 from lce_rig.sources.events.bag import BagEvents
@@ -23,7 +24,7 @@ from lce_rig.sources.merging import merge_by_time
 from lce_rig.sources.overlap import check_overlap
 from lce_rig.sources.pointcloud2 import decode_pointcloud2
 from lce_rig.sources.ros_image import decode_ros_compressed_image, decode_ros_image
-from lce_rig.sources.topics import Target, choose_topics, list_topics
+from lce_rig.sources.topics import Target, choose_topics
 
 # A stamp this much earlier than the one before is a clock that was set, not a message that came late.
 CLOCK_JUMP_NS = 1_000_000_000

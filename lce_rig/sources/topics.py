@@ -7,6 +7,7 @@ from typing import TypeAlias
 
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
+from lce_rig.sources.bag_file import list_topics
 from lce_rig.sources.base import SourceOptions, Stream
 from lce_rig.sources.events.bag import EVENT_TYPES
 
@@ -85,12 +86,6 @@ def choose_topics(
     _add_only_events(path, topics, rig, chosen, notes)
     _add_only_candidates(path, topics, rig, chosen, notes, options.is_part)
     return chosen
-
-
-def list_topics(topics: Topics) -> str:
-    """List the topics of a bag, for messages."""
-    listed = ", ".join(f"{name} ({kind}, {n})" for name, (kind, n) in sorted(topics.items()))
-    return f"topics there: {listed or 'none'}"
 
 
 def _find_topic(target: Target, asked: str | None, profile_topic: str | None, topics: Topics) -> str | None:

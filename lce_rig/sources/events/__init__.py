@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from lce_rig.core.errors import SourceError
-from lce_rig.sources.bag_file import SUFFIXES
+from lce_rig.sources.bag_file import is_bag_file
 from lce_rig.sources.events.recording import EventRecording
 
 READERS = {
@@ -60,5 +60,4 @@ def open_events(
 def _kind(path: Path) -> str:
     if not path.is_dir():
         return path.suffix.lower()
-    bags = sorted(file.suffix.lower() for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
-    return bags[0] if bags else "folder"
+    return ".bag" if any(is_bag_file(file) for file in path.iterdir()) else "folder"

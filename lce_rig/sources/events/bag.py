@@ -5,7 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from lce_rig.core.errors import SourceError
-from lce_rig.sources.bag_file import BagFile, RawMessage
+from lce_rig.sources.bag_file import BagFile, list_topics
+from lce_rig.sources.bag_storage import RawMessage
 from lce_rig.sources.events.event_array import decode_event_array
 from lce_rig.sources.events.event_packet import (
     EventPacket,
@@ -104,7 +105,7 @@ def read_triggers(path: Path, topic: str | None = None) -> Triggers:
     packets = []
     for name in topics:
         if name not in bag.topics:
-            raise SourceError(f"{path} has no topic {name}", _list_topics(bag))
+            raise SourceError(f"{path} has no topic {name}", list_topics(bag.topics))
         packets += [p for p in _packets(bag, name) if p.encoding == "trigger"]
     return decode_triggers(packets)
 
@@ -135,7 +136,7 @@ def _messages(bag: BagFile, topic: str, findings: Findings) -> Iterator[tuple[in
 
 def _choose_topic(bag: BagFile, asked: str | None) -> str:
     """Take the topic asked for, else the only one that carries events."""
-    there = _list_topics(bag)
+    there = list_topics(bag.topics)
     if asked is not None:
         kind, _ = bag.topics.get(asked, ("", 0))
         if kind not in EVENT_TYPES:
@@ -156,8 +157,3 @@ def _holds_triggers(bag: BagFile, topic: str) -> bool:
         return False
     first = next(_packets(bag, topic), None)
     return first is not None and first.encoding == "trigger"
-
-
-def _list_topics(bag: BagFile) -> str:
-    listed = ", ".join(f"{name} ({kind}, {n})" for name, (kind, n) in sorted(bag.topics.items()))
-    return f"topics there: {listed or 'none'}"
