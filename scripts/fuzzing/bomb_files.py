@@ -170,7 +170,8 @@ def aedat4_entities(samples: Samples) -> bytes:
     from lce_rig.sources.events.aedat4_writer import _header
 
     entities = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 12))
-    text = f'<?xml version="1.0"?><!DOCTYPE dv [<!ENTITY a0 "lol">{entities}]><dv><node name="outInfo">&a11;</node></dv>'
+    text = f'<?xml version="1.0"?><!DOCTYPE dv [<!ENTITY a0 "lol">{entities}]>'
+    text += '<dv><node name="outInfo">&a11;</node></dv>'
     return MAGIC + _header(text.encode())
 
 

@@ -173,7 +173,17 @@ def _run(command: str, build: Build, samples: Samples) -> _Ran:
         environment = {**os.environ, "PYTHONPATH": str(_ROOT), "OMP_NUM_THREADS": "1", "COLUMNS": "300"}
         with log.open("wb") as out:
             launched = subprocess.run(
-                [sys.executable, "-S", "-c", _LAUNCHER, str(_PATIENCE_S), sys.executable, "-c", _MAIN, *words],
+                [
+                    sys.executable,
+                    "-S",
+                    "-c",
+                    _LAUNCHER,
+                    str(_PATIENCE_S),
+                    sys.executable,
+                    "-c",
+                    _MAIN,
+                    *words,
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=out,

@@ -468,6 +468,7 @@ def add_raw_messages(writer: Any, messages: list[tuple[Any, int, bytes]], *, is_
 
 
 def bag_writer(path: Path, suffix: str) -> Any:
+    """Begin a bag: ROS 1, or the folder of a ROS 2 bag with a file of that suffix."""
     if suffix == ".bag":
         from rosbags.rosbag1 import Writer as Writer1
 

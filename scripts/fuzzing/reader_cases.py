@@ -107,7 +107,7 @@ def run_case(name: str, seeds: Sequence[Files], seed: int, case: int, folder: Pa
         verdict, what, detail = WRONG, _place_of(error), traceback.format_exc(limit=-12)
     seconds = time.perf_counter() - began_s
     if case % 50 == 0 and verdict == REFUSED and reader.is_sound:
-        verdict, what = WRONG, f"a sound input is refused: {what[:100]}"
+        verdict, what, detail = WRONG, "a sound input is refused", what
     grown = _peak_bytes() - before
     if verdict != WRONG and seconds > MAX_SECONDS:
         verdict, what = WRONG, f"longer than {MAX_SECONDS:g} s"
@@ -137,7 +137,7 @@ def _place_of(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if "/lce_rig/" in frame.filename]
     place = f"{own[-1].filename.rpartition('/lce_rig/')[2]}:{own[-1].lineno}" if own else "outside lce_rig"
-    return f"{type(error).__name__} at {place}: {' '.join(str(error).split())[:80]}"
+    return f"{type(error).__name__} at {place}"
 
 
 def _forget_peak() -> int:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatch
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -267,13 +268,15 @@ def _truth(folder: Path) -> None:
     require_kind(folder / "s", 0)
 
 
-def _export(module: str) -> Callable[[Path], None]:
-    """Read a file of a result back as its writer does, which also compares it with the result."""
+def _export(module: str, file: str, *, has_trees: bool = False) -> Callable[[Path], None]:
+    """Read an export back as its writer does, which compares it with the result."""
 
     def read(folder: Path) -> None:
-        from importlib import import_module
+        from lce_rig.export.frames import build_trees
 
-        import_module(f"lce_rig.export.{module}").read_back(folder, [sessions.calibration()], small_rig())
+        calibrations, rig = [sessions.calibration()], small_rig()
+        trees = [build_trees(calibrations, rig)] if has_trees else []
+        import_module(f"lce_rig.export.{module}")._check(folder / file, *trees, calibrations, rig)
 
     return read
 
@@ -394,7 +397,7 @@ READERS: dict[str, Reader] = {
     "text": Reader(recordings.text, _events, layers=(TEXT,)),
     "text-zip": _recordings(recordings.zipped_text, layers.ZIP_TEXTS, read=_events),
     # Folders
-    "folder-names": Reader(recordings.folder, _named_folder, "names.txt", (TEXT,)),
+    "folder-names": Reader(recordings.folder, _named_folder, "names.txt", (TEXT,), is_sound=False),
     "recorded-folder": _recordings(recordings.recorded_folder, read=_joined),
     # Sessions
     "session.json": Reader(sessions.session, _marker, "s/session.json", (JSON,)),
@@ -419,6 +422,18 @@ READERS: dict[str, Reader] = {
     "result.json": Reader(sessions.result, _result, layers=(JSON,)),
     "reference": Reader(sessions.reference, _reference, layers=(JSON,)),
     "camera_info": Reader(sessions.exports, _camera_info, "camera_info_*.yaml", (TEXT,)),
+    "extrinsics": Reader(
+        sessions.exports, _export("extrinsics", "extrinsics.yaml"), "extrinsics.yaml", (TEXT,)
+    ),
+    "kalibr": Reader(
+        sessions.exports, _export("kalibr", "camchain_lidar.yaml"), "camchain_lidar.yaml", (TEXT,)
+    ),
+    "autoware": Reader(
+        sessions.exports,
+        _export("autoware", "sensor_kit_calibration.yaml", has_trees=True),
+        "sensor_kit_calibration.yaml",
+        (TEXT,),
+    ),
     "urdf": Reader(sessions.exports, _urdf, "*.urdf", (TEXT,)),
     "static_tf": Reader(sessions.exports, _static_tf, "static_transforms.txt", (TEXT,)),
     "network": _recordings(sessions.network, read=_network),

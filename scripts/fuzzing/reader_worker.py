@@ -25,7 +25,7 @@ def main() -> None:
     from fuzzing.reader_cases import run_case
 
     # Written by the parent a moment ago.
-    seeds = pickle.loads(seeds_file.read_bytes())  # noqa: S301
+    seeds = pickle.loads(seeds_file.read_bytes())
     for line in sys.stdin:
         job = json.loads(line)
         deadline_s = time.monotonic() + job["seconds"]
