@@ -693,10 +693,13 @@ def recorded_folder(samples: Samples) -> list[Files]:
 
 def velodyne_web(_samples: Samples) -> list[Files]:
     """What a VLP-16's web page answers."""
+    host = {"addr": "255.255.255.255", "dport": "2368", "tport": 8308}
+    fov, gps = {"start": 0, "end": 359}, {"pps_state": "Locked", "position": "4807.038N 01131.000E"}
+    motor, laser = {"state": "On", "rpm": 600}, {"state": "On"}
     pages = {
         "info": {"model": "VLP-16", "serial": "AG29123456789", "major": {"version": "3.0.37.0"}},
-        "status": {"gps": {"pps_state": "Locked", "position": "4807.038N 01131.000E"}, "motor": {"state": "On", "rpm": 600}, "laser": {"state": "On"}},
-        "settings": {"rpm": "600", "returns": "Strongest", "fov": {"start": 0, "end": 359}, "host": {"addr": "255.255.255.255", "dport": "2368", "tport": 8308}, "laser": "On"},
+        "status": {"gps": gps, "motor": motor, "laser": laser},
+        "settings": {"rpm": "600", "returns": "Strongest", "fov": fov, "host": host, "laser": "On"},
         "diag": {"volt_temp": {"top": {"lm20_temp": 2000}, "bot": {"lm20_temp": 2100}}},
-    }  # fmt: skip
+    }
     return [{"pages.json": json.dumps(pages).encode()}]

@@ -15,7 +15,7 @@ import yaml
 from fuzzing.samples import CAMERA, LIDAR, SIZE, Samples, small_rig
 from fuzzing.seeds_of_recordings import Files
 from lce_rig.core.results import Calibration, Certificate, ImageBoard, Metrics, PointUncertainty, Refusal
-from lce_rig.rig import dump_rig, find_profile
+from lce_rig.rig import find_profile
 from lce_rig.session import Session
 
 CAPTURE = "s/captures/000000"
