@@ -160,7 +160,16 @@ def test_a_process_that_hangs_or_dies_costs_one_case_and_is_named(
 
 # Readers whose sound input is made quickly.
 _QUICK = (
-    *("pcd-ascii", "pcd-binary", "pcd-compressed", "ply-big-endian", "png", "jpeg", "stream-y4m", "ros1-torn"),
+    *(
+        "pcd-ascii",
+        "pcd-binary",
+        "pcd-compressed",
+        "ply-big-endian",
+        "png",
+        "jpeg",
+        "stream-y4m",
+        "ros1-torn",
+    ),
     *("aedat4-zstd", "evt2", "evt3", "hdf5", "npz-foreign", "text-zip", "session.json", "manifest"),
     *("stored-scan", "detection-cache", "rig-values", "result.json", "reference", "urdf"),
 )
