@@ -153,7 +153,7 @@ def fuzz_bombs(n: int, seed: int, *, names: Sequence[str] = ()) -> BombReport:
 
 
 def _quickest(bomb: Bomb, samples: Samples, start_s: float) -> "_Ran":
-    """Run a bomb; again where it took too long but ended: a busy computer adds time, and never takes any off."""
+    """Run a bomb, again where it took too long but ended: a busy computer only ever adds time."""
     runs = [_run(bomb.command, bomb.build, samples)]
     while len(runs) < _TRIES and runs[-1].exit_code >= 0 and runs[-1].seconds - start_s > MAX_SECONDS:
         runs.append(_run(bomb.command, bomb.build, samples))

@@ -1,4 +1,4 @@
-"""Damaged files for every reader: the campaign finds what is planted, repeats itself, and finds nothing else."""
+"""The campaign against readers finds what is planted, repeats itself, and finds nothing else."""
 
 import json
 import os
@@ -124,7 +124,7 @@ def test_inner_parts_are_put_back_as_they_were() -> None:
         bag = READERS[name].make(samples)[0][f"a{suffix}"]
         again = layer.join(bag, layer.split(bag))
         contents = [[(c.topic, t, raw) for c, t, raw in layers.messages_in(d, suffix)] for d in (bag, again)]
-        assert contents[0] == contents[1] and len(contents[0]) == 5, name
+        assert contents[0] == contents[1] and len(contents[0]) >= 5, name
 
 
 def test_zips_laid_out_here_are_what_zipfile_reads() -> None:
