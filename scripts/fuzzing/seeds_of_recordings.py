@@ -570,40 +570,32 @@ def _listed(events: Events) -> list[tuple[int, int, int, int]]:
 
 
 def hdf5(samples: Samples) -> list[Files]:
-    """DSEC's layout: plain, chunked and compressed; and columns and attributes of strange types."""
+    """DSEC's layout, plain, and in compressed chunks with checksums."""
+    packed = {"compression": "gzip", "chunks": (64,), "fletcher32": True}
+    columns = _dsec_columns(samples.events)
+    seeds = [_written(lambda path, o=o: _write_dsec(path, columns, {}, o), "a.h5") for o in ({}, packed)]  # type: ignore[misc]
+    return [{"a.h5": data} for data in seeds]
+
+
+def hdf5_strange(samples: Samples) -> list[Files]:
+    """Columns and attributes of types that no recorder writes."""
     import h5py  # type: ignore[import-untyped]
 
-    events, t_us = samples.events, _from_zero_us(samples.events)
-    n = len(t_us)
-    columns = {
-        "t": t_us.astype(np.uint32),
-        "x": events.x,
-        "y": events.y,
-        "p": events.polarity.astype(np.uint8),
-    }
-    strange: dict[str, Any] = {
-        "compound": np.zeros(n, dtype=[("a", "<i4"), ("b", "<f4")]),
-        "bytes": np.array([b"12"] * n),
-        "two_dimensional": np.zeros((n, 2), np.uint16),
-        "scalar": np.uint16(3),
-        "float": np.full(n, np.nan),
-        "complex": np.zeros(n, np.complex128),
-        "empty": h5py.Empty("<u2"),
-    }
-
-    def write(path: Path, changed: dict[str, Any], options: dict[str, Any]) -> None:
-        with h5py.File(path, "w") as file:
-            for name, values in {**columns, **changed}.items():
-                file.create_dataset(f"events/{name}", data=values, **(options if name not in changed else {}))
-            file["t_offset"] = 10**15
-            file.attrs["width"], file.attrs["height"] = SIZE
-
+    columns = _dsec_columns(samples.events)
+    n = len(columns["t"])
+    strange: tuple[Any, ...] = (
+        np.zeros(n, dtype=[("a", "<i4"), ("b", "<f4")]),
+        np.array([b"12"] * n),
+        np.zeros((n, 2), np.uint16),
+        np.uint16(3),
+        np.full(n, np.nan),
+        np.zeros(n, np.complex128),
+        h5py.Empty("<u2"),
+    )
     seeds = [
-        _written(lambda path, o=o: write(path, {}, o), "a.h5")
-        for o in ({}, {"compression": "gzip", "chunks": (64,), "fletcher32": True})
-    ]  # type: ignore[misc]
-    for k, values in enumerate(strange.values()):
-        seeds.append(_written(lambda path, k=k, v=values: write(path, {"txyp"[k % 4]: v}, {}), "a.h5"))  # type: ignore[misc]
+        _written(lambda path, k=k, v=v: _write_dsec(path, columns, {"txyp"[k % 4]: v}, {}), "a.h5")  # type: ignore[misc]
+        for k, v in enumerate(strange)
+    ]
 
     def write_text(path: Path) -> None:
         with h5py.File(path, "w") as file:
@@ -615,6 +607,23 @@ def hdf5(samples: Samples) -> list[Files]:
             file["t_offset"] = np.zeros(0)
 
     return [{"a.h5": data} for data in (*seeds, _written(write_text, "a.h5"))]
+
+
+def _dsec_columns(events: Events) -> dict[str, np.ndarray]:
+    t_us = _from_zero_us(events).astype(np.uint32)
+    return {"t": t_us, "x": events.x, "y": events.y, "p": events.polarity.astype(np.uint8)}
+
+
+def _write_dsec(
+    path: Path, columns: dict[str, np.ndarray], changed: dict[str, Any], options: dict[str, Any]
+) -> None:
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for name, values in {**columns, **changed}.items():
+            file.create_dataset(f"events/{name}", data=values, **(options if name not in changed else {}))
+        file["t_offset"] = 10**15
+        file.attrs["width"], file.attrs["height"] = SIZE
 
 
 def npz_own(samples: Samples) -> list[Files]:

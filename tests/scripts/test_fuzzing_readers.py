@@ -177,10 +177,10 @@ _QUICK = (
 
 
 def test_damaged_files_are_refused_or_read_right() -> None:
-    report = fuzz_readers(10, 0, names=_QUICK)
+    report = fuzz_readers(8, 0, names=_QUICK)
     assert report.n_wrong == 0, said(report)
-    assert report.n == 10 * len(_QUICK)
-    assert report.n_refused > 60 and report.n_accepted > 30
+    assert report.n == 8 * len(_QUICK)
+    assert report.n_refused > 50 and report.n_accepted > 25
 
 
 @pytest.mark.long
