@@ -133,7 +133,8 @@ def fuzz_result_kills(n: int, seed: int) -> ResultKillReport:
             report.wrong += [f"{where}: {what}" for what in check(session, known)]
             if k % _EVERY == _EVERY - 1:
                 report.wrong += [f"{where}: {what}" for what in _run_undisturbed(session, chance, known)]
-                print(f"{k + 1} kills, {report.n_wrong} wrong", file=sys.stderr, flush=True)
+                lines = [f"{k + 1} kills, {report.n_wrong} wrong", *report.wrong[-3:]]
+                print("\n".join(lines), file=sys.stderr, flush=True)
     report.seconds = round(time.monotonic() - began_s, 1)
     return report
 
