@@ -283,14 +283,15 @@ def _kill_once(
         report.wrong.append(f"{name} goes on for {_PATIENCE_S:g} s after {number.name}")
         process.kill()
         process.wait()
-    seconds = time.monotonic() - began_s
+    seconds, text = time.monotonic() - began_s, _said(process)
     if number == signal.SIGINT:
+        # Python itself ends with 1 where it is stopped before anything of this program has run.
+        is_ours = process.returncode != 1 or "lce_rig" in text
+        if process.returncode not in (0, 130, -signal.SIGINT) and is_ours:
+            report.wrong.append(f"{name} ends with {process.returncode} after Ctrl-C: {text[-300:]}")
         report.slowest_stop_s = max(report.slowest_stop_s, round(seconds, 2))
         if seconds > _MAX_STOP_S:
             report.wrong.append(f"{name} goes on for {seconds:.1f} s after Ctrl-C (limit {_MAX_STOP_S:g} s)")
-        if process.returncode not in (0, 130, -signal.SIGINT):
-            report.wrong.append(f"{name} ends with {process.returncode} after Ctrl-C")
-    text = _said(process)
     if "Traceback" in text and number != signal.SIGINT:
         report.wrong.append(f"{name} ends with a traceback: {text[-300:]}")
 
