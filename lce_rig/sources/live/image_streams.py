@@ -156,9 +156,7 @@ class Y4mPictures(PictureStream):
         if int(width) * int(height) > MAX_PIXELS:
             raise ValueError(f"Y4M images of {width}x{height} px are too large: at most {MAX_PIXELS} px")
         if colour != "mono" and (int(width) % 2 or int(height) % 2):
-            raise ValueError(
-                f"Y4M images of {width}x{height} px in colour: both must be even"
-            )
+            raise ValueError(f"Y4M images of {width}x{height} px in colour: both must be even")
         self._colour, self._size = colour, (int(width), int(height))
         return PixelDecoder("GREY" if colour == "mono" else "YU12", *self._size)
 
