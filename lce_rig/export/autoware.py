@@ -10,7 +10,7 @@ from lce_rig.core.results import Calibration
 from lce_rig.export.frames import T_BODY_OPTICAL, FrameTree, build_trees, choose_channels
 from lce_rig.export.probes import check_pose
 from lce_rig.export.rotations import rotation_from_rpy, rpy
-from lce_rig.export.writing import header, number, quoted, write_atomically
+from lce_rig.export.writing import header, number, quoted, reads_back, write_atomically
 from lce_rig.rig import Rig
 
 FILE_NAME = "sensor_kit_calibration.yaml"
@@ -50,6 +50,7 @@ def _block(tree: FrameTree) -> list[str]:
     return lines
 
 
+@reads_back
 def _check(path: Path, trees: Sequence[FrameTree], chosen: Sequence[Calibration], rig: Rig) -> None:
     import yaml
 

@@ -11,7 +11,7 @@ from lce_rig.core.errors import LceRigError
 from lce_rig.core.results import Calibration
 from lce_rig.export.frames import choose_channels
 from lce_rig.export.probes import check_projection
-from lce_rig.export.writing import header, numbers, quoted, write_atomically
+from lce_rig.export.writing import header, numbers, quoted, reads_back, write_atomically
 from lce_rig.rig import Rig
 
 
@@ -67,6 +67,7 @@ def _matrix(key: str, matrix: Any) -> list[str]:
     return [f"{key}:", f"  rows: {n_rows}", f"  cols: {n_cols}", f"  data: {numbers(matrix.ravel())}"]
 
 
+@reads_back
 def read_camera_info(path: Path) -> Intrinsics:
     """Read a camera model from a camera_info file.
 

@@ -11,7 +11,17 @@ from lce_rig.core.geometry import Array, invert, pose, transform
 from lce_rig.core.results import Calibration
 from lce_rig.export.probes import TOLERANCE, check_pose
 from lce_rig.export.rotations import quaternion_wxyz, rotation_from_quaternion
-from lce_rig.export.writing import MADE_BY, header, number, numbers, quoted, rows, texts, write_atomically
+from lce_rig.export.writing import (
+    MADE_BY,
+    header,
+    number,
+    numbers,
+    quoted,
+    reads_back,
+    rows,
+    texts,
+    write_atomically,
+)
 from lce_rig.rig import Rig
 
 FILE_NAME = "extrinsics.yaml"
@@ -104,6 +114,7 @@ def _judgement(calibration: Calibration) -> list[str]:
     ]
 
 
+@reads_back
 def _check(path: Path, calibrations: Sequence[Calibration], rig: Rig) -> None:
     import yaml
 

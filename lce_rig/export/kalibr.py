@@ -10,7 +10,7 @@ from lce_rig.core.geometry import Array, invert
 from lce_rig.core.results import Calibration
 from lce_rig.export.frames import choose_channels
 from lce_rig.export.probes import check_projection
-from lce_rig.export.writing import header, numbers, quoted, rows, write_atomically
+from lce_rig.export.writing import header, numbers, quoted, reads_back, rows, write_atomically
 from lce_rig.rig import Rig
 
 
@@ -71,6 +71,7 @@ def _text(chain: Sequence[Calibration], rig: Rig) -> str:
     return "\n".join(lines) + "\n"
 
 
+@reads_back
 def _check(path: Path, chain: Sequence[Calibration], rig: Rig) -> None:
     import yaml
 

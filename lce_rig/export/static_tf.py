@@ -12,7 +12,7 @@ from lce_rig.core.results import Calibration
 from lce_rig.export.frames import Joint, build_trees, choose_channels
 from lce_rig.export.probes import check_pose
 from lce_rig.export.rotations import quaternion_wxyz, rotation_from_quaternion
-from lce_rig.export.writing import header, number, write_atomically
+from lce_rig.export.writing import header, number, reads_back, write_atomically
 from lce_rig.rig import Rig
 
 FILE_NAME = "static_transforms.txt"
@@ -58,6 +58,7 @@ def _ros2(joint: Joint) -> str:
     return f"ros2 run tf2_ros static_transform_publisher {named} {frames}"
 
 
+@reads_back
 def read_static_tf(path: Path) -> dict[str, dict[tuple[str, str], Array]]:
     """Read T_parent_child (4, 4) by (parent, child) from the commands of each ROS ("ros1", "ros2")."""
     found: dict[str, dict[tuple[str, str], Array]] = {"ros1": {}, "ros2": {}}
@@ -78,6 +79,7 @@ def _pose(values: Sequence[str]) -> Array:
     return pose(rotation_from_quaternion(np.array([qw, qx, qy, qz])), np.array([x, y, z]))
 
 
+@reads_back
 def _check(path: Path, joints: Sequence[Joint], chosen: Sequence[Calibration], rig: Rig) -> None:
     wanted = {(joint.parent, joint.child) for joint in joints}
     for version, poses in read_static_tf(path).items():

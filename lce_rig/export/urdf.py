@@ -13,7 +13,7 @@ from lce_rig.core.results import Calibration
 from lce_rig.export.frames import RPY_BODY_OPTICAL, FrameTree, build_trees, check_tree, choose_channels
 from lce_rig.export.probes import check_pose
 from lce_rig.export.rotations import rotation_from_rpy, rpy
-from lce_rig.export.writing import header, number, write_atomically
+from lce_rig.export.writing import header, number, reads_back, write_atomically
 from lce_rig.rig import Rig
 
 
@@ -54,6 +54,7 @@ def _text(tree: FrameTree, head: list[str], name: str) -> str:
     return "\n".join([*lines, "</robot>"]) + "\n"
 
 
+@reads_back
 def read_urdf(path: Path) -> dict[str, Array]:
     """Read the pose T_root_link (4, 4) of each link from a URDF of fixed joints.
 
@@ -89,6 +90,7 @@ def _from_root(link: str, steps: dict[str, tuple[str, Array]]) -> Array:
     return T
 
 
+@reads_back
 def _check(path: Path, tree: FrameTree, chosen: Sequence[Calibration], rig: Rig) -> None:
     poses = read_urdf(path)
     if set(poses) != set(tree.frames):

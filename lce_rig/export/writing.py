@@ -1,18 +1,28 @@
 """Text on disk: numbers that read back exactly, files that exist whole or not at all."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import wraps
 from pathlib import Path
+from typing import Concatenate, ParamSpec, TypeVar
 
 import numpy as np
+import yaml
 
 import lce_rig
-from lce_rig.core.errors import ResultRefusedError, SessionError
+from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Calibration
 from lce_rig.rig import Rig
 from lce_rig.session.durable import replace_file
 
+_Arguments = ParamSpec("_Arguments")
+_Read = TypeVar("_Read")
+# What damage to a text of numbers does to whoever reads it: syntax, missing keys, other types, other shapes.
+_DAMAGE = (
+    *(OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError),
+    yaml.YAMLError,
+)
 MADE_BY = f"lce-rig {lce_rig.__version__}"
 
 
@@ -90,3 +100,26 @@ def write_atomically(path: Path, text: str) -> None:
         raise SessionError(
             f"{path}: cannot be written: {error.strerror or error}", "free space or choose another folder"
         ) from error
+
+
+def reads_back(
+    read: Callable[Concatenate[Path, _Arguments], _Read],
+) -> Callable[Concatenate[Path, _Arguments], _Read]:
+    """Let a function that reads an export back report any damage to the file as one error.
+
+    Args:
+        read: takes the file's path first. Poses that are not finite are its to refuse.
+    """
+
+    @wraps(read)
+    def guarded(path: Path, /, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Read:
+        try:
+            with np.errstate(all="ignore"):
+                return read(path, *args, **kwargs)
+        except _DAMAGE as error:
+            said = " ".join(str(error).split())[:120] or type(error).__name__
+            raise LceRigError(
+                f"{path}: cannot be read back: {said}", "Check the disk, then run the same command again."
+            ) from error
+
+    return guarded

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from lce_rig.core.limits import MAX_PIXELS
 from lce_rig.sources.image_file import decode_image
 from lce_rig.sources.live.pixel_formats import FORMATS, PixelDecoder, Pixels
 
@@ -152,6 +153,10 @@ class Y4mPictures(PictureStream):
             raise ValueError(f"the Y4M header tells no size: {line[:80]!r}")
         if colour not in ("mono", "444", "422", *_420):
             raise ValueError(f"Y4M colour {colour} is not read here: let the command write 4:2:0, 8 bit")
+        if int(width) * int(height) > MAX_PIXELS:
+            raise ValueError(f"Y4M images of {width}x{height} px are too large: at most {MAX_PIXELS} px")
+        if colour != "mono" and (int(width) % 2 or int(height) % 2):
+            raise ValueError(f"Y4M images of {width}x{height} px in colour: both must be even")
         self._colour, self._size = colour, (int(width), int(height))
         return PixelDecoder("GREY" if colour == "mono" else "YU12", *self._size)
 

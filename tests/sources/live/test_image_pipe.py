@@ -340,3 +340,10 @@ def test_ffmpeg_is_read(output: tuple[str, ...]) -> None:
         images = take(source, 5)
     assert {image.pixels.shape for image in images} == {(HEIGHT, WIDTH, 3)}
     assert images[0].pixels.std() > 20
+
+
+@pytest.mark.parametrize("size", ["W64 H47", "W63 H48", "W60000 H60000"])
+def test_y4m_of_a_size_that_cannot_be_is_refused_in_words(size: str) -> None:
+    stream = Y4mPictures()
+    with pytest.raises(ValueError, match="Y4M images of"):
+        list(stream.feed(f"YUV4MPEG2 {size} F30:1 C420jpeg\n".encode()))
