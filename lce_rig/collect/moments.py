@@ -17,6 +17,9 @@ from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
 from lce_rig.sources.base import Sample, Stream
 
+# How often an image without a board is searched thoroughly, which takes most of a second.
+_THOROUGH_S = 1.0
+
 
 @dataclass
 class MomentSearch:
@@ -69,7 +72,7 @@ class MomentSearch:
             samples = with_event_pictures(samples, self.rig, cameras, self._tally)
         stillness = self.stillness or StillnessOptions(max_motion_m=self.rig.quality.max_motion_m)
         interval_s = self.motion.search_interval_s if self.has_events else stillness.search_interval_s
-        watcher = BoardWatcher(self.rig, interval_s, self._counts, self._tally)
+        watcher = BoardWatcher(self.rig, interval_s, self._counts, self._tally, _THOROUGH_S)
         frames = pair_by_time(samples, self.rig, self._pairing)
         sightings = (watcher.sight(frame) for frame in frames)
         if self.has_events:

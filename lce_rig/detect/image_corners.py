@@ -142,6 +142,8 @@ def _attempts(
             yield _classic(grey, size, min(1.0, 1280 / width))
         level = level_contrast(_resize(grey, scale))
         yield _to_full_scale(_sector_based(level, size, 1.0, _SB_THOROUGH), scale)
+        # Squares of 10 px, as of a board 5 m away, are too small at half the size.
+        yield _sector_based(grey, size, min(1.0, 1280 / width), _SB_THOROUGH)
         return
     level = level_contrast(grey)
     if not is_other_seen:
