@@ -8,6 +8,7 @@
     scripts/bench.py guidance    a person who follows the guidance against random placements
     scripts/bench.py paper       the experiments of the LCE-Calib paper: tables and figures, every method
     scripts/bench.py faults      sessions with faults: how many wrong results pass
+    scripts/bench.py corruptions  sessions that are wrong as a whole: verdict, error and reported uncertainty
     scripts/bench.py live        live collection under load, over real transports, for --seconds
     scripts/bench.py uncertainty  the joint estimate: errors against their bound, truth of its claim
     scripts/bench.py speed       detection, Algorithm 1, the command line
@@ -29,6 +30,7 @@ PARTS = {
     "guidance": 20,
     "paper": 20,
     "faults": 100,
+    "corruptions": 0,
     "uncertainty": 100,
     "live": 0,
     "speed": 0,
@@ -44,7 +46,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, help="simulated sessions (default 20, of moving boards 10)")
     parser.add_argument("--splits", type=int, default=20, help="random split halves (default 20)")
     parser.add_argument(
-        "--only", default="", help="recorded sets whose name contains this; of `paper` also: simulated"
+        "--only", default="", help="sets whose name contains this; of `paper` also: simulated"
     )
     parser.add_argument(
         "-o",
@@ -72,6 +74,8 @@ def main() -> None:
         bench(arguments.seeds or PARTS["uncertainty"], arguments.output, arguments.only, arguments.captures)
     elif arguments.part == "faults":
         bench(arguments.seeds or PARTS["faults"], n_sessions=arguments.scans)
+    elif arguments.part == "corruptions":
+        bench(arguments.only)
     elif arguments.part == "live":
         bench(arguments.seconds)
     elif arguments.part == "speed":
