@@ -83,6 +83,10 @@ def bench_corruptions(only: str = "") -> None:
         for outcomes in judge_session(samples, corruptions()):
             print_row(*_cells(outcomes))
             every += outcomes
+    print("\n`*` The data cannot show it:\n")
+    for kind in corruptions():
+        if kind.unobservable:
+            print(f"- {kind.name}: {kind.unobservable}")
     print("\n### Together\n")
     print_summary(every)
 
