@@ -9,6 +9,7 @@
     scripts/bench.py paper       the experiments of the LCE-Calib paper: tables and figures, every method
     scripts/bench.py faults      sessions with faults: how many wrong results pass
     scripts/bench.py goes_on     collections on the simulated rig: do all end with --captures?
+    scripts/bench.py corruptions  sessions that are wrong as a whole: verdict, error and reported uncertainty
     scripts/bench.py live        live collection under load, over real transports, for --seconds
     scripts/bench.py uncertainty  the joint estimate: errors against their bound, truth of its claim
     scripts/bench.py speed       detection, Algorithm 1, the command line
@@ -30,6 +31,7 @@ PARTS = {
     "guidance": 20,
     "paper": 20,
     "faults": 100,
+    "corruptions": 0,
     "uncertainty": 100,
     "goes_on": 10,
     "live": 0,
@@ -46,7 +48,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, help="simulated sessions (default 20, of moving boards 10)")
     parser.add_argument("--splits", type=int, default=20, help="random split halves (default 20)")
     parser.add_argument(
-        "--only", default="", help="recorded sets whose name contains this; of `paper` also: simulated"
+        "--only", default="", help="sets whose name contains this; of `paper` also: simulated"
     )
     parser.add_argument(
         "-o",
@@ -85,6 +87,8 @@ def main() -> None:
         bench(seeds, arguments.captures or 20, arguments.only, arguments.first_seed)
     elif arguments.part == "faults":
         bench(arguments.seeds or PARTS["faults"], n_sessions=arguments.scans)
+    elif arguments.part == "corruptions":
+        bench(arguments.only)
     elif arguments.part == "live":
         bench(arguments.seconds)
     elif arguments.part == "speed":

@@ -95,7 +95,7 @@ def _simulate(rig: Rig, seed: int) -> SimulatedScans:
     parallel_poses: dict[str, Array] = {}
     parallel_scans: dict[str, LidarDetection] = {}
     rng = stage.rng(_PARALLEL)
-    for index, T_world_board in enumerate(_nearly_parallel(stage, rng)):
+    for index, T_world_board in enumerate(nearly_parallel(stage, rng)):
         name = f"{index:06d}"
         parallel_poses[name] = invert(stage.views[0].T_world_cam) @ T_world_board
         seen = scan_held_board(stage, T_world_board, rng, 1000 + index)
@@ -103,7 +103,7 @@ def _simulate(rig: Rig, seed: int) -> SimulatedScans:
     return SimulatedScans(seed, truth, poses, scans, resized, parallel_poses, parallel_scans)
 
 
-def _nearly_parallel(stage: Stage, rng: np.random.Generator) -> Iterator[Array]:
+def nearly_parallel(stage: Stage, rng: np.random.Generator) -> Iterator[Array]:
     """Hold the board at many places with its normal within a few degrees of one direction."""
     view, spread_deg = stage.views[0], rng.uniform(1.0, 5.0)
     lean = exp_so3(np.radians(15) * rng.uniform(-1, 1, 3) * [1, 1, 0])

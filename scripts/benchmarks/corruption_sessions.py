@@ -1,0 +1,178 @@
+"""Whole sessions for the study of corruptions: images, scans and profile, simulated or recorded by others.
+
+What is corrupted here are the samples themselves, so that detectors have their say as well.
+"""
+
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.fault_sessions import nearly_parallel
+from benchmarks.recordings import RecordedSet
+from lce_rig import pipeline
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.errors import ProfileError
+from lce_rig.core.geometry import Array, perturb
+from lce_rig.core.results import Refusal
+from lce_rig.detect.detection import Detections, ImageDetection
+from lce_rig.rig import Rig, load_rig
+from lce_rig.session import Session
+from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures, truth_extrinsics
+from lce_rig.simulate.captures import capture_at
+from lce_rig.simulate.stage import PLACEMENT, Stage, set_stage
+
+SEED = 0
+N_CAPTURES, N_IN_ONE_PLACE = 15, 12
+PARALLEL, ONE_PLACE = "parallel", "one place"
+# How late the timestamps of a moving board's images are, s.
+LATE_S = (0.02, 0.05, 0.1)
+# Further streams of random numbers; the simulation itself uses the lower ones.
+_PARALLEL, _ONE_PLACE = 90, 91
+# Captures of boards that are placed otherwise have noise of their own.
+_FIRST_PARALLEL, _FIRST_IN_ONE_PLACE = 1000, 2000
+# How still somebody holds the board who never moves it on purpose.
+_JITTER_M, _JITTER_RAD = 0.01, np.radians(1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """A session of one camera channel and one LiDAR in memory.
+
+    Attributes:
+        name: of the session.
+        rig: the profile.
+        images: by capture.
+        scans: by capture.
+        T_cam_lidar: (4, 4) the truth; None where nobody knows it.
+        T_lidar_moved: (4, 4) p_lidar = T p_moved: where the LiDAR went while the session was taken. The truth
+            that an error counts against is T_cam_lidar @ T_lidar_moved.
+        variants: sessions of the same rig in which boards were shown otherwise, by name.
+    """
+
+    name: str
+    rig: Rig
+    images: Mapping[str, Image]
+    scans: Mapping[str, Scan]
+    T_cam_lidar: Array | None = None
+    T_lidar_moved: Array = field(default_factory=lambda: np.eye(4))
+    variants: Mapping[str, "Samples"] = field(default_factory=dict)
+
+    @property
+    def captures(self) -> list[str]:
+        """Names of the captures, sorted."""
+        return sorted(self.images)
+
+
+def late(offset_s: float) -> str:
+    """Name the variant in which a board moves and images are late."""
+    return f"{1000 * offset_s:.0f} ms late"
+
+
+def simulated_samples(rig_name: str, seed: int = SEED, n_captures: int = N_CAPTURES) -> Samples:
+    """Simulate a session of boards held still, and its variants.
+
+    Args:
+        rig_name: of a shipped profile with one camera and one LiDAR.
+        seed: of everything random.
+        n_captures: of the session, and of its variants with moving boards.
+    """
+    rig = load_rig(rig_name)
+    options = SimulationOptions.for_rig(rig.name)
+    stage = set_stage(rig, seed, options)
+    truth = truth_extrinsics(rig, seed, options)[next(iter(rig.cameras)), next(iter(rig.lidars))]
+    plain = _gather(rig, truth, (_placed(stage, index) for index in range(n_captures)))
+    variants = {
+        PARALLEL: _gather(rig, truth, _facing_one_way(stage)),
+        ONE_PLACE: _gather(rig, truth, _in_one_place(stage)),
+    }
+    if rig.cameras[next(iter(rig.cameras))].first_channel("events"):
+        for offset_s in LATE_S:
+            moving = replace(SimulationOptions.for_rig(rig.name, "moving"), frame_offset_s=offset_s)
+            captures = simulate_captures(_frames_only(rig), n_captures=n_captures, seed=seed, options=moving)
+            variants[late(offset_s)] = _gather(rig, truth, captures)
+    return replace(plain, variants=variants)
+
+
+def recorded_samples(recorded: RecordedSet) -> Samples:
+    """Read a recorded set of one camera channel and one LiDAR, collected as a user would."""
+    with tempfile.TemporaryDirectory() as scratch:
+        recorded.collect(Path(scratch) / "session")
+        session = Session.open(Path(scratch) / "session")
+        (channel,) = (channel for _, channel in recorded.folders)
+        camera, lidar = next(iter(session.rig.cameras)), next(iter(session.rig.lidars))
+        captures = session.captures
+        images = {capture.name: capture.image(camera, channel) for capture in captures}
+        scans = {capture.name: capture.scan(lidar) for capture in captures}
+        return Samples(recorded.name, session.rig, images, scans)
+
+
+class Detector:
+    """Finds boards as `pipeline.detect` does, and remembers those of a session's own samples.
+
+    Args:
+        samples: the session; where its profile is another one, samples are looked at again.
+    """
+
+    def __init__(self, samples: Samples) -> None:
+        self._rig = samples.rig
+        self._images = {image: _see(samples.rig, image) for image in samples.images.values()}
+        self._scans = {scan: pipeline.detect_scan(samples.rig, scan) for scan in samples.scans.values()}
+
+    def detect(self, samples: Samples) -> Detections:
+        """Find the board in every sample."""
+        rig = samples.rig
+        is_own_board = rig.board == self._rig.board
+        known_images = self._images if is_own_board and rig.cameras == self._rig.cameras else {}
+        known_scans = self._scans if is_own_board else {}
+        images = {name: known_images.get(each) or _see(rig, each) for name, each in samples.images.items()}
+        scans = {
+            name: known_scans.get(each) or pipeline.detect_scan(rig, each)
+            for name, each in samples.scans.items()
+        }
+        image, scan = next(iter(samples.images.values())), next(iter(samples.scans.values()))
+        return Detections({(image.sensor, image.channel): images}, {scan.sensor: scans})
+
+
+def _see(rig: Rig, image: Image) -> ImageDetection:
+    """Find the board in an image; one of another size than the profile's is refused, as in a session."""
+    try:
+        return pipeline.detect_image(rig, image)
+    except ProfileError as error:
+        return Refusal("image", error.what, error.hint)
+
+
+def _gather(rig: Rig, truth: Array, captures: Iterator[SimulatedCapture]) -> Samples:
+    images, scans = {}, {}
+    for number, capture in enumerate(captures):
+        images[f"{number:06d}"], scans[f"{number:06d}"] = capture.images[0], capture.scans[0]
+    return Samples(rig.name, rig, images, scans, truth)
+
+
+def _placed(stage: Stage, index: int) -> SimulatedCapture:
+    rng = stage.rng(index, PLACEMENT)
+    return capture_at(stage, index, stage.place(index, rng), rng)
+
+
+def _facing_one_way(stage: Stage) -> Iterator[SimulatedCapture]:
+    for number, T_world_board in enumerate(nearly_parallel(stage, stage.rng(_PARALLEL))):
+        yield capture_at(stage, _FIRST_PARALLEL + number, T_world_board)
+
+
+def _in_one_place(stage: Stage) -> Iterator[SimulatedCapture]:
+    T_world_board = stage.place(0, stage.rng(0, PLACEMENT))
+    rng = stage.rng(_ONE_PLACE)
+    for number in range(N_IN_ONE_PLACE):
+        jitter = rng.standard_normal(6) * np.repeat([_JITTER_M, _JITTER_RAD], 3) / np.sqrt(3)
+        yield capture_at(stage, _FIRST_IN_ONE_PLACE + number, perturb(T_world_board, jitter))
+
+
+def _frames_only(rig: Rig) -> Rig:
+    """Leave out channels of events, which would take most of a simulation's time."""
+    cameras = {}
+    for name, camera in rig.cameras.items():
+        frames = {key: channel for key, channel in camera.channels.items() if channel.kind == "frames"}
+        cameras[name] = camera.model_copy(update={"channels": frames})
+    return rig.model_copy(update={"cameras": cameras})
