@@ -12,12 +12,12 @@ import numpy as np
 
 from benchmarks.fault_sessions import nearly_parallel
 from benchmarks.recordings import RecordedSet
-from lce_rig import pipeline
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import Refusal
 from lce_rig.detect.detection import Detections, ImageDetection
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig, load_rig
 from lce_rig.session import Session
 from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures, truth_extrinsics
@@ -119,7 +119,7 @@ class Detector:
     def __init__(self, samples: Samples) -> None:
         self._rig = samples.rig
         self._images = {image: _see(samples.rig, image) for image in samples.images.values()}
-        self._scans = {scan: pipeline.detect_scan(samples.rig, scan) for scan in samples.scans.values()}
+        self._scans = {scan: BoardFinder(samples.rig).scan(scan) for scan in samples.scans.values()}
 
     def detect(self, samples: Samples) -> Detections:
         """Find the board in every sample."""
@@ -129,8 +129,7 @@ class Detector:
         known_scans = self._scans if is_own_board else {}
         images = {name: known_images.get(each) or _see(rig, each) for name, each in samples.images.items()}
         scans = {
-            name: known_scans.get(each) or pipeline.detect_scan(rig, each)
-            for name, each in samples.scans.items()
+            name: known_scans.get(each) or BoardFinder(rig).scan(each) for name, each in samples.scans.items()
         }
         image, scan = next(iter(samples.images.values())), next(iter(samples.scans.values()))
         return Detections({(image.sensor, image.channel): images}, {scan.sensor: scans})
@@ -139,7 +138,7 @@ class Detector:
 def _see(rig: Rig, image: Image) -> ImageDetection:
     """Find the board in an image; one of another size than the profile's is refused, as in a session."""
     try:
-        return pipeline.detect_image(rig, image)
+        return BoardFinder(rig).image(image)
     except ProfileError as error:
         return Refusal("image", error.what, error.hint)
 
