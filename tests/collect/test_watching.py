@@ -5,8 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from lce_rig.collect.pairing import Frame
-from lce_rig.collect.watching import BoardWatcher, Sighting
+from lce_rig.collect.stillness import StillnessOptions, find_still_moments
+from lce_rig.collect.watching import BoardWatcher, Moment, Sighting
 from lce_rig.core.geometry import transform
+from lce_rig.core.results import Refusal
+from lce_rig.detect.finder import BoardFinder
+from lce_rig.rig import Rig
 from tests.collect.live.replay import placements, rig
 
 T0_NS = 1_700_000_000_000_000_000
@@ -43,3 +47,54 @@ def test_a_board_that_was_out_of_sight_is_searched_for_at_once() -> None:
     unseen = watcher.sight(Frame(T0_NS + 500_000_000, (blank,), capture.scans))
     assert not unseen.images and not unseen.lidars
     assert nearest_m(see(watcher, 3, 1.0), 3) < 0.3
+
+
+def strict(**limits: float) -> Rig:
+    """Give the rig with other limits on boards."""
+    return rig().model_copy(update={"quality": rig().quality.model_copy(update=limits)})
+
+
+def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> None:
+    watcher = BoardWatcher(strict(min_square_px=1000.0), 0.3)
+    seen = [see(watcher, 0, 0.1 * k) for k in range(30)]
+    assert all(("davis", "frames") in each.images for each in seen)
+    assert not any(each.is_usable for each in seen)
+    refusal = seen[-1].unfit["davis", "frames"]
+    assert refusal.stage == "image" and "1000" in refusal.cause
+    assert list(find_still_moments(seen, watcher.finder.board, StillnessOptions())) == []
+    assert sum(watcher.refusals.counts().values()) == 30
+
+
+def test_candidates_beyond_the_profiles_limits_are_no_board_in_the_scan() -> None:
+    watcher = BoardWatcher(strict(min_points=100_000), 0.3)
+    sighting = see(watcher, 0, 0.0)
+    assert sighting.images and not sighting.lidars and not sighting.is_usable
+    assert "100000 needed" in sighting.unscanned["lidar"].cause
+
+
+def test_live_and_offline_take_the_same_boards() -> None:
+    for limits in ({}, {"max_distance_m": 3.0}, {"max_tilt_deg": 20.0}, {"min_rings": 8}):
+        profile = strict(**limits)
+        finder, watcher = BoardFinder(profile), BoardWatcher(profile, 0.0)
+        for k, capture in enumerate(placements()):
+            sighting = see(watcher, k, float(k))
+            image, scan = finder.image(capture.images[0]), finder.scan(capture.scans[0])
+            key = ("davis", "frames")
+            assert (key in sighting.images.keys() - sighting.unfit.keys()) != isinstance(image, Refusal)
+            if sighting.images:
+                assert ("lidar" in sighting.lidars) != isinstance(scan, Refusal)
+
+
+def test_a_moment_is_confirmed_by_the_search_that_check_makes() -> None:
+    watcher = BoardWatcher(rig(), 0.3)
+    for time_s in (0.0, 0.1, 0.2):
+        sighting = see(watcher, 0, time_s)
+    confirmed = watcher.confirm(Moment(sighting, {"motion_m": 0.001}))
+    assert isinstance(confirmed, Moment) and confirmed.figures == {"motion_m": 0.001}
+    whole = watcher.finder.image(placements()[0].images[0])
+    assert not isinstance(whole, Refusal)
+    assert np.array_equal(confirmed.sighting.images["davis", "frames"].corners_px, whole.corners_px)
+    blank = replace(sighting.frame.images[0], pixels=np.full_like(sighting.frame.images[0].pixels, 90))
+    gone = replace(sighting, frame=replace(sighting.frame, images=(blank,)))
+    refused = watcher.confirm(Moment(gone, {}))
+    assert isinstance(refused, Refusal) and refused.stage == "image"

@@ -20,10 +20,8 @@ KEY = ("davis", "frames")
 
 @cache
 def boards(k: int = 0) -> tuple[ImageBoard, list[LidarBoard]]:
-    image, scan = (
-        BoardFinder(rig()).image(placements()[k].images[0]),
-        BoardFinder(rig()).scan(placements()[k].scans[0]),
-    )
+    finder, seen = BoardFinder(rig()), placements()[k]
+    image, scan = finder.image(seen.images[0]), finder.scan(seen.scans[0])
     assert isinstance(image, ImageBoard) and isinstance(scan, list)
     return image, scan
 
