@@ -38,22 +38,30 @@ MAX_TOPICS = 1 << 14
 MAX_RECORDS = 1 << 18
 """Of one chunk of a bag."""
 
+# File systems that compress store recordings in a tenth of their size, not in a hundredth.
+_MAX_HOLES = 100
+
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a file for reading; pipes and devices, which may never end, are refused.
+    """Open a file for reading; pipes and devices, which may never end, and files of holes are refused.
 
     Raises:
         OSError: it is not there, or may not be read.
-        ValueError: it is no regular file.
+        ValueError: it is no regular file, or hardly anything was ever written to it.
     """
     # Without O_NONBLOCK opening a pipe waits for whoever writes to it.
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        mode = os.fstat(descriptor).st_mode
-        if stat.S_ISDIR(mode):
+        status = os.fstat(descriptor)
+        if stat.S_ISDIR(status.st_mode):
             raise IsADirectoryError(21, "it is a folder", str(path))
-        if not stat.S_ISREG(mode):
+        if not stat.S_ISREG(status.st_mode):
             raise ValueError("it is a pipe or device, not a file")
+        n_stored = 512 * status.st_blocks
+        if status.st_size > _MAX_HOLES * (n_stored + MAX_CHUNK_BYTES):
+            raise ValueError(
+                f"it has {megabytes(status.st_size)}, of which {megabytes(n_stored)} were written"
+            )
         return os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)

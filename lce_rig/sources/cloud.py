@@ -30,7 +30,7 @@ class CloudReading:
 
     Attributes:
         n_not_finite: points dropped because a coordinate is NaN or infinite.
-        n_zero_range: points dropped because they lie at the origin (no return).
+        n_zero_range: points dropped because they lie at the origin (no return), or above or below it.
         notes: what the cloud lacks or how it was understood, in words; the same for like clouds.
     """
 
@@ -73,9 +73,11 @@ def to_scan(
         raise SourceError(f"{where}: the cloud has no field {missing[0]!r}; its fields are {have}")
     points = np.stack([cloud[fields[axis]].astype(np.float32) for axis in "xyz"], axis=1)
     is_finite = np.isfinite(points).all(axis=1)
-    range_m = np.zeros(len(points))
-    range_m[is_finite] = np.linalg.norm(points[is_finite].astype(np.float64), axis=1)
-    keep = np.flatnonzero(range_m > MIN_RANGE_M)
+    range_m, flat_m = np.zeros(len(points)), np.zeros(len(points))
+    exact = points[is_finite].astype(np.float64)
+    range_m[is_finite], flat_m[is_finite] = np.linalg.norm(exact, axis=1), np.hypot(exact[:, 0], exact[:, 1])
+    # No laser of a spinning LiDAR looks along its axis: such a point has no ring.
+    keep = np.flatnonzero(flat_m > MIN_RANGE_M)
     if len(keep) == 0:
         raise SourceError(f"{where}: the cloud has no valid point ({len(points)} in all)")
     _check_unit(float(np.median(range_m[keep])), settings, where)

@@ -19,6 +19,14 @@ def test_a_file_beyond_the_limit_is_not_read(tmp_path):
         read_file(path)
 
 
+def test_a_file_to_which_hardly_anything_was_written_is_refused(tmp_path):
+    with (tmp_path / "holes").open("wb") as file:
+        file.write(b"head")
+        file.truncate(1 << 40)
+    with pytest.raises(ValueError, match=r"1\.1 TB, of which 0 MB were written"):
+        open_regular(tmp_path / "holes")
+
+
 def test_a_pipe_is_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ValueError, match="pipe"):
