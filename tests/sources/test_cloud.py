@@ -36,7 +36,7 @@ def test_points_without_a_return_are_dropped_and_counted(room):
 def test_a_point_on_the_axis_of_rotation_belongs_to_no_laser_and_is_dropped(room):
     above = drop_fields(room, "ring")
     above["x"][7], above["y"][7], above["z"][7] = 0.0, 0.0, 2.0
-    reading = to_scan(above, "lidar", SETTINGS, "a.pcd")
+    reading = to_scan(above, "lidar", FIRST, "a.pcd")
     assert reading.n_zero_range == 1 and len(reading.scan.points) == len(room) - 1
     assert reading.scan.ring.min() == 0
 
