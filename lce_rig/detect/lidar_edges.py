@@ -76,13 +76,12 @@ def find_ring_ends(scan: OrderedScan, view: PlaneView, is_board: NDArray[np.bool
 def _outwards(
     scan: OrderedScan, member: Indices, side: NDArray[np.int8], n: int
 ) -> tuple[Indices, NDArray[np.bool_]]:
-    """Find the n-th return beyond each ring end and whether it is there: same ring, a few firings off."""
-    other = np.clip(member + n * side.astype(np.intp), 0, len(scan.index) - 1)
+    """Find the n-th return beyond each ring end, all the way round, and whether it is a few firings off."""
+    ring = scan.ring[member]
+    start, end = np.searchsorted(scan.ring, ring), np.searchsorted(scan.ring, ring, side="right")
+    other = start + np.mod(member - start + n * side.astype(np.intp), end - start)
     turn = np.abs(np.mod(scan.azimuth[other] - scan.azimuth[member] + np.pi, 2 * np.pi) - np.pi)
-    exists = (
-        (scan.ring[other] == scan.ring[member]) & (turn < (n + MAX_STEPS) * scan.step_rad) & (other != member)
-    )
-    return other, exists
+    return other, (turn < (n + MAX_STEPS) * scan.step_rad) & (other != member)
 
 
 def measure_size(

@@ -54,6 +54,24 @@ def test_board_at_the_seam_of_the_sweep_is_found_whole(start_deg):
     assert_is_board(find(cast([board_plate(T), *ROOM], sigma_m=0.01, start_deg=start_deg)), T)
 
 
+def rotated_about_z(scan, deg):
+    """Give the same returns in the frame of a LiDAR that is mounted with another yaw."""
+    c, s = np.cos(np.radians(deg)), np.sin(np.radians(deg))
+    return replace(
+        scan, points=(scan.points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])).astype(np.float32)
+    )
+
+
+def test_what_lies_beyond_the_edges_does_not_depend_on_the_yaw_of_the_lidar():
+    scan = cast([board_plate(place(2.5, 20)), *ROOM], sigma_m=0.01)
+    ahead = find(scan)[0]
+    # Rings are cut at their first break from azimuth -180 deg on; boards at every angle to it.
+    for deg in (148, 155, 160, 165, 172):
+        turned = find(rotated_about_z(scan, deg))[0]
+        assert len(turned.edge_points) == len(ahead.edge_points), deg
+        assert np.isfinite(turned.edge_behind_m).sum() == np.isfinite(ahead.edge_behind_m).sum(), deg
+
+
 @pytest.mark.parametrize("roll_deg", [0, 20, 45, 70, 90])
 @pytest.mark.parametrize("distance_m", [1.2, 2, 3, 4])
 def test_board_is_found_at_every_distance_however_it_hangs(distance_m, roll_deg):
