@@ -147,7 +147,7 @@ def _locked(folder: Path, *, waits: bool = True) -> Iterator[None]:
     Raises:
         BlockingIOError: another process holds it, and this one does not wait.
     """
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
