@@ -16,6 +16,7 @@ from lce_rig.core.data import Events
 FORMAT_VERSION = 1
 _NS_PER_US = 1000
 _MAX_HEAD_BYTES = 1 << 16
+_MAX_COLUMN_RATIO = 8
 _PIECE_BYTES = 1 << 20
 # The same events, the same bytes: no time of writing goes into the archive.
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -73,7 +74,9 @@ def read_events(file: BinaryIO, sensor: str, resolution_px: tuple[int, int] | No
         ValueError: what is wrong with the file, in words.
     """
     archive = EventArchive(file)
-    limits.check_size(archive.largest_column_bytes, "a column")
+    # A capture of many events is a large file, too: pixels hardly shrink. What is small stays small.
+    n_bytes = min(_MAX_COLUMN_RATIO * file.seek(0, io.SEEK_END), limits.MAX_FILE_BYTES)
+    limits.check_size(archive.largest_column_bytes, "a column", max(n_bytes, limits.MAX_CHUNK_BYTES))
     t_ns, x, y, polarity = next(archive.stretches(max(archive.n_events, 1)))
     extent_px = (int(x.max()) + 1, int(y.max()) + 1) if len(x) else (0, 0)
     width, height = archive.resolution_px or resolution_px or extent_px

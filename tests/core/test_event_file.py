@@ -172,6 +172,15 @@ def test_a_long_recording_is_read_in_stretches_whatever_its_columns_are_made_of(
     assert peak_bytes < n * 8
 
 
+@pytest.mark.long
+def test_what_can_be_stored_of_a_flickering_scene_can_be_read() -> None:
+    n = 17_500_000
+    t_ns = np.arange(n) * 100_000
+    x = np.zeros(n, np.uint16)
+    data = encode_events(Events("cam", t_ns, x, x, np.ones(n, np.bool_), 1280, 720))
+    assert len(decode_events(data, "cam")) == n
+
+
 def test_a_damaged_end_is_an_error_after_what_lies_before() -> None:
     n = 200_000
     noise = np.random.default_rng(0).integers(0, 1000, n)
