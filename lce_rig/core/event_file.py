@@ -15,8 +15,9 @@ from lce_rig.core.data import Events
 
 FORMAT_VERSION = 1
 _NS_PER_US = 1000
-# Columns of a sensor shrink to a tenth at best.
-_USUAL_RATIO = 20
+_MAX_HEAD_BYTES = 1 << 16
+_MAX_COLUMN_RATIO = 8
+_PIECE_BYTES = 1 << 20
 # The same events, the same bytes: no time of writing goes into the archive.
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 # By the columns' names in archives of other programs.
@@ -62,9 +63,7 @@ def decode_events(data: bytes, sensor: str, resolution_px: tuple[int, int] | Non
 
 
 def read_events(file: BinaryIO, sensor: str, resolution_px: tuple[int, int] | None = None) -> Events:
-    """Read an archive of this program or another's: t|ts, x|xs, y|ys, p|ps|pol, in any order of time.
-
-    Times of other programs are seconds where they are fractions, else microseconds.
+    """Read an archive of this program or another's whole; see `EventArchive`.
 
     Args:
         file: the archive.
@@ -74,23 +73,77 @@ def read_events(file: BinaryIO, sensor: str, resolution_px: tuple[int, int] | No
     Raises:
         ValueError: what is wrong with the file, in words.
     """
-    columns = _Columns(file)
-    t_ns = _times(columns)
-    x, y = _pixels(columns, "x"), _pixels(columns, "y")
-    polarity = _column(columns, "polarity") > 0
-    lengths = {len(column) for column in (t_ns, x, y, polarity)}
-    if len(lengths) != 1:
-        raise ValueError(f"its columns are of unequal length: {sorted(lengths)}")
-    declared_px = _resolution(columns)
+    archive = EventArchive(file)
+    # A capture of many events is a large file, too: pixels hardly shrink. What is small stays small.
+    n_bytes = min(_MAX_COLUMN_RATIO * file.seek(0, io.SEEK_END), limits.MAX_FILE_BYTES)
+    limits.check_size(archive.largest_column_bytes, "a column", max(n_bytes, limits.MAX_CHUNK_BYTES))
+    t_ns, x, y, polarity = next(archive.stretches(max(archive.n_events, 1)))
     extent_px = (int(x.max()) + 1, int(y.max()) + 1) if len(x) else (0, 0)
-    width, height = declared_px or resolution_px or extent_px
+    width, height = archive.resolution_px or resolution_px or extent_px
     if width * height > limits.MAX_EVENT_PIXELS:
         raise ValueError(f"its pixels are beyond any sensor: {width}x{height}")
-    return Events(sensor, t_ns, x, y, polarity, width, height, _host_ns(columns))
+    return Events(sensor, t_ns, x, y, polarity, width, height, archive.host_ns)
+
+
+class EventArchive:
+    """An archive of this program or another's: t|ts, x|xs, y|ys, p|ps|pol, in any order of time.
+
+    Times of other programs are seconds where they are fractions, else microseconds.
+
+    Attributes:
+        n_events: how many there are.
+        largest_column_bytes: of the columns with the events, in memory.
+        resolution_px: (width, height); None where the archive does not say.
+        host_ns: host time of the first event; None where the archive does not say.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        """Find the columns.
+
+        Raises:
+            ValueError: what is wrong with the file, in words.
+        """
+        self._columns = _Columns(file)
+        self._time = next((name for name in _TIMES if name in self._columns), None)
+        if self._time is None:
+            raise ValueError(f"it has no times (t_us); it has {self._columns}")
+        self._names = [self._time, *(self._find(name) for name in _ALIASES)]
+        columns = [self._columns.open(name) for name in self._names]
+        if flat := [column.name for column in columns if not column.shape]:
+            raise ValueError(f"its column {flat[0]} is no list of numbers")
+        lengths = {column.n_left for column in columns}
+        if len(lengths) != 1:
+            raise ValueError(f"its columns are of unequal length: {sorted(lengths)}")
+        (self.n_events,) = lengths
+        self.largest_column_bytes = max(column.n_bytes_left for column in columns)
+        self.resolution_px = _resolution(self._columns)
+        self.host_ns = _host_ns(self._columns)
+
+    def stretches(
+        self, n_events: int
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]]:
+        """Yield times (ns), x, y and polarity of so many events at a time; once where there is none.
+
+        Raises:
+            ValueError: what is wrong with the file, in words.
+        """
+        t, x, y, polarity = (self._columns.open(name) for name in self._names)
+        while True:
+            n = min(n_events, t.n_left)
+            times = _times(t.read(n), t.name)
+            yield times, _pixels(x.read(n)), _pixels(y.read(n)), polarity.read(n) > 0
+            if not t.n_left:
+                return
+
+    def _find(self, name: str) -> str:
+        found = next((alias for alias in _ALIASES[name] if alias in self._columns), None)
+        if found is None:
+            raise ValueError(f"it has no column {name}; it has {self._columns}")
+        return found
 
 
 class _Columns:
-    """The arrays of an archive by name, each unpacked when asked for."""
+    """The arrays of an archive by name."""
 
     def __init__(self, file: BinaryIO) -> None:
         with _damage_in_words():
@@ -99,6 +152,8 @@ class _Columns:
         self._members = {member.filename.removesuffix(".npy"): member for member in members}
         if len(self._members) != len(members):
             raise ValueError("it holds several columns of one name")
+        n_stored = sum(member.compress_size for member in members)
+        self._max_bytes = unpacking.unpacked_limit(min(n_stored, file.seek(0, io.SEEK_END)))
 
     def __contains__(self, name: str) -> bool:
         return name in self._members
@@ -106,24 +161,67 @@ class _Columns:
     def __str__(self) -> str:
         return limits.describe(", ".join(sorted(self._members)) or "nothing")
 
-    def read(self, name: str) -> NDArray[Any]:
-        """Unpack one; its own header must agree with what is there.
+    def open(self, name: str) -> "_Column":
+        """Open an array.
+
+        Raises:
+            ValueError: it is damaged, too large for what is stored, or no array of numbers.
+        """
+        return _Column(self._archive, self._members[name], name, self._max_bytes)
+
+
+class _Column:
+    """An array of an archive, read from its beginning on.
+
+    Attributes:
+        name: of the array.
+        shape: of the whole.
+        n_left: numbers that were not read yet.
+    """
+
+    def __init__(self, archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, max_bytes: int) -> None:
+        """Read the header, which must agree with the size of what follows.
 
         Raises:
             ValueError: it is damaged, too large, or no array of numbers.
         """
+        self.name = name
         with _damage_in_words():
-            member = self._members[name]
-            # A long recording is large in the file, too; what is small there stays small.
-            stored = min(_USUAL_RATIO * member.compress_size, 8 * limits.MAX_EVENTS)
-            data = unpacking.read_member(self._archive, member, max(stored, limits.MAX_CHUNK_BYTES))
-            shape, dtype, begin = _npy_header(data, name)
-        n_numbers = math.prod(shape)
-        if dtype.kind not in "biuf" or len(shape) > 1:
+            self._file = unpacking.open_member(archive, member, max_bytes)
+            head = self._file.read(_MAX_HEAD_BYTES)
+            self.shape, self._dtype, begin = _npy_header(head, name)
+        self._ahead = head[begin:]
+        self.n_left = math.prod(self.shape)
+        if self._dtype.kind not in "biuf" or len(self.shape) > 1:
             raise ValueError(f"its column {name} is no list of numbers")
-        if begin + n_numbers * dtype.itemsize != len(data):
-            raise ValueError(f"its column {name} declares {n_numbers} numbers and holds others")
-        return np.frombuffer(data, dtype, n_numbers, begin).reshape(shape)
+        if begin + self.n_left * self._dtype.itemsize != member.file_size:
+            raise ValueError(f"its column {name} declares {self.n_left} numbers and holds others")
+
+    @property
+    def n_bytes_left(self) -> int:
+        return self.n_left * self._dtype.itemsize
+
+    def read(self, n_numbers: int) -> NDArray[Any]:
+        """Read the next numbers.
+
+        Raises:
+            ValueError: they are damaged, or not there.
+        """
+        self.n_left -= n_numbers
+        pieces = [self._ahead]
+        n_missing = n_numbers * self._dtype.itemsize - len(self._ahead)
+        with _damage_in_words():
+            while n_missing > 0 and (piece := self._file.read(min(n_missing, _PIECE_BYTES))):
+                pieces.append(piece)
+                n_missing -= len(piece)
+            if not self.n_left:
+                self._file.read(1)  # Only there zipfile compares the checksum.
+        data = b"".join(pieces)
+        end = n_numbers * self._dtype.itemsize
+        if len(data) < end:
+            raise ValueError(f"its column {self.name} is truncated")
+        self._ahead = data[end:]
+        return np.frombuffer(data, self._dtype, n_numbers)
 
 
 @contextmanager
@@ -149,11 +247,8 @@ def _npy_header(data: bytes, name: str) -> tuple[tuple[int, ...], np.dtype[Any],
     return shape, dtype, file.tell()
 
 
-def _times(columns: _Columns) -> NDArray[np.int64]:
-    name = next((name for name in _TIMES if name in columns), None)
-    if name is None:
-        raise ValueError(f"it has no times (t_us); it has {columns}")
-    times, scale = _list_of_numbers(columns, name), _TIMES[name]
+def _times(times: NDArray[Any], name: str) -> NDArray[np.int64]:
+    scale = _TIMES[name]
     if scale is None and times.dtype.kind == "f":
         with np.errstate(over="ignore"):  # Of numbers longer than double; seen below.
             times_us = times.astype(np.float64) * 1e6
@@ -171,38 +266,28 @@ def _check_times(times: NDArray[Any], scale: int, name: str) -> None:
         raise ValueError(f"its column {name} holds times beyond any clock")
 
 
-def _pixels(columns: _Columns, name: str) -> NDArray[np.uint16]:
-    found = _column(columns, name)
+def _pixels(found: NDArray[Any]) -> NDArray[np.uint16]:
     if len(found) and not (found.min() >= 0 and found.max() <= np.iinfo(np.uint16).max):
         raise ValueError("its pixels are beyond any sensor")
     return found.astype(np.uint16)
 
 
-def _column(columns: _Columns, name: str) -> NDArray[Any]:
-    found = next((alias for alias in _ALIASES[name] if alias in columns), None)
-    if found is None:
-        raise ValueError(f"it has no column {name}; it has {columns}")
-    return _list_of_numbers(columns, found)
-
-
-def _list_of_numbers(columns: _Columns, name: str) -> NDArray[Any]:
-    column = columns.read(name)
-    if column.ndim != 1:
-        raise ValueError(f"its column {name} is no list of numbers")
-    return column
-
-
 def _resolution(columns: _Columns) -> tuple[int, int] | None:
     if "resolution_px" not in columns:
         return None
-    size = columns.read("resolution_px")
-    if size.shape != (2,) or size.dtype.kind not in "iu":
+    column = columns.open("resolution_px")
+    size = column.read(2) if column.shape == (2,) else np.empty(0)
+    if size.dtype.kind not in "iu":
         raise ValueError("its resolution_px is no width and height")
-    return int(size[0]), int(size[1])
+    width, height = map(int, size)
+    if width * height > limits.MAX_EVENT_PIXELS:
+        raise ValueError(f"its pixels are beyond any sensor: {width}x{height}")
+    return width, height
 
 
 def _host_ns(columns: _Columns) -> int | None:
-    host = columns.read("host_ns") if "host_ns" in columns else None
-    if host is None or host.ndim or host.dtype.kind not in "iu" or abs(int(host)) >= limits.MAX_TIME_NS:
+    column = columns.open("host_ns") if "host_ns" in columns else None
+    if column is None or column.shape:
         return None
-    return int(host)
+    (host,) = column.read(1)
+    return int(host) if host.dtype.kind in "iu" and abs(int(host)) < limits.MAX_TIME_NS else None

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-_FARTHEST_M = 1e6
+FARTHEST_M = 1e6
+"""No pose of a rig is so far from another."""
 
 
 def skew(v: Array) -> Array:
@@ -106,9 +107,7 @@ def parse_pose(value: Any, rounding: float = 1e-6) -> Array:
     is_matrix = isinstance(value, list) and len(value) == 4
     if not is_matrix or not all(isinstance(row, list) and len(row) == 4 for row in value):
         raise ValueError("is missing or no 4x4 matrix of numbers")
-    if not all(
-        type(figure) in (int, float) and abs(figure) <= _FARTHEST_M for row in value for figure in row
-    ):
+    if not all(type(figure) in (int, float) and abs(figure) <= FARTHEST_M for row in value for figure in row):
         raise ValueError("is missing or no 4x4 matrix of numbers")
     T = np.array(value, dtype=np.float64)
     R = project_to_so3(T[:3, :3])

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-_FARTHEST_M = 1e6
+from lce_rig.core.geometry import FARTHEST_M
 
 
 def _check_pose(rows: list[list[float]]) -> list[list[float]]:
@@ -15,8 +15,8 @@ def _check_pose(rows: list[list[float]]) -> list[list[float]]:
         raise ValueError("the last row is not 0 0 0 1")
     if np.abs(R).max() > 2 or not (np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0):
         raise ValueError("not a rotation")
-    if np.abs(T[:3, 3]).max() > _FARTHEST_M:
-        raise ValueError(f"a translation beyond {_FARTHEST_M:g} m")
+    if np.abs(T[:3, 3]).max() > FARTHEST_M:
+        raise ValueError(f"a translation beyond {FARTHEST_M:g} m")
     return rows
 
 

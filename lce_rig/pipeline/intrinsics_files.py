@@ -16,7 +16,16 @@ from lce_rig.export.camera_info import camera_info_text, read_camera_info, ros_d
 from lce_rig.export.writing import MADE_BY, number, numbers, write_atomically
 from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
 from lce_rig.pipeline.result_files import keep_earlier
-from lce_rig.rig import Rig, dump_rig, find_profile, load_rig, parse_rig, set_value, shipped_profiles
+from lce_rig.rig import (
+    Rig,
+    dump_rig,
+    find_profile,
+    load_rig,
+    parse_rig,
+    read_profile,
+    set_value,
+    shipped_profiles,
+)
 from lce_rig.session import Session
 from lce_rig.session.replacing import copy_over
 from lce_rig.session.session import INTRINSICS
@@ -144,7 +153,7 @@ def save_profile(session: Session, measured: Sequence[MeasuredIntrinsics], path:
 def _profile_text(rig: Rig) -> str:
     """Find the text of a profile with its comments: a session keeps none, a shipped profile does."""
     if rig.name in shipped_profiles() and load_rig(rig.name) == rig:
-        return find_profile(rig.name).read_text(encoding="utf-8")
+        return read_profile(find_profile(rig.name))
     return dump_rig(rig)
 
 

@@ -163,7 +163,7 @@ def _is_of_a_result(path: Path) -> bool:
 
 
 def _content(path: Path) -> bytes | None:
-    """Read a file; None where there is none, or nothing that lce-rig wrote: a pipe, or too large."""
-    with suppress(FileNotFoundError, ValueError):
+    """Read a file; None where there is none, or nothing that lce-rig wrote: a folder, a pipe, too large."""
+    with suppress(FileNotFoundError, IsADirectoryError, ValueError):
         return read_file(path)
     return None

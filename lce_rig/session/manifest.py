@@ -5,12 +5,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from lce_rig.core.limits import MAX_FILE_BYTES, describe
+from lce_rig.core.limits import MAX_FILE_BYTES, MAX_TIME_NS, describe
 from lce_rig.rig.settings import Name
 
-# Beyond it stands no clock, and sums of two fit 64 bits.
-_MAX_STAMP_NS = 1 << 62
-_Stamp = Annotated[int, Field(ge=-_MAX_STAMP_NS, le=_MAX_STAMP_NS)] | None
+_Stamp = Annotated[int, Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)] | None
 _Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 

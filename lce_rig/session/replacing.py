@@ -60,7 +60,7 @@ def replacing(
                 folder.parent.mkdir(exist_ok=True)
                 _change_places(draft, folder, root, can_exchange=can_exchange)
         finally:
-            shutil.rmtree(draft, ignore_errors=True)
+            _discard(draft)
 
 
 def recover(root: Path) -> None:
@@ -103,7 +103,7 @@ def _change_places(draft: Path, folder: Path, root: Path, *, can_exchange: bool)
         folder.rename(aside)
         # A process that is killed here has left both: `recover` puts the earlier folder back.
         draft.rename(folder)
-        shutil.rmtree(aside, ignore_errors=True)
+        _discard(aside)
     flush_folder(folder.parent)
     if folder.parent != root:
         flush_folder(root)
@@ -128,7 +128,7 @@ def _put_back(root: Path) -> None:
     for aside in root.glob(f"{ASIDE}*"):
         folder = root.joinpath(*aside.name.removeprefix(ASIDE).split("+"))
         if folder.exists():
-            shutil.rmtree(aside, ignore_errors=True)
+            _discard(aside)
         else:
             aside.rename(folder)
 
@@ -137,7 +137,15 @@ def _remove_drafts(root: Path, name: str) -> None:
     """Remove what killed processes left; what a living one fills is locked."""
     for draft in root.glob(f"{DRAFT}{name}-*"):
         with suppress(OSError), _locked(draft, waits=False):
-            shutil.rmtree(draft, ignore_errors=True)
+            _discard(draft)
+
+
+def _discard(folder: Path) -> None:
+    """Remove a folder; of a link that stood in its place, the link."""
+    if folder.is_symlink():
+        folder.unlink()
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager
@@ -147,7 +155,7 @@ def _locked(folder: Path, *, waits: bool = True) -> Iterator[None]:
     Raises:
         BlockingIOError: another process holds it, and this one does not wait.
     """
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))

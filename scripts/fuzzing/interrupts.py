@@ -16,6 +16,8 @@ from pathlib import Path
 
 from wire.rig import ENVIRONMENT
 
+from fuzzing.report import Report
+
 WITHIN_S = 2.0
 _PATIENCE_S = 30.0
 _LONGEST_S = 30.0
@@ -23,33 +25,20 @@ _SAID = "interrupted; what was written so far is whole"
 
 
 @dataclass
-class InterruptReport:
+class InterruptReport(Report):
     """What became of interrupted programs.
 
     Attributes:
-        n: programs interrupted.
         n_over: programs that had ended before the moment.
         n_twice: interrupted twice.
         kinds: how many of each verb were interrupted.
         slowest_s: longest time from Ctrl-C to the end, of each verb.
-        wrong: programs that took longer, ended with another code or said something else.
-        grown_bytes: always 0: each program is a process of its own.
-        seconds: how long all of it took.
     """
 
-    n: int = 0
     n_over: int = 0
     n_twice: int = 0
     kinds: Counter[str] = field(default_factory=Counter)
     slowest_s: dict[str, float] = field(default_factory=dict)
-    wrong: list[str] = field(default_factory=list)
-    grown_bytes: int = 0
-    seconds: float = 0.0
-
-    @property
-    def n_wrong(self) -> int:
-        """How much is wrong."""
-        return len(self.wrong)
 
 
 def fuzz_interrupts(n: int, seed: int) -> InterruptReport:

@@ -6,13 +6,14 @@ import signal
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from wire.collecting import Collecting
 from wire.reel import make_reel
 from wire.rig import WireRig, small_rig
 
+from fuzzing.report import Report
 from lce_rig.core.errors import SessionError
 from lce_rig.session import Session
 
@@ -23,31 +24,18 @@ _PATIENCE_S = 300.0
 
 
 @dataclass
-class KillReport:
+class KillReport(Report):
     """What became of the session.
 
     Attributes:
-        n: kills.
         n_captures: listed in the end.
         n_said: captures that were said to be safe before the kill.
         n_writing: kills while a capture was being written, by the drafts that were left behind.
-        wrong: captures that are damaged, or were said to be safe and are not there.
-        grown_bytes: always 0: each run is a process of its own.
-        seconds: how long all of it took.
     """
 
-    n: int = 0
     n_captures: int = 0
     n_said: int = 0
     n_writing: int = 0
-    wrong: list[str] = field(default_factory=list)
-    grown_bytes: int = 0
-    seconds: float = 0.0
-
-    @property
-    def n_wrong(self) -> int:
-        """How much is wrong."""
-        return len(self.wrong)
 
 
 def fuzz_kills(n: int, seed: int) -> KillReport:

@@ -22,6 +22,7 @@ from wire.collecting import Collecting
 from wire.reel import make_reel
 from wire.rig import WireRig, small_rig
 
+from fuzzing.report import Report
 from lce_rig.core.errors import SessionError
 from lce_rig.session import Session
 
@@ -37,11 +38,10 @@ _PRELUDE = f"import resource; resource.setrlimit(resource.RLIMIT_NOFILE, ({N_DES
 
 
 @dataclass
-class PreviewReport:
+class PreviewReport(Report):
     """What became of the collection.
 
     Attributes:
-        n: hostile connections made.
         kinds: how many of each kind.
         n_open: most that were held open at once by the hostile end.
         n_pages: honest pages opened meanwhile.
@@ -50,12 +50,8 @@ class PreviewReport:
         n_captures: saved meanwhile.
         n_descriptors: most that the collection had open.
         log_bytes: written to its terminal.
-        grown_bytes: by how much its process grew after the first tenth.
-        wrong: what should not have happened.
-        seconds: how long all of it took.
     """
 
-    n: int = 0
     kinds: Counter[str] = field(default_factory=Counter)
     n_open: int = 0
     n_pages: int = 0
@@ -64,14 +60,6 @@ class PreviewReport:
     n_captures: int = 0
     n_descriptors: int = 0
     log_bytes: int = 0
-    grown_bytes: int = 0
-    wrong: list[str] = field(default_factory=list)
-    seconds: float = 0.0
-
-    @property
-    def n_wrong(self) -> int:
-        """How much is wrong."""
-        return len(self.wrong)
 
 
 def fuzz_preview(n: int, seed: int) -> PreviewReport:

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from fuzzing.report import Report
 from lce_rig.core.errors import LceRigError
 from lce_rig.export import write_exports
 from lce_rig.export.result import read_result
@@ -57,35 +58,22 @@ VERBS = {
 
 
 @dataclass
-class ResultKillReport:
+class ResultKillReport(Report):
     """What became of the results.
 
     Attributes:
-        n: kills.
         n_by_kind: of them, by verb and signal.
         n_about_swap: at the time when new files take the place of old ones.
         n_drafts: kills that left a draft behind.
         n_too_late: of processes that had ended before.
         slowest_stop_s: from Ctrl-C to the end of the process.
-        wrong: whatever was not whole, or missing.
-        grown_bytes: always 0: each run is a process of its own.
-        seconds: how long all of it took.
     """
 
-    n: int = 0
     n_by_kind: Counter[str] = field(default_factory=Counter)
     n_about_swap: int = 0
     n_drafts: int = 0
     n_too_late: int = 0
     slowest_stop_s: float = 0.0
-    wrong: list[str] = field(default_factory=list)
-    grown_bytes: int = 0
-    seconds: float = 0.0
-
-    @property
-    def n_wrong(self) -> int:
-        """How much is wrong."""
-        return len(self.wrong)
 
 
 @dataclass

@@ -1,6 +1,7 @@
 """Events as one file: exact, repeatable, readable by numpy alone."""
 
 import io
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.data import Events
-from lce_rig.core.event_file import decode_events, encode_events
+from lce_rig.core.event_file import EventArchive, decode_events, encode_events
 
 
 def events_at(t_ns: list[int], host_ns: int | None = None) -> Events:
@@ -106,7 +107,7 @@ def npy(shape: tuple[int, ...], content: bytes, descr: object = "<i8") -> bytes:
         (npy((10,), bytes(80), "|O"), "no list of numbers"),
         (b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + bytes(80), "damaged"),
         (b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 65_535, "damaged"),
-        (bytes(140_000_000), "declares 140 MB"),
+        (npy((17_500_000,), bytes(140_000_000)), "declares 140 MB"),
     ],
 )
 def test_members_that_are_not_what_they_say_are_refused_in_words(column: bytes, cause: str) -> None:
@@ -150,6 +151,48 @@ def test_resolutions_that_no_sensor_has_are_refused(size: list[int]) -> None:
     np.savez(buffer, t=[1, 2], x=[1, 2], y=[1, 2], p=[0, 1], resolution_px=size)
     with pytest.raises(ValueError, match="beyond any sensor"):
         decode_events(buffer.getvalue(), "cam")
+
+
+def test_a_long_recording_is_read_in_stretches_whatever_its_columns_are_made_of() -> None:
+    n = 3_000_000
+    polarity = np.random.default_rng(0).integers(0, 2, n)  # 64 bits for one: it shrinks to a 27th
+    t_us, x = np.arange(n), (np.arange(n) % 1280).astype(np.uint16)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
+        for name, column in (("t", t_us), ("x", x), ("y", x // 2), ("p", polarity)):
+            file.writestr(f"{name}.npy", npy(column.shape, column.tobytes(), column.dtype.str))
+    tracemalloc.start()
+    stretches = EventArchive(buffer).stretches(100_000)
+    found = [np.array([t[-1] // 1000, x[-1], y[-1], on.sum()]) for t, x, y, on in stretches]
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    ends = np.arange(100_000, n + 1, 100_000)
+    assert np.array([row[:3] for row in found]).tolist() == [[e - 1, x[e - 1], x[e - 1] // 2] for e in ends]
+    assert sum(row[3] for row in found) == polarity.sum()
+    assert peak_bytes < n * 8
+
+
+@pytest.mark.long
+def test_what_can_be_stored_of_a_flickering_scene_can_be_read() -> None:
+    n = 17_500_000
+    t_ns = np.arange(n) * 100_000
+    x = np.zeros(n, np.uint16)
+    data = encode_events(Events("cam", t_ns, x, x, np.ones(n, np.bool_), 1280, 720))
+    assert len(decode_events(data, "cam")) == n
+
+
+def test_a_damaged_end_is_an_error_after_what_lies_before() -> None:
+    n = 200_000
+    noise = np.random.default_rng(0).integers(0, 1000, n)
+    data = archive(t=npy((n,), np.arange(n).tobytes()), **dict.fromkeys("xyp", npy((n,), noise.tobytes())))
+    at = data.rindex(b"p.npy", 0, data.rindex(b"t.npy"))
+    damaged = bytearray(data)
+    damaged[at + 150_000] ^= 0x40
+    read = []
+    with pytest.raises(ValueError, match="damaged"):
+        for t_ns, *_ in EventArchive(io.BytesIO(bytes(damaged))).stretches(10_000):
+            read.append(len(t_ns))
+    assert 0 < sum(read) < n
 
 
 def test_two_columns_of_one_name_are_refused() -> None:

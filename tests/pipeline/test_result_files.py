@@ -6,7 +6,7 @@ import pytest
 
 from lce_rig.core.errors import ResultRefusedError, SessionError
 from lce_rig.export.result import read_result
-from lce_rig.pipeline.result_files import is_usable, keep_earlier, write_results
+from lce_rig.pipeline.result_files import is_usable, keep_earlier, result_content, write_results
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from tests.export.conftest import calibration, some_pose
@@ -142,3 +142,12 @@ def test_nothing_becomes_previous_where_there_was_no_result(tmp_path):
     (tmp_path / "draft" / "a.json").write_text("{}")
     assert not keep_earlier(tmp_path / "old", tmp_path / "draft", "a.json", lambda path: True)
     assert names(tmp_path / "draft") == {"a.json"}
+
+
+def test_a_folder_in_place_of_the_result_is_no_result_and_is_kept(session, folder):
+    (folder / "result.json").mkdir(parents=True)
+    (folder / "result.json" / "note").write_text("mine")
+    assert result_content(session) is None
+    write_results(session, [GOOD], force=False)
+    assert (pose_in(folder) == GOOD.T_cam_lidar).all()
+    assert (folder / "previous" / "result.json" / "note").read_text() == "mine"

@@ -1,36 +1,47 @@
 """NumPy archives of events: this program's own, and others' with columns of the usual names."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from lce_rig.core.errors import SourceError
-from lce_rig.core.event_file import read_events
+from lce_rig.core.event_file import EventArchive
 from lce_rig.sources.events.stream import EventColumns, Findings, open_recorded
 
 _STRETCH_EVENTS = 1 << 20
-_UNKNOWN_PX = (0, 0)
 
 
 class NpzEvents:
-    """Events of an .npz file, which has to be read whole; see `EventStream`."""
+    """Events of an .npz file; see `EventStream`."""
 
     def __init__(self, path: Path) -> None:
-        """Read the file.
+        """Find the columns.
 
         Raises:
             SourceError: it is damaged, or no archive of events.
         """
+        self._path = path
         self.notes: list[str] = []
-        with open_recorded(path) as file:
-            try:
-                events = read_events(file, sensor="", resolution_px=_UNKNOWN_PX)
-            except ValueError as error:
-                raise SourceError(f"{path}: {error}", "Expected columns t_us, x, y, polarity.") from None
-        size_px = events.width_px, events.height_px
-        self.resolution_px = None if size_px == _UNKNOWN_PX else size_px
-        self._events = EventColumns(events.t_ns, events.x, events.y, events.polarity, events.host_ns)
+        with _archive(path) as archive:
+            self.resolution_px = archive.resolution_px
 
     def stretches(self, findings: Findings) -> Iterator[EventColumns]:
-        """Yield the events a million at a time."""
-        for begin in range(0, len(self._events), _STRETCH_EVENTS):
-            yield self._events.select(slice(begin, begin + _STRETCH_EVENTS))
+        """Yield the events a million at a time.
+
+        Raises:
+            SourceError: it is damaged, after what lies before.
+        """
+        with _archive(self._path) as archive:
+            host_ns = archive.host_ns
+            for columns in archive.stretches(_STRETCH_EVENTS):
+                yield EventColumns(*columns, host_ns)
+                host_ns = None
+
+
+@contextmanager
+def _archive(path: Path) -> Iterator[EventArchive]:
+    with open_recorded(path) as file:
+        try:
+            yield EventArchive(file)
+        except ValueError as error:
+            raise SourceError(f"{path}: {error}", "Expected columns t_us, x, y, polarity.") from None

@@ -288,7 +288,8 @@ def test_a_zip_whose_text_is_far_longer_than_text_packs_is_refused(tmp_path: Pat
 def test_other_archives_than_deflated_ones_are_refused(tmp_path: Path) -> None:
     for name, method in (("a.zip", zipfile.ZIP_BZIP2), ("a.npz", zipfile.ZIP_LZMA)):
         with zipfile.ZipFile(tmp_path / name, "w", method) as archive:
-            archive.writestr("t.txt" if name == "a.zip" else "t.npy", b"346 260\n1 1 1 1\n")
+            for member in ["t.txt"] if name == "a.zip" else ["t.npy", "x.npy", "y.npy", "p.npy"]:
+                archive.writestr(member, b"346 260\n1 1 1 1\n")
         assert "not by deflate" in refusal(tmp_path / name)
 
 
