@@ -82,6 +82,8 @@ def parse_packet(data: bytes, encoding: str) -> EventPacket:
     reader = MessageReader(data, encoding)
     header = read_header(reader)
     number, time_base_ns = reader.number("Q"), reader.number("Q")
+    if time_base_ns > limits.MAX_TIME_NS:
+        raise ValueError(f"its time base, {time_base_ns} ns, is beyond any clock")
     name = reader.text()
     is_big_endian = bool(reader.number("B"))
     n_bytes = limits.check_size(reader.number("I"), "a packet", limits.MAX_PACKET_BYTES)

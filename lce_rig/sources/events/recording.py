@@ -175,6 +175,11 @@ class EventRecording:
                 f"camera {self.sensor!r} has {_size(profile_px)}",
                 "Is it another camera's recording? Else correct resolution_px in the profile.",
             )
+        if file_px and file_px[0] * file_px[1] > limits.MAX_EVENT_PIXELS:
+            raise SourceError(
+                f"{self.path} declares a sensor of {_size(file_px)} pixels",
+                "No event camera has so many pixels: the file is damaged.",
+            )
         if profile_px or file_px:
             return profile_px or file_px or (0, 0)
         width = height = 0

@@ -65,6 +65,22 @@ def test_broken_packets_are_counted_and_the_first_is_named(tmp_path: Path, name:
     )
 
 
+def test_a_packet_whose_time_base_is_beyond_any_clock_is_skipped_and_named(tmp_path: Path) -> None:
+    sent = messages(is_ros1=True)
+    data = encoders.packet(encoders.mono(PIECES[3], 0), "mono", is_ros1=True, number=3, base_ns=2**63 + 5)
+    sent[3] = TOPIC, sent[3][1], data
+    recording = open_events(write_packet_bag(tmp_path / "a.bag", sent))
+    assert everything(recording) == [event for i, piece in enumerate(PIECES) if i != 3 for event in piece]
+    assert any("1 broken packets" in note and "beyond any clock" in note for note in recording.notes)
+
+
+def test_a_sensor_of_more_pixels_than_any_event_camera_has_is_damage(tmp_path: Path) -> None:
+    data = encoders.packet(encoders.mono(TRUTH, 0), "mono", is_ros1=True, size=(2**32 - 688, 60))
+    path = write_packet_bag(tmp_path / "a.bag", [(TOPIC, 10**9, data)])
+    with pytest.raises(SourceError, match="declares a sensor of 4294966608x60 pixels"):
+        open_events(path)
+
+
 def test_packets_that_never_arrived_are_counted(tmp_path: Path) -> None:
     sent = messages(is_ros1=True)
     recording = open_events(write_packet_bag(tmp_path / "a.bag", sent[:4] + sent[7:]))
