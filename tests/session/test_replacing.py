@@ -113,12 +113,12 @@ def test_readers_beside_a_writer_always_find_one_whole_folder(tmp_path):
 @pytest.mark.parametrize("exchanges", ["1", "0"])
 def test_whoever_is_killed_leaves_one_whole_folder(tmp_path, exchanges):
     fill(tmp_path, "first")
-    for k in range(8):
+    for k in range(3):  # scripts/fuzz.py result-kills does it by the hundred
         process = subprocess.Popen(
             [sys.executable, "-c", ENDLESS, str(tmp_path), exchanges], stdout=subprocess.PIPE
         )
         process.stdout.readline()
-        time.sleep(0.004 * k)
+        time.sleep(0.007 * k)
         process.send_signal(signal.SIGKILL)
         process.wait()
         process.stdout.close()
