@@ -6,11 +6,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from lce_rig.core.errors import LceRigError
+from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.core.limits import read_file
 from lce_rig.core.results import Calibration
 from lce_rig.session import Session
-from lce_rig.session.replacing import copy_over
+from lce_rig.session.replacing import check_folder, copy_over
 from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE
 from lce_rig.session.writing import MANIFEST
 
@@ -65,7 +65,7 @@ def write_results(session: Session, calibrations: Sequence[Calibration], *, forc
     previous = folder / PREVIOUS
     return WrittenResults(
         tuple(folder / name for name in names),
-        previous if previous.is_dir() else None,
+        previous if (previous / RESULT).exists() else None,
         is_usable(previous),
         is_same,
     )
@@ -113,10 +113,11 @@ def keep_earlier(
         Whether both results are the same to the byte: then what was previous stays so.
 
     Raises:
-        OSError: a full disk, no permission.
+        OSError: a full disk, no permission; or `previous` is a file, or a link.
     """
     if not earlier.is_dir():
         return False
+    check_folder(earlier / PREVIOUS)
     keep_foreign(earlier, draft, lambda path: path.name == PREVIOUS or is_ours(path))
     is_same = _content(earlier / document) == _content(draft / document)
     has_earlier = deserves and (earlier / document).exists()
@@ -126,6 +127,7 @@ def keep_earlier(
         for entry in earlier.iterdir():
             if entry.name != PREVIOUS and is_ours(entry):
                 copy_over(entry, draft / PREVIOUS / entry.name)
+        keep_foreign(earlier / PREVIOUS, draft / PREVIOUS, is_ours)
     elif kept.is_dir():
         copy_over(kept, draft / PREVIOUS)
     return is_same
@@ -139,12 +141,21 @@ def keep_foreign(earlier: Path, draft: Path, is_ours: Callable[[Path], bool]) ->
     """
     for entry in earlier.iterdir() if earlier.is_dir() else ():
         if not is_ours(entry) and not (draft / entry.name).exists():
+            draft.mkdir(exist_ok=True)
             copy_over(entry, draft / entry.name)
 
 
 def result_content(session: Session) -> bytes | None:
-    """Read the session's result.json as it lies on the disk; None where there is none."""
-    return _content(session.path / CALIBRATION / RESULT)
+    """Read the session's result.json as it lies on the disk; None where there is none.
+
+    Raises:
+        SessionError: it cannot be read.
+    """
+    path = session.path / CALIBRATION / RESULT
+    try:
+        return _content(path)
+    except OSError as error:
+        raise SessionError(f"{path} cannot be read: {error.strerror or error}") from error
 
 
 def _keep_earlier_results(earlier: Path, draft: Path) -> bool:

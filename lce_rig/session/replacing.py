@@ -43,9 +43,10 @@ def replacing(
         can_exchange: False takes the way of file systems that cannot exchange two folders in one step.
 
     Raises:
-        OSError: a full disk, no permission.
+        OSError: a full disk, no permission; or a file, or a link, is in the folder's place.
     """
     with ExitStack() as lock:
+        check_folder(folder)
         draft = root / f"{DRAFT}{folder.name}-{secrets.token_hex(4)}"
         with _locked(root):
             _remove_drafts(root, folder.name)
@@ -55,12 +56,24 @@ def replacing(
             yield draft
             with _locked(root):
                 _put_back(root)
+                check_folder(folder)
                 finish(folder, draft)
                 _flush(draft)
                 folder.parent.mkdir(exist_ok=True)
                 _change_places(draft, folder, root, can_exchange=can_exchange)
         finally:
             shutil.rmtree(draft, ignore_errors=True)
+
+
+def check_folder(path: Path) -> None:
+    """Pass where a folder is, or nothing.
+
+    Raises:
+        NotADirectoryError: there is a file, or a link: an exchange would take it away from where it is.
+    """
+    if path.is_symlink() or (path.exists() and not path.is_dir()):
+        what = "link" if path.is_symlink() else "file"
+        raise NotADirectoryError(errno.ENOTDIR, f"{path.name} is a {what}, not a folder", str(path))
 
 
 def recover(root: Path) -> None:
@@ -147,7 +160,8 @@ def _locked(folder: Path, *, waits: bool = True) -> Iterator[None]:
     Raises:
         BlockingIOError: another process holds it, and this one does not wait.
     """
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    # Links are followed: the session's own folder may be one. What a link leads to is locked, nothing else.
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))

@@ -1,6 +1,7 @@
 """Results take an earlier one's place whole, and the last usable one is kept."""
 
 import resource
+from pathlib import Path
 
 import pytest
 
@@ -100,6 +101,26 @@ def test_what_the_user_put_there_stays(session, folder):
     assert (folder / "notes.txt").read_text() == "measured on Tuesday"
     assert (folder / "photos" / "rig.jpg").read_bytes() == b"x"
     assert "notes.txt" not in names(folder / "previous")
+
+
+def test_what_the_user_put_beside_the_previous_result_stays(session, folder):
+    (folder / "previous").mkdir(parents=True)
+    (folder / "previous" / "notes.txt").write_text("measured on Tuesday")
+    assert write_results(session, [GOOD], force=False).previous is None
+    for result in (OTHER, GOOD, GOOD, FAILED):
+        assert write_results(session, [result], force=False).previous == folder / "previous"
+        assert (folder / "previous" / "notes.txt").read_text() == "measured on Tuesday"
+
+
+@pytest.mark.parametrize("name", ["calibration", "calibration/previous"])
+def test_a_file_in_place_of_a_folder_is_refused_and_stays(session, folder, name):
+    if name != "calibration":
+        write_results(session, [GOOD], force=False)
+    (session.path / name).write_text("mine")
+    with pytest.raises(SessionError, match=f"{Path(name).name} is a file, not a folder"):
+        write_results(session, [OTHER], force=False)
+    assert (session.path / name).read_text() == "mine"
+    assert not list(session.path.glob(".new-*"))
 
 
 def test_a_result_that_cannot_be_written_leaves_the_earlier_one(session, folder):

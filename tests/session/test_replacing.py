@@ -60,6 +60,20 @@ def test_an_error_leaves_the_earlier_folder(tmp_path, can_exchange):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+def test_the_session_itself_may_be_a_link_but_not_what_is_replaced(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    for text in ("one", "two"):
+        fill(tmp_path / "link", text)
+        assert contents(tmp_path / "real" / "out") == {text}
+    (tmp_path / "real" / "out").rename(tmp_path / "real" / "may")
+    (tmp_path / "real" / "out").symlink_to("may")
+    with pytest.raises(NotADirectoryError, match="out is a link, not a folder"):
+        fill(tmp_path / "link", "three")
+    assert {path.name for path in (tmp_path / "real").iterdir()} == {"out", "may"}
+    assert contents(tmp_path / "real" / "may") == {"two"}
+
+
 def test_readers_beside_a_writer_always_find_one_whole_folder(tmp_path):
     fill(tmp_path, "0")
     torn, is_over = [], threading.Event()
