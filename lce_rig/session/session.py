@@ -174,10 +174,12 @@ class Session:
         """
         folder = self.path / CAPTURES
         try:
-            names = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
+            names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
         except OSError as error:
             raise SessionError(f"{folder} cannot be read: {error.strerror or error}") from error
-        return [Capture(folder / name) for name in names if re.fullmatch(r"[0-9]{6,}", name)]
+        numbered = [name for name in names if re.fullmatch(r"[0-9]{6,}", name)]
+        # By number: 1000000 follows 999999.
+        return [Capture(folder / name) for name in sorted(numbered, key=lambda name: (len(name), name))]
 
     def capture(self, name: str) -> Capture:
         """Find one capture.
