@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from lce_rig.session.durable import flush_folder
+from lce_rig.session.durable import flush_folder, own_path
 
 DRAFT, ASIDE = ".new-", ".old-"
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
@@ -139,7 +139,14 @@ def _exchange(a: Path, b: Path) -> bool:
 def _put_back(root: Path) -> None:
     """Give each folder that stands aside its place back where nothing took it, else remove it."""
     for aside in root.glob(f"{ASIDE}*"):
-        folder = root.joinpath(*aside.name.removeprefix(ASIDE).split("+"))
+        parts = aside.name.removeprefix(ASIDE).split("+")
+        # A session may come from others: its names must not move folders out of it.
+        if aside.is_symlink() or not aside.is_dir() or not {"", ".", ".."}.isdisjoint(parts):
+            continue
+        folder = root.joinpath(*parts)
+        own_path(root, folder)
+        if not folder.parent.is_dir():
+            continue
         if folder.exists():
             shutil.rmtree(aside, ignore_errors=True)
         else:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 
 import pytest
 
@@ -126,6 +127,19 @@ def test_a_folder_put_aside_by_a_killed_process_comes_back(tmp_path):
     (tmp_path / "out").rename(tmp_path / ".old-out")
     recover(tmp_path)
     assert contents(tmp_path / "out") == {"one"}
+
+
+@pytest.mark.parametrize("name", ["..+evil", "..+..+evil", "link+evil", "nowhere+evil", "", "+", "."])
+def test_a_name_made_up_to_lead_out_of_the_session_moves_nothing(tmp_path, name):
+    root = tmp_path / "deep" / "s"
+    (root / f".old-{name}").mkdir(parents=True)
+    (root / "link").symlink_to(tmp_path)
+    before = set(tmp_path.rglob("*"))
+    with suppress(OSError):
+        recover(root)
+    if name != "link+evil":
+        fill(root, "one")
+    assert {path for path in tmp_path.rglob("*") if (root / "out") not in (path, *path.parents)} == before
 
 
 def test_a_draft_that_is_being_filled_is_left_alone(tmp_path):
