@@ -25,12 +25,14 @@ class WrittenResults:
         files: the result.json and exports of this run.
         previous: the folder with the earlier run's files; None where there was none.
         has_usable_previous: whether that run had a result that may be used.
+        only_previous: cameras and LiDARs with a usable result there and none, usable or not, in this run.
         is_same: whether this result is the same to the byte as the one that was there.
     """
 
     files: tuple[Path, ...]
     previous: Path | None
     has_usable_previous: bool
+    only_previous: tuple[str, ...]
     is_same: bool
 
 
@@ -38,7 +40,8 @@ def write_results(session: Session, calibrations: Sequence[Calibration], *, forc
     """Write result.json and, unless a verdict forbids it, every export, in place of an earlier run's.
 
     All files of a run appear together. Those of the earlier run move to calibration/previous/; a failed run
-    never takes the place of a usable one there. Where the result is the same to the byte, overlays and
+    never takes the place of a usable one there, nor one without a camera whose only usable result is there.
+    Where the result is the same to the byte, overlays and
     calibration/previous/ stay. Files that lce-rig did not write stay, too.
 
     Raises:
@@ -67,6 +70,7 @@ def write_results(session: Session, calibrations: Sequence[Calibration], *, forc
         tuple(folder / name for name in names),
         previous if (previous / RESULT).exists() else None,
         is_usable(previous),
+        tuple(sorted(_usable(previous) - {f"{c.camera} and {c.lidar}" for c in calibrations})),
         is_same,
     )
 
@@ -90,11 +94,20 @@ def inputs_sha256(session: Session, calibrations: Sequence[Calibration]) -> dict
 
 def is_usable(folder: Path) -> bool:
     """Tell whether a folder holds the result of a calibration that did not fail."""
+    return bool(_usable(folder))
+
+
+def _usable(folder: Path) -> set[str]:
+    """Name the cameras and LiDARs of which a folder holds a result that did not fail."""
     from lce_rig.export.result import read_result
 
     with suppress(LceRigError):
-        return any(c.verdict != "fail" for c in read_result(folder / RESULT).calibrations)
-    return False
+        return {
+            f"{c.camera} and {c.lidar}"
+            for c in read_result(folder / RESULT).calibrations
+            if c.verdict != "fail"
+        }
+    return set()
 
 
 def keep_earlier(
@@ -160,7 +173,8 @@ def result_content(session: Session) -> bytes | None:
 
 def _keep_earlier_results(earlier: Path, draft: Path) -> bool:
     """Keep the last usable result, and overlays with their result; tell whether both results are the same."""
-    deserves = is_usable(earlier) or not is_usable(earlier / PREVIOUS)
+    usable, kept = _usable(earlier), _usable(earlier / PREVIOUS)
+    deserves = (bool(usable) or not kept) and kept <= usable | _usable(draft)
     is_same = keep_earlier(earlier, draft, RESULT, _is_of_a_result, deserves=deserves)
     if is_same and (earlier / OVERLAYS).is_dir():
         copy_over(earlier / OVERLAYS, draft / OVERLAYS)

@@ -1,6 +1,7 @@
 """Results take an earlier one's place whole, and the last usable one is kept."""
 
 import resource
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,27 @@ def test_no_number_of_failures_takes_the_last_usable_result_away(session, folder
     assert (folder / "previous" / "extrinsics.yaml").exists()
     write_results(session, [OTHER], force=False)
     assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
+
+
+def test_no_number_of_runs_of_one_camera_takes_the_other_ones_result_away(tmp_path):
+    rig = load_rig("rles")
+    cameras = {
+        name: rig.cameras["davis"].model_copy(update={"frame": name, "optical_frame": f"{name}_optical"})
+        for name in ("left", "right")
+    }
+    session = Session(tmp_path / "s", rig.model_copy(update={"cameras": cameras}), None)
+    folder = session.path / "calibration"
+    session.path.mkdir()
+    (session.path / "rig.yaml").touch()
+    left, right = replace(GOOD, camera="left"), replace(GOOD, camera="right")
+    assert write_results(session, [left, right], force=False).only_previous == ()
+    for k in range(3):
+        again = replace(OTHER, camera="left", reasons=(f"{k}",))
+        assert write_results(session, [again], force=False).only_previous == ("right and lidar",)
+        kept = read_result(folder / "previous" / "result.json").calibrations
+        assert [c.camera for c in kept] == ["left", "right"]
+    assert write_results(session, [left, right], force=False).only_previous == ()
+    assert [c.camera for c in read_result(folder / "previous" / "result.json").calibrations] == ["left"]
 
 
 def test_without_a_usable_result_the_last_failed_one_is_kept(session, folder):
