@@ -202,6 +202,8 @@ def _tell_earlier(written: "WrittenResults") -> None:
         show.warn(f"no exports of this result; the last usable one is in {written.previous}")
     elif not written.is_same:
         show.note(f"the earlier result is in {written.previous}")
+    if written.only_previous:
+        show.note(f"not calibrated in this run: {', '.join(written.only_previous)}")
 
 
 def _exit(

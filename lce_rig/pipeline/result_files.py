@@ -6,11 +6,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from lce_rig.core.errors import LceRigError
+from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.core.limits import read_file
 from lce_rig.core.results import Calibration
 from lce_rig.session import Session
-from lce_rig.session.replacing import copy_over
+from lce_rig.session.replacing import check_folder, copy_over
 from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE
 from lce_rig.session.writing import MANIFEST
 
@@ -25,12 +25,14 @@ class WrittenResults:
         files: the result.json and exports of this run.
         previous: the folder with the earlier run's files; None where there was none.
         has_usable_previous: whether that run had a result that may be used.
+        only_previous: cameras and LiDARs with a usable result there and none, usable or not, in this run.
         is_same: whether this result is the same to the byte as the one that was there.
     """
 
     files: tuple[Path, ...]
     previous: Path | None
     has_usable_previous: bool
+    only_previous: tuple[str, ...]
     is_same: bool
 
 
@@ -38,7 +40,8 @@ def write_results(session: Session, calibrations: Sequence[Calibration], *, forc
     """Write result.json and, unless a verdict forbids it, every export, in place of an earlier run's.
 
     All files of a run appear together. Those of the earlier run move to calibration/previous/; a failed run
-    never takes the place of a usable one there. Where the result is the same to the byte, overlays and
+    never takes the place of a usable one there, nor one without a camera whose only usable result is there.
+    Where the result is the same to the byte, overlays and
     calibration/previous/ stay. Files that lce-rig did not write stay, too.
 
     Raises:
@@ -65,8 +68,9 @@ def write_results(session: Session, calibrations: Sequence[Calibration], *, forc
     previous = folder / PREVIOUS
     return WrittenResults(
         tuple(folder / name for name in names),
-        previous if previous.is_dir() else None,
+        previous if (previous / RESULT).exists() else None,
         is_usable(previous),
+        tuple(sorted(_usable(previous) - {f"{c.camera} and {c.lidar}" for c in calibrations})),
         is_same,
     )
 
@@ -90,11 +94,20 @@ def inputs_sha256(session: Session, calibrations: Sequence[Calibration]) -> dict
 
 def is_usable(folder: Path) -> bool:
     """Tell whether a folder holds the result of a calibration that did not fail."""
+    return bool(_usable(folder))
+
+
+def _usable(folder: Path) -> set[str]:
+    """Name the cameras and LiDARs of which a folder holds a result that did not fail."""
     from lce_rig.export.result import read_result
 
     with suppress(LceRigError):
-        return any(c.verdict != "fail" for c in read_result(folder / RESULT).calibrations)
-    return False
+        return {
+            f"{c.camera} and {c.lidar}"
+            for c in read_result(folder / RESULT).calibrations
+            if c.verdict != "fail"
+        }
+    return set()
 
 
 def keep_earlier(
@@ -113,10 +126,11 @@ def keep_earlier(
         Whether both results are the same to the byte: then what was previous stays so.
 
     Raises:
-        OSError: a full disk, no permission.
+        OSError: a full disk, no permission; or `previous` is a file, or a link.
     """
     if not earlier.is_dir():
         return False
+    check_folder(earlier / PREVIOUS)
     keep_foreign(earlier, draft, lambda path: path.name == PREVIOUS or is_ours(path))
     is_same = _content(earlier / document) == _content(draft / document)
     has_earlier = deserves and (earlier / document).exists()
@@ -126,6 +140,7 @@ def keep_earlier(
         for entry in earlier.iterdir():
             if entry.name != PREVIOUS and is_ours(entry):
                 copy_over(entry, draft / PREVIOUS / entry.name)
+        keep_foreign(earlier / PREVIOUS, draft / PREVIOUS, is_ours)
     elif kept.is_dir():
         copy_over(kept, draft / PREVIOUS)
     return is_same
@@ -139,17 +154,27 @@ def keep_foreign(earlier: Path, draft: Path, is_ours: Callable[[Path], bool]) ->
     """
     for entry in earlier.iterdir() if earlier.is_dir() else ():
         if not is_ours(entry) and not (draft / entry.name).exists():
+            draft.mkdir(exist_ok=True)
             copy_over(entry, draft / entry.name)
 
 
 def result_content(session: Session) -> bytes | None:
-    """Read the session's result.json as it lies on the disk; None where there is none."""
-    return _content(session.path / CALIBRATION / RESULT)
+    """Read the session's result.json as it lies on the disk; None where there is none.
+
+    Raises:
+        SessionError: it cannot be read.
+    """
+    path = session.path / CALIBRATION / RESULT
+    try:
+        return _content(path)
+    except OSError as error:
+        raise SessionError(f"{path} cannot be read: {error.strerror or error}") from error
 
 
 def _keep_earlier_results(earlier: Path, draft: Path) -> bool:
     """Keep the last usable result, and overlays with their result; tell whether both results are the same."""
-    deserves = is_usable(earlier) or not is_usable(earlier / PREVIOUS)
+    usable, kept = _usable(earlier), _usable(earlier / PREVIOUS)
+    deserves = (bool(usable) or not kept) and kept <= usable | _usable(draft)
     is_same = keep_earlier(earlier, draft, RESULT, _is_of_a_result, deserves=deserves)
     if is_same and (earlier / OVERLAYS).is_dir():
         copy_over(earlier / OVERLAYS, draft / OVERLAYS)

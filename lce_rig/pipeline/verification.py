@@ -13,10 +13,12 @@ from lce_rig.pipeline.event_detection import event_channels
 from lce_rig.pipeline.progress import Progress, silent
 from lce_rig.pipeline.result_files import OVERLAYS, keep_foreign, result_content
 from lce_rig.pipeline.solving import clocks_of
+from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.session.session import CALIBRATION, DEBUG
 from lce_rig.verify.event_picture import CameraView
 from lce_rig.verify.session_check import SessionCheck, check_session
+from lce_rig.verify.writing import is_overlay
 
 
 def verify(
@@ -79,13 +81,27 @@ def verify(
                 f"{session.path / CALIBRATION} was calibrated again while overlays were drawn",
                 "Run `lce-rig verify` again.",
             )
-        keep_foreign(earlier, draft, lambda path: path.is_dir() or path.suffix == ".png")
+        _keep_users_files(session.rig, earlier, draft)
 
     parts = (OVERLAYS,) if result is None else (CALIBRATION, OVERLAYS)
     with session.replacing(*parts, finish=finish) as draft:
         checks = check(draft)
     place = session.path.joinpath(*parts)
     return [each.moved(draft, place) for each in checks]
+
+
+def _keep_users_files(rig: Rig, earlier: Path, draft: Path) -> None:
+    """Take over what `verify` did not draw, beside its images and in its folders."""
+    folders = {
+        Pair(camera, channel, lidar).folder_name
+        for camera, sensor in rig.cameras.items()
+        for channel in sensor.channels
+        for lidar in rig.lidars
+    }
+    keep_foreign(earlier, draft, lambda path: path.name in folders or is_overlay(path))
+    for name in folders:
+        if not (earlier / name).is_symlink():
+            keep_foreign(earlier / name, draft / name, is_overlay)
 
 
 def _pairs_held(detections: Detections, calibration: Calibration) -> list[Pair]:

@@ -178,9 +178,11 @@ class Capture:
 
     def _require_here(self, name: str) -> None:
         # The manifest is input like any other: it must not make us read, or show, files elsewhere.
-        # Unlike Path.resolve, realpath has an answer where links run in a circle.
-        folder, file = (Path(os.path.realpath(path)) for path in (self.path, self.path / name))
-        if not SAFE_NAME.fullmatch(name) or file.parent != folder:
+        # Unlike Path.resolve, realpath has an answer where links run in a circle; a NUL it does not take.
+        is_here = SAFE_NAME.fullmatch(name) is not None and (
+            Path(os.path.realpath(self.path / name)).parent == Path(os.path.realpath(self.path))
+        )
+        if not is_here:
             raise SessionError(
                 f"capture {self.name}: {MANIFEST} names the file {name!r} outside the capture's folder",
                 f"Nothing outside {self.path} is read. Remove this capture if you did not make it yourself.",

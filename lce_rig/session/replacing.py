@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from lce_rig.session.durable import flush_folder
+from lce_rig.session.durable import flush_folder, own_path
 
 DRAFT, ASIDE = ".new-", ".old-"
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
@@ -43,9 +43,10 @@ def replacing(
         can_exchange: False takes the way of file systems that cannot exchange two folders in one step.
 
     Raises:
-        OSError: a full disk, no permission.
+        OSError: a full disk, no permission; or a file, or a link, is in the folder's place.
     """
     with ExitStack() as lock:
+        check_folder(folder)
         draft = root / f"{DRAFT}{folder.name}-{secrets.token_hex(4)}"
         with _locked(root):
             _remove_drafts(root, folder.name)
@@ -55,12 +56,24 @@ def replacing(
             yield draft
             with _locked(root):
                 _put_back(root)
+                check_folder(folder)
                 finish(folder, draft)
                 _flush(draft)
                 folder.parent.mkdir(exist_ok=True)
                 _change_places(draft, folder, root, can_exchange=can_exchange)
         finally:
             _discard(draft)
+
+
+def check_folder(path: Path) -> None:
+    """Pass where a folder is, or nothing.
+
+    Raises:
+        NotADirectoryError: there is a file, or a link: an exchange would take it away from where it is.
+    """
+    if path.is_symlink() or (path.exists() and not path.is_dir()):
+        what = "link" if path.is_symlink() else "file"
+        raise NotADirectoryError(errno.ENOTDIR, f"{path.name} is a {what}, not a folder", str(path))
 
 
 def recover(root: Path) -> None:
@@ -126,7 +139,14 @@ def _exchange(a: Path, b: Path) -> bool:
 def _put_back(root: Path) -> None:
     """Give each folder that stands aside its place back where nothing took it, else remove it."""
     for aside in root.glob(f"{ASIDE}*"):
-        folder = root.joinpath(*aside.name.removeprefix(ASIDE).split("+"))
+        parts = aside.name.removeprefix(ASIDE).split("+")
+        # A session may come from others: its names must not move folders out of it.
+        if aside.is_symlink() or not aside.is_dir() or not {"", ".", ".."}.isdisjoint(parts):
+            continue
+        folder = root.joinpath(*parts)
+        own_path(root, folder)
+        if not folder.parent.is_dir():
+            continue
         if folder.exists():
             _discard(aside)
         else:
@@ -155,6 +175,7 @@ def _locked(folder: Path, *, waits: bool = True) -> Iterator[None]:
     Raises:
         BlockingIOError: another process holds it, and this one does not wait.
     """
+    # Links are followed: the session's own folder may be one. What a link leads to is locked, nothing else.
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         try:

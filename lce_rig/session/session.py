@@ -167,10 +167,19 @@ class Session:
 
     @property
     def captures(self) -> list[Capture]:
-        """Every whole capture, by name."""
+        """Every whole capture, by name.
+
+        Raises:
+            SessionError: their folder may not be read.
+        """
         folder = self.path / CAPTURES
-        names = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
-        return [Capture(folder / name) for name in names if re.fullmatch(r"[0-9]{6,}", name)]
+        try:
+            names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+        except OSError as error:
+            raise SessionError(f"{folder} cannot be read: {error.strerror or error}") from error
+        numbered = [name for name in names if re.fullmatch(r"[0-9]{6,}", name)]
+        # By number: 1000000 follows 999999.
+        return [Capture(folder / name) for name in sorted(numbered, key=lambda name: (len(name), name))]
 
     def capture(self, name: str) -> Capture:
         """Find one capture.
@@ -362,7 +371,7 @@ def _take_lock(path: Path) -> WriterLock:
 def _not_writable(path: Path, error: OSError, n_safe: int | None = None) -> SessionError:
     safe = "" if not n_safe else f" The {n_safe} captures before it are safe."
     if isinstance(error, (FileExistsError, NotADirectoryError)):
-        hint = "There is a file of that name: choose another folder."
+        hint = "Move away what is in its place, or choose another folder."
     elif error.errno == errno.ELOOP:
         hint = "Put a folder or file of its own there: nothing outside the session is written or removed."
     elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):

@@ -45,6 +45,11 @@ def write_overlays(folder: Path, overlays: Iterable[tuple[str, Picture, Picture]
     return files
 
 
+def is_overlay(path: Path) -> bool:
+    """Tell by its name whether a file is one that `write_overlays` makes of a session's captures."""
+    return path.name == CONTACT_SHEET or re.fullmatch(r"[0-9]{6,}\.png", path.name) is not None
+
+
 def write_picture(path: Path, picture: Picture) -> Path:
     """Write one PNG, whole or not at all.
 

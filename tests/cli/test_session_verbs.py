@@ -161,6 +161,22 @@ def test_another_result_moves_the_earlier_one_and_its_overlays_to_previous(lce_r
     assert not (folder / "overlays").exists()
 
 
+def test_verify_again_leaves_what_the_user_put_beside_the_overlays(lce_rig, calibrated_few):
+    folder = calibrated_few / "calibration" / "overlays"
+    for path in ("notes.txt", "for-the-paper.png", "report/text.md", "cam.frames.lidar/notes.txt"):
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text("mine")
+    (folder / "999999.png").write_text("of a capture that is gone")
+    lce_rig("verify", calibrated_few)
+    mine = {
+        str(path.relative_to(folder))
+        for path in folder.rglob("*")
+        if path.is_file() and path.read_bytes() == b"mine"
+    }
+    assert mine == {"notes.txt", "for-the-paper.png", "report/text.md", "cam.frames.lidar/notes.txt"}
+    assert (folder / "000000.png").exists() and not (folder / "999999.png").exists()
+
+
 def test_verify_of_a_result_from_elsewhere_leaves_the_sessions_own_overlays(
     lce_rig, calibrated_few, tmp_path
 ):

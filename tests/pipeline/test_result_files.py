@@ -1,6 +1,8 @@
 """Results take an earlier one's place whole, and the last usable one is kept."""
 
 import resource
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -65,6 +67,27 @@ def test_no_number_of_failures_takes_the_last_usable_result_away(session, folder
     assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
 
 
+def test_no_number_of_runs_of_one_camera_takes_the_other_ones_result_away(tmp_path):
+    rig = load_rig("rles")
+    cameras = {
+        name: rig.cameras["davis"].model_copy(update={"frame": name, "optical_frame": f"{name}_optical"})
+        for name in ("left", "right")
+    }
+    session = Session(tmp_path / "s", rig.model_copy(update={"cameras": cameras}), None)
+    folder = session.path / "calibration"
+    session.path.mkdir()
+    (session.path / "rig.yaml").touch()
+    left, right = replace(GOOD, camera="left"), replace(GOOD, camera="right")
+    assert write_results(session, [left, right], force=False).only_previous == ()
+    for k in range(3):
+        again = replace(OTHER, camera="left", reasons=(f"{k}",))
+        assert write_results(session, [again], force=False).only_previous == ("right and lidar",)
+        kept = read_result(folder / "previous" / "result.json").calibrations
+        assert [c.camera for c in kept] == ["left", "right"]
+    assert write_results(session, [left, right], force=False).only_previous == ()
+    assert [c.camera for c in read_result(folder / "previous" / "result.json").calibrations] == ["left"]
+
+
 def test_without_a_usable_result_the_last_failed_one_is_kept(session, folder):
     write_results(session, [FAILED], force=False)
     written = write_results(session, [calibration(verdict="fail", captures_used=())], force=True)
@@ -100,6 +123,26 @@ def test_what_the_user_put_there_stays(session, folder):
     assert (folder / "notes.txt").read_text() == "measured on Tuesday"
     assert (folder / "photos" / "rig.jpg").read_bytes() == b"x"
     assert "notes.txt" not in names(folder / "previous")
+
+
+def test_what_the_user_put_beside_the_previous_result_stays(session, folder):
+    (folder / "previous").mkdir(parents=True)
+    (folder / "previous" / "notes.txt").write_text("measured on Tuesday")
+    assert write_results(session, [GOOD], force=False).previous is None
+    for result in (OTHER, GOOD, GOOD, FAILED):
+        assert write_results(session, [result], force=False).previous == folder / "previous"
+        assert (folder / "previous" / "notes.txt").read_text() == "measured on Tuesday"
+
+
+@pytest.mark.parametrize("name", ["calibration", "calibration/previous"])
+def test_a_file_in_place_of_a_folder_is_refused_and_stays(session, folder, name):
+    if name != "calibration":
+        write_results(session, [GOOD], force=False)
+    (session.path / name).write_text("mine")
+    with pytest.raises(SessionError, match=f"{Path(name).name} is a file, not a folder"):
+        write_results(session, [OTHER], force=False)
+    assert (session.path / name).read_text() == "mine"
+    assert not list(session.path.glob(".new-*"))
 
 
 def test_a_result_that_cannot_be_written_leaves_the_earlier_one(session, folder):

@@ -122,7 +122,9 @@ def _tamper(session: Session, **changes: object) -> None:
     path.write_text(json.dumps(manifest))
 
 
-@pytest.mark.parametrize("name", ["../../rig.yaml", "/etc/passwd", "a/b.png", "..", ".hidden", "", "x\ny"])
+@pytest.mark.parametrize(
+    "name", ["../../rig.yaml", "/etc/passwd", "a/b.png", "..", ".hidden", "", "x\ny", "x\0y"]
+)
 def test_names_that_point_outside_the_capture_are_refused(tmp_path, rig, samples, name):
     session = Session.create(tmp_path / "s", rig)
     session.add_capture(*samples(0), {})

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 
 import pytest
 
@@ -81,6 +82,20 @@ def test_an_error_leaves_the_earlier_folder(tmp_path, can_exchange):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+def test_the_session_itself_may_be_a_link_but_not_what_is_replaced(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    for text in ("one", "two"):
+        fill(tmp_path / "link", text)
+        assert contents(tmp_path / "real" / "out") == {text}
+    (tmp_path / "real" / "out").rename(tmp_path / "real" / "may")
+    (tmp_path / "real" / "out").symlink_to("may")
+    with pytest.raises(NotADirectoryError, match="out is a link, not a folder"):
+        fill(tmp_path / "link", "three")
+    assert {path.name for path in (tmp_path / "real").iterdir()} == {"out", "may"}
+    assert contents(tmp_path / "real" / "may") == {"two"}
+
+
 def test_readers_beside_a_writer_always_find_one_whole_folder(tmp_path):
     fill(tmp_path, "0")
     torn, is_over = [], threading.Event()
@@ -133,6 +148,19 @@ def test_a_folder_put_aside_by_a_killed_process_comes_back(tmp_path):
     (tmp_path / "out").rename(tmp_path / ".old-out")
     recover(tmp_path)
     assert contents(tmp_path / "out") == {"one"}
+
+
+@pytest.mark.parametrize("name", ["..+evil", "..+..+evil", "link+evil", "nowhere+evil", "", "+", "."])
+def test_a_name_made_up_to_lead_out_of_the_session_moves_nothing(tmp_path, name):
+    root = tmp_path / "deep" / "s"
+    (root / f".old-{name}").mkdir(parents=True)
+    (root / "link").symlink_to(tmp_path)
+    before = set(tmp_path.rglob("*"))
+    with suppress(OSError):
+        recover(root)
+    if name != "link+evil":
+        fill(root, "one")
+    assert {path for path in tmp_path.rglob("*") if (root / "out") not in (path, *path.parents)} == before
 
 
 def test_a_draft_that_is_being_filled_is_left_alone(tmp_path):

@@ -258,3 +258,10 @@ def test_meta_that_is_no_json_is_refused_and_leaves_nothing(tmp_path, rig, sampl
         session.add_capture(*samples(0), {"x": float("nan")})
     assert list((tmp_path / "s" / "captures").iterdir()) == []
     assert json.loads((tmp_path / "s" / "session.json").read_text())["rig"] == "rlfs"
+
+
+def test_captures_are_in_the_order_of_their_numbers(tmp_path, rig, samples):
+    with Session.create(tmp_path / "s", rig) as session:
+        (tmp_path / "s" / "captures" / "999999").mkdir()
+        assert [session.add_capture(*samples(k), {}) for k in range(2)] == ["1000000", "1000001"]
+        assert [capture.name for capture in session.captures] == ["999999", "1000000", "1000001"]
