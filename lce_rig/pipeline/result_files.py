@@ -41,8 +41,8 @@ def write_results(session: Session, calibrations: Sequence[Calibration], *, forc
 
     All files of a run appear together. Those of the earlier run move to calibration/previous/; a failed run
     never takes the place of a usable one there, nor one without a camera whose only usable result is there.
-    Where the result is the same to the byte, overlays and
-    calibration/previous/ stay. Files that lce-rig did not write stay, too.
+    Where the result is the same to the byte, overlays and calibration/previous/ stay. Files that lce-rig did
+    not write stay, too.
 
     Raises:
         SessionError: a capture that was used is gone, or the disk is full; the earlier files are untouched.

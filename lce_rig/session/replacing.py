@@ -62,7 +62,7 @@ def replacing(
                 folder.parent.mkdir(exist_ok=True)
                 _change_places(draft, folder, root, can_exchange=can_exchange)
         finally:
-            _discard(draft)
+            shutil.rmtree(draft, ignore_errors=True)
 
 
 def check_folder(path: Path) -> None:
@@ -116,7 +116,7 @@ def _change_places(draft: Path, folder: Path, root: Path, *, can_exchange: bool)
         folder.rename(aside)
         # A process that is killed here has left both: `recover` puts the earlier folder back.
         draft.rename(folder)
-        _discard(aside)
+        shutil.rmtree(aside, ignore_errors=True)
     flush_folder(folder.parent)
     if folder.parent != root:
         flush_folder(root)
@@ -148,7 +148,7 @@ def _put_back(root: Path) -> None:
         if not folder.parent.is_dir():
             continue
         if folder.exists():
-            _discard(aside)
+            shutil.rmtree(aside, ignore_errors=True)
         else:
             aside.rename(folder)
 
@@ -157,15 +157,7 @@ def _remove_drafts(root: Path, name: str) -> None:
     """Remove what killed processes left; what a living one fills is locked."""
     for draft in root.glob(f"{DRAFT}{name}-*"):
         with suppress(OSError), _locked(draft, waits=False):
-            _discard(draft)
-
-
-def _discard(folder: Path) -> None:
-    """Remove a folder; of a link that stood in its place, the link."""
-    if folder.is_symlink():
-        folder.unlink()
-    else:
-        shutil.rmtree(folder, ignore_errors=True)
+            shutil.rmtree(draft, ignore_errors=True)
 
 
 @contextmanager

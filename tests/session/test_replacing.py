@@ -56,17 +56,6 @@ def test_a_session_may_itself_be_reached_by_a_link(tmp_path, can_exchange):
 
 
 @pytest.mark.parametrize("can_exchange", [True, False])
-def test_a_link_to_a_folder_of_the_session_is_replaced_and_leaves_no_draft(tmp_path, can_exchange):
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "note").write_text("note")
-    (tmp_path / "out").symlink_to("mine")
-    fill(tmp_path, "one", can_exchange=can_exchange)
-    assert contents(tmp_path / "out") == {"one"}
-    assert contents(tmp_path / "mine") == {"note"}
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "out"]
-
-
-@pytest.mark.parametrize("can_exchange", [True, False])
 def test_an_error_leaves_the_earlier_folder(tmp_path, can_exchange):
     fill(tmp_path, "one")
     with pytest.raises(ZeroDivisionError), replacing(tmp_path, tmp_path / "out") as draft:
