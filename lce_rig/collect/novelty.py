@@ -89,9 +89,9 @@ def capture_poses(capture: Capture, session: Session) -> dict[ImageKey, Array]:
     stored = capture.meta.get("T_cam_board")
     if isinstance(stored, dict):
         return dict(_stored_poses(stored, session.rig))
-    found = {}
+    found, finder = {}, BoardFinder(session.rig)
     for camera, channel in capture.image_keys:
-        board = BoardFinder(session.rig).search_image(capture.image(camera, channel)).board
+        board = finder.search_image(capture.image(camera, channel)).board
         if isinstance(board, ImageBoard):
             found[camera, channel] = board.T_cam_board
     return found

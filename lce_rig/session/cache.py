@@ -3,7 +3,6 @@
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core import unpacking
 from lce_rig.core.documents import parse_json
-from lce_rig.core.limits import MAX_CHUNK_BYTES, check_size, read_file
+from lce_rig.core.limits import MAX_CHUNK_BYTES, read_file
 from lce_rig.session.durable import replace_file
 
 _VALUES = "values_json"
@@ -79,14 +79,12 @@ def _seal(path: Path, archive: bytes) -> bytes:
 def _unpack(archive: bytes) -> dict[str, NDArray[Any]]:
     arrays = {}
     n_left = MAX_CHUNK_BYTES
-    with zipfile.ZipFile(io.BytesIO(archive)) as file:
+    with unpacking.open_archive(io.BytesIO(archive)) as file:
         if len(file.infolist()) > _MAX_MEMBERS:
             raise ValueError(f"it has more than {_MAX_MEMBERS} members")
         for member in file.infolist():
-            # What is declared is what zipfile stops at; of deflate only, as other methods unpack at once.
-            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError("it is compressed by another method")
-            n_left -= check_size(member.file_size, max_bytes=n_left)
-            array = np.lib.format.read_array(io.BytesIO(file.read(member)), allow_pickle=False)
+            data = unpacking.read_member(file, member, n_left)
+            n_left -= len(data)
+            array = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
             arrays[member.filename.removesuffix(".npy")] = array
     return arrays

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from lce_rig.core import limits, unpacking
-from lce_rig.sources.bag_storage import Contents, Damages, RawMessage, unpack
+from lce_rig.sources.bag_storage import Connection, Contents, Damages, RawMessage, unpack
 
 # What a message takes of a file at least, packed as well as can be.
 _MIN_RECORD_BYTES = 4
@@ -189,6 +189,15 @@ class ChunkedBag(ABC):
         messages = sorted((message for _, message in block.messages), key=lambda message: message.log_ns)
         del block
         yield from messages
+
+    def _find_topic(self, reading: Pass, number: int, block: Block) -> Connection | None:
+        """Look up what a message is of; None where nobody wants it, or where that is not known."""
+        if reading.wanted is not None and number not in reading.wanted:
+            return None
+        found = self.contents.connections.get(number)
+        if found is None:
+            block.damages.add(f"a message of no known topic, {number}")
+        return found
 
     def _survey(self, whole: Pass, begin: int) -> None:
         """Go through the file from the front, as far as records follow each other, and count."""

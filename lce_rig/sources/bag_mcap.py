@@ -145,11 +145,8 @@ class McapBag(ChunkedBag):
         if end - begin < _MESSAGE_HEAD.size:
             raise ValueError("a message is shorter than its head")
         number, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(raw, begin)
-        if reading.wanted is not None and number not in reading.wanted:
-            return
-        found = self.contents.connections.get(number)
+        found = self._find_topic(reading, number, block)
         if found is None:
-            block.damages.add(f"a message of no known topic, {number}")
             return
         block.messages.append((number, RawMessage(*found, log_ns, raw[begin + _MESSAGE_HEAD.size : end])))
 

@@ -109,11 +109,8 @@ class Ros1Bag(ChunkedBag):
         self, reading: Pass, fields: dict[bytes, bytes], raw: bytes, begin: int, end: int, block: Block
     ) -> None:
         number = _number(fields[b"conn"])
-        if reading.wanted is not None and number not in reading.wanted:
-            return
-        found = self.contents.connections.get(number)
+        found = self._find_topic(reading, number, block)
         if found is None:
-            block.damages.add(f"a message of no known topic, {number}")
             return
         block.messages.append((number, RawMessage(*found, _time_ns(fields[b"time"]), raw[begin:end])))
 
