@@ -1,0 +1,50 @@
+"""What was found about a sensor, a capture or a result, as facts; `words` renders them."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+Severity = Literal["note", "warning", "error"]
+Figure = float | int | bool | str | None | tuple["Figure", ...]
+_ORDER: tuple[Severity, ...] = ("note", "warning", "error")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One fact with its figures.
+
+    Attributes:
+        code: what was found, "family.name"; stable, listed in docs/findings.md.
+        severity: "note" changes nothing; "warning": usable, less well; "error": must not be used.
+        subject: what it is about: a sensor's or capture's name, a profile key, a file; "" where it is plain.
+        figures: by name with units ("rms_m"), for the words and for programs.
+        action: which of several actions applies, by its code in `words`; "" where the code has just one.
+    """
+
+    code: str
+    severity: Severity = "error"
+    subject: str = ""
+    figures: Mapping[str, Figure] = field(default_factory=dict)
+    action: str = ""
+
+    def figure(self, name: str) -> float:
+        """Give a figure as a number.
+
+        Raises:
+            KeyError: the finding has no such figure.
+            TypeError: it is no number.
+        """
+        value = self.figures[name]
+        if not isinstance(value, float | int):
+            raise TypeError(f"{self.code}: {name} is {value!r}")
+        return float(value)
+
+
+def worst(findings: Iterable[Finding]) -> Severity:
+    """Give the highest severity; "note" where nothing was found."""
+    return max((finding.severity for finding in findings), key=_ORDER.index, default="note")
+
+
+def ranked(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """List findings, the worst first, otherwise in the order given."""
+    return tuple(sorted(findings, key=lambda finding: -_ORDER.index(finding.severity)))

@@ -1,0 +1,9 @@
+"""Findings in plain English: the only place where a code becomes a sentence.
+
+Each family of codes has a module with a table PHRASES. A phrase is a template over the finding's figures, or
+a function where one template does not serve. Only screens, pages, reports and messages import this.
+"""
+
+from lce_rig.words.rendering import Phrase, as_json, describe, recommend, sentence
+
+__all__ = ["Phrase", "as_json", "describe", "recommend", "sentence"]

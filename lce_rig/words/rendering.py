@@ -1,0 +1,103 @@
+"""Templates and functions that turn a finding's figures into words."""
+
+import math
+import string
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+from lce_rig.core.findings import Finding
+
+FAMILIES: tuple[str, ...] = ()
+"""Modules of this package with a table PHRASES of their own."""
+
+Template = str | Callable[[Finding], str]
+
+# Suffix of a format spec -> (factor, decimals where none are given, unit as printed).
+_UNITS: Mapping[str, tuple[float, int, str]] = {
+    "mm": (1000.0, 0, " mm"),
+    "cm": (100.0, 0, " cm"),
+    "ms": (1000.0, 1, " ms"),
+    "us": (1e6, 0, " us"),
+    "deg": (1.0, 2, " deg"),
+    "percent": (100.0, 0, " %"),
+}
+
+
+@dataclass(frozen=True)
+class Phrase:
+    """How one code reads.
+
+    Attributes:
+        text: what was found, with figures; no action.
+        action: what to do, in the imperative; "" where nothing is to be done.
+        actions: other actions by the name that `Finding.action` gives.
+    """
+
+    text: Template
+    action: Template = ""
+    actions: Mapping[str, Template] | None = None
+
+
+class _Figures(string.Formatter):
+    """Format figures; {rms_m:mm}, {tilt_deg:1deg}, {share:percent} scale and add the unit."""
+
+    def format_field(self, value: Any, spec: str) -> str:
+        unit = next((unit for unit in _UNITS if spec.endswith(unit)), None)
+        if unit is None:
+            return str(format(value, spec))
+        factor, decimals, printed = _UNITS[unit]
+        digits = spec.removesuffix(unit)
+        number = factor * float(value)
+        shown = f"{number:.{int(digits) if digits else decimals}f}" if math.isfinite(number) else "unknown"
+        return shown + printed
+
+
+_FORMATTER = _Figures()
+
+
+@cache
+def phrases() -> Mapping[str, Phrase]:
+    """Gather the tables of all families: code -> phrase."""
+    table: dict[str, Phrase] = {}
+    for family in FAMILIES:
+        table |= import_module(f"lce_rig.words.{family}").PHRASES
+    return table
+
+
+def describe(finding: Finding) -> str:
+    """Say what was found, without what to do."""
+    return _render(phrases()[finding.code].text, finding)
+
+
+def recommend(finding: Finding) -> str:
+    """Say what to do; "" where nothing is to be done."""
+    phrase = phrases()[finding.code]
+    chosen = (phrase.actions or {})[finding.action] if finding.action else phrase.action
+    return _render(chosen, finding)
+
+
+def sentence(finding: Finding) -> str:
+    """Say what was found and what to do, in one line."""
+    action = recommend(finding)
+    return f"{describe(finding)}: {action}" if action else describe(finding)
+
+
+def as_json(finding: Finding) -> dict[str, object]:
+    """Write a finding for programs: code, severity, subject and figures are stable, the text is not."""
+    return {
+        "code": finding.code,
+        "severity": finding.severity,
+        "subject": finding.subject,
+        "figures": dict(finding.figures),
+        "text": describe(finding),
+        "action": recommend(finding),
+    }
+
+
+def _render(template: Template, finding: Finding) -> str:
+    if callable(template):
+        return template(finding)
+    return _FORMATTER.vformat(template, (), {"subject": finding.subject, **finding.figures})
