@@ -32,8 +32,9 @@ class Image:
         """The picture as (H, W) uint8 grey values (ITU-R BT.601 weights)."""
         if self.pixels.ndim == 2:
             return self.pixels
-        weights = np.array([0.114, 0.587, 0.299], dtype=np.float32)
-        return np.asarray(np.rint(self.pixels @ weights), dtype=np.uint8)
+        import cv2  # Slow to import, and of no use to commands that look at no image.
+
+        return np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
