@@ -4,12 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lce_rig.calibrate.estimate import CaptureResidual
 from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, rotation_angle, transform
-from lce_rig.core.results import Metrics, Observation
+from lce_rig.core.results import CaptureResidual, Metrics, Observation
 
 # What is measured must not depend on what was switched on while fitting.
 _AS_MEASURED = CalibrateOptions(point_projection="ray", half_step=False)
