@@ -1,4 +1,4 @@
-"""Compare the calibrations of two independent sessions of one rig, and check one result on the other's captures.
+"""Compare the calibrations of two independent sessions; check one result on the captures of the other.
 
 python compare_sessions.py SESSION SESSION
 """
