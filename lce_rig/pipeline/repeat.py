@@ -42,13 +42,13 @@ class Repeat:
     failed: tuple[str, ...]
 
 
-def repeat(paths: Sequence[Path | str], *, progress: Progress = silent) -> Repeat:
+def repeat(folders: Sequence[Path | str], *, progress: Progress = silent) -> Repeat:
     """Compare the results of independent sessions of one rig.
 
     A session without a result is calibrated with the usual options; nothing is written.
 
     Args:
-        paths: of the sessions.
+        folders: of the sessions.
         progress: called with (done, total) sessions.
 
     Raises:
@@ -57,7 +57,7 @@ def repeat(paths: Sequence[Path | str], *, progress: Progress = silent) -> Repea
             camera and LiDAR in two of them.
         NotEnoughDataError: a session holds too few captures to be calibrated; it is named.
     """
-    paths = [Path(path) for path in paths]
+    paths = [Path(folder) for folder in folders]
     if len(paths) < 2:
         raise UsageError("one session alone has nothing to agree with", "Name two sessions or more.")
     _require_different(paths)
