@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, ChannelsEstimate, calibrate
+from lce_rig.calibrate import CalibrateOptions, calibrate
 from lce_rig.calibrate.examination import examine
 from lce_rig.calibrate.intrinsics_estimate import View
 from lce_rig.calibrate.report import NO_CERTIFICATE
@@ -35,15 +35,13 @@ def verdict_of(estimate):
     """Judge a changed estimate by what the checks found on the sound one."""
 
     def judged(changed, n_captures=20):
-        examination = replace(examined(estimate), estimate=changed)
-        return judge(ChannelsEstimate(changed, ()), examination, RIG, "cam", "lidar", n_captures)
+        return judge(changed, replace(examined(estimate), cov=changed.cov), RIG, "cam", "lidar", n_captures)
 
     return judged
 
 
 def examined_verdict_of(estimate, lens=CAMERA):
-    examination = examined(estimate, lens)
-    return judge(ChannelsEstimate(estimate, ()), examination, RIG, "cam", "lidar", len(estimate.used))
+    return judge(estimate, examined(estimate, lens), RIG, "cam", "lidar", len(estimate.used))
 
 
 def test_a_sound_result_passes_without_reasons(estimate, verdict_of):
