@@ -201,15 +201,16 @@ def sum_ranges(scans: StackedScans, T_lidar_board: Array, offset_m: Array, lens:
         offset_m: (L,) of each ring.
         lens: (2,) theta.
     """
-    R, t, n = T_lidar_board[:, :3, :3], T_lidar_board[:, :3, 3], T_lidar_board[:, :3, 2]
+    R, n = T_lidar_board[:, :3, :3], T_lidar_board[:, :3, 2]
     k = scans.capture
-    cosine = np.sum(n[k] * scans.rays, axis=1)
-    r = np.sum(n * t, axis=1)[k] / cosine
+    # Rays and the boards' middles in the axes of each board; returns are ordered by capture.
+    by_capture = np.split(scans.rays, np.searchsorted(k, np.arange(1, scans.n_captures)))
+    x, y, cosine = np.concatenate([u @ axes for u, axes in zip(by_capture, R, strict=True)]).T
+    middle = np.einsum("fji,fj->fi", R, T_lidar_board[:, :3, 3])
+    r = middle[k, 2] / cosine
     v = np.ones((len(r), _OF_RETURN))
-    for axis in (0, 1):
-        along = R[:, :, axis]
-        v[:, 1 + axis] = r * np.sum(along[k] * scans.rays, axis=1) - np.sum(along * t, axis=1)[k]
-    v[:, :_ONE] /= cosine[:, None]
+    v[:, 0], v[:, 1], v[:, 2] = 1 / cosine, r * x - middle[k, 0], r * y - middle[k, 1]
+    v[:, 1:_ONE] /= cosine[:, None]
     v[:, _ONE + 1 : -1] = -np.einsum("ni,nij->nj", n[k], scans.fields) / cosine[:, None]
     v[:, -1] = r + v[:, _ONE + 1 : -1] @ lens + offset_m[scans.ring] - scans.range_m
     sums = np.zeros((scans.n_captures * len(scans.rings), _OF_RETURN, _OF_RETURN))
