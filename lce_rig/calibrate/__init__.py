@@ -1,6 +1,6 @@
 """Extrinsic calibration of one camera and one LiDAR from pairs of detected boards."""
 
-from lce_rig.calibrate.calibrate import calibrate
+from lce_rig.calibrate.calibrate import fit_extrinsic
 from lce_rig.calibrate.channels import calibrate_channels
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.metrics import capture_residual, error_to_reference
@@ -12,8 +12,8 @@ __all__ = [
     "CalibrationEstimate",
     "CaptureCandidates",
     "Clocks",
-    "calibrate",
     "calibrate_channels",
     "capture_residual",
     "error_to_reference",
+    "fit_extrinsic",
 ]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, calibrate
+from lce_rig.calibrate import CalibrateOptions, fit_extrinsic
 from lce_rig.calibrate.claim import resample, widening
 from lce_rig.calibrate.control import doubt_control, run_control
 from lce_rig.calibrate.examination import examine
@@ -25,7 +25,7 @@ T_NEAR = perturb(T_FORWARD, np.array([0.003, -0.002, 0.004, 0.001, -0.001, 0.001
 
 
 def calibrated(n=20, seed=1):
-    return calibrate(simulate(n, seed), BOARD, FAST)
+    return fit_extrinsic(simulate(n, seed), BOARD, FAST)
 
 
 def observed(n=15, seed=1, scenario=None):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, Clocks, calibrate, calibrate_channels
+from lce_rig.calibrate import CalibrateOptions, Clocks, calibrate_channels, fit_extrinsic
 from lce_rig.calibrate.motion import deskew, fit_motions, sample_poses
 from lce_rig.core.geometry import Array, difference, invert
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, random_pose, scan_board
@@ -95,7 +95,9 @@ def test_time_offsets_are_found_from_two_pictures_a_capture():
 
 def test_compensation_brings_the_error_of_moving_boards_down_to_that_of_still_ones(followed):
     compensated = [errors(result.T_cam_lidar) for _, result in followed]
-    plain = [errors(calibrate(captures["events"], BOARD, OPTIONS).T_cam_lidar) for captures, _ in followed]
+    plain = [
+        errors(fit_extrinsic(captures["events"], BOARD, OPTIONS).T_cam_lidar) for captures, _ in followed
+    ]
     rms, plain_rms = (np.sqrt(np.mean(np.square(e), axis=0)) for e in (compensated, plain))
     assert np.all(rms < plain_rms / 2)
     assert np.all(rms < [0.07, 2.5])
@@ -137,7 +139,7 @@ def test_pictures_without_stamps_are_timed_by_the_motion_between_channels():
     captures = simulate_moving(25, 0, moving)
     result = calibrate_channels(captures, BOARD, OPTIONS, Clocks())
     assert np.all(
-        errors(result.T_cam_lidar) < errors(calibrate(captures["frames"], BOARD, OPTIONS).T_cam_lidar)
+        errors(result.T_cam_lidar) < errors(fit_extrinsic(captures["frames"], BOARD, OPTIONS).T_cam_lidar)
     )
     for channel in result.channels:
         assert abs(channel.time_offset_s - dict(moving.offset_s)[channel.channel]) < 0.02
@@ -152,7 +154,7 @@ def test_boards_that_stand_still_are_not_moved_and_say_nothing_of_time():
 
 def test_one_channel_that_is_not_followed_is_calibrated_as_before():
     captures = simulate_moving(12, 0)["frames"]
-    plain = calibrate(captures, BOARD, OPTIONS)
+    plain = fit_extrinsic(captures, BOARD, OPTIONS)
     result = calibrate_channels({"frames": captures}, BOARD, OPTIONS, Clocks())
     np.testing.assert_array_equal(result.T_cam_lidar, plain.T_cam_lidar)
     np.testing.assert_array_equal(result.cov, plain.cov)
