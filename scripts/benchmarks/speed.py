@@ -14,8 +14,7 @@ import numpy as np
 from benchmarks.recordings import SETS
 from benchmarks.tables import print_head, print_row
 from lce_rig import pipeline
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates
-from lce_rig.calibrate import calibrate as fit_extrinsic
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, fit_extrinsic
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.finder import BoardFinder
 
