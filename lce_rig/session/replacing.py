@@ -1,8 +1,8 @@
 """Folders of results, replaced as a whole: a reader finds all earlier files or all new ones, at any time.
 
-The writer fills a draft beside the session's other folders (`.new-calibration-XXXX`) and exchanges both in one
-system call (renameat2). A killed process leaves one complete folder, and a draft that the next process removes.
-A draft is locked (flock) while its writer lives.
+The writer fills a draft beside the session's other folders (`.new-calibration-XXXX`), then exchanges both in
+one system call (renameat2). A killed process leaves one complete folder, and a draft that the next process
+removes. A draft is locked (flock) while its writer lives.
 """
 
 import ctypes
