@@ -31,10 +31,10 @@ class Refusal(Finding):
         """The stage that refuses the capture."""
         return cast(Stage, self.code.partition(".")[0])
 
-    @classmethod
-    def of_error(cls, stage: Stage, error: LceRigError, action: str = "") -> "Refusal":
+    @staticmethod
+    def of_error(stage: Stage, error: LceRigError, action: str = "") -> "Refusal":
         """Refuse a capture for an error that was raised about it."""
-        return cls(f"{stage}.error", figures={"what": error.what, "hint": error.hint}, action=action)
+        return Refusal(f"{stage}.error", figures={"what": error.what, "hint": error.hint}, action=action)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,16 +21,28 @@ _REMOVE_OTHERS = "remove other things of the board's size, or cover them"
 
 
 def _flicker(finding: Finding) -> str:
+    """Most events come from light that flickers, at {frequency_hz} Hz."""
     frequency_hz = finding.figures["frequency_hz"]
     rhythm = f" at {frequency_hz:.0f} Hz" if frequency_hz else ""
     return f"most events come from light that flickers{rhythm}"
 
 
-def _of_lost(finding: Finding) -> Finding:
+def _lost(finding: Finding) -> str:
+    """Lost near its last place, for the code in {cause}, with its figures."""
+    return f"lost near its last place: {describe(_cause(finding))}"
+
+
+def _find_again(finding: Finding) -> str:
+    """The action of that code."""
+    return recommend(_cause(finding))
+
+
+def _cause(finding: Finding) -> Finding:
     return replace(finding, code=str(finding.figures["cause"]))
 
 
 def _candidates(finding: Finding) -> str:
+    """Best of {n_candidates} candidates: {distance_m}, {rotation_deg} from the predicted pose."""
     n = finding.figures["n_candidates"]
     which = "the only candidate" if n == 1 else f"best of {n} candidates"
     apart = f"{100 * finding.figure('distance_m'):.0f} cm, {finding.figure('rotation_deg'):.0f} deg"
@@ -38,7 +50,11 @@ def _candidates(finding: Finding) -> str:
 
 
 def _hint_or(otherwise: str) -> Template:
-    return lambda finding: str(finding.figures["hint"] or otherwise)
+    def hint(finding: Finding) -> str:
+        return str(finding.figures["hint"] or otherwise)
+
+    hint.__doc__ = f"{{hint}}, else: {otherwise}."
+    return hint
 
 
 _RECOLLECT = _hint_or("collect this placement again")
@@ -213,10 +229,7 @@ PHRASES: dict[str, Phrase] = {
         "ring ends {rms_m:mm} rms from a rectangle (limit {max_rms_m:mm})",
         "keep hands and other things away from the board's border",
     ),
-    "lidar.lost": Phrase(
-        lambda finding: f"lost near its last place: {describe(_of_lost(finding))}",
-        lambda finding: recommend(_of_lost(finding)),
-    ),
+    "lidar.lost": Phrase(_lost, _find_again),
     "lidar.turned_away": Phrase(
         "the only plate near the board's last place is rotated by over {max_turn_deg:.0f} deg",
         "move more slowly",
