@@ -7,11 +7,23 @@ a function where one template does not serve. Only screens, pages, reports and m
 from lce_rig.words.rendering import (
     Phrase,
     as_json,
+    as_line,
     describe,
+    enumerated,
     is_renderable,
     recommend,
     refusal_as_json,
     sentence,
 )
 
-__all__ = ["Phrase", "as_json", "describe", "is_renderable", "recommend", "refusal_as_json", "sentence"]
+__all__ = [
+    "Phrase",
+    "as_json",
+    "as_line",
+    "describe",
+    "enumerated",
+    "is_renderable",
+    "recommend",
+    "refusal_as_json",
+    "sentence",
+]

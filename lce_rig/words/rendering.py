@@ -2,7 +2,7 @@
 
 import math
 import string
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -13,7 +13,7 @@ from lce_rig.core.findings import Figure, Finding
 if TYPE_CHECKING:
     from lce_rig.core.results import Refusal
 
-FAMILIES: tuple[str, ...] = ("detection",)
+FAMILIES: tuple[str, ...] = ("detection", "drivers")
 """Modules of this package with a table PHRASES of their own."""
 
 Template = str | Callable[[Finding], str]
@@ -90,13 +90,23 @@ def sentence(finding: Finding) -> str:
     return f"{describe(finding)}: {action}" if action else describe(finding)
 
 
+def as_line(text: str) -> str:
+    """Write words as a line of their own: a capital first, a full stop last."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+
+
+def enumerated(finding: Finding, reasons: Iterable[Finding]) -> str:
+    """Say what was found and what makes it so, in one line."""
+    return f"{describe(finding)}: {'; '.join(sentence(reason) for reason in reasons)}"
+
+
 def as_json(finding: Finding) -> dict[str, object]:
     """Write a finding for programs: texts may change, everything else is stable."""
     return {
         "code": finding.code,
         "severity": finding.severity,
         "subject": finding.subject,
-        "figures": {name: _plain(value) for name, value in finding.figures.items()},
+        "figures": {name: _finite(figure) for name, figure in finding.figures.items()},
         "action_code": finding.action,
         "text": describe(finding),
         "action": recommend(finding),
@@ -125,11 +135,11 @@ def is_renderable(finding: Finding) -> bool:
     return True
 
 
-def _plain(value: Figure) -> object:
-    """Give a figure in JSON's types; null in place of what is not finite."""
-    if isinstance(value, tuple):
-        return [_plain(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _finite(figure: Figure) -> Figure:
+    """Give None for a number that JSON has no word for."""
+    if isinstance(figure, tuple):
+        return tuple(_finite(each) for each in figure)
+    return None if isinstance(figure, float) and not math.isfinite(figure) else figure
 
 
 def _render(template: Template, finding: Finding) -> str:

@@ -188,7 +188,8 @@ class _Loop:
         if report.ending == "exhausted":
             waited_s = time.monotonic() - self._captured_s
             report.notes.append(f"no capture in the last {waited_s:.0f} s, {self._monitor.last_words()}")
-        report.notes += self._keeper.notes() + self._clock.problems() + self._clock.account()
+        ties = self._clock.problems() + self._clock.account()
+        report.notes += self._keeper.notes() + [f"{each.subject}: {sentence(each)}" for each in ties]
         if self._recorder is not None:
             report.notes += self._recorder.problems()
         self._session.journal(
