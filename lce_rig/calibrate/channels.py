@@ -17,7 +17,6 @@ from lce_rig.calibrate.consensus import Consensus
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.motion import PoseSamples, fit_motions
 from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates
-from lce_rig.calibrate.problem import Weights
 from lce_rig.calibrate.shared_scans import (
     Clocks,
     SharedScan,
@@ -31,6 +30,8 @@ from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference
 from lce_rig.core.results import ChannelResult, Observation
+from lce_rig.residuals.moments import Weights
+from lce_rig.residuals.plane_and_ends import along_normals
 
 # Fewer captures with known motion say nothing about clocks.
 _MIN_MOVING = 6
@@ -39,30 +40,13 @@ _MOVED = 1.0
 _N_SHARES = 7
 
 
-@dataclass(frozen=True, eq=False)
-class ChannelsEstimate:
-    """An extrinsic from all channels.
-
-    Attributes:
-        estimate: from all of them together.
-        channels: what each says alone, by name.
-        difference: (6,) tangent between the two channels' extrinsics; None with one channel.
-        difference_cov: (6, 6) of it.
-    """
-
-    estimate: CalibrationEstimate
-    channels: tuple[ChannelResult, ...]
-    difference: Array | None = None
-    difference_cov: Array | None = None
-
-
 def calibrate_channels(
     candidates: Mapping[str, Sequence[CaptureCandidates]],
     board: Board,
     options: CalibrateOptions,
     clocks: Clocks,
     progress: Callable[[int, int], None] | None = None,
-) -> ChannelsEstimate:
+) -> CalibrationEstimate:
     """Estimate T_cam_lidar from what the channels of one camera and a LiDAR saw of the board.
 
     Args:
@@ -87,7 +71,7 @@ def calibrate_channels(
         estimate = with_consensus(estimate, consensus)
         n_captures = len(consensus.observations)
         result = _channel_result(name, n_captures, noise_px[name], estimate, estimate, None)
-        return ChannelsEstimate(estimate, (result,))
+        return replace(estimate, channels=(result,))
     still = {name: _alone(consensus, board, options) for name, consensus in agreed.items()}
     start = next(iter(still.values()))
     offsets = _offsets(samples, scans, board, options, clocks, start) if is_moving else None
@@ -103,7 +87,8 @@ def calibrate_channels(
         )
         for name in sorted(agreed)
     )
-    return ChannelsEstimate(estimate, results, *_difference(mover, results, board, options))
+    apart, cov = _difference(mover, results, board, options)
+    return replace(estimate, channels=results, channel_difference=apart, channel_difference_cov=cov)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,12 +218,10 @@ def _channel_result(
 
 def depth_scatter_m(estimate: CalibrationEstimate) -> float:
     """Compute the standard deviation over captures of the LiDAR's mean distance from the camera's plane."""
-    T = estimate.T_cam_lidar
-    depths = []
-    for observation in estimate.observations.values():
-        T_cam_board = observation.image.T_cam_board
-        middle = T[:3, :3] @ observation.lidar.points.mean(axis=0) + T[:3, 3]
-        depths.append(float(T_cam_board[:3, 2] @ (middle - T_cam_board[:3, 3])))
+    seen = estimate.observations.values()
+    T_cam_board = np.array([observation.image.T_cam_board for observation in seen])
+    middles = np.array([observation.lidar.points.mean(axis=0) for observation in seen])
+    depths = along_normals(T_cam_board[:, :3, 2], T_cam_board[:, :3, 3], middles, estimate.T_cam_lidar)
     return float(np.std(depths))
 
 
