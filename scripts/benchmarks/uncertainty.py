@@ -139,7 +139,7 @@ def cramer_rao_bound(terms: Terms, levels: Levels, priors: Priors, T_cam_lidar: 
         priors: of the constant errors.
         T_cam_lidar: (4, 4) the truth.
     """
-    information = assemble(terms, levels, priors).information
+    information = assemble(terms, levels, priors).cost.information
     J = to_extrinsic(T_cam_lidar, 0, len(information))
     return np.asarray(J @ np.linalg.inv(information) @ J.T)
 

@@ -22,7 +22,6 @@ from lce_rig.residuals.along_rays import N_SHIFTS, SHIFTS
 from lce_rig.residuals.features import extract_features
 from lce_rig.residuals.placements import group_placements
 from lce_rig.residuals.quadratics import Quadratics
-from lce_rig.solvers.covariance import symmetric_inverse
 
 # A profile that states no error of the ranges is taken at its word.
 _EXACT_M = 1e-6
@@ -120,10 +119,9 @@ def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp])
     n_cameras = len(joint.T_cam_lidar)
     order = [camera, *(c for c in range(n_cameras) if c != camera)]
     mine = np.concatenate([np.arange(6) + PER_CAMERA * c for c in order])
-    gradients, hessians = joint.system.gradients[:, mine], joint.system.hessians[:, mine[:, None], mine]
     # Shares of captures that another camera did not see leave its extrinsic open: 1 m, 1 rad.
     prior = np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6))
-    return Quadratics(gradients, hessians, prior, np.zeros(len(mine)), placement)
+    return replace(joint.cost.of(mine), prior=prior, prior_gradient=np.zeros(len(mine)), placement=placement)
 
 
 def figures_of(joint: JointEstimate, camera: int) -> dict[str, float]:
@@ -158,9 +156,9 @@ def _sigmas(joint: JointEstimate, camera: int) -> dict[str, float]:
 
     With information H = sum_k H_k + P, the covariance H^-1 is H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1.
     """
-    system = joint.system
-    J = joint.to_extrinsics[camera] @ symmetric_inverse(system.information)
+    cost = joint.cost
+    J = joint.to_extrinsics[camera] @ cost.covariance()
     figures: dict[str, float] = {}
-    for name, part in (("scatter", system.hessians.sum(axis=0)), ("systematic", system.prior)):
+    for name, part in (("scatter", cost.hessians.sum(axis=0)), ("systematic", cost.prior)):
         figures |= name_sigmas(name, J @ part @ J.T)
     return figures

@@ -22,7 +22,6 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation, Refusal
 from lce_rig.residuals.placements import group_shared_placements
-from lce_rig.solvers.covariance import symmetric_inverse
 
 # Diagnostics that hold a camera's pose errors beyond corner noise, by the level that they are.
 _POSE_FIGURES = {
@@ -96,7 +95,7 @@ def calibrate_together(
             estimated_with=tuple(other for other in names if other != name),
         )
     scale = np.concatenate(scales)
-    cov = scale[:, None] * (J @ symmetric_inverse(joint.system.information) @ J.T) * scale
+    cov = scale[:, None] * (J @ joint.cost.covariance() @ J.T) * scale
     return TogetherEstimate(names, estimates, cov)
 
 
