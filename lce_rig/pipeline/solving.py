@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from lce_rig.calibrate import (
     CalibrateOptions,
@@ -10,6 +10,7 @@ from lce_rig.calibrate import (
     CaptureCandidates,
     ChannelsEstimate,
     Clocks,
+    EstimateSettings,
     calibrate_channels,
 )
 from lce_rig.calibrate.consensus import find_consensus
@@ -36,7 +37,7 @@ class Solved:
     """
 
     pairs: tuple[Pair, ...]
-    options: CalibrateOptions
+    options: EstimateSettings
     refused: Mapping[str, Refusal]
     result: ChannelsEstimate
     examination: Examination
@@ -76,7 +77,7 @@ def solve(
         rig: thresholds, targets, lens and board.
         detections: of one session.
         pairs: channels of the camera with the LiDAR.
-        options: switches of the algorithm.
+        options: the user's.
         progress: called with (done, total).
 
     Raises:
@@ -84,16 +85,11 @@ def solve(
     """
     candidates, refused = _usable(rig, detections, pairs)
     camera, lidar = pairs[0].camera, pairs[0].lidar
-    settings = rig.lidars[lidar]
-    options = replace(
-        options,
-        laser_bias_sigma_m=settings.laser_bias_sigma_m,
-        range_offset_sigma_m=settings.range_offset_sigma_m,
-    )
+    settings = EstimateSettings.of(options, rig.lidars[lidar])
     clocks = clocks_of(rig, camera, lidar)
-    result = calibrate_channels(candidates, rig.board.to_board(), options, clocks, progress)
+    result = calibrate_channels(candidates, rig.board.to_board(), settings, clocks, progress)
     examination = examine_pairs(rig, detections, pairs, result)
-    return Solved(tuple(pairs), options, refused, result, examination)
+    return Solved(tuple(pairs), settings, refused, result, examination)
 
 
 def examine_pairs(

@@ -1,8 +1,8 @@
-"""Thresholds and weights of a profile; every one has a default and may be left out."""
+"""Thresholds of a profile; every one has a default and may be left out."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lce_rig.rig.settings import NotNegative, Positive, Settings
 
@@ -61,20 +61,25 @@ class QualitySettings(Settings):
     max_mee_m: Positive = 0.04
 
 
+_WEIGHTS = ("plane_weight", "edge_weight")
+
+
 class CalibrationSettings(Settings):
-    """Weights of the cost, and how sure the result has to be.
+    """How sure the result has to be.
 
     Attributes:
-        plane_weight: weight of a point's distance from the board's plane.
-        edge_weight: weight of a ring end's distance from the board's edge.
         target_sigma_deg: standard deviation of the rotation to reach; above it a result is marginal.
         target_sigma_m: standard deviation of the translation to reach; above it a result is marginal.
     """
 
-    plane_weight: Positive = 1.0
-    edge_weight: Positive = 3.0
     target_sigma_deg: Positive = 0.2
     target_sigma_m: Positive = 0.01
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_weights(cls, data: Any) -> Any:
+        """Drop weights, which profiles of earlier sessions hold: they follow from the captures."""
+        return {k: v for k, v in data.items() if k not in _WEIGHTS} if isinstance(data, dict) else data
 
     def in_targets(self, rotation_deg: float, translation_m: float) -> float:
         """Measure an error or a difference in units of the targets; the larger of the two counts."""

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, EstimateSettings, calibrate
 from lce_rig.calibrate.likelihood.end_density import density
 from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import stack_pictures
@@ -108,12 +108,7 @@ def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[R
     rig = load_rig(case.rig)
     board = rig.board.to_board()
     lidar = next(iter(rig.lidars.values()))
-    options = CalibrateOptions(
-        method="ml",
-        n_draws=0,
-        laser_bias_sigma_m=lidar.laser_bias_sigma_m,
-        range_offset_sigma_m=lidar.range_offset_sigma_m,
-    )
+    options = EstimateSettings.of(CalibrateOptions("ml", n_draws=0), lidar)
     sessions = [
         still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder)
         for seed in range(n_seeds)

@@ -5,12 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, calibrate, capture_residual, error_to_reference
+from lce_rig.calibrate import (
+    Algorithm1Parts,
+    EstimateSettings,
+    calibrate,
+    capture_residual,
+    error_to_reference,
+)
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import difference, exp_so3, pose
+from lce_rig.residuals.features import FeatureSettings
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
-FAST = CalibrateOptions(n_draws=3)
+FAST = EstimateSettings(n_draws=3)
 
 
 def errors_over_seeds(scenario, n_captures, n_seeds, options=FAST):
@@ -55,7 +62,7 @@ def test_exact_data_give_the_exact_extrinsic():
 def test_ring_ends_beyond_the_printed_edge_are_explained_by_the_shift():
     captures = simulate(20, 0, Scenario(footprint_m=0.008))
     free = calibrate(captures, BOARD, FAST)
-    off = calibrate(captures, BOARD, replace(FAST, edge_shift="off"))
+    off = calibrate(captures, BOARD, replace(FAST, parts=Algorithm1Parts(is_shift_free=False)))
     shift, sigma = free.diagnostics["edge_shift_m"], free.diagnostics["edge_shift_sigma_m"]
     assert abs(shift - 0.008) < 4 * sigma + 3e-4
     assert "edge_shift_m" not in off.diagnostics
@@ -85,26 +92,24 @@ def test_the_result_is_as_good_with_the_lidar_turned(turn_deg):
 @pytest.mark.parametrize(
     "switch",
     [
-        {"point_projection": "normal"},
-        {"point_projection": "none"},
+        {"features": FeatureSettings(point_projection="normal")},
+        {"features": FeatureSettings(point_projection="none")},
+        {"features": FeatureSettings(half_step=False)},
         {"use_uncertainty": False},
-        {"use_ptpl": False},
-        {"use_ptl": False},
-        {"half_step": False},
-        {"edge_shift": "off"},
-        {"plane_weight": 1.0, "edge_weight": 10.0},
+        {"use_planes": False},
+        {"use_ends": False},
+        {"is_shift_free": False},
         {"reject_outliers": False},
-        {"n_draws": 1},
         {"n_rounds": 1},
     ],
 )
-def test_every_switch_changes_the_result_or_nothing_but_never_breaks_it(switch):
+def test_without_any_part_of_algorithm_1_the_result_changes_or_not_but_never_breaks(switch):
     captures = simulate(12, 8)
-    estimate = calibrate(captures, BOARD, replace(FAST, **switch))
+    estimate = calibrate(captures, BOARD, replace(FAST, parts=Algorithm1Parts(**switch)))
     angle_deg, distance_m = error_to_reference(estimate.T_cam_lidar, T_FORWARD)
     assert angle_deg < 0.6
     assert distance_m < 0.02
-    unchanged = {"reject_outliers", "n_draws", "n_rounds"}
+    unchanged = {"reject_outliers", "n_rounds"}
     is_same = np.array_equal(estimate.T_cam_lidar, calibrate(captures, BOARD, FAST).T_cam_lidar)
     assert is_same <= (set(switch) <= unchanged)
 

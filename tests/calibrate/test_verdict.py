@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, ChannelsEstimate, calibrate
+from lce_rig.calibrate import ChannelsEstimate, EstimateSettings, calibrate
 from lce_rig.calibrate.examination import examine
 from lce_rig.calibrate.intrinsics_estimate import View
 from lce_rig.calibrate.report import NO_CERTIFICATE
@@ -21,7 +21,7 @@ RIG = load_rig("rlfs")
 
 @pytest.fixture(scope="module")
 def estimate():
-    return calibrate(simulate(20, seed=1), BOARD, CalibrateOptions(n_draws=3))
+    return calibrate(simulate(20, seed=1), BOARD, EstimateSettings(n_draws=3))
 
 
 @functools.cache
@@ -146,7 +146,7 @@ def test_squares_of_the_wrong_size_are_told_from_the_distances():
         T[:3, 3] /= 1.05
         image = replace(item.image, T_cam_board=T, T_cam_board_alternative=None)
         captures.append(replace(item, image=image))
-    wrong = calibrate(captures, BOARD, CalibrateOptions(n_draws=3))
+    wrong = calibrate(captures, BOARD, EstimateSettings(n_draws=3))
     verdict, reasons = examined_verdict_of(wrong)
     assert verdict == "fail"
     assert any("the squares measure 73." in reason for reason in reasons)

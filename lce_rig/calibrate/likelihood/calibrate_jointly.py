@@ -13,7 +13,7 @@ from lce_rig.calibrate.likelihood.refine import JointEstimate, refine
 from lce_rig.calibrate.likelihood.spread import inflate
 from lce_rig.calibrate.likelihood.system import PER_CAMERA
 from lce_rig.calibrate.metrics import error_to_reference
-from lce_rig.calibrate.options import CalibrateOptions
+from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M, EstimateSettings
 from lce_rig.calibrate.report import name_sigmas, report_estimate
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
@@ -30,7 +30,7 @@ _EXACT_M = 1e-6
 def calibrate_by_likelihood(
     observations: Sequence[Observation],
     board: Board,
-    options: CalibrateOptions,
+    options: EstimateSettings,
     progress: Callable[[int, int], None] | None = None,
 ) -> CalibrationEstimate:
     """Estimate T_cam_lidar from boards whose pairing is settled.
@@ -64,9 +64,9 @@ def calibrate_by_likelihood(
     return replace(estimate, expansion=expand_joint(joint, 0, placement))
 
 
-def what_is_known(options: CalibrateOptions) -> tuple[Priors, Levels]:
+def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
     """Read off the options what is known of constant errors and of noise before any capture is seen."""
-    priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=options.edge_shift_sigma_m)
+    priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=EDGE_SHIFT_SIGMA_M)
     return priors, Levels(laser_m=options.laser_bias_sigma_m)
 
 
@@ -77,7 +77,7 @@ def describe(
     start: CalibrationEstimate,
     used: Sequence[Observation],
     board: Board,
-    options: CalibrateOptions,
+    options: EstimateSettings,
     figures: Mapping[str, float],
 ) -> CalibrationEstimate:
     """Report one camera's extrinsic of a joint estimate.
@@ -92,7 +92,7 @@ def describe(
         options: switches of the features.
         figures: diagnostics; those of the start are overwritten.
     """
-    features = [extract_features(observation, board, options.features) for observation in used]
+    features = [extract_features(observation, board, options.parts.features) for observation in used]
     return report_estimate(
         joint.T_cam_lidar[camera],
         cov,

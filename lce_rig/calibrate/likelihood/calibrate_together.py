@@ -16,7 +16,7 @@ from lce_rig.calibrate.likelihood.calibrate_jointly import (
 from lce_rig.calibrate.likelihood.levels import PoseLevels
 from lce_rig.calibrate.likelihood.refine import refine
 from lce_rig.calibrate.likelihood.spread import inflate
-from lce_rig.calibrate.options import CalibrateOptions
+from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.shared_scans import REMOVE_OTHERS, take_apart
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
@@ -57,7 +57,7 @@ class TogetherEstimate:
 
 
 def calibrate_together(
-    alone: Mapping[str, CalibrationEstimate], board: Board, options: CalibrateOptions
+    alone: Mapping[str, CalibrationEstimate], board: Board, options: EstimateSettings
 ) -> TogetherEstimate:
     """Estimate the extrinsics of cameras that share scans of one LiDAR in one likelihood.
 
