@@ -23,7 +23,7 @@ METHODS: Mapping[Method, Estimator] = {
 """Name -> what estimates T_cam_lidar from boards whose pairing is settled."""
 
 
-def calibrate(
+def fit_extrinsic(
     candidates: Sequence[CaptureCandidates],
     board: Board,
     options: EstimateSettings | None = None,

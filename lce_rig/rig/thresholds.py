@@ -1,4 +1,4 @@
-"""Thresholds of a profile; every one has a default and may be left out."""
+"""Thresholds of a profile; each is optional and has a default."""
 
 from typing import Annotated, Any
 
@@ -10,7 +10,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class QualitySettings(Settings):
-    """From which figures on a capture is used, and a result passes.
+    """Limits for using a capture and for passing a result.
 
     Attributes:
         min_square_px: least side of a square in the picture; below it corners are blurred together.
@@ -65,7 +65,7 @@ _WEIGHTS = ("plane_weight", "edge_weight")
 
 
 class CalibrationSettings(Settings):
-    """How sure the result has to be.
+    """Target standard deviations.
 
     Attributes:
         target_sigma_deg: standard deviation of the rotation to reach; above it a result is marginal.
@@ -87,7 +87,7 @@ class CalibrationSettings(Settings):
 
 
 class VerdictSettings(Settings):
-    """When a result passes; what is beyond a limit is marginal, and fails where a second limit says so.
+    """Limits of the verdict: beyond a limit a result is marginal, beyond a second limit it fails.
 
     Attributes:
         fail_factor: a deviation, or a difference between two answers, this many times the target fails.

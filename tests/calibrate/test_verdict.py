@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import ChannelsEstimate, EstimateSettings, calibrate
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.examination import examine
 from lce_rig.calibrate.intrinsics_estimate import View
 from lce_rig.calibrate.report import NO_CERTIFICATE
@@ -21,7 +21,7 @@ RIG = load_rig("rlfs")
 
 @pytest.fixture(scope="module")
 def estimate():
-    return calibrate(simulate(20, seed=1), BOARD, EstimateSettings(n_draws=3))
+    return fit_extrinsic(simulate(20, seed=1), BOARD, EstimateSettings(n_draws=3))
 
 
 @functools.cache
@@ -35,15 +35,13 @@ def verdict_of(estimate):
     """Judge a changed estimate by what the checks found on the sound one."""
 
     def judged(changed, n_captures=20):
-        examination = replace(examined(estimate), estimate=changed)
-        return judge(ChannelsEstimate(changed, ()), examination, RIG, "cam", "lidar", n_captures)
+        return judge(changed, replace(examined(estimate), cov=changed.cov), RIG, "cam", "lidar", n_captures)
 
     return judged
 
 
 def examined_verdict_of(estimate, lens=CAMERA):
-    examination = examined(estimate, lens)
-    return judge(ChannelsEstimate(estimate, ()), examination, RIG, "cam", "lidar", len(estimate.used))
+    return judge(estimate, examined(estimate, lens), RIG, "cam", "lidar", len(estimate.used))
 
 
 def test_a_sound_result_passes_without_reasons(estimate, verdict_of):
@@ -90,9 +88,9 @@ def test_a_result_far_from_the_nominal_extrinsic_fails_with_both_figures(estimat
 
 
 def test_sensors_that_disagree_in_many_captures_are_a_doubt(estimate, verdict_of):
-    refused = {f"x{k}": Refusal("pair", "elsewhere", "hold still") for k in range(10)}
+    refused = {f"x{k}": Refusal("pair.no_candidate") for k in range(10)}
     assert verdict_of(replace(estimate, refused=refused))[0] == "marginal"
-    refused |= {f"y{k}": Refusal("calibrate", "off", "hold still") for k in range(20)}
+    refused |= {f"y{k}": Refusal("calibrate.outlier") for k in range(20)}
     verdict, reasons = verdict_of(replace(estimate, refused=refused))
     assert verdict == "fail"
     assert "30 of 50 captures" in reasons[0]
@@ -146,7 +144,7 @@ def test_squares_of_the_wrong_size_are_told_from_the_distances():
         T[:3, 3] /= 1.05
         image = replace(item.image, T_cam_board=T, T_cam_board_alternative=None)
         captures.append(replace(item, image=image))
-    wrong = calibrate(captures, BOARD, EstimateSettings(n_draws=3))
+    wrong = fit_extrinsic(captures, BOARD, EstimateSettings(n_draws=3))
     verdict, reasons = examined_verdict_of(wrong)
     assert verdict == "fail"
     assert any("the squares measure 73." in reason for reason in reasons)
