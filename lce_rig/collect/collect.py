@@ -226,7 +226,8 @@ class _Collector:
             self.report.counts["the board stood as in a capture before"] += 1
             return
         self._note_sizes(images)
-        events = self._stored.join(frame.events)
+        self._stored.note(frame.events)
+        events = [cut.events for cut in frame.events]
         figures = {**moment.figures, **board_figures(boards)}
         self._store(key, label, images, frame.scans, figures, events)
         known.add(self._names_by_key.get(key, label), boards)

@@ -142,7 +142,7 @@ def _events_before(key: ImageKey, sighting: Sighting, cut: EventCut, rig: Rig) -
     # Frames and events of one camera may have clocks, or delays, of their own.
     time_ns = rig_time_ns(image, rig)
     stamp_ns = (sighting.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
-    return cut.between(stamp_ns - MEMORY_NS, stamp_ns), stamp_ns
+    return cut.events.between(stamp_ns - MEMORY_NS, stamp_ns), stamp_ns
 
 
 def _events_on_board(key: ImageKey, sighting: Sighting, recent: Events, stamp_ns: int, rig: Rig) -> float:
@@ -157,6 +157,6 @@ def _explain_unseen(sighting: Sighting, cuts: Mapping[str, EventCut], rig: Rig) 
     for (camera, channel), refusal in sorted(sighting.unseen.items()):
         if rig.cameras[camera].channels[channel].kind == "events" and camera in cuts:
             stamp_ns = sighting.frame.time_ns - cuts[camera].offset_ns
-            recent = cuts[camera].between(stamp_ns - MEMORY_NS, stamp_ns)
+            recent = cuts[camera].events.between(stamp_ns - MEMORY_NS, stamp_ns)
             return explain_missing_board(recent, stamp_ns, refusal, rig.quality)
     return None

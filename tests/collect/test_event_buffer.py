@@ -65,7 +65,7 @@ def is_cut_exactly(frame: Frame, events: Events, begin_ms: float) -> bool:
     (cut,) = frame.events
     start_ns = T0_NS + round(begin_ms * MS) - BEFORE_NS
     truth = events.between(start_ns, start_ns + BEFORE_NS + 100 * MS + AFTER_NS)
-    found = cut.join()
+    found = cut.events
     columns = ("t_ns", "x", "y", "polarity")
     return all(np.array_equal(getattr(found, name), getattr(truth, name)) for name in columns)
 
@@ -80,7 +80,7 @@ def test_the_events_around_each_scan_are_cut_exactly_whatever_their_packets(edge
     assert len(frames) == 3
     assert all(is_cut_exactly(frame, events, t) for frame, t in zip(frames, begins_ms, strict=True))
     assert all(frame.events[0].missing_ns == 0 for frame in frames)
-    assert frames[0].events[0].join().host_ns is None
+    assert frames[0].events[0].events.host_ns is None
 
 
 def test_a_stream_that_begins_late_or_ends_early_gives_what_it_has_and_says_what_is_missing(rig: Rig) -> None:
@@ -120,7 +120,7 @@ def test_the_profiles_offset_of_the_events_is_applied(rig: Rig) -> None:
     (frame,) = frames_of([*packets(ahead, range(100, 4000, 100)), scan(1300), image(1350)], shifted)
     (cut,) = frame.events
     own = ahead.between(T0_NS + 600 * MS, T0_NS + 2050 * MS)
-    assert np.array_equal(cut.join().t_ns, own.t_ns) and cut.offset_ns == -500 * MS
+    assert np.array_equal(cut.events.t_ns, own.t_ns) and cut.offset_ns == -500 * MS
 
 
 def test_two_event_cameras_get_a_stretch_each(rig: Rig) -> None:
@@ -145,7 +145,7 @@ def test_events_from_before_the_clocks_were_set_back_are_forgotten(rig: Rig) -> 
     ordered = [*sorted(before, key=lambda s: rig_time_ns(s, rig) or 0), image(0), *after, image(2000)]
     frames = list(pair_by_time(ordered, rig, PairingCounts()))
     assert frames[-1].time_ns == T0_NS + 1050 * MS
-    assert all(part.t_ns[-1] < T0_NS + 2000 * MS for part in frames[-1].events[0].parts)
+    assert frames[-1].events[0].events.t_ns[-1] < T0_NS + 2000 * MS
 
 
 def test_memory_holds_some_seconds_of_a_long_stream_also_while_the_lidar_is_silent(rig: Rig) -> None:

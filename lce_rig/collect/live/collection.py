@@ -11,27 +11,24 @@ from contextlib import contextmanager
 
 from lce_rig.collect.live.frame_feed import FrameFeed
 from lce_rig.collect.live.gates import LiveGate, SlowBoards, StillBoards
-from lce_rig.collect.live.guide import GIVE_UP_S, Guide
+from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
 from lce_rig.collect.live.keeper import Keeper, Task
+from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.live.monitor import Monitor
 from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_unseen
 from lce_rig.collect.live.options import Ending, Key, LiveOptions, LiveReport
 from lce_rig.collect.live.pumps import Pumps
 from lce_rig.collect.live.recorder import SampleRecorder
 from lce_rig.collect.live.rig_clock import RigClock, SyncTimes
+from lce_rig.collect.live.search import BoardSearch
 from lce_rig.collect.live.state import LiveState
 from lce_rig.collect.novelty import Placements, capture_poses
 from lce_rig.collect.sync import pair_times
-from lce_rig.collect.watching import BoardWatcher, ImageKey, Moment, Sighting
+from lce_rig.collect.watching import Moment, Sighting
 from lce_rig.core.errors import LceRigError
-from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.sources.live.base import LiveSource
 
-#: How often a picture without a board is searched thoroughly, during which nothing is said.
-THOROUGH_S = 3.0
-#: How often a scan is searched for other things of the board's size while all that are known are followed.
-RESCAN_S = 1.0
 _WAIT_S = 0.1
 _TURN_S = 0.0005
 _NOVEL_M, _NOVEL_DEG = 0.15, 10.0
@@ -67,13 +64,17 @@ def collect_live(
     for capture in session.captures:
         _count_in(capture, session, guides)
     # Leaving closes in turn: nothing new comes, what was decided is written, the devices are let go.
-    with _swift_turns(), Pumps(sources) as pumps:
+    search = BoardSearch(rig, options.search_interval_s)
+    with _swift_turns(), search, Pumps(sources) as pumps:
         clock = RigClock(rig, board)
         with (
-            Keeper(session, guides, rig.quality.min_captures) as keeper,
+            Learning(rig, guides) as learning,
+            Keeper(session, learning) as keeper,
             FrameFeed(rig, pumps, clock, None if recorder is None else recorder.put) as feed,
         ):
-            loop = _Loop(session, options, pumps, clock, feed, keeper, guides, show, recorder)
+            loop = _Loop(
+                session, options, pumps, clock, feed, search, learning, keeper, guides, show, recorder
+            )
             report = loop.run(keys)
         loop.take_kept()
         loop.close_books()
@@ -93,15 +94,6 @@ def _swift_turns() -> Iterator[None]:
         yield
     finally:
         sys.setswitchinterval(before_s)
-
-
-def make_guides(rig: Rig) -> list[Guide]:
-    """Make a guide for every camera with every LiDAR: by its frames where it has any."""
-    keys: list[ImageKey] = [
-        (name, camera.first_channel("frames") or next(iter(camera.channels)))
-        for name, camera in rig.cameras.items()
-    ]
-    return [Guide(rig, key, lidar) for key in keys for lidar in rig.lidars]
 
 
 def _count_in(capture: Capture, session: Session, guides: Sequence[Guide]) -> None:
@@ -128,6 +120,8 @@ class _Loop:
         pumps: Pumps,
         clock: RigClock,
         feed: FrameFeed,
+        search: BoardSearch,
+        learning: Learning,
         keeper: Keeper,
         guides: Sequence[Guide],
         show: Callable[[LiveState], None],
@@ -140,9 +134,7 @@ class _Loop:
         self._show = show
         self._recorder = recorder
         self._began_s = time.monotonic()
-        self._watcher = BoardWatcher(
-            self._rig, options.search_interval_s, thorough_interval_s=THOROUGH_S, rescan_interval_s=RESCAN_S
-        )
+        self._search, self._learning = search, learning
         self._gate: LiveGate | None = None
         self._n_captures = len(session.captures)
         names = [capture.name for capture in session.captures]
@@ -159,7 +151,7 @@ class _Loop:
             self.take_kept()
             if frame is not None:
                 self.report.n_frames += 1
-                self._see(self._watcher.sight(frame))
+                self._see(self._search.sight(frame))
             key = keys()
             self._obey(key)
             ending = self._find_ending(key)
@@ -170,7 +162,8 @@ class _Loop:
                 return self.report
 
     def take_kept(self) -> None:
-        """Count the captures that have become safe."""
+        """Count the captures that have become safe, and take what they taught."""
+        self._learning.teach()
         for kept in self._keeper.take():
             self._n_captures += 1
             self.report.captured.append(kept.name)
@@ -187,7 +180,8 @@ class _Loop:
         if report.ending == "exhausted":
             waited_s = time.monotonic() - self._captured_s
             report.notes.append(f"no capture in the last {waited_s:.0f} s, {self._monitor.last_words()}")
-        report.notes += self._keeper.notes() + self._clock.problems() + self._clock.account()
+        report.notes += self._keeper.notes() + self._learning.notes()
+        report.notes += self._clock.problems() + self._clock.account()
         if self._recorder is not None:
             report.notes += self._recorder.problems()
         self._session.journal(
@@ -229,7 +223,7 @@ class _Loop:
         present = sighting.images[guide.key].T_cam_board
         refusal = guide.adds_nothing(present)
         if refusal is None:
-            confirmed = self._watcher.confirm(moment)
+            confirmed = self._search.confirm(moment)
             if isinstance(confirmed, Moment):
                 self._capture(confirmed)
                 return Narration("saving", "captured")
@@ -270,7 +264,7 @@ class _Loop:
         if self._seeing_guide(sighting) is None:
             self._monitor.cue("refused", "not captured: not every sensor sees the board")
             return
-        confirmed = self._watcher.confirm(Moment(sighting, {"by_hand": 1.0}))
+        confirmed = self._search.confirm(Moment(sighting, {"by_hand": 1.0}))
         if isinstance(confirmed, Moment):
             self._capture(confirmed)
         else:

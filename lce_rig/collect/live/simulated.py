@@ -6,11 +6,9 @@ is too slow for that, all of it goes in slow motion: sensors, stamps and the per
 """
 
 import multiprocessing
-import signal
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from types import TracebackType
 
@@ -19,6 +17,7 @@ import numpy as np
 from lce_rig.collect.guidance import HeldPose, Person, View, build_pose, model_sensors
 from lce_rig.collect.live.simulated_pace import SimulatedPace
 from lce_rig.collect.live.state import LiveState
+from lce_rig.collect.live.worker import start_without_interrupts
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError, ProfileError, SourceError
 from lce_rig.core.geometry import Array, invert
@@ -148,7 +147,7 @@ class SimulatedRig:
         self._connection, theirs = context.Pipe()
         arguments = theirs, self._rig, self._seed, self._person, dict(self._views)
         self._process = context.Process(target=_simulate, args=arguments, name="simulated rig", daemon=True)
-        _start_without_interrupts(self._process)
+        start_without_interrupts(self._process)
         theirs.close()
         try:
             if not self._connection.poll(START_S * len(self._views)):
@@ -201,17 +200,6 @@ class SimulatedRig:
             self._by_sensor[sample.sensor].put(sample)
             if sample.sensor == self._counted:
                 self.pace.turn()
-
-
-def _start_without_interrupts(process: multiprocessing.process.BaseProcess) -> None:
-    """Start a process that Ctrl-C does not reach: a terminal sends it to both, and ours ends the other."""
-    # Starting the tracker would let interrupts through again.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        process.start()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _view(rig: Rig, camera: str) -> View:

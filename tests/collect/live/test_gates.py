@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 
-from lce_rig.collect.live.collection import make_guides
 from lce_rig.collect.live.gates import StillBoards
+from lce_rig.collect.live.guide import make_guides
 from lce_rig.collect.pairing import Frame
 from lce_rig.collect.watching import Sighting
 from lce_rig.core.geometry import Array
