@@ -14,6 +14,8 @@ AFTER_NS = 150_000_000
 """... and after its last, for the board to be followed."""
 
 _LEAST_EVENTS = 1 << 16
+# Of what is held: more room costs memory, less of it copies more often.
+_ROOM = 1.5
 # A clock that is fitted anew while events come may move them back by microseconds.
 _MAX_BACK_NS = 1_000_000
 
@@ -129,7 +131,7 @@ class _Stream:
 
     def _begin_block(self, n_more: int) -> None:
         held = self._held()
-        self._block = _block_like(held, max(_LEAST_EVENTS, 2 * (len(held) + n_more)))
+        self._block = _block_like(held, max(_LEAST_EVENTS, round(_ROOM * (len(held) + n_more))))
         _write(self._block, 0, held)
         self._start, self._end = 0, len(held)
 
