@@ -14,25 +14,24 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.background import estimate_shifts, move_ends
 from lce_rig.calibrate.draws import Draws, draw_subsets
 from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.features import CaptureFeatures, extract_features
 from lce_rig.calibrate.initial import drop_uncertain, solve_planes
 from lce_rig.calibrate.metrics import error_to_reference
-from lce_rig.calibrate.observability import linearise, require_observable
+from lce_rig.calibrate.observability import require_observable
 from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.calibrate.outliers import reject_outliers
-from lce_rig.calibrate.placements import group_placements
-from lce_rig.calibrate.problem import Problem, Solutions, Weights
 from lce_rig.calibrate.report import name_sigmas, report_estimate
 from lce_rig.calibrate.systematic import ring_sensitivities
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Certificate, Observation
+from lce_rig.residuals.features import CaptureFeatures, extract_features
+from lce_rig.residuals.moments import Problem, Solutions, Weights
+from lce_rig.residuals.placements import group_placements
+from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS
 from lce_rig.solvers.covariance import systematic_covariance
-from lce_rig.solvers.jackknife import jackknife_covariance, sum_by_group
 
 # Weights given by the user count in captures with residuals of this size, which sets the scale of the prior.
 NOMINAL_SIGMA_M = 0.01
-_PLANE_FREEDOMS = 3
 # Names of what `estimate_shifts` finds.
 _SHIFTS = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m")
 
@@ -54,14 +53,14 @@ def calibrate_by_algorithm_1(
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
-    features = [extract_features(observation, board, options) for observation in observations]
+    features = [extract_features(observation, board, options.features) for observation in observations]
     problem, T_planes = _start(features, board, _weights(options, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
     fitted, shifts = list(observations), dict.fromkeys(_SHIFTS, 0.0)
     if problem.n_shift:
         shifts_m = estimate_shifts(observations, features, T_planes, board)
         if shifts_m.any():
             fitted = move_ends(observations, features, T_planes, board, shifts_m)
-            features = [extract_features(observation, board, options) for observation in fitted]
+            features = [extract_features(observation, board, options.features) for observation in fitted]
             problem = Problem(features, board, problem.weights)
         shifts = dict(zip(_SHIFTS, shifts_m.tolist(), strict=True))
 
@@ -123,7 +122,7 @@ def _weights(
     unit = 1 / NOMINAL_SIGMA_M**2
     n_ends = float(np.mean([len(f.edge_points) for f in features]))
     if options.plane_weight is None or options.edge_weight is None:
-        plane, edge = _PLANE_FREEDOMS / plane_sigma_m**2, n_ends / edge_sigma_m**2
+        plane, edge = PLANE_FREEDOMS / plane_sigma_m**2, n_ends / edge_sigma_m**2
     else:
         plane, edge = options.plane_weight * unit, options.edge_weight * unit
     return Weights(
@@ -146,19 +145,14 @@ def _covariances(
         What the scatter between captures shows, and what the LiDAR's errors common to them add.
     """
     x, edge_ids = solution.x[0], solution.edge_ids[0]
-    gradients, hessians = linearise(problem, x, edge_ids)
-    prior = np.zeros_like(hessians[0])
-    if problem.weights.shift_prior is not None:
-        prior[6, 6] = problem.weights.shift_prior
-    # Captures of one placement share its errors: they are left out together.
-    placement = group_placements(observations)
-    together = [sum_by_group(each, placement) for each in (gradients, hessians)]
-    scatter = jackknife_covariance(together[0], together[1], prior)
+    cost = problem.quadratics(x, edge_ids, group_placements(observations))
+    scatter = cost.jackknife_covariance()
     laser_m, offset_m = options.laser_bias_sigma_m, options.range_offset_sigma_m
     if laser_m == 0 and offset_m == 0:
         return scatter, np.zeros_like(scatter)
-    information = hessians.sum(axis=0) + prior
-    sensitivities = ring_sensitivities(observations, board, options, problem, x, edge_ids, information)
+    sensitivities = ring_sensitivities(
+        observations, board, options.features, problem, x, edge_ids, cost.information
+    )
     return scatter, systematic_covariance(sensitivities, laser_m, offset_m)
 
 

@@ -11,14 +11,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.expansion import SHIFT, end_rows
-from lce_rig.calibrate.features import CaptureFeatures
+from lce_rig.calibrate.expansion import SHIFT
 from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array, transform
+from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Observation
+from lce_rig.residuals.features import CaptureFeatures
+from lce_rig.residuals.plane_and_ends import end_residuals, end_rows
+from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.solvers.covariance import symmetric_inverse
-from lce_rig.solvers.jackknife import jackknife_scatter, leave_one_out_moves
 
 BLENDS_M = 0.35
 """Echoes from surfaces nearer to each other than this blend into one."""
@@ -109,8 +110,8 @@ def _fit_shifts(
         x = np.linalg.solve(information, A.T @ (weights * inside_m))
     gradients = np.add.reduceat(A * (weights * (A @ x - inside_m))[:, None], first, axis=0)
     hessians = np.add.reduceat(A[:, :, None] * (weights[:, None] * A)[:, None, :], first, axis=0)
-    moves = leave_one_out_moves(gradients, hessians, hessians.sum(axis=0) + prior)
-    scatter = jackknife_scatter(moves)
+    cost = Quadratics(gradients, hessians, prior, prior @ x, np.arange(len(first)))
+    scatter = jackknife_scatter(cost.without_each() - cost.optimum())
     return x[-_N_SHIFTS:], scatter[-_N_SHIFTS:, -_N_SHIFTS:]
 
 
@@ -134,7 +135,7 @@ def move_ends(
     """Take the shifts (3,) of `estimate_shifts` off ring ends."""
     moved = []
     for observation, f in zip(observations, features, strict=True):
-        edge = board.nearest_edge(transform(f.T_board_cam @ T_cam_lidar, f.edge_points))
+        _, edge = end_residuals(f, T_cam_lidar, board)
         outwards = f.edge_normals[edge] @ T_cam_lidar[:3, :3]
         shift = (describe_background(observation.lidar) @ shifts_m)[:, None] * outwards
         lidar = replace(observation.lidar, edge_points=observation.lidar.edge_points - shift)

@@ -11,18 +11,17 @@ import numpy as np
 
 from lce_rig.calibrate.doubt import SURPRISING_CHI2, Doubt, Verdict
 from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.expansion import Expansion
 from lce_rig.calibrate.halves import contrast_halves, doubt_halves
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.picture_terms import stack_pictures
 from lce_rig.calibrate.mean_pose import mean_pose
-from lce_rig.calibrate.placements import group_placements
 from lce_rig.calibrate.relative_pose import relative_covariance, relative_pose
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation
+from lce_rig.residuals.placements import group_placements
+from lce_rig.residuals.quadratics import Quadratics, without_prior
 from lce_rig.rig import CalibrationSettings, VerdictSettings
 from lce_rig.solvers.covariance import symmetric_inverse
-from lce_rig.solvers.jackknife import jackknife_covariance, sum_by_group
 
 # Fewer placements show no scatter.
 _MIN_PLACEMENTS = 4
@@ -46,6 +45,7 @@ class PicturePose:
         board_rms_m: how far apart the two cameras put the middle of a board, rms.
         scatter: of single boards about it, in standard deviations that poses in pictures usually have.
         expansion: of the cost about T_second_first, capture by capture.
+        centres: (F, 3) middle of the board in each, frame of the first camera, m.
     """
 
     T_second_first: Array
@@ -53,7 +53,8 @@ class PicturePose:
     captures: tuple[str, ...]
     board_rms_m: float
     scatter: float
-    expansion: Expansion
+    expansion: Quadratics
+    centres: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,15 +141,15 @@ def pose_from_pictures(shared: Sequence[tuple[Observation, Observation]]) -> Pic
     chi2 = float(np.einsum("ki,kij,kj->", apart, information, apart))
     hessians = weight[:, None, None] * information
     gradients = -(hessians @ apart[..., None])[..., 0]
-    none, board_rms_m = np.zeros((6, 6)), _board_rms_m(shared, mean)
-    expansion = Expansion(mean, gradients, hessians, none, placement, T_first[:, :3, 3])
+    expansion = without_prior(gradients, hessians, placement)
     scatter = float(np.sqrt(chi2 / (6 * (len(T) - 1))))
-    pulls, stiffness = (sum_by_group(each, placement) for each in (gradients, hessians))
-    if len(pulls) < _MIN_JACKKNIFE:
-        cov = max(scatter, 1.0) ** 2 * symmetric_inverse(stiffness.sum(axis=0))
+    if len(expansion.groups) < _MIN_JACKKNIFE:
+        cov = max(scatter, 1.0) ** 2 * expansion.covariance()
     else:
-        cov = jackknife_covariance(pulls, stiffness, none)
-    return PicturePose(mean, cov, tuple(one.capture for one in firsts), board_rms_m, scatter, expansion)
+        cov = expansion.jackknife_covariance()
+    captures = tuple(one.capture for one in firsts)
+    board_rms_m = _board_rms_m(shared, mean)
+    return PicturePose(mean, cov, captures, board_rms_m, scatter, expansion, T_first[:, :3, 3])
 
 
 def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
@@ -191,7 +192,8 @@ def doubt_cameras(
         return []
     # Pictures are exact enough to show any change that matters.
     strict = limits.model_copy(update={"max_change": limits.max_camera_difference})
-    changed = doubt_halves(contrast_halves(pair.pictures.expansion), pair.pictures.captures, target, strict)
+    halves = contrast_halves(pair.pictures.expansion, pair.pictures.centres)
+    changed = doubt_halves(halves, pair.pictures.captures, target, strict)
     first, second = names
     return [
         *(

@@ -17,7 +17,6 @@ from lce_rig.calibrate.consensus import Consensus
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.motion import PoseSamples, fit_motions
 from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates
-from lce_rig.calibrate.problem import Weights
 from lce_rig.calibrate.shared_scans import (
     Clocks,
     SharedScan,
@@ -31,6 +30,8 @@ from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference
 from lce_rig.core.results import ChannelResult, Observation
+from lce_rig.residuals.moments import Weights
+from lce_rig.residuals.plane_and_ends import along_normals
 
 # Fewer captures with known motion say nothing about clocks.
 _MIN_MOVING = 6
@@ -233,12 +234,10 @@ def _channel_result(
 
 def depth_scatter_m(estimate: CalibrationEstimate) -> float:
     """Compute the standard deviation over captures of the LiDAR's mean distance from the camera's plane."""
-    T = estimate.T_cam_lidar
-    depths = []
-    for observation in estimate.observations.values():
-        T_cam_board = observation.image.T_cam_board
-        middle = T[:3, :3] @ observation.lidar.points.mean(axis=0) + T[:3, 3]
-        depths.append(float(T_cam_board[:3, 2] @ (middle - T_cam_board[:3, 3])))
+    seen = estimate.observations.values()
+    T_cam_board = np.array([observation.image.T_cam_board for observation in seen])
+    middles = np.array([observation.lidar.points.mean(axis=0) for observation in seen])
+    depths = along_normals(T_cam_board[:, :3, 2], T_cam_board[:, :3, 3], middles, estimate.T_cam_lidar)
     return float(np.std(depths))
 
 

@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.expansion import Expansion
 from lce_rig.core.geometry import Array
+from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.rig import VerdictSettings
-from lce_rig.solvers.jackknife import jackknife_scatter
 
 _N_DRAWS = 300
 
@@ -54,7 +53,7 @@ class Spread:
         return ratios[words], words
 
 
-def resample(expansion: Expansion, seed: int = 0) -> Spread:
+def resample(expansion: Quadratics, seed: int = 0) -> Spread:
     """Spread the extrinsic by resampling placements.
 
     Args:

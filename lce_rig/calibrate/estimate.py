@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from lce_rig.calibrate.expansion import Expansion
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Certificate, Metrics, Observation, Refusal
+from lce_rig.residuals.quadratics import Quadratics
 
 
 @dataclass(frozen=True)
@@ -68,5 +68,5 @@ class CalibrationEstimate:
     weak_direction: str
     diagnostics: Mapping[str, float]
     method: str = "paper"
-    expansion: Expansion | None = None
+    expansion: Quadratics | None = None
     estimated_with: tuple[str, ...] = ()

@@ -80,8 +80,9 @@ def examine(
         rig.verdict.control_sigmas,
     )
     rings = np.unique(np.concatenate([observation.lidar.ring for observation in observations]))
+    centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
     nuisances = estimate_nuisances(expansion, rings)
-    return Examination(widened, remark, contrast_halves(settled), control, nuisances, intrinsics)
+    return Examination(widened, remark, contrast_halves(settled, centres), control, nuisances, intrinsics)
 
 
 def _thinned(views: Sequence[View]) -> list[View]:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lce_rig.calibrate.doubt import Doubt, Verdict
-from lce_rig.calibrate.expansion import Expansion
 from lce_rig.core.geometry import Array, tangent_sizes
+from lce_rig.residuals.quadratics import Quadratics
 from lce_rig.rig import CalibrationSettings, VerdictSettings
 
 # Fewer placements are not worth halving.
@@ -48,11 +48,12 @@ class Contrast:
     n_first: int
 
 
-def contrast_halves(expansion: Expansion, seed: int = 0) -> tuple[Contrast, ...]:
+def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tuple[Contrast, ...]:
     """Compare shares that ought to agree.
 
     Args:
-        expansion: of captures in the order in which they were taken, settled.
+        expansion: of F captures in the order in which they were taken, settled.
+        centres: (F, 3) middle of the board in each, frame camera, m.
         seed: of the lots.
 
     Returns:
@@ -65,10 +66,10 @@ def contrast_halves(expansion: Expansion, seed: int = 0) -> tuple[Contrast, ...]
     order = np.argsort(np.random.default_rng(seed).random((_N_LOTS, n_placements)), axis=1)
     by_lot, _ = _chi2(expansion, (order < n_placements // 2) @ expansion.groups)
     unit = max(float(np.median(by_lot)) / _MEDIAN_CHI2, 1e-12)
-    x, y, z = expansion.centres.T
+    x, y, z = centres.T
     found = [_changed_on_the_way(expansion, unit)]
     for first, second, key in (
-        ("near", "far", np.linalg.norm(expansion.centres, axis=1)),
+        ("near", "far", np.linalg.norm(centres, axis=1)),
         ("left", "right", x / z),
         ("upper", "lower", y / z),
     ):
@@ -78,7 +79,7 @@ def contrast_halves(expansion: Expansion, seed: int = 0) -> tuple[Contrast, ...]
     return tuple(found)
 
 
-def _changed_on_the_way(expansion: Expansion, unit: float) -> Contrast:
+def _changed_on_the_way(expansion: Quadratics, unit: float) -> Contrast:
     """Find the capture from which on the others differ most; with as many chances as there are captures."""
     n = len(expansion.gradients)
     cuts = np.arange(_MIN_SHARE, n - _MIN_SHARE + 1)
@@ -94,7 +95,7 @@ def _tail(chi2: float) -> float:
     return float(chdtrc(6, chi2))
 
 
-def _chi2(expansion: Expansion, shares: Array) -> tuple[Array, Array]:
+def _chi2(expansion: Quadratics, shares: Array) -> tuple[Array, Array]:
     """Hold shares (B, F) against the rest: squared distance (B,) in units of noise, tangents (B, 6)."""
     H_first = np.tensordot(shares, expansion.hessians, axes=1)
     g_first = shares @ expansion.gradients

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.doubt import Doubt, Verdict
-from lce_rig.calibrate.expansion import FIRST_RING, SCALE, SHIFT, Expansion
+from lce_rig.calibrate.expansion import FIRST_RING, SCALE, SHIFT
 from lce_rig.core.board import Board
+from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.rig import LidarSettings, VerdictSettings
-from lce_rig.solvers.jackknife import jackknife_scatter
 
 # A scale that is off by this many times the limit leaves nothing to be used.
 _SCALE_FAIL = 2.5
@@ -40,7 +40,7 @@ class Nuisances:
     laser: int
 
 
-def estimate_nuisances(expansion: Expansion, rings: NDArray[np.int16]) -> Nuisances:
+def estimate_nuisances(expansion: Quadratics, rings: NDArray[np.int16]) -> Nuisances:
     """Estimate what all captures share, the scale without any prior.
 
     Args:
@@ -62,7 +62,7 @@ def estimate_nuisances(expansion: Expansion, rings: NDArray[np.int16]) -> Nuisan
     )
 
 
-def _sigma(expansion: Expansion, unknown: int) -> float:
+def _sigma(expansion: Quadratics, unknown: int) -> float:
     """Estimate a deviation from what single errors do, and from the estimates without each placement."""
     without = expansion.without_each()[:, [unknown]]
     scatter = jackknife_scatter(without - without.mean(axis=0))[0, 0]

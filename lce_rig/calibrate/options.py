@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.residuals.features import FeatureSettings
 
 Method = Literal["ml", "paper", "zhou", "corners"]
 
@@ -73,6 +74,11 @@ class CalibrateOptions:
     range_offset_sigma_m: float = 0.0
     reject_outliers: bool = True
     min_captures: int = 3
+
+    @property
+    def features(self) -> FeatureSettings:
+        """How points and ring ends come onto the board's plane."""
+        return FeatureSettings(self.point_projection, self.half_step)
 
     @property
     def edge_shift_precision(self) -> float | None:

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.calibrate.options import CalibrateOptions
-from lce_rig.calibrate.problem import Problem
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
+from lce_rig.residuals.features import CaptureFeatures
+from lce_rig.residuals.moments import Problem
 
 _DEVIATIONS = 6.0
 _TIMES_MEDIAN = 3.0

@@ -66,7 +66,7 @@ class LineFit:
         covariance is r > 1 times that of independent readings, that one is multiplied by r.
 
         References:
-            `lce_rig.solvers.jackknife.jackknife_covariance`, which has the factor as well.
+            `lce_rig.residuals.quadratics.Quadratics.jackknife_covariance`, which has the factor as well.
         """
         design, value, information = self._normal()
         inverse = np.linalg.inv(information)

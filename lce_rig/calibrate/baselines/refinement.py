@@ -4,16 +4,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lce_rig.calibrate.placements import group_placements
 from lce_rig.core.geometry import Array, pose
 from lce_rig.core.results import Observation
-from lce_rig.solvers.jackknife import jackknife_covariance, sum_by_group
+from lce_rig.residuals.placements import group_placements
+from lce_rig.residuals.plane_and_ends import residual_rows
+from lce_rig.residuals.quadratics import without_prior
 from lce_rig.solvers.registration import (
     N_ROTATION,
     eliminate_linear,
     linear_unknowns,
     minimise_on_so3,
-    residual_rows,
     tangent_basis,
     vec_rotation,
     with_one,
@@ -71,7 +71,7 @@ def placement_covariance(moments: Array, T: Array, observations: Sequence[Observ
         T: (4, 4) the minimum.
         observations: of each capture.
     """
-    groups = sum_by_group(moments, group_placements(observations))
     x = with_one(np.concatenate([vec_rotation(T[:3, :3]), T[:3, 3]]))
     J = tangent_basis(T[:3, :3], 0)
-    return jackknife_covariance(groups @ x @ J, J.T @ groups @ J, np.zeros((6, 6)))
+    cost = without_prior(moments @ x @ J, J.T @ moments @ J, group_placements(observations))
+    return cost.jackknife_covariance()

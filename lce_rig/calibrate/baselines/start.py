@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 
-from lce_rig.calibrate.features import CaptureFeatures, extract_features
 from lce_rig.calibrate.initial import solve_planes
 from lce_rig.calibrate.observability import require_observable
 from lce_rig.calibrate.options import CalibrateOptions
-from lce_rig.calibrate.problem import Problem, Weights
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
+from lce_rig.residuals.features import CaptureFeatures, extract_features
+from lce_rig.residuals.moments import Problem, Weights
 
 
 def start_from_planes(
@@ -28,7 +28,7 @@ def start_from_planes(
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
-    features = [extract_features(observation, board, options) for observation in observations]
+    features = [extract_features(observation, board, options.features) for observation in observations]
     problem = Problem(features, board, Weights(1.0, 0.0, None))
     T_planes = solve_planes(features, problem)
     require_observable(features, problem, T_planes)

@@ -33,7 +33,8 @@ from lce_rig.calibrate.report import report_estimate
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, pose
 from lce_rig.core.results import Observation
-from lce_rig.solvers.registration import residual_rows, rotation_from_directions
+from lce_rig.residuals.plane_and_ends import residual_rows
+from lce_rig.solvers.registration import rotation_from_directions
 
 
 def calibrate_by_lines_and_planes(

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.expansion import Expansion
-from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.refine import JointEstimate, refine
@@ -17,11 +15,13 @@ from lce_rig.calibrate.likelihood.spread import inflate
 from lce_rig.calibrate.likelihood.system import PER_CAMERA
 from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.calibrate.options import CalibrateOptions
-from lce_rig.calibrate.placements import group_placements
 from lce_rig.calibrate.report import name_sigmas, report_estimate
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
+from lce_rig.residuals.features import extract_features
+from lce_rig.residuals.placements import group_placements
+from lce_rig.residuals.quadratics import Quadratics
 from lce_rig.solvers.covariance import symmetric_inverse
 
 # A profile that states no error of the ranges is taken at its word.
@@ -93,7 +93,7 @@ def describe(
         options: switches of the features.
         figures: diagnostics; those of the start are overwritten.
     """
-    features = [extract_features(observation, board, options) for observation in used]
+    features = [extract_features(observation, board, options.features) for observation in used]
     return report_estimate(
         joint.T_cam_lidar[camera],
         cov,
@@ -107,7 +107,7 @@ def describe(
     )
 
 
-def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp]) -> Expansion:
+def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp]) -> Quadratics:
     """Expand the cost about a joint estimate, in the extrinsics alone, the camera's own first.
 
     Constant errors are held where they are.
@@ -120,16 +120,10 @@ def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp])
     n_cameras = len(joint.T_cam_lidar)
     order = [camera, *(c for c in range(n_cameras) if c != camera)]
     mine = np.concatenate([np.arange(6) + PER_CAMERA * c for c in order])
-    T = joint.T_cam_lidar[camera]
-    return Expansion(
-        T,
-        joint.system.gradients[:, mine],
-        joint.system.hessians[:, mine[:, None], mine],
-        # Shares of captures that another camera did not see leave its extrinsic open: 1 m, 1 rad.
-        np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6)),
-        placement,
-        (T @ joint.T_lidar_board)[:, :3, 3],
-    )
+    gradients, hessians = joint.system.gradients[:, mine], joint.system.hessians[:, mine[:, None], mine]
+    # Shares of captures that another camera did not see leave its extrinsic open: 1 m, 1 rad.
+    prior = np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6))
+    return Quadratics(gradients, hessians, prior, np.zeros(len(mine)), placement)
 
 
 def figures_of(joint: JointEstimate, camera: int) -> dict[str, float]:

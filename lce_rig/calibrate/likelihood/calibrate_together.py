@@ -17,11 +17,11 @@ from lce_rig.calibrate.likelihood.levels import PoseLevels
 from lce_rig.calibrate.likelihood.refine import refine
 from lce_rig.calibrate.likelihood.spread import inflate
 from lce_rig.calibrate.options import CalibrateOptions
-from lce_rig.calibrate.placements import group_shared_placements
 from lce_rig.calibrate.shared_scans import REMOVE_OTHERS, take_apart
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation, Refusal
+from lce_rig.residuals.placements import group_shared_placements
 from lce_rig.solvers.covariance import symmetric_inverse
 
 # Diagnostics that hold a camera's pose errors beyond corner noise, by the level that they are.

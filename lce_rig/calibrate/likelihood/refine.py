@@ -15,10 +15,10 @@ from lce_rig.calibrate.likelihood.levels_fit import fit_levels
 from lce_rig.calibrate.likelihood.picture_terms import Pictures, stack_pictures
 from lce_rig.calibrate.likelihood.scans import N_FIELDS, StackedScans, interior, lens_fields, stack_scans
 from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, System, Terms, assemble, linearise
-from lce_rig.calibrate.placements import group_placements
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import Observation
+from lce_rig.residuals.placements import group_placements
 from lce_rig.solvers.covariance import symmetric_inverse
 
 # Steps between changes of the levels, and at most in the end.

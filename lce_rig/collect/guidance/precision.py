@@ -43,8 +43,8 @@ class Precision:
     def claimed(self, n_captures: int) -> Array:
         """Predict the covariance (..., 6, 6) that the calibration will state after so many captures.
 
-        It estimates the scatter from the captures themselves, and makes up for how few they are (equation (2)
-        of `jackknife_covariance`).
+        It estimates the scatter from the captures themselves, and makes up for how few they are (as
+        `Quadratics.jackknife_covariance` does).
         """
         few = (n_captures - 1) / max(n_captures - N_UNKNOWNS - 2, 2)
         return np.asarray(max(few, 1.0) * self.scatter + self.lasers + self.offset)

@@ -12,8 +12,8 @@ from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.refine import refine
 from lce_rig.calibrate.likelihood.scans import turn_about_z
 from lce_rig.calibrate.likelihood.spread import inflate
-from lce_rig.calibrate.placements import group_placements
 from lce_rig.core.geometry import difference, exp_so3, invert, perturb, pose
+from lce_rig.residuals.placements import group_placements
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, simulate
 
 ML = CalibrateOptions(method="ml", n_draws=3, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)

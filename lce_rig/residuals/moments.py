@@ -17,14 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, pose
+from lce_rig.residuals.features import CaptureFeatures
+from lce_rig.residuals.plane_and_ends import residual_rows
+from lce_rig.residuals.quadratics import Quadratics
 from lce_rig.solvers.certificate import Certificates, solve_globally
 from lce_rig.solvers.registration import (
     eliminate_linear,
     linear_unknowns,
-    residual_rows,
+    tangent_basis,
     vec_rotation,
     with_one,
 )
@@ -182,6 +184,37 @@ class Problem:
             R, certificates = solve_globally(Q, R)
             linear = linear_unknowns(L, R)
         return Solutions(R, linear, edge_ids, certificates)
+
+    def quadratics(
+        self,
+        x: Array,
+        edge_ids: NDArray[np.int8],
+        placement: NDArray[np.intp] | None = None,
+        weights: Weights | None = None,
+    ) -> Quadratics:
+        """Expand each capture's cost in the tangent (translation m, rotation rad, edge shift m).
+
+        Args:
+            x: (m,) solution [vec R; t; d; 1].
+            edge_ids: (n,) its association.
+            placement: (F,) numbers of the board placements; each capture's own by default.
+            weights: other weights than the problem's.
+        """
+        w = weights or self.weights
+        M = self.moments(
+            np.eye(self.n_captures),
+            np.repeat(edge_ids[None], self.n_captures, axis=0),
+            Weights(w.plane, w.edge, None if w.shift_prior is None else 0.0),
+        )
+        J = tangent_basis(x[:9].reshape(3, 3).T, self.n_shift)
+        prior = np.zeros((6 + self.n_shift, 6 + self.n_shift))
+        if w.shift_prior is not None:
+            prior[6, 6] = w.shift_prior
+        prior_gradient = prior[:, -1] * x[-2]
+        captures = np.arange(self.n_captures)
+        return Quadratics(
+            (M @ x) @ J, J.T @ M @ J, prior, prior_gradient, captures if placement is None else placement
+        )
 
     def errors(self, x: Array) -> tuple[Array, Array]:
         """Compute each capture's rms plane and edge residual in m, (B, F) each.

@@ -1,16 +1,33 @@
 """From a pair of detected boards to the points, planes and lines that are fitted to each other."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, skew, transform
 from lce_rig.core.results import LidarBoard, Observation
 
 _GRAZING_COSINE = 0.2
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """How what the LiDAR measured comes onto the board's plane; benchmarks compare the choices.
+
+    Attributes:
+        point_projection: along the rays ("ray"), along the plane's normal ("normal"), or not at all ("none").
+        half_step: move ring ends outwards by half an azimuth step, to where the edge is expected.
+    """
+
+    point_projection: Literal["ray", "normal", "none"] = "ray"
+    half_step: bool = True
+
+
+AS_FITTED = FeatureSettings()
+AS_MEASURED = FeatureSettings(half_step=False)
+"""Ring ends where the LiDAR saw them, for residuals that are reported."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +61,15 @@ class CaptureFeatures:
     cov_normal: Array
 
 
-def extract_features(observation: Observation, board: Board, options: CalibrateOptions) -> CaptureFeatures:
+def extract_features(
+    observation: Observation, board: Board, settings: FeatureSettings = AS_FITTED
+) -> CaptureFeatures:
     """Build what one capture contributes to the cost."""
     lidar = observation.lidar
-    edge_points, edge_steps_m = _ring_ends(lidar, options)
+    edge_points, edge_steps_m = _ring_ends(lidar, settings)
     return CaptureFeatures(
         capture=observation.capture,
-        plane_points=_onto_plane(lidar.points, lidar.plane, options),
+        plane_points=_onto_plane(lidar.points, lidar.plane, settings),
         edge_points=edge_points,
         edge_steps_m=edge_steps_m,
         lidar_normal=lidar.plane[:3],
@@ -100,16 +119,16 @@ def normal_covariance(normal: Array, cov_pose: Array) -> Array:
     return np.asarray(cross @ cov_pose[3:, 3:] @ cross.T)
 
 
-def _onto_plane(points: Array, plane: Array, options: CalibrateOptions) -> Array:
+def _onto_plane(points: Array, plane: Array, settings: FeatureSettings) -> Array:
     """Project points (N, 3) onto the plane n.p + d = 0.
 
     A LiDAR errs along its rays, so that the ray's intersection with the plane is the point it measured; along
     the normal an error of range also moves the point sideways, by its size times the sine of the incidence.
     """
     points = np.asarray(points, dtype=np.float64)
-    if options.point_projection == "none":
+    if settings.point_projection == "none":
         return points
-    if options.point_projection == "normal":
+    if settings.point_projection == "normal":
         return np.asarray(points - (points @ plane[:3] + plane[3])[:, None] * plane[:3])
     return _meet_plane(points, plane)
 
@@ -123,7 +142,7 @@ def _meet_plane(points: Array, plane: Array) -> Array:
     return np.asarray(np.where(is_grazing[:, None], straight, points * scale[:, None]))
 
 
-def _ring_ends(lidar: LidarBoard, options: CalibrateOptions) -> tuple[Array, Array]:
+def _ring_ends(lidar: LidarBoard, settings: FeatureSettings) -> tuple[Array, Array]:
     """Place the ring ends (M, 3) on the plane, and measure the spacing (M,) of their rings there.
 
     The edge lies between the last ray that met the board and the next one, which did not: on average half a
@@ -140,6 +159,6 @@ def _ring_ends(lidar: LidarBoard, options: CalibrateOptions) -> tuple[Array, Arr
         axis=1,
     )
     half_steps = _meet_plane(turned, lidar.plane) - _meet_plane(ends, lidar.plane)
-    placed = _onto_plane(ends, lidar.plane, options)
+    placed = _onto_plane(ends, lidar.plane, settings)
     steps_m = 2 * np.linalg.norm(half_steps, axis=1)
-    return (placed + half_steps if options.half_step else placed), steps_m
+    return (placed + half_steps if settings.half_step else placed), steps_m

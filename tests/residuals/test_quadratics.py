@@ -2,12 +2,7 @@
 
 import numpy as np
 
-from lce_rig.solvers.jackknife import (
-    jackknife_covariance,
-    jackknife_scatter,
-    leave_one_out_moves,
-    sum_by_group,
-)
+from lce_rig.residuals.quadratics import jackknife_scatter, without_prior
 
 
 def sample_regressions(n_groups, n_trials, seed=0):
@@ -22,7 +17,8 @@ def sample_regressions(n_groups, n_trials, seed=0):
         estimate = np.linalg.solve(hessians.sum(axis=0), right.sum(axis=0))
         gradients = (design.swapaxes(1, 2) @ (design @ estimate - noise)[..., None])[..., 0]
         errors.append(estimate)
-        covariances.append(jackknife_covariance(gradients, hessians, np.zeros((3, 3))))
+        cost = without_prior(gradients, hessians, np.arange(n_groups))
+        covariances.append(cost.jackknife_covariance())
     return np.array(errors), np.array(covariances)
 
 
@@ -49,8 +45,7 @@ def test_moves_are_those_of_estimates_made_anew_without_each_group():
     estimate = fit(group >= 0)
     gradients = np.einsum("fni,fn->fi", A, A @ estimate - b)
     hessians = np.swapaxes(A, 1, 2) @ A
-    sums = [sum_by_group(values, group) for values in (gradients, hessians)]
-    moves = leave_one_out_moves(*sums, hessians.sum(axis=0))
+    moves = without_prior(gradients, hessians, group).without_each()
     anew = np.array([fit(group != k) for k in range(4)])
     np.testing.assert_allclose(estimate + moves, anew, atol=1e-12)
     expected = 3 / 4 * (anew - estimate).T @ (anew - estimate)

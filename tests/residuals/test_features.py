@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate.features import extract_features, normal_covariance
-from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.core.geometry import exp_so3, transform
 from lce_rig.core.results import Observation
+from lce_rig.residuals.features import FeatureSettings, extract_features, normal_covariance
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 
@@ -19,7 +18,7 @@ def observe(seed=0, **scenario):
 
 def test_points_are_projected_along_their_rays_by_default():
     observation = observe()
-    points = extract_features(observation, BOARD, CalibrateOptions()).plane_points
+    points = extract_features(observation, BOARD).plane_points
     plane = observation.lidar.plane
     np.testing.assert_allclose(points @ plane[:3] + plane[3], 0, atol=1e-12)
     np.testing.assert_allclose(np.cross(points, observation.lidar.points), 0, atol=1e-12)
@@ -28,10 +27,10 @@ def test_points_are_projected_along_their_rays_by_default():
 def test_points_are_projected_along_the_normal_or_not_at_all_on_demand():
     observation = observe()
     plane, measured = observation.lidar.plane, observation.lidar.points
-    points = extract_features(observation, BOARD, CalibrateOptions(point_projection="normal")).plane_points
+    points = extract_features(observation, BOARD, FeatureSettings(point_projection="normal")).plane_points
     np.testing.assert_allclose(points @ plane[:3] + plane[3], 0, atol=1e-12)
     np.testing.assert_allclose(np.cross(points - measured, plane[:3]), 0, atol=1e-12)
-    points = extract_features(observation, BOARD, CalibrateOptions(point_projection="none")).plane_points
+    points = extract_features(observation, BOARD, FeatureSettings(point_projection="none")).plane_points
     np.testing.assert_array_equal(points, measured)
 
 
@@ -40,7 +39,7 @@ def test_half_a_step_removes_the_bias_of_ring_ends(half_step, bias_m):
     beyond = []
     for seed in range(20):
         observation = observe(seed, range_sigma_m=0.0, corner_sigma_px=0.0)
-        features = extract_features(observation, BOARD, CalibrateOptions(half_step=half_step))
+        features = extract_features(observation, BOARD, FeatureSettings(half_step=half_step))
         ends = transform(features.T_board_cam @ T_FORWARD, features.edge_points)
         is_inside = np.all(np.abs(ends[:, :2]) < [BOARD.width_m / 2, BOARD.height_m / 2], axis=1)
         beyond.append(np.where(is_inside, 1, -1) * BOARD.outline_distance(ends))
@@ -54,9 +53,7 @@ def test_a_grazing_ray_is_not_thrown_far_away():
     along = lidar.points[0] / np.linalg.norm(lidar.points[0])
     grazing = np.cross(along, np.cross(lidar.plane[:3], along))
     plane = np.append(grazing / np.linalg.norm(grazing), lidar.plane[3])
-    features = extract_features(
-        Observation("a", observation.image, replace(lidar, plane=plane)), BOARD, CalibrateOptions()
-    )
+    features = extract_features(Observation("a", observation.image, replace(lidar, plane=plane)), BOARD)
     assert np.abs(features.plane_points).max() < 50
 
 
