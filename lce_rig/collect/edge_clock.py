@@ -10,6 +10,7 @@ import numpy as np
 
 from lce_rig.core.clock import NS_PER_S, ClockModel
 from lce_rig.core.clock_fit import MIN_PAIRS, RESOLUTION_NS, Stamps, fit_clock, match_edges
+from lce_rig.core.findings import Finding
 from lce_rig.sources.live.base import Pulse
 
 _N_EDGES = 2048
@@ -23,7 +24,7 @@ class EdgeClock:
     """Pulses of the board and edges that a sensor saw, and the board's time on that sensor's clock.
 
     Attributes:
-        problem: why there is no model, and what to do; "" while there is one.
+        problem: why there is no model; None while there is one.
     """
 
     def __init__(self, sensor: str, coarse_error_ns: float) -> None:
@@ -33,7 +34,7 @@ class EdgeClock:
             sensor: its name in the profile.
             coarse_error_ns: how far off the coarse model may be.
         """
-        self.problem = f"{sensor}: no edges yet; is its trigger input wired, and switched on?"
+        self.problem: Finding | None = Finding("edges.none_seen", "error", sensor)
         self._sensor = sensor
         self._coarse_error_ns = coarse_error_ns
         self._coarse: ClockModel | None = None
@@ -74,16 +75,14 @@ class EdgeClock:
             return None
         least_ns = float(np.diff(sent_ns).min())
         if self._model is None and self._coarse_error_ns > _NEAR * least_ns:
-            self.problem = (
-                f"{self._sensor}: its clock is known to {self._coarse_error_ns / 1e6:.0f} ms, too little for "
-                f"pulses every {least_ns / 1e6:.0f} ms; wire the pulse per second, or begin slower"
-            )
+            figures = {"sigma_ms": self._coarse_error_ns / 1e6, "period_ms": least_ns / 1e6}
+            self.problem = Finding("edges.too_close", "error", self._sensor, figures)
             return None
         pairs = match_edges(seen_ns, sent_ns, start, min(self._coarse_error_ns, _NEAR * least_ns))
         if pairs is None or len(pairs) < max(MIN_PAIRS, _MIN_MATCHED * len(seen_ns)):
-            self.problem = f"{self._sensor}: the edges it saw are not the board's pulses; check the wire"
+            self.problem = Finding("edges.not_the_pulses", "error", self._sensor)
             return None
-        self._model, self.problem = fit_clock(pairs, "edges", RESOLUTION_NS), ""
+        self._model, self.problem = fit_clock(pairs, "edges", RESOLUTION_NS), None
         return self._model
 
     def _seen_during(self, sent_ns: Stamps, start: ClockModel) -> Stamps:

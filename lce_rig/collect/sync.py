@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from lce_rig.collect.pairing import Frame, middle_of_sweep_ns
 from lce_rig.core.clock import ClockModel
 from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.findings import Finding
 from lce_rig.rig import Rig
 from lce_rig.sources.live.base import LiveSample
 from lce_rig.sources.rig_time import rig_time_ns
@@ -53,16 +54,18 @@ class SyncVerdict:
 
     Attributes:
         requires_still_boards: whether they must.
-        reasons: why, each a sentence with what would change it; empty where they may move.
+        reasons: why; empty where they may move.
     """
 
     requires_still_boards: bool
-    reasons: tuple[str, ...]
+    reasons: tuple[Finding, ...]
 
-    def __str__(self) -> str:
-        if not self.requires_still_boards:
-            return "boards may move while they are captured"
-        return f"boards must stand still while they are captured: {'; '.join(self.reasons)}"
+    @property
+    def finding(self) -> Finding:
+        """What the verdict says by itself, without the reasons."""
+        return Finding(
+            "sync.boards_must_stand" if self.requires_still_boards else "sync.boards_may_move", "note"
+        )
 
 
 class CommonClock:
@@ -140,17 +143,20 @@ def judge_sync(rig: Rig, clock: CommonClock | None = None) -> SyncVerdict:
     for name, camera in rig.cameras.items():
         for channel, given in camera.channels.items():
             sensors.append((name, f"cameras.{name}.channels.{channel}", given.timestamps))
-    reasons: list[str] = []
+    reasons: list[Finding] = []
     for name, key, timestamps in sensors:
         model = None if clock is None else clock.model(name)
         if timestamps.sync == "none":
-            reasons.append(f"{key}.timestamps.sync is none")
+            reasons.append(
+                Finding("sync.none_in_profile", "warning", name, {"key": f"{key}.timestamps.sync"})
+            )
         elif clock is not None and model is None:
-            reasons.append(f"the clock of {name} is not tied to the rig's; `lce-rig doctor` says why")
+            reasons.append(Finding("sync.not_tied", "warning", name))
         elif model is not None and model.sigma_ns(model.last_ns) > limit_ns:
-            sigma_ms, limit_ms = model.sigma_ns(model.last_ns) / 1e6, limit_ns / 1e6
-            reasons.append(f"the time of {name} is known to {sigma_ms:.1f} ms, {limit_ms:.1f} ms are needed")
-    unique = tuple(dict.fromkeys(reasons))
+            figures = {"sigma_ms": model.sigma_ns(model.last_ns) / 1e6, "limit_ms": limit_ns / 1e6}
+            reasons.append(Finding("sync.too_uncertain", "warning", name, figures))
+    # Channels of one camera share its clock.
+    unique = tuple(found for index, found in enumerate(reasons) if found not in reasons[:index])
     return SyncVerdict(bool(unique), unique)
 
 

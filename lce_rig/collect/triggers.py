@@ -14,6 +14,7 @@ from statistics import median
 from lce_rig.collect.pulse_log import PulseLog
 from lce_rig.core.clock import ClockModel
 from lce_rig.core.data import Image
+from lce_rig.core.findings import Finding
 from lce_rig.sources.live.base import Pulse
 
 # VersaVIS, too, asks for four in a row.
@@ -85,7 +86,7 @@ class TriggerMatcher:
 
     Attributes:
         counts: how matching went.
-        problem: why pictures are not matched now, and what to do; "" while they are.
+        problem: why images are not matched now; None while they are.
     """
 
     def __init__(self, camera: str, max_delay_ns: int, min_delay_ns: int = 0) -> None:
@@ -97,7 +98,7 @@ class TriggerMatcher:
             min_delay_ns: earliest; below 0 where the two clocks are tied loosely.
         """
         self.counts = TriggerCounts()
-        self.problem = f"{camera}: no pictures and pulses yet"
+        self.problem: Finding | None = Finding("pulses.nothing_yet", "error", camera)
         self._camera = camera
         self._window_ns = (min_delay_ns, max_delay_ns)
         self._clock: ClockModel | None = None
@@ -121,7 +122,7 @@ class TriggerMatcher:
             if pulse.stamp_ns <= self._pulses.last_ns and pulse.stamp_ns in self._pulses:
                 self.counts.n_repeated += 1
                 return []
-            self._begin_anew("the board began to count anew")
+            self._begin_anew("pulses.board_restarted")
             self._pulses.clear()
         self._pulses.add(pulse.count, pulse.stamp_ns)
         return list(self._proceed())
@@ -130,21 +131,21 @@ class TriggerMatcher:
         """Take a picture, and give those whose pulses are now known."""
         if image.count is None or image.stamp_ns is None or self._clock is None:
             self.counts.n_unmatched += 1
-            what = "its pictures carry no numbers" if image.count is None else "its clock is not tied yet"
-            self.problem = f"{self._camera}: {what}; pictures cannot be matched to pulses"
+            code = "pulses.images_not_numbered" if image.count is None else "pulses.clock_not_tied"
+            self.problem = Finding(code, "error", self._camera)
             return []
         if self._last is not None and image.count <= self._last[0]:
             if image.stamp_ns <= self._last[1]:
                 self.counts.n_repeated += 1
                 return []
-            self._begin_anew("the camera began to count anew")
+            self._begin_anew("pulses.camera_restarted")
         elif self._last is not None:
             self.counts.n_lost_frames += image.count - self._last[0] - 1
         self._last = image.count, image.stamp_ns
         if len(self._waiting) == _N_WAITING:
             self._waiting.popleft()
             self.counts.n_unmatched += 1
-            self.problem = f"{self._camera}: pictures and no pulses; check the board's line to the computer"
+            self.problem = Finding("pulses.none", "error", self._camera)
         self._waiting.append(_Waiting(image, image.count, self._clock.convert(image.stamp_ns)))
         return list(self._proceed())
 
@@ -169,12 +170,10 @@ class TriggerMatcher:
         is_ambiguous = len(possible) > 1 or self._pulses.least_period_ns() < most_ns - least_ns
         constant = frame.number - possible[0] if len(possible) == 1 and not is_ambiguous else None
         if is_ambiguous:
-            self.problem = (
-                f"{self._camera}: more than one pulse in {(most_ns - least_ns) / 1e6:.0f} ms could have made "
-                f"a picture; begin with slower pulses, or lower sync.triggers.{self._camera}.max_delay_s"
-            )
+            window = {"window_ms": (most_ns - least_ns) / 1e6}
+            self.problem = Finding("pulses.ambiguous", "error", self._camera, window)
         elif not possible:
-            self.problem = f"{self._camera}: pictures without pulses; is it in trigger mode, on that line?"
+            self.problem = Finding("pulses.images_without", "error", self._camera)
         if constant is None or constant != self._candidate:
             self._drop(self._agreeing)
             self._candidate = constant
@@ -183,7 +182,7 @@ class TriggerMatcher:
             return
         self._agreeing = [*self._agreeing, frame]
         if len(self._agreeing) == N_AGREE:
-            self._constant, self.problem = constant, ""
+            self._constant, self.problem = constant, None
             agreeing, self._agreeing = self._agreeing, []
             for known in agreeing:
                 found = self._pulses.time_of(known.number - constant)
@@ -219,7 +218,7 @@ class TriggerMatcher:
         shift = shifts.pop()
         if shifts or shift is None or self._is_slipping(doubtful[-1].number):
             self._drop(doubtful)
-            self._begin_anew("its pictures do not follow the pulses; is it in trigger mode?")
+            self._begin_anew("pulses.not_followed")
             return
         assert self._constant is not None
         self._constant -= shift
@@ -257,8 +256,8 @@ class TriggerMatcher:
         stamp_ns = time_ns + round(median(self._delays_ns))
         yield TriggeredImage(frame.image, number, time_ns, stamp_ns, is_interpolated)
 
-    def _begin_anew(self, why: str) -> None:
-        self.problem = f"{self._camera}: {why}"
+    def _begin_anew(self, code: str) -> None:
+        self.problem = Finding(code, "error", self._camera)
         self.counts.n_restarts += 1
         for frames in (self._waiting, self._agreeing, self._doubtful):
             self._drop(frames)

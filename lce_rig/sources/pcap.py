@@ -8,6 +8,7 @@ from pathlib import Path
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.sources.base import SourceOptions, Span, Stream
 from lce_rig.sources.datagrams import Datagram
@@ -17,6 +18,7 @@ from lce_rig.sources.sensors import choose_lidar
 from lce_rig.sources.velodyne_packet import BadPacketError, OtherModelError, read_data_packet
 from lce_rig.sources.velodyne_points import DUAL_NOTE, OFFSETS_NOTE
 from lce_rig.sources.velodyne_stream import Vlp16Stream
+from lce_rig.words import describe
 
 # So many data packets, a second or less of one sensor, show which sensors were recorded.
 _SURVEY_PACKETS = 800
@@ -30,7 +32,7 @@ class _Survey:
     Attributes:
         senders: data packets of VLP-16s by IP address.
         others: data packets of other models by name.
-        refused: packets of the right length that are no data packets, by what is wrong with them.
+        refused: packets of the right length that are no data packets, by the code of what is wrong.
         ports: all UDP packets by the port they were sent to.
         n_bytes: how much of the file this is.
     """
@@ -109,7 +111,7 @@ class PcapRecording:
                 except OtherModelError as error:
                     survey.others[error.model] += 1
                 except BadPacketError as error:
-                    survey.refused[str(error)] += 1
+                    survey.refused[error.code] += 1
             n_found = survey.senders.total() + survey.others.total()
             if n_found >= _SURVEY_PACKETS or (n_found and survey.ports.total() >= 50 * _SURVEY_PACKETS):
                 break
@@ -150,18 +152,17 @@ class PcapRecording:
     def _what_is_there(self, survey: _Survey) -> str:
         wrong = survey.refused + self._file.flaws
         if wrong:
-            cut = " (record with tcpdump -s 0)" if "cut short by the recorder" in wrong else ""
-            return ", ".join(f"{n} {what}" for what, n in wrong.most_common(_MAX_SHOWN)) + cut
+            cut = " (record with tcpdump -s 0)" if "datagram.cut_short" in wrong else ""
+            return ", ".join(describe(_flaw(code, n)) for code, n in wrong.most_common(_MAX_SHOWN)) + cut
         ports = ", ".join(f"{n} to {port}" for port, n in survey.ports.most_common(_MAX_SHOWN))
         there = f"UDP packets by port: {ports}" if ports else "no UDP packets at all"
         return f"{there}; {self._file.damage}" if self._file.damage else there
 
     def _summarise(self, stream: Vlp16Stream) -> None:
         lines = [OFFSETS_NOTE, *([DUAL_NOTE] if stream.mode == velodyne.DUAL else [])]
-        state = stream.clock.state()
-        lines.append(f"stamps are {state.text}")
+        lines.append(describe(stream.clock.state()))
         lines += _account(stream)
-        lines += [f"{n} datagrams {what}" for what, n in sorted(self._file.flaws.items())]
+        lines += [describe(_flaw(code, n)) for code, n in sorted(self._file.flaws.items())]
         lines += [self._file.damage] if self._file.damage else []
         notes = [f"{self.path.name}: {line}" for line in lines]
         self.notes += [note for note in notes if note not in self.notes]
@@ -190,4 +191,8 @@ def _account(stream: Vlp16Stream) -> list[str]:
         "scans whose stamps do not rise, left out": counts.n_not_rising,
     }
     lines = [f"{n} {what}" for what, n in figures.items() if n]
-    return lines + [f"{n} {what}, left out" for what, n in sorted(counts.bad.items())]
+    return lines + [describe(flaw) for flaw in counts.flaws()]
+
+
+def _flaw(code: str, n: int) -> Finding:
+    return Finding(code, "warning", figures={"n": n, "of": "data"})

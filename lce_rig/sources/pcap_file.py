@@ -43,7 +43,7 @@ class PcapFile:
 
     Attributes:
         path: the file.
-        flaws: datagrams that could not be read, by what is wrong with them; grows while it is read.
+        flaws: datagrams that could not be read, by the code of what is wrong; grows while it is read.
         damage: where the file ends before its end, in words; "" before that is known, or where it is whole.
         n_bytes_read: how far the last reading has come.
     """

@@ -7,6 +7,7 @@ import numpy as np
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
+from lce_rig.core.findings import Finding
 from lce_rig.rig import LidarSettings
 from lce_rig.sources.velodyne_clock import VelodyneClock
 from lce_rig.sources.velodyne_controls import read_controls
@@ -14,6 +15,7 @@ from lce_rig.sources.velodyne_order import OrderCounts, PacketOrder, Place
 from lce_rig.sources.velodyne_packet import (
     BadPacketError,
     DataPacket,
+    OtherModelError,
     read_data_packet,
     read_position_packet,
 )
@@ -58,7 +60,9 @@ class StreamCounts:
         n_thin: revolutions left out because more than half of their packets were lost.
         n_empty: revolutions without a single return.
         n_not_rising: scans left out because it turned out that those before were stamped late.
-        bad: packets left out, by what is wrong with them.
+        bad: data packets left out, by the code of what is wrong with them.
+        bad_positions: position packets left out, likewise.
+        other_models: data packets of other models, by name.
         order: what the sensor's counter told.
     """
 
@@ -70,7 +74,23 @@ class StreamCounts:
     n_empty: int = 0
     n_not_rising: int = 0
     bad: Counter[str] = field(default_factory=Counter)
+    bad_positions: Counter[str] = field(default_factory=Counter)
+    other_models: Counter[str] = field(default_factory=Counter)
     order: OrderCounts = field(default_factory=OrderCounts)
+
+    @property
+    def n_bad(self) -> int:
+        """Packets of both kinds left out."""
+        return self.bad.total() + self.bad_positions.total()
+
+    def flaws(self) -> list[Finding]:
+        """List what was wrong with packets, each with how many."""
+        kinds = (("data", self.bad), ("position", self.bad_positions))
+        return [
+            Finding(code, "warning", figures={"n": n, "of": kind})
+            for kind, bad in kinds
+            for code, n in sorted(bad.items())
+        ]
 
 
 class Vlp16Stream:
@@ -107,7 +127,7 @@ class Vlp16Stream:
         try:
             packet = read_position_packet(payload, host_ns)
         except BadPacketError as error:
-            self.counts.bad[f"position packets {error}"] += 1
+            self.counts.bad_positions[error.code] += 1
             return
         self.counts.n_position += 1
         self.clock.see_position(packet)
@@ -122,7 +142,9 @@ class Vlp16Stream:
         try:
             packet = read_data_packet(payload, host_ns)
         except BadPacketError as error:
-            self.counts.bad[f"data packets {error}"] += 1
+            self.counts.bad[error.code] += 1
+            if isinstance(error, OtherModelError):
+                self.counts.other_models[error.model] += 1
             return None
         place = self._order.place(packet)
         if place is Place.HELD:

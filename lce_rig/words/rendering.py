@@ -2,15 +2,15 @@
 
 import math
 import string
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from typing import Any
 
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Figure, Finding
 
-FAMILIES: tuple[str, ...] = ()
+FAMILIES: tuple[str, ...] = ("drivers",)
 """Modules of this package with a table PHRASES of their own."""
 
 Template = str | Callable[[Finding], str]
@@ -85,16 +85,33 @@ def sentence(finding: Finding) -> str:
     return f"{describe(finding)}: {action}" if action else describe(finding)
 
 
+def as_line(text: str) -> str:
+    """Write words as a line of their own: a capital first, a full stop last."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+
+
+def enumerated(finding: Finding, reasons: Iterable[Finding]) -> str:
+    """Say what was found and what makes it so, in one line."""
+    return f"{describe(finding)}: {'; '.join(sentence(reason) for reason in reasons)}"
+
+
 def as_json(finding: Finding) -> dict[str, object]:
     """Write a finding for programs: code, severity, subject and figures are stable, the text is not."""
     return {
         "code": finding.code,
         "severity": finding.severity,
         "subject": finding.subject,
-        "figures": dict(finding.figures),
+        "figures": {name: _finite(figure) for name, figure in finding.figures.items()},
         "text": describe(finding),
         "action": recommend(finding),
     }
+
+
+def _finite(figure: Figure) -> Figure:
+    """Give None for a number that JSON has no word for."""
+    if isinstance(figure, tuple):
+        return tuple(_finite(each) for each in figure)
+    return None if isinstance(figure, float) and not math.isfinite(figure) else figure
 
 
 def _render(template: Template, finding: Finding) -> str:

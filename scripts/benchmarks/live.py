@@ -229,7 +229,7 @@ def print_load(load: Load) -> None:
     gaps_s = np.diff(load.shown_ns) * 1e-9
     latencies_s = load.report.latencies_s
     sent = load.sent
-    n_packets, n_events = lidar.figures["data_packets"], davis.figures["n_events"]
+    n_packets, n_events = lidar.n_packets or 0, davis.figures["n_events"]
     print_head("what", "figure")
     print_row("duration", f"{load.wall_s:.1f} s")
     print_row("packets sent, taken, lost by us", f"{sent['lidar']['sent']}, {n_packets:.0f}, {lidar.n_lost}")

@@ -100,7 +100,7 @@ def test_a_rig_with_hardware_sync_and_good_clocks_may_move_its_board(rlfs):
     clock = CommonClock({"cam": fitted()[0], "lidar": ClockModel.identity(1000.0, "PPS locked")})
     verdict = judge_sync(rlfs, clock)
     assert not verdict.requires_still_boards
-    assert str(verdict) == "boards may move while they are captured"
+    assert (verdict.finding.code, verdict.reasons) == ("sync.boards_may_move", ())
     assert not judge_sync(rlfs).requires_still_boards
 
 
@@ -111,14 +111,17 @@ def test_a_rig_without_hardware_sync_needs_still_boards_and_says_why(rlfs):
     cameras = {"cam": camera.model_copy(update={"channels": {"frames": free}})}
     verdict = judge_sync(rlfs.model_copy(update={"cameras": cameras}))
     assert verdict.requires_still_boards
-    assert verdict.reasons == ("cameras.cam.channels.frames.timestamps.sync is none",)
-    assert str(verdict).startswith("boards must stand still while they are captured: cameras.cam")
+    (reason,) = verdict.reasons
+    assert (reason.code, reason.subject) == ("sync.none_in_profile", "cam")
+    assert reason.figures == {"key": "cameras.cam.channels.frames.timestamps.sync"}
+    assert verdict.finding.code == "sync.boards_must_stand"
 
 
 def test_clocks_that_are_not_tied_or_known_too_loosely_need_still_boards(rlfs):
     loose = ClockModel.identity(25e6, "arrivals of packets")
     verdict = judge_sync(rlfs, CommonClock({"lidar": loose}))
-    assert verdict.reasons == (
-        "the time of lidar is known to 25.0 ms, 10.0 ms are needed",
-        "the clock of cam is not tied to the rig's; `lce-rig doctor` says why",
-    )
+    assert [(found.code, found.subject) for found in verdict.reasons] == [
+        ("sync.too_uncertain", "lidar"),
+        ("sync.not_tied", "cam"),
+    ]
+    assert verdict.reasons[0].figures == {"sigma_ms": pytest.approx(25), "limit_ms": pytest.approx(10)}

@@ -64,7 +64,7 @@ def test_its_streams_come_and_none_of_them_is_lost(everything: tuple[Lines, floa
     lines, *_ = everything
     # A busy computer sends late and in bursts: how rates are judged is tested by itself.
     assert lines["lidar", "stream"].values["rate_hz"] > 0 and lines["cam", "stream"].values["rate_hz"] > 0
-    assert lines["lidar", "stream"].values["data_packets"] > 200
+    assert lines["lidar", "stream"].values["n_packets"] > 200
     assert lines["lidar", "stream"].values["n_lost"] == lines["cam", "stream"].values["n_lost"] == 0
     assert lines["cam", "pulses"].values["n_pulses"] > 3 and lines["cam", "pulses"].values["n_frames"] > 3
     assert lines["sync", "pulses"].values["cam_hz"] > 0
@@ -93,7 +93,7 @@ def test_its_clocks_are_compared(everything: tuple[Lines, float, float]) -> None
         values = lines["rig", "clocks"].values
         assert {"lidar.drift_ppm", "lidar.offset_ms", "sync.drift_ppm"} <= set(values)
         assert abs(values["lidar.offset_ms"]) <= 100
-    assert lines["sync", "clock"].figure.startswith("the board's own, to the computer's by ")
+    assert "ppm" in lines["sync", "clock"].figure
     assert lines["rig", "sync"].severity in ("green", "yellow")
 
 

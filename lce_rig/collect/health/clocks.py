@@ -11,6 +11,8 @@ from lce_rig.collect.health.sensors import SYNC, driver_of
 from lce_rig.collect.sync import CommonClock, judge_sync
 from lce_rig.core.clock import ClockModel
 from lce_rig.core.clock_fit import fit_arrivals
+from lce_rig.core.findings import Finding
+from lce_rig.words import as_line, describe
 
 _RIG = "rig"
 _PPS_LINE = "pps"
@@ -28,11 +30,10 @@ def check_clock(exam: Examination, sensor: str) -> Check | None:
     if status is None:
         return None
     problems = remarks(status, "clock")
-    figure, figures = status.clock or "no stamps yet", status.figures
-    if "delay_ms" in figures:
-        figure += f"; {figures['delay_ms']:.0f} ms old on arrival"
-    if "round_trip_us" in figures:
-        figure += f"; round trip {figures['round_trip_us'] / 1000:.1f} ms"
+    figure, figures = (
+        "no stamps yet" if status.clock is None else describe(status.clock.finding),
+        status.figures,
+    )
     severity: Severity = "yellow" if problems else "green"
     return Check(sensor, "clock", severity, figure, as_remedy(problems), figures)
 
@@ -45,7 +46,7 @@ def check_edges(exam: Examination, sensor: str) -> Check | None:
     n_seen = len(exam.seen[sensor].pulses)
     if model is None:
         figure = f"{n_seen} edges seen of {n_sent} pulses, clock not fitted"
-        return Check(sensor, "edges", "red", figure, as_remedy([problem]))
+        return Check(sensor, "edges", "red", figure, as_remedy(filter(None, [problem])))
     drift_ppm, rms_us = -1e6 * model.drift, model.rms_ns / 1000
     values = {"drift_ppm": drift_ppm, "rms_us": rms_us, "n_edges": float(n_seen), "n_pulses": float(n_sent)}
     figure = f"{n_seen} of {n_sent} pulses, drift {drift_ppm:+.1f} ppm, scatter {rms_us:.1f} us"
@@ -76,22 +77,19 @@ def check_offsets(exam: Examination) -> Check | None:
     if not words:
         return None
     severity: Severity = "yellow" if strays else "green"
-    return Check(_RIG, "clocks", severity, "; ".join(words), as_remedy(strays), values)
+    return Check(_RIG, "clocks", severity, "; ".join(words), "\n".join(map(as_line, strays)), values)
 
 
 def check_sync(exam: Examination) -> Check | None:
     """Judge whether boards may move while they are captured; absent sensors are left out of it."""
     rig, verdict = exam.rig, judge_sync(exam.rig, tie(exam))
     if not verdict.requires_still_boards:
-        return Check(_RIG, "sync", "green", str(verdict))
+        return Check(_RIG, "sync", "green", describe(verdict.finding))
     absent = [sensor for sensor, seen in exam.seen.items() if not seen.has_opened]
-    reasons = [reason.partition(";")[0] for reason in verdict.reasons]
-    reasons = [
-        reason for reason in reasons if not any(f"the clock of {name} is" in reason for name in absent)
-    ]
+    reasons = [each for each in verdict.reasons if each.code != "sync.not_tied" or each.subject not in absent]
     if not reasons:
         return None
-    figure = f"boards must stand still while they are captured: {'; '.join(reasons)}"
+    figure = f"{describe(verdict.finding)}: {'; '.join(map(describe, reasons))}"
     if all(sync == "none" for sync in _promises(exam)):
         return Check(_RIG, "sync", "green", figure)
     if rig.sync is None:
@@ -111,7 +109,7 @@ def tie(exam: Examination) -> CommonClock:
         if seen.status is None or sensor == SYNC:
             continue
         model = host
-        if seen.status.figures.get("is_device_time"):
+        if _is_utc(seen):
             model = ClockModel.identity(_LOCKED_SIGMA_NS, "UTC by PPS and NMEA")
         elif _sees_edges(exam, sensor):
             fitted, _, _ = _fit_edges(exam, sensor)
@@ -120,6 +118,10 @@ def tie(exam: Examination) -> CommonClock:
         if model is not None:
             clock.tie(sensor, model)
     return clock
+
+
+def _is_utc(seen: Observation) -> bool:
+    return seen.status is not None and seen.status.clock is not None and seen.status.clock.is_utc
 
 
 def _promises(exam: Examination) -> list[str]:
@@ -136,7 +138,7 @@ def _sees_edges(exam: Examination, sensor: str) -> bool:
     return is_davis and seen.status is not None and board is not None and board.status is not None
 
 
-def _fit_edges(exam: Examination, sensor: str) -> tuple[ClockModel | None, str, int]:
+def _fit_edges(exam: Examination, sensor: str) -> tuple[ClockModel | None, Finding | None, int]:
     """Fit the board's time on a sensor's clock; gives why not as well, and how many pulses were sent."""
     board, seen = exam.seen[SYNC], exam.seen[sensor]
     assert exam.rig.sync is not None
@@ -144,13 +146,13 @@ def _fit_edges(exam: Examination, sensor: str) -> tuple[ClockModel | None, str, 
     sent = [pulse for pulse in board.pulses if pulse.sensor == line]
     edges = EdgeClock(sensor, _COARSE_EDGE_NS)
     if board.host_clock is None:
-        return None, "the board's clock is not tied to this computer's", len(sent)
+        return None, Finding("clock.board_not_tied", "error", sensor), len(sent)
     edges.set_clock(board.host_clock.inverse())
     for pulse in sent:
         edges.take_sent(pulse)
     for pulse in seen.pulses:
         edges.take_seen(pulse)
-    return edges.fit(), edges.problem.removeprefix(f"{sensor}: "), len(sent)
+    return edges.fit(), edges.problem, len(sent)
 
 
 def _by_arrivals(exam: Examination, seen: Observation) -> ClockModel | None:
@@ -158,7 +160,7 @@ def _by_arrivals(exam: Examination, seen: Observation) -> ClockModel | None:
     stream = next((name for name in _STREAMS if name in seen.stamps), None)
     if stream is None or seen.status is None or driver_of(exam.rig, seen.sensor) == "command":
         return None
-    if stream == "scans" and not seen.status.figures.get("is_device_time"):
+    if stream == "scans" and not _is_utc(seen):
         return None
     stamps, arrivals = seen.times(stream)
     # A LiDAR's first scans may be stamped by arrival yet, until its position packets have come.
@@ -177,8 +179,8 @@ def _offset_ms(seen: Observation, model: ClockModel) -> float | None:
     if seen.sensor == SYNC:
         return None
     if "scans" in seen.stamps:
-        ahead_s = seen.status.figures.get("device_ahead_s")
-        return None if ahead_s is None else 1000 * ahead_s
+        clock = seen.status.clock
+        return None if clock is None or clock.ahead_s is None else 1000 * clock.ahead_s
     return (model.anchor_ns - model.reference_ns) * 1e-6
 
 

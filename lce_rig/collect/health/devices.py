@@ -12,6 +12,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.sources.live.base import SourceStatus
 from lce_rig.sources.live.velodyne_web import WebReport
+from lce_rig.words import as_line
 
 # A rotor holds its speed within some tenths of a percent, cameras theirs within a few percent.
 _MAX_OFF_RATE = 0.05
@@ -55,12 +56,14 @@ def check_stream(exam: Examination, sensor: str) -> Check | None:
     findings += [_event_rate(seen)] if "events" in kinds else []
     findings.append(_losses(seen.status, len(seen.stamps.get(stream, ()))))
     problems = remarks(seen.status, "stream")
-    remedies = problems or [each.remedy for each in findings if each.remedy]
+    remedies = as_remedy(problems) or "\n".join(as_line(each.remedy) for each in findings if each.remedy)
     severity = worst(["yellow" if problems else "green", *(each.severity for each in findings)])
-    values = {"watched_s": seen.watched_s, "rate_hz": rate_hz(seen, stream)} | seen.status.figures
+    values = {"watched_s": seen.watched_s, "rate_hz": rate_hz(seen, stream), **seen.status.figures}
     values |= {"n_lost": float(seen.status.n_lost), "n_dropped": float(seen.status.n_dropped)}
+    if seen.status.n_packets is not None:
+        values["n_packets"] = float(seen.status.n_packets)
     figure = ", ".join(each.words for each in findings)
-    return Check(sensor, "stream", severity, figure, as_remedy(remedies), values)
+    return Check(sensor, "stream", severity, figure, remedies, values)
 
 
 def wanted_rate_hz(rig: Rig, sensor: str) -> float | None:
@@ -82,7 +85,7 @@ def rate_hz(seen: Observation, stream: str) -> float:
 
     A LiDAR's is its rotor's speed, by its own clock: scans arrive late on a busy computer.
     """
-    rotor_hz = 0.0 if seen.status is None else seen.status.figures.get("rotor_hz", 0.0)
+    rotor_hz = 0.0 if seen.status is None else seen.status.rates_hz.get("scans", 0.0)
     if stream == "scans" and seen.stamps.get(stream) and rotor_hz > 0:
         return rotor_hz
     _, arrivals = seen.times(stream)
@@ -139,8 +142,8 @@ def _event_rate(seen: Observation) -> _Finding:
 
 def _losses(status: SourceStatus, n_came: int) -> _Finding:
     """Count what was lost on the way and by this computer."""
-    n_packets = status.figures.get("data_packets")
-    packets = "" if n_packets is None else f"{n_packets:.0f} packets, "
+    n_packets = status.n_packets
+    packets = "" if n_packets is None else f"{n_packets} packets, "
     if not status.n_lost + status.n_dropped:
         return _Finding(f"{packets}none lost")
     late = f", {status.n_dropped} not taken in time" if status.n_dropped else ""

@@ -28,7 +28,7 @@ def check_pulses_sent(exam: Examination) -> Check | None:
     board, sync = exam.seen[SYNC], exam.rig.sync
     if board.status is None or sync is None or not DIALECTS[sync.type]().has_triggers:
         return None
-    words, problems, severities = [], remarks(board.status, "stream"), list[Severity]()
+    words, remedies, severities = [], [as_remedy(remarks(board.status, "stream"))], list[Severity]()
     wanted = {_PPS_LINE: 1.0} | {name: trigger.rate_hz for name, trigger in sync.triggers.items()}
     values = {}
     for line, wanted_hz in wanted.items():
@@ -40,11 +40,12 @@ def check_pulses_sent(exam: Examination) -> Check | None:
         if is_off and (rate_hz or line != _PPS_LINE):
             severities.append("yellow" if rate_hz else "red")
             key = "" if line == _PPS_LINE else f"check sync.triggers.{line}, "
-            problems.append(f"line {line} should pulse at {wanted_hz:g} Hz: {key}reset the board")
+            remedies.append(f"Line {line} should pulse at {wanted_hz:g} Hz: {key}reset the board.")
     n_lost = board.status.n_lost
-    severities.append("yellow" if problems else "green")
+    remedy = "\n".join(filter(None, remedies))
+    severities.append("yellow" if remedy else "green")
     figure = f"{', '.join(words)}; {n_lost or 'none'} lost"
-    return Check(SYNC, "pulses", worst(severities), figure, as_remedy(problems), values)
+    return Check(SYNC, "pulses", worst(severities), figure, remedy, values)
 
 
 def check_frames_of_pulses(exam: Examination, sensor: str) -> Check | None:
@@ -75,10 +76,10 @@ def _by_matching(matcher: TriggerMatcher, board: Observation, seen: Observation,
     counts = matcher.counts
     values = {**counted.values, "n_matched": float(counts.n_matched), "n_missed": float(counts.n_missed)}
     values |= {"n_slips": float(counts.n_slips), "n_lost_pulses": float(counts.n_lost_pulses)}
-    if matcher.problem or not len(delays_ms):
-        problem = matcher.problem.removeprefix(f"{seen.sensor}: ")
+    if matcher.problem is not None or not len(delays_ms):
+        remedy = _REMEDY if matcher.problem is None else as_remedy([matcher.problem])
         figure = f"{counted.figure}, not matched"
-        return replace(counted, severity="red", figure=figure, remedy=as_remedy([problem]), values=values)
+        return replace(counted, severity="red", figure=figure, remedy=remedy, values=values)
     middle_ms = float(np.median(delays_ms))
     scatter_ms = _SIGMA_PER_MAD * float(np.median(np.abs(delays_ms - middle_ms)))
     values |= {"delay_ms": middle_ms, "delay_scatter_ms": scatter_ms}
@@ -94,7 +95,7 @@ def _rate_hz(board: Observation, line: str) -> float:
     stamps_ns = [pulse.stamp_ns for pulse in board.pulses if pulse.sensor == line]
     if len(stamps_ns) < 2 or stamps_ns[-1] <= stamps_ns[0] or board.status is None:
         return 0.0
-    n_lost = board.status.figures.get(f"n_lost.{line}", 0.0)
+    n_lost = board.status.n_lost_by_line.get(line, 0)
     return 1e9 * (len(stamps_ns) - 1 + n_lost) / (stamps_ns[-1] - stamps_ns[0])
 
 

@@ -1,52 +1,30 @@
 """What drivers complain of, sorted to the line of the screen that it belongs to."""
 
+from collections.abc import Iterable, Mapping
 from typing import Literal
 
+from lce_rig.core.findings import Finding, about
 from lce_rig.sources.live.base import SourceStatus
+from lce_rig.words import as_line, sentence
 
 Topic = Literal["device", "stream", "clock", "buffer"]
 
-# The first that fits decides; whatever fits nowhere is the device's.
-_WORDS: tuple[tuple[Topic, tuple[str, ...]], ...] = (
-    ("buffer", ("the receive buffer holds",)),
-    (
-        "stream",
-        (
-            "lost",
-            "dropped",
-            "never came",
-            "damaged",
-            "left out",
-            "too slow",
-            "pictures a second",
-            "the rotor turns",
-            "buffers",
-            "no pulses for",
-        ),
-    ),
-    (
-        "clock",
-        ("clock", "stamp", "pulse per second", "pulses per second", "UTC", "time requests", "the receiver"),
-    ),
-)
+# By the family of a problem's code.
+_TOPICS: Mapping[str, Topic] = {
+    "device": "device",
+    "stream": "stream",
+    "packet": "stream",
+    "clock": "clock",
+    "buffer": "buffer",
+}
 
 
-def remarks(status: SourceStatus, topic: Topic) -> list[str]:
-    """Give a driver's complaints of one topic, each a sentence with what to do."""
-    return [problem for problem in status.problems if _topic(problem) == topic]
+def remarks(status: SourceStatus, topic: Topic) -> tuple[Finding, ...]:
+    """Give a driver's complaints of one topic."""
+    found = [problem for problem in status.problems if _TOPICS[problem.family] == topic]
+    return about(status.sensor, found)
 
 
-def as_remedy(problems: list[str]) -> str:
+def as_remedy(problems: Iterable[Finding]) -> str:
     """Write complaints as sentences, a line each."""
-    return "\n".join(f"{problem[0].upper()}{problem[1:].rstrip('.')}{_end(problem)}" for problem in problems)
-
-
-def _end(problem: str) -> str:
-    return "" if problem.endswith("?") else "."
-
-
-def _topic(problem: str) -> Topic:
-    return next(
-        (topic for topic, words in _WORDS if any(word in problem for word in words)),
-        "device",
-    )
+    return "\n".join(as_line(sentence(problem)) for problem in problems)

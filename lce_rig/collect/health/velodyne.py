@@ -1,16 +1,19 @@
 """A VLP-16: how its web page says that it is set, and whether pulses and sentences give it UTC."""
 
+from collections.abc import Mapping
+
 from lce_rig.collect.health.check import Check, Severity
 from lce_rig.collect.health.examination import Examination
 from lce_rig.collect.health.remarks import as_remedy
 from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Figure
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.sources.live.velodyne_web import VelodyneWeb, WebReport, find_problems
+from lce_rig.words import as_line, describe, recommend
 
 _WEB_TIMEOUT_S = 1.0
-_PPS_PROBLEM = "PPS is "
-_CLOCK_FIGURES = ("pps_state", "nmea_fix", "device_ahead_s")
+_PPS_PROBLEM = "settings.pps"
 
 
 def read_web(rig: Rig, lidar: str, port: int = 80) -> WebReport | SourceError:
@@ -34,9 +37,7 @@ def check_settings(exam: Examination, sensor: str) -> Check | None:
         remedy = "Firmware and settings stay unknown. Is driver.address its own, and no firewall in the way?"
         return Check(sensor, "settings", "yellow", report.what, remedy)
     problems = [
-        problem
-        for problem in find_problems(report, exam.rig.lidars[sensor])
-        if not problem.startswith(_PPS_PROBLEM)
+        problem for problem in find_problems(report, exam.rig.lidars[sensor]) if problem.code != _PPS_PROBLEM
     ]
     return Check(
         sensor, "settings", "yellow" if problems else "green", _setting_words(report), as_remedy(problems)
@@ -48,19 +49,17 @@ def check_pulse(exam: Examination, sensor: str) -> Check | None:
     seen, report, lidar = exam.seen[sensor], exam.web.get(sensor), exam.rig.lidars[sensor]
     if seen.status is None:
         return None
-    figures = seen.status.figures
-    if "pps_state" in figures:
-        state = velodyne.PPS_STATES[round(figures["pps_state"])]
-    else:
-        state = report.pps if isinstance(report, WebReport) and report.pps else "unknown"
+    clock = seen.status.clock
+    assert clock is not None  # a VLP-16 that is open has one
+    figures = clock.finding.figures
+    told = report.pps if isinstance(report, WebReport) and report.pps else "unknown"
+    state = figures.get("pps", told)
     figure = f"{state}, {_nmea_words(figures)}"
-    values = {name: value for name, value in figures.items() if name in _CLOCK_FIGURES}
-    if figures.get("is_device_time"):
-        return Check(sensor, "PPS", "green", f"{figure}; {seen.status.clock}", values=values)
-    cause = seen.status.clock.partition("by arrival: ")[2]
-    is_said = cause in ("", f"PPS is {state}", f"PPS is {state}, but no NMEA arrives")
-    figure += "; scans are stamped by arrival" if is_said else f"; scans are stamped by arrival: {cause}"
-    remedy = _lost_time_remedy(seen.status.clock, seen.status.problems)
+    values = {} if clock.ahead_s is None else {"ahead_s": clock.ahead_s}
+    figure += f"; {describe(clock.finding)}"
+    if clock.is_utc:
+        return Check(sensor, "PPS", "green", figure, values=values)
+    remedy = _lost_time_remedy(recommend(clock.finding))
     return Check(sensor, "PPS", _without_lock(lidar), figure, remedy, values)
 
 
@@ -71,19 +70,18 @@ def _without_lock(lidar: LidarSettings) -> Severity:
     return "red" if lidar.timestamps.sync == "hardware" else "yellow"
 
 
-def _nmea_words(figures: dict[str, float]) -> str:
-    if "nmea_past_hour_s" in figures:
-        minute, second = divmod(round(figures["nmea_past_hour_s"]), 60)
-        fix = "" if figures.get("nmea_fix") else ", no fix"
+def _nmea_words(figures: Mapping[str, Figure]) -> str:
+    past_hour_s = figures.get("nmea_past_hour_s")
+    if isinstance(past_hour_s, int):
+        minute, second = divmod(past_hour_s, 60)
+        fix = "" if figures.get("is_fix") else ", no fix"
         return f"NMEA {minute:02d}:{second:02d} past the hour{fix}"
-    return "no NMEA" if "pps_state" in figures else "no position packets"
+    return "no NMEA" if "pps" in figures else "no position packets"
 
 
-def _lost_time_remedy(clock: str, problems: tuple[str, ...]) -> str:
-    begin = f"scans are stamped with {clock}; "
-    found = [problem.removeprefix(begin) for problem in problems if problem.startswith(begin)]
+def _lost_time_remedy(remedy: str) -> str:
     otherwise = "without hardware: lidars.*.timestamps sync: none, clock: host; boards must then stand still"
-    return as_remedy([*found, otherwise]) if found else ""
+    return f"{as_line(remedy)}\n{as_line(otherwise)}" if remedy else ""
 
 
 def _setting_words(report: WebReport) -> str:

@@ -28,6 +28,7 @@ from lce_rig.collect.watching import Moment, Sighting
 from lce_rig.core.errors import LceRigError
 from lce_rig.session import Capture, Session
 from lce_rig.sources.live.base import LiveSource
+from lce_rig.words import sentence
 
 _WAIT_S = 0.1
 _TURN_S = 0.0005
@@ -180,8 +181,9 @@ class _Loop:
         if report.ending == "exhausted":
             waited_s = time.monotonic() - self._captured_s
             report.notes.append(f"no capture in the last {waited_s:.0f} s, {self._monitor.last_words()}")
+        ties = self._clock.problems() + self._clock.account()
         report.notes += self._keeper.notes() + self._learning.notes()
-        report.notes += self._clock.problems() + self._clock.account()
+        report.notes += [f"{each.subject}: {sentence(each)}" for each in ties]
         if self._recorder is not None:
             report.notes += self._recorder.problems()
         self._session.journal(

@@ -16,6 +16,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
 from lce_rig.session import Session
 from lce_rig.sources.live.base import SourceStatus
+from lce_rig.words import enumerated, sentence
 
 _EVERY_S = 0.5
 _N_CUES, _N_LOG = 8, 40
@@ -197,7 +198,7 @@ class Monitor:
             for channel, given in camera.channels.items():
                 # Of two kinds of one camera only its source can tell the rates apart.
                 otherwise_hz = status.rate_hz if given.kind == "frames" else 0.0
-                kind_hz = status.figures.get(f"{given.kind}_hz", otherwise_hz)
+                kind_hz = status.rates_hz.get(given.kind, otherwise_hz)
                 streams.append(self._camera_stream(name, channel, given.kind == "frames", kind_hz, status))
         for name in rig.lidars:
             streams.append(self._lidar_stream(name, self._statuses.get(name, SourceStatus(name))))
@@ -240,12 +241,12 @@ class Monitor:
 
     def _notes(self) -> tuple[str, ...]:
         verdict = self._clock.verdict()
-        notes = [str(verdict)] if verdict.requires_still_boards else []
-        notes += self._clock.problems()
+        notes = [enumerated(verdict.finding, verdict.reasons)] if verdict.requires_still_boards else []
+        notes += [f"{each.subject}: {sentence(each)}" for each in self._clock.problems()]
         named: dict[str, list[str]] = {}
         for name, status in self._statuses.items():
             for problem in status.problems:
-                named.setdefault(problem, []).append(name)
+                named.setdefault(sentence(problem), []).append(name)
         notes += [f"{', '.join(names)}: {problem}" for problem, names in named.items()]
         if self._guide is not None and self._guide.problem:
             notes.append(self._guide.problem)

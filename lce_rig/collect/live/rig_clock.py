@@ -15,6 +15,7 @@ from lce_rig.collect.sync import CommonClock, SyncVerdict, judge_sync
 from lce_rig.collect.triggers import TriggerMatcher
 from lce_rig.core.clock import ClockModel
 from lce_rig.core.data import Image
+from lce_rig.core.findings import Finding
 from lce_rig.rig import Rig
 from lce_rig.sources.base import Sample
 from lce_rig.sources.live.base import LiveSample, Pulse, SourceStatus
@@ -94,7 +95,7 @@ class RigClock:
             return self._take_pulse(source, sample)
         matcher = self._matchers.get(sample.sensor)
         if isinstance(sample, Image) and matcher is not None:
-            was_matching = not matcher.problem
+            was_matching = matcher.problem is None
             matched = matcher.take_image(sample)
             if was_matching:
                 return [self._at_pulse(each.image, each.stamp_ns) for each in matched]
@@ -114,32 +115,33 @@ class RigClock:
         self._refreshed_s = now_s
         statuses, host = ask(), self._rig_from_host()
         for name in self._rig.lidars:
-            is_own = statuses[name].figures.get("is_device_time", 0.0) > 0 if name in statuses else False
+            state = statuses[name].clock if name in statuses else None
+            is_own = state is not None and state.is_utc
             self._tie(name, ClockModel.identity(_LOCKED_SIGMA_NS, "UTC by PPS and NMEA") if is_own else host)
         for name in self._rig.cameras:
             if name not in self._edges:
                 self._tie(name, host)
         self._refresh_board()
 
-    def problems(self) -> list[str]:
-        """Say which clocks are not tied as they should be, and why."""
-        matchers = [each.problem for each in self._matchers.values() if each.problem]
-        edges = [each.problem for each in self._edges.values() if each.problem]
-        return matchers + edges
+    def problems(self) -> list[Finding]:
+        """List which clocks are not tied as they should be, and why."""
+        matchers = [each.problem for each in self._matchers.values()]
+        edges = [each.problem for each in self._edges.values()]
+        return [problem for problem in matchers + edges if problem is not None]
 
-    def account(self) -> list[str]:
-        """Say which cameras' counts slipped against their pulses so far."""
+    def account(self) -> list[Finding]:
+        """List the cameras whose counts slipped against their pulses so far."""
+        counts = {name: matcher.counts for name, matcher in self._matchers.items()}
         return [
-            f"{name}: its count slipped against the pulses {counts.n_slips} times and began anew "
-            f"{counts.n_restarts} times; {counts.n_matched} pictures were matched, {counts.n_unmatched} not"
-            for name, counts in ((name, matcher.counts) for name, matcher in self._matchers.items())
-            if counts.n_slips or counts.n_restarts
+            Finding("pulses.slipped", "note", name, dict(vars(each)))
+            for name, each in counts.items()
+            if each.n_slips or each.n_restarts
         ]
 
     def verdict(self) -> SyncVerdict:
         """Judge whether boards must stand still while they are captured."""
         if self._board is None:
-            return SyncVerdict(True, ("no sync board ties the cameras' clocks to the LiDAR's",))
+            return SyncVerdict(True, (Finding("sync.no_board", "warning"),))
         return judge_sync(self._rig, self.common)
 
     def _take_pulse(self, source: str, pulse: Pulse) -> list[Sample]:
@@ -156,7 +158,7 @@ class RigClock:
         matcher = self._matchers.get(pulse.sensor)
         if matcher is None:
             return []
-        was_matching = not matcher.problem
+        was_matching = matcher.problem is None
         matched = matcher.take_pulse(pulse)
         return [self._at_pulse(each.image, each.stamp_ns) for each in matched] if was_matching else []
 
@@ -181,7 +183,7 @@ class RigClock:
             edges.set_clock(host.inverse())
             model = edges.fit()
             self._tie(name, None if model is None else model.then(clock))
-        if self._is_slow and not any(matcher.problem for matcher in self._matchers.values()):
+        if self._is_slow and all(matcher.problem is None for matcher in self._matchers.values()):
             self._is_slow = False
             self._board.start_triggers()
 

@@ -20,11 +20,12 @@ from lce_rig.collect.live.state import LiveState
 from lce_rig.collect.live.worker import start_without_interrupts
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError, ProfileError, SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene, between
-from lce_rig.sources.live.base import LiveSource, Mailbox, SourceStatus
+from lce_rig.sources.live.base import ClockState, LiveSource, Mailbox, SourceStatus
 from lce_rig.sources.live.reading import RateMeter
 
 # For each camera: what it sees of the room is rendered first.
@@ -73,14 +74,14 @@ class SimulatedSource:
 
     def status(self) -> SourceStatus:
         """Say how the sensor does."""
-        box, problem = self._mailbox, self._pace.problem() if self._pace else ""
+        box, problem = self._mailbox, self._pace.problem() if self._pace else None
         return SourceStatus(
             self.sensor,
             box.n_put,
             box.n_dropped,
             rate_hz=self._rate.rate_hz,
-            clock="simulated",
-            problems=(problem,) if problem else (),
+            clock=ClockState(Finding("clock.simulated", "note")),
+            problems=() if problem is None else (problem,),
             device="simulated",
         )
 

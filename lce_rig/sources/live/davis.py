@@ -12,8 +12,9 @@ from types import TracebackType
 from typing import Any
 
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.rig import CameraSettings
-from lce_rig.sources.live.base import LiveSample, SourceStatus
+from lce_rig.sources.live.base import ClockState, LiveSample, SourceStatus
 from lce_rig.sources.live.davis_device import OpenedCamera, open_davis
 from lce_rig.sources.live.davis_samples import DavisSamples
 from lce_rig.sources.live.reading import RateMeter, ReaderThread
@@ -21,7 +22,7 @@ from lce_rig.sources.live.reading import RateMeter, ReaderThread
 # A batch of events lasts 10 ms: ten seconds of a taker's absence at three streams.
 _N_SLOTS = 2048
 _PAUSE_S = 0.002
-_MAX_CLOCK_ERROR_NS = 500_000_000
+_MAX_CLOCK_ERROR_MS = 500.0
 _SILENT_HINT = "Check the USB cable; unplug the camera for some seconds and start again."
 
 
@@ -49,7 +50,7 @@ class DavisSource:
         self._samples = DavisSamples(sensor, settings)
         self._reader = ReaderThread(f"camera {sensor!r}", self._read, _N_SLOTS, silence_s, _SILENT_HINT)
         self._stack = ExitStack()
-        self._notes: tuple[str, ...] = ()
+        self._notes: tuple[Finding, ...] = ()
         self._device = ""
         self._n_imu = 0
         self._rates = {"events": RateMeter(), "frames": RateMeter(), "pulses": RateMeter()}
@@ -90,25 +91,24 @@ class DavisSource:
     def status(self) -> SourceStatus:
         """Say how the camera does."""
         counted = self._samples
-        figures = {f"{name}_hz": rate.rate_hz for name, rate in self._rates.items()} | {
+        figures = {
+            "pulses_hz": self._rates["pulses"].rate_hz,
             "n_events": float(counted.n_events),
             "n_frames": float(counted.n_frames),
             "n_pulses": float(counted.n_pulses),
             "n_imu": float(self._n_imu),
         }
-        delay_ns = self._delay_ns()
-        if delay_ns is not None:
-            figures["delay_ms"] = delay_ns * 1e-6
         return SourceStatus(
             self.sensor,
             self._reader.n_samples,
             self._reader.n_dropped,
             counted.n_frames_lost,
             self._reader.rate_hz,
-            "the camera's own, set to this computer's UTC on opening; drifts until fitted to trigger edges",
+            ClockState(Finding("clock.davis", "note", figures={"delay_ms": self._delay_ms()})),
             tuple(self._problems()),
             figures,
             self._device,
+            {kind: self._rates[kind].rate_hz for kind in ("events", "frames")},
         )
 
     def _find_streams(self) -> list[Callable[[int], list[LiveSample]]]:
@@ -174,20 +174,19 @@ class DavisSource:
         self._n_imu += 0 if batch is None else len(batch)
         return []
 
-    def _delay_ns(self) -> int | None:
+    def _delay_ms(self) -> float | None:
         """Give how old the freshest of the last events were on arrival; None before any came."""
-        return min(self._delays_ns.copy(), default=None)
+        delay_ns = min(self._delays_ns.copy(), default=None)
+        return None if delay_ns is None else delay_ns * 1e-6
 
-    def _problems(self) -> list[str]:
+    def _problems(self) -> list[Finding]:
         found = list(self._notes)
-        delay_ns = self._delay_ns()
-        if delay_ns is not None and abs(delay_ns) > _MAX_CLOCK_ERROR_NS:
-            found.append(
-                f"its clock and this computer's differ by {abs(delay_ns) * 1e-9:.3g} s: "
-                "was the computer's set meanwhile? Open the camera again"
-            )
+        delay_ms = self._delay_ms()
+        if delay_ms is not None and abs(delay_ms) > _MAX_CLOCK_ERROR_MS:
+            figures = {"difference_s": abs(delay_ms) / 1000}
+            found.append(Finding("clock.differs_from_computer", "warning", figures=figures))
         if self._samples.n_resets:
-            found.append("its clock began anew while it ran: a sync cable sent a reset; open it again")
+            found.append(Finding("clock.restarted", "warning", figures={"n": self._samples.n_resets}))
         return found
 
     def _let_go(self) -> None:

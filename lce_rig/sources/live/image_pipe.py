@@ -14,8 +14,9 @@ from typing import IO
 
 from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.rig import CameraSettings
-from lce_rig.sources.live.base import LiveSample, SourceStatus
+from lce_rig.sources.live.base import ClockState, LiveSample, SourceStatus
 from lce_rig.sources.live.image_streams import JpegPictures, PictureStream, RawPictures, find_stream
 from lce_rig.sources.live.pixel_formats import FORMATS, find_format
 from lce_rig.sources.live.reading import ReaderThread
@@ -114,20 +115,21 @@ class ImagePipeSource:
     def status(self) -> SourceStatus:
         """Say how the camera does."""
         n_damaged = self._stream.n_damaged if self._stream else 0
-        problems = [f"{n_damaged} pictures came damaged: check the command"] if n_damaged else []
+        problems = []
+        if n_damaged:
+            figures = {"n": n_damaged}
+            problems.append(Finding("stream.damaged_images", "warning", figures=figures, action="command"))
         if isinstance(self._stream, RawPictures) and self._stream.row_bytes % 4:
             n_row = self._stream.row_bytes
-            problems.append(
-                f"rows are taken to have {n_row} bytes, GStreamer pads them to {n_row + -n_row % 4}: "
-                "if the picture is slanted, let it write JPEG (jpegenc)"
-            )
+            figures = {"row_bytes": n_row, "padded_bytes": n_row + -n_row % 4}
+            problems.append(Finding("device.row_padding", "warning", figures=figures))
         return SourceStatus(
             self.sensor,
             self._reader.n_samples,
             self._reader.n_dropped,
             n_damaged,
             self._reader.rate_hz,
-            "arrival at this computer, later than the exposure by what the command takes",
+            ClockState(Finding("clock.arrival", "note")),
             tuple(problems),
             device=" ".join(self._settings.driver.command),
         )

@@ -15,7 +15,7 @@ from lce_rig.sources.live.reading import ReaderThread
 from lce_rig.sources.live.sync_board_port import BoardPort
 from lce_rig.sources.live.sync_board_report import (
     BoardView,
-    clock_words,
+    clock_state,
     device_words,
     figures,
     problems,
@@ -133,10 +133,11 @@ class SyncBoard:
                 n_dropped=self._thread.n_dropped,
                 n_lost=sum(self._state.counts.n_lost.values()),
                 rate_hz=self._thread.rate_hz,
-                clock=clock_words(view),
+                clock=clock_state(view),
                 problems=problems(view),
                 figures=figures(view),
                 device=device_words(view),
+                n_lost_by_line=dict(self._state.counts.n_lost),
             )
 
     @property

@@ -7,8 +7,9 @@ from types import TracebackType
 
 from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.rig import CameraSettings
-from lce_rig.sources.live.base import LiveSample, SourceStatus
+from lce_rig.sources.live.base import ClockState, LiveSample, SourceStatus
 from lce_rig.sources.live.pixel_formats import FORMATS, PixelDecoder, find_format
 from lce_rig.sources.live.reading import ReaderThread
 from lce_rig.sources.live.v4l2_clock import StampClock
@@ -48,7 +49,7 @@ class V4l2Source:
         self._last_sequence: int | None = None
         self._n_lost = 0
         self._n_damaged = 0
-        self._notes: list[str] = []
+        self._notes: list[Finding] = []
         self._device_in_words = ""
         self._mark: Mark = "start_of_frame"
         self._timing = FrameTiming(settings.resolution_px[1], None)
@@ -89,7 +90,6 @@ class V4l2Source:
         """Say how the camera does."""
         figures = {
             "n_damaged": float(self._n_damaged),
-            "delay_ms": self._clock.delay_ns * 1e-6,
             "stamp_to_mid_exposure_ms": self._timing.to_mid_ns(self._mark) * 1e-6,
             "trigger_to_mid_exposure_ms": self._timing.to_mid_ns("trigger") * 1e-6,
         }
@@ -101,7 +101,7 @@ class V4l2Source:
             self._reader.n_dropped,
             self._n_lost,
             self._reader.rate_hz,
-            self._clock_in_words(),
+            self._clock_state(),
             tuple(self._problems()),
             figures,
             self._device_in_words,
@@ -127,16 +127,13 @@ class V4l2Source:
         if driver.frame_rate_hz is not None:
             given_hz = self._device.set_rate(driver.frame_rate_hz)
             if given_hz is not None and abs(given_hz / driver.frame_rate_hz - 1) > 0.01:
-                self._notes.append(
-                    f"the camera sends {given_hz:.4g} pictures a second, the profile wants "
-                    f"{driver.frame_rate_hz:g}: see `v4l2-ctl --list-formats-ext`"
-                )
+                rates = {"rate_hz": given_hz, "expected_hz": driver.frame_rate_hz}
+                self._notes.append(Finding("stream.rate_refused", "warning", figures=rates))
         self._read_exposure()
         n_buffers = self._device.start(N_BUFFERS)
         if n_buffers < N_BUFFERS:
-            self._notes.append(
-                f"the driver grants {n_buffers} buffers, {N_BUFFERS} wanted: pictures may be lost"
-            )
+            buffers = {"n": n_buffers, "expected": N_BUFFERS}
+            self._notes.append(Finding("stream.few_buffers", "warning", figures=buffers))
 
     def _set_up_pictures(self) -> PixelDecoder:
         """Agree on the form of the pictures.
@@ -213,23 +210,19 @@ class V4l2Source:
         asked = read_exposure_us(self._device, self._known) if given is None else None
         self._timing = frame_timing(self._settings.driver, self._settings.resolution_px[1], asked)
 
-    def _clock_in_words(self) -> str:
+    def _clock_state(self) -> ClockState | None:
         if not self._reader.n_samples:
-            return ""
+            return None
         if self._clock.used is None:
-            return "arrival at this computer, later than the exposure"
-        moment = self._mark.replace("_", " ")
-        return f"{moment} by clock {self._clock.used}, as this computer's UTC; moved to mid exposure"
+            return ClockState(Finding("clock.arrival", "note"))
+        delay_ms = self._clock.delay_ns * 1e-6
+        figures: dict[str, Figure] = {"clock": self._clock.used, "mark": self._mark, "delay_ms": delay_ms}
+        return ClockState(Finding("clock.mid_exposure", "note", figures=figures))
 
-    def _problems(self) -> list[str]:
+    def _problems(self) -> list[Finding]:
         found = self._notes + self._clock.problems()
         if self._n_damaged:
-            found.append(
-                f"{self._n_damaged} pictures came damaged: check the camera's cable and `dmesg | tail`"
-            )
+            found.append(Finding("stream.damaged_images", "warning", figures={"n": self._n_damaged}))
         if self._clock.used is not None and self._timing.exposure_ns is None and self._reader.n_samples:
-            found.append(
-                "the camera does not tell its exposure, stamps are off by half of it: "
-                "set driver.frame_timing.exposure_us"
-            )
+            found.append(Finding("clock.exposure_unknown", "warning"))
         return found

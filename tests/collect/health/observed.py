@@ -9,11 +9,15 @@ from lce_rig.collect.health.examination import Examination
 from lce_rig.collect.health.observing import Observation
 from lce_rig.core.clock import ClockModel
 from lce_rig.core.data import Image, Scan
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.rig import Rig
-from lce_rig.sources.live.base import Pulse, SourceStatus
+from lce_rig.sources.live.base import ClockState, Pulse, SourceStatus
 
 S = 1_000_000_000
 START_NS = 1_753_000_000 * S
+UTC_FIGURES: dict[str, Figure] = {"pps": "locked", "is_fix": True, "nmea_past_hour_s": 754, "ahead_s": 0.0003}
+LOCKED = ClockState(Finding("clock.lidar_utc", "note", figures=UTC_FIGURES), True, 0.0003)
+UNLOCKED = ClockState(Finding("clock.pps_not_locked", "warning", figures={"pps": "absent"}))
 BOARD_NS = 5 * S
 """What the board's clock shows at START_NS."""
 

@@ -9,14 +9,16 @@ from lce_rig.collect.live.rig_clock import SLOW_TRIGGERS_HZ, RigClock
 from lce_rig.core.clock import ClockModel
 from lce_rig.core.clock_fit import TimePairs, fit_clock
 from lce_rig.core.data import Image, Scan
+from lce_rig.core.findings import Finding
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.sync import SyncSettings
-from lce_rig.sources.live.base import Pulse, SourceStatus
+from lce_rig.sources.live.base import ClockState, Pulse, SourceStatus
 
 T0_NS = 1_700_000_000_000_000_000
 HOST_AHEAD_NS = 37_000_000
 PERIOD_NS = 50_000_000
-LOCKED = {"lidar": SourceStatus("lidar", figures={"is_device_time": 1.0})}
+UTC = ClockState(Finding("clock.lidar_utc", "note"), is_utc=True)
+LOCKED = {"lidar": SourceStatus("lidar", clock=UTC)}
 
 
 def tie(source_ns: np.ndarray, reference_ns: np.ndarray) -> ClockModel:
@@ -66,7 +68,8 @@ def test_without_a_board_everything_keeps_its_time_and_boards_must_stand_still()
     clock.refresh(dict)
     assert clock.take("cam", picture(T0_NS))[0].stamp_ns == T0_NS
     assert clock.take("lidar", scan(T0_NS))[0].stamp_ns == T0_NS
-    assert clock.verdict().requires_still_boards and "no sync board" in str(clock.verdict())
+    assert clock.verdict().requires_still_boards
+    assert [reason.code for reason in clock.verdict().reasons] == ["sync.no_board"]
 
 
 def test_a_locked_lidar_keeps_its_utc_and_pictures_of_the_computers_time_are_brought_to_it() -> None:
@@ -81,7 +84,7 @@ def test_a_locked_lidar_keeps_its_utc_and_pictures_of_the_computers_time_are_bro
 
 def test_an_unlocked_lidar_counts_by_the_computers_clock() -> None:
     clock = RigClock(synced("rlfs", "cam"), Board())
-    clock.refresh(lambda: {"lidar": SourceStatus("lidar", figures={"is_device_time": 0.0})})
+    clock.refresh(lambda: {"lidar": SourceStatus("lidar", clock=ClockState(Finding("clock.no_nmea")))})
     placed = clock.take("lidar", scan(T0_NS + 2_000_000_000 + HOST_AHEAD_NS))[0]
     assert placed.stamp_ns == pytest.approx(T0_NS + 2_000_000_000, abs=2000)
 
@@ -118,7 +121,8 @@ def test_a_pulse_that_the_camera_missed_is_found_and_told() -> None:
         placed = clock.take("cam", picture(T0_NS + sent_ns + HOST_AHEAD_NS + 10_000_000, number))
         number += 1
     assert abs(int(placed[-1].stamp_ns or 0) - T0_NS - sent_ns - 10_000_000) < 1_000_000
-    assert "slipped against the pulses 1 times" in clock.account()[0]
+    (slipped,) = clock.account()
+    assert (slipped.code, slipped.subject, slipped.figures["n_slips"]) == ("pulses.slipped", "cam", 1)
 
 
 def test_lines_too_fast_for_their_delay_begin_slowly_and_then_run_at_full_rate() -> None:
@@ -139,7 +143,7 @@ def test_a_davis_is_tied_by_the_edges_it_saw() -> None:
     rig = synced("rles", "davis")
     clock = RigClock(rig, Board())
     clock.refresh(lambda: LOCKED)
-    assert "no edges yet" in clock.problems()[0]
+    assert [found.code for found in clock.problems()] == ["edges.none_seen"]
     # Its clock was set on opening, 20 ms off, and gains 30 ppm.
     for k in range(40):
         sent_ns = 1_000_000_000 + k * 250_000_000
