@@ -10,11 +10,11 @@ from lce_rig.collect.novelty import Placements, board_figures, known_placements
 from lce_rig.collect.stillness import StillnessOptions
 from lce_rig.collect.stored_events import StoredEvents
 from lce_rig.collect.watching import Moment
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.results import Refusal
 from lce_rig.session import Session
-from lce_rig.sources.base import ContinuousRecording, PairedRecording, PairFiles, Recording, Sample
+from lce_rig.sources.base import ContinuousRecording, PairedRecording, PairFiles, Recording
 from lce_rig.sources.joining import join_recordings, require_sensors
 
 Progress = Callable[[int, int, str], None]

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.collect.event_buffer import EventCut
 from lce_rig.collect.watching import ImageKey, Moment, Sighting
 from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array
@@ -22,7 +21,8 @@ from lce_rig.detect.event_figures import MEMORY_NS, event_figures, outline_px
 from lce_rig.detect.event_gate import explain_missing_board
 from lce_rig.detect.flicker import Flicker, measure_flicker
 from lce_rig.rig import Rig
-from lce_rig.sources.rig_time import rig_time_ns
+from lce_rig.timing.event_buffer import EventCut
+from lce_rig.timing.rig_time import rig_time_ns
 
 _LEAST_SIGHTINGS = 3
 _MOVE = "move it sideways slowly, about 10 cm/s"

@@ -4,8 +4,8 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from lce_rig.collect.event_buffer import BEFORE_NS, EventCut
 from lce_rig.collect.event_moment import look_for_flicker
+from lce_rig.timing.event_buffer import BEFORE_NS, EventCut
 
 
 @dataclass

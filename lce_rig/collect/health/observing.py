@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.clock import ClockModel
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, LiveSample, Pulse, Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.sources.live.base import LiveSample, LiveSource, Pulse, SourceStatus
+from lce_rig.sources.live.base import LiveSource, SourceStatus
 from lce_rig.sources.live.sync_board import SyncBoard
+from lce_rig.timing.clock import ClockModel
 
 # A sync board that its port's opening resets takes some seconds to speak; nobody waits longer.
 PATIENCE_S = 3.0

@@ -9,13 +9,12 @@ from lce_rig.collect.health.check import Check, Severity, worst
 from lce_rig.collect.health.examination import Examination
 from lce_rig.collect.health.observing import Observation
 from lce_rig.collect.health.remarks import as_remedy, remarks
-from lce_rig.collect.health.sensors import SYNC, driver_of
-from lce_rig.collect.triggers import TriggeredImage, TriggerMatcher
-from lce_rig.core.data import Image
-from lce_rig.sources.live.base import Pulse
+from lce_rig.collect.health.sensors import driver_of
+from lce_rig.core.data import Image, Pulse
+from lce_rig.rig.sync import BOARD, PPS_LINE
 from lce_rig.sources.live.sync_lines import DIALECTS
+from lce_rig.timing.triggers import TriggeredImage, TriggerMatcher
 
-_PPS_LINE = "pps"
 _SIGMA_PER_MAD = 1.4826
 _MAX_OFF_RATE = 0.02
 # Frames and lines come in bursts: how many are still on their way differs.
@@ -25,11 +24,11 @@ _REMEDY = "Every pulse must make one frame: set the camera's trigger mode in dri
 
 def check_pulses_sent(exam: Examination) -> Check | None:
     """Count the board's pulses by line, and hold their rates against the profile."""
-    board, sync = exam.seen[SYNC], exam.rig.sync
+    board, sync = exam.seen[BOARD], exam.rig.sync
     if board.status is None or sync is None or not DIALECTS[sync.type]().has_triggers:
         return None
     words, remedies, severities = [], [as_remedy(remarks(board.status, "stream"))], list[Severity]()
-    wanted = {_PPS_LINE: 1.0} | {name: trigger.rate_hz for name, trigger in sync.triggers.items()}
+    wanted = {PPS_LINE: 1.0} | {name: trigger.rate_hz for name, trigger in sync.triggers.items()}
     values = {}
     for line, wanted_hz in wanted.items():
         rate_hz = _rate_hz(board, line)
@@ -37,20 +36,20 @@ def check_pulses_sent(exam: Examination) -> Check | None:
         words.append(f"{line} {rate_hz:.3g} Hz" if rate_hz else f"{line} none")
         is_off = abs(rate_hz / wanted_hz - 1) > _MAX_OFF_RATE
         # Boards of others make no pulse per second; that one of ours is missing, the driver says.
-        if is_off and (rate_hz or line != _PPS_LINE):
+        if is_off and (rate_hz or line != PPS_LINE):
             severities.append("yellow" if rate_hz else "red")
-            key = "" if line == _PPS_LINE else f"check sync.triggers.{line}, "
+            key = "" if line == PPS_LINE else f"check sync.triggers.{line}, "
             remedies.append(f"Line {line} should pulse at {wanted_hz:g} Hz: {key}reset the board.")
     n_lost = board.status.n_lost
     remedy = "\n".join(filter(None, remedies))
     severities.append("yellow" if remedy else "green")
     figure = f"{', '.join(words)}; {n_lost or 'none'} lost"
-    return Check(SYNC, "pulses", worst(severities), figure, remedy, values)
+    return Check(BOARD, "pulses", worst(severities), figure, remedy, values)
 
 
 def check_frames_of_pulses(exam: Examination, sensor: str) -> Check | None:
     """See whether each pulse made a frame of a triggered camera."""
-    sync, board, seen = exam.rig.sync, exam.seen.get(SYNC), exam.seen[sensor]
+    sync, board, seen = exam.rig.sync, exam.seen.get(BOARD), exam.seen[sensor]
     is_triggered = sync is not None and sensor in sync.triggers and driver_of(exam.rig, sensor) != "davis"
     if sync is None or board is None or not is_triggered or board.status is None or seen.status is None:
         return None

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from lce_rig.collect.live.frame_feed import FrameFeed
+from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
 from lce_rig.collect.live.gates import LiveGate, SlowBoards, StillBoards
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
 from lce_rig.collect.live.keeper import Keeper, Task
@@ -19,15 +19,16 @@ from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_u
 from lce_rig.collect.live.options import Ending, Key, LiveOptions, LiveReport
 from lce_rig.collect.live.pumps import Pumps
 from lce_rig.collect.live.recorder import SampleRecorder
-from lce_rig.collect.live.rig_clock import RigClock, SyncTimes
 from lce_rig.collect.live.search import BoardSearch
 from lce_rig.collect.live.state import LiveState
 from lce_rig.collect.novelty import Placements, capture_poses
-from lce_rig.collect.sync import pair_times
 from lce_rig.collect.watching import Moment, Sighting
 from lce_rig.core.errors import LceRigError
 from lce_rig.session import Capture, Session
 from lce_rig.sources.live.base import LiveSource
+from lce_rig.sources.live.opening import edge_cameras
+from lce_rig.timing.rig_clock import RigClock
+from lce_rig.timing.sync import pair_times
 from lce_rig.words import sentence
 
 _WAIT_S = 0.1
@@ -67,11 +68,11 @@ def collect_live(
     # Leaving closes in turn: nothing new comes, what was decided is written, the devices are let go.
     search = BoardSearch(rig, options.search_interval_s)
     with _swift_turns(), search, Pumps(sources) as pumps:
-        clock = RigClock(rig, board)
+        clock = RigClock(rig, has_board=board is not None, edge_cameras=edge_cameras(rig))
         with (
             Learning(rig, guides) as learning,
             Keeper(session, learning) as keeper,
-            FrameFeed(rig, pumps, clock, None if recorder is None else recorder.put) as feed,
+            FrameFeed(rig, pumps, clock, board, None if recorder is None else recorder.put) as feed,
         ):
             loop = _Loop(
                 session, options, pumps, clock, feed, search, learning, keeper, guides, show, recorder

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 
-from lce_rig.collect.event_buffer import EventCut
 from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.novelty import board_figures
 from lce_rig.collect.stored_events import StoredEvents
@@ -16,6 +15,7 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.core.results import ImageBoard
 from lce_rig.session import Session
+from lce_rig.timing.event_buffer import EventCut
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,13 +9,13 @@ from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.narration import Narration, image_figures, scan_figures, stream_name
 from lce_rig.collect.live.options import LiveOptions
 from lce_rig.collect.live.pumps import Pumps
-from lce_rig.collect.live.rig_clock import RigClock
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, Phase, Sound, StreamState
 from lce_rig.collect.watching import Sighting
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
 from lce_rig.session import Session
 from lce_rig.sources.live.base import SourceStatus
+from lce_rig.timing.rig_clock import RigClock
 from lce_rig.words import enumerated, sentence
 
 _EVERY_S = 0.5

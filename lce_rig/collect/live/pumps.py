@@ -7,8 +7,9 @@ from contextlib import ExitStack
 from dataclasses import replace
 from types import TracebackType
 
+from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
-from lce_rig.sources.live.base import LiveSample, LiveSource, Mailbox, SourceStatus
+from lce_rig.sources.live.base import LiveSource, Mailbox, SourceStatus
 
 REOPEN_EVERY_S = 1.0
 # Events come in batches of 10 ms: several seconds of everything.

@@ -4,11 +4,11 @@ from collections import Counter
 from dataclasses import replace
 
 from lce_rig.collect.live.worker import Worker
-from lce_rig.collect.pairing import Frame
 from lce_rig.collect.tally import Tally
 from lce_rig.collect.watching import BoardWatcher, Moment, Sighting
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
+from lce_rig.timing.scan_pairing import Frame
 
 #: How often a picture without a board is searched thoroughly, during which nothing is said.
 THOROUGH_S = 3.0

@@ -7,31 +7,11 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Generic, Protocol, TypeVar
 
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Pulse:
-    """One edge that a trigger line made or a sensor saw.
-
-    Attributes:
-        sensor: name of the line: a camera that it triggers, or the sensor that saw it.
-        stamp_ns: device time of the board or sensor that reports it.
-        count: running number of its line; gaps are lost pulses.
-        host_ns: arrival at the host.
-    """
-
-    sensor: str
-    stamp_ns: int
-    count: int
-    host_ns: int
-
-
-LiveSample = Image | Scan | Events | Pulse
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,11 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Any
 
+from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.rig import CameraSettings
-from lce_rig.sources.live.base import ClockState, LiveSample, SourceStatus
+from lce_rig.sources.live.base import ClockState, SourceStatus
 from lce_rig.sources.live.davis_device import OpenedCamera, open_davis
 from lce_rig.sources.live.davis_samples import DavisSamples
 from lce_rig.sources.live.reading import RateMeter, ReaderThread

@@ -12,11 +12,11 @@ from fcntl import F_SETPIPE_SZ, fcntl
 from types import TracebackType
 from typing import IO
 
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.rig import CameraSettings
-from lce_rig.sources.live.base import ClockState, LiveSample, SourceStatus
+from lce_rig.sources.live.base import ClockState, SourceStatus
 from lce_rig.sources.live.image_streams import JpegPictures, PictureStream, RawPictures, find_stream
 from lce_rig.sources.live.pixel_formats import FORMATS, find_format
 from lce_rig.sources.live.reading import ReaderThread

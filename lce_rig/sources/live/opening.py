@@ -70,6 +70,16 @@ def driver_type(kind: str, name: str, model: str, driver: DriverSettings) -> str
     raise SourceError(what, f"Set driver.type to one of {', '.join(known)} if it talks like one of these.")
 
 
+def edge_cameras(rig: Rig) -> list[str]:
+    """Name the cameras that stamp a sync board's edges themselves.
+
+    Raises:
+        SourceError: a camera's driver is unknown.
+    """
+    kinds = {name: driver_type("camera", name, each.model, each.driver) for name, each in rig.cameras.items()}
+    return [name for name, kind in kinds.items() if kind == "davis"]
+
+
 def _by_model(model: str) -> str | None:
     return next((kind for begin, kind in _TYPE_BY_MODEL.items() if model.upper().startswith(begin)), None)
 

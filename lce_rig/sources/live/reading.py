@@ -5,8 +5,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 
+from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
-from lce_rig.sources.live.base import LiveSample, Mailbox
+from lce_rig.sources.live.base import Mailbox
 
 _TAKE_S = 0.2
 _RATE_WINDOW_S = 3.0

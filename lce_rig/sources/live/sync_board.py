@@ -7,10 +7,10 @@ from collections import deque
 from collections.abc import Iterator
 from types import TracebackType
 
-from lce_rig.core.clock import NS_PER_S, ClockModel
+from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
-from lce_rig.rig.sync import SyncSettings
-from lce_rig.sources.live.base import Pulse, SourceStatus
+from lce_rig.rig.sync import BOARD, SyncSettings
+from lce_rig.sources.live.base import SourceStatus
 from lce_rig.sources.live.reading import ReaderThread
 from lce_rig.sources.live.sync_board_port import BoardPort
 from lce_rig.sources.live.sync_board_report import (
@@ -24,6 +24,7 @@ from lce_rig.sources.live.sync_board_state import Arrival, BoardState
 from lce_rig.sources.live.sync_lines import DIALECTS, LineReader
 from lce_rig.sources.live.sync_lines.lce1 import VERSION
 from lce_rig.sources.live.sync_lines.messages import Hello
+from lce_rig.timing.clock import NS_PER_S, ClockModel
 
 # Opening the port may reset the board, and a VLP-16 takes 2.3 s to lock on its pulses again.
 HELLO_S = 6.0
@@ -50,7 +51,7 @@ class SyncBoard:
     def __init__(
         self,
         settings: SyncSettings,
-        sensor: str = "sync",
+        sensor: str = BOARD,
         hello_s: float = HELLO_S,
         silence_s: float = SILENCE_S,
     ) -> None:

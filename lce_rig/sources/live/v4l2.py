@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from types import TracebackType
 
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.rig import CameraSettings
-from lce_rig.sources.live.base import ClockState, LiveSample, SourceStatus
+from lce_rig.sources.live.base import ClockState, SourceStatus
 from lce_rig.sources.live.pixel_formats import FORMATS, PixelDecoder, find_format
 from lce_rig.sources.live.reading import ReaderThread
 from lce_rig.sources.live.v4l2_clock import StampClock

@@ -5,8 +5,8 @@ import time
 
 import pytest
 
+from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
-from lce_rig.sources.live.base import Pulse
 from lce_rig.sources.live.reading import RateMeter, ReaderThread
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from lce_rig.core.data import Events
 from lce_rig.rig import Rig
-from lce_rig.sources.rig_time import rig_offset_ns, stream_of
+from lce_rig.timing.rig_time import rig_offset_ns, stream_of
 
 BEFORE_NS = 1_200_000_000
 """Kept before a scan's first firing, for the network to settle ..."""

@@ -1,9 +1,8 @@
 """The rig's clock, on which the stamps of different sensors meet."""
 
-from lce_rig.core.data import Events, Image
+from lce_rig.core.data import Events, Image, Sample, Stream
 from lce_rig.rig import Rig
 from lce_rig.rig.sensors import TimestampSettings
-from lce_rig.sources.base import Sample, Stream
 
 
 def event_channel(rig: Rig, camera: str) -> str | None:
