@@ -2,7 +2,7 @@
 
 from lce_rig.calibrate.calibrate import calibrate
 from lce_rig.calibrate.channels import ChannelsEstimate, calibrate_channels
-from lce_rig.calibrate.estimate import CalibrationEstimate, CaptureResidual
+from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.metrics import capture_residual, error_to_reference
 from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates
 from lce_rig.calibrate.shared_scans import Clocks
@@ -11,7 +11,6 @@ __all__ = [
     "CalibrateOptions",
     "CalibrationEstimate",
     "CaptureCandidates",
-    "CaptureResidual",
     "ChannelsEstimate",
     "Clocks",
     "calibrate",

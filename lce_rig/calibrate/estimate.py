@@ -4,29 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Certificate, Metrics, Observation, Refusal
+from lce_rig.core.results import CaptureResidual, Certificate, Metrics, Observation, Refusal
 from lce_rig.residuals.quadratics import Quadratics
-
-
-@dataclass(frozen=True)
-class CaptureResidual:
-    """How well one capture fits an extrinsic.
-
-    Attributes:
-        capture: its name.
-        plane_mean_m, plane_rms_m: distance of the LiDAR's board points from the camera's board plane.
-        edge_mean_m, edge_rms_m: distance in the board's plane of ring ends from the board's edges.
-        held_out_m: rms of both where the capture was not fitted; NaN without draws.
-        reprojection_px: rms corner residual of the board's pose.
-    """
-
-    capture: str
-    plane_mean_m: float
-    plane_rms_m: float
-    edge_mean_m: float
-    edge_rms_m: float
-    held_out_m: float
-    reprojection_px: float
 
 
 @dataclass(frozen=True, eq=False)

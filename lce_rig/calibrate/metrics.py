@@ -4,10 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lce_rig.calibrate.estimate import CaptureResidual
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, rotation_angle
-from lce_rig.core.results import Metrics, Observation
+from lce_rig.core.results import CaptureResidual, Metrics, Observation
 from lce_rig.residuals.features import AS_MEASURED, extract_features
 from lce_rig.residuals.plane_and_ends import ends_on_board, plane_residuals
 

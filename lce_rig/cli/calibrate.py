@@ -118,13 +118,11 @@ def calibrate(
     Exits with 7 where a result must not be used: that camera is then left out of the exports, unless --force
     is given. Exits with 6 where a camera has no result.
     """
-    from lce_rig import pipeline
-    from lce_rig.calibrate import CalibrateOptions
+    import lce_rig as lce
     from lce_rig.core.errors import UsageError
     from lce_rig.export.reference import read_reference
-    from lce_rig.session import Session
 
-    opened = Session.open(session)
+    opened = lce.Session.open(session)
     rig = opened.rig
     require_sensors("camera", cameras, rig.cameras)
     if weights == "profile":
@@ -132,7 +130,7 @@ def calibrate(
         switches |= {"plane_weight": settings.plane_weight, "edge_weight": settings.edge_weight}
     if not (switches["use_ptpl"] or switches["use_ptl"]):
         raise UsageError("--no-ptpl and --no-ptl together leave nothing to fit")
-    options = CalibrateOptions(**switches)
+    options = lce.CalibrateOptions(**switches)
     wanted = [
         name
         for name, camera in rig.cameras.items()
@@ -146,36 +144,32 @@ def calibrate(
         )
     with _earlier_result_named(opened.path):
         with show.progress_bar("detecting") as progress:
-            detections = pipeline.detect(opened, event_image=event_image, progress=progress)
+            detections = lce.detect(opened, event_image=event_image, progress=progress)
         with show.progress_bar("calibrating") as progress:
-            results, troubles = pipeline.calibrate(
-                rig,
+            result = lce.calibrate(
+                opened,
                 detections,
-                options,
+                options=options,
                 cameras=cameras or None,
                 channels=channels,
                 reference=truth,
                 progress=progress,
             )
-        for trouble in troubles:
-            show.warn(str(trouble))
-        calibrations = [calibration for calibration, _ in results]
-        if truth is not None and any(c.egt_rotation_deg is None for c in calibrations):
+        for shortage in result.shortages:
+            show.warn(str(shortage))
+        if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
             show.warn(f"{reference} holds no T_cam_lidar of these sensors")
-        written = pipeline.write_results(opened, calibrations, force=force)
+        written = result.write(force=force)
     if as_json:
-        from lce_rig.export.result import to_json_dict
-
-        inputs = pipeline.inputs_sha256(opened, calibrations)
-        show.print_json(to_json_dict(rig.name, calibrations, inputs))
+        show.print_json(result.document())
     else:
-        for calibration, estimate in results:
-            show.print_lines(_lines(calibration, estimate.held_out_m, estimate.weak_direction))
-        for calibration in calibrations:
-            show.print_lines(camera_lines(calibration, calibrations))
+        for calibration in result.pairs:
+            show.print_lines(_lines(calibration))
+        for calibration in result.pairs:
+            show.print_lines(camera_lines(calibration, result.pairs))
         show.note("written: " + ", ".join(f.name for f in written.files) + f" in {written.files[0].parent}")
     _tell_earlier(written)
-    _exit(calibrations, wanted, {pair.camera for pair in detections.pairs}, are_told=not as_json)
+    _exit(result.pairs, wanted, {pair.camera for pair in detections.pairs}, are_told=not as_json)
 
 
 @contextmanager
@@ -237,7 +231,7 @@ def _left_out(held_out_m: float) -> str:
     return f"left out {1000 * held_out_m:.1f} mm, " if math.isfinite(held_out_m) else ""
 
 
-def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> list[str]:
+def _lines(calibration: Calibration) -> list[str]:
     c = calibration
     colour = show.COLOURS[c.verdict]
     metrics = c.metrics
@@ -245,11 +239,11 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
         f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/]",
         "  T_cam_lidar (p_cam = R p_lidar + t)",
         *("    " + "  ".join(f"{value: .6f}" for value in row) for row in c.T_cam_lidar[:3]),
-        *uncertainty_lines(c, weak_direction),
+        *uncertainty_lines(c),
         f"  captures     {len(c.captures_used)} used of {c.n_captures}, "
         f"board found by both sensors in {c.n_detected}",
         f"  residuals    planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm, "
-        f"{_left_out(held_out_m)}corners {metrics.reprojection_px:.2f} px",
+        f"{_left_out(c.held_out_m)}corners {metrics.reprojection_px:.2f} px",
         f"  certificate  {_certificate(c)}",
     ]
     lines += [*_channel_lines(c), *together_lines(c)]

@@ -24,22 +24,20 @@ def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) ->
 
     Exits with 6 where no capture can be used.
     """
-    from lce_rig import pipeline
+    import lce_rig as lce
     from lce_rig.core.errors import NotEnoughDataError
-    from lce_rig.session import Session
+    from lce_rig.pipeline import refusals_of, write_debug_images
 
-    opened = Session.open(session)
+    opened = lce.Session.open(session)
     if not opened.captures:
         raise NotEnoughDataError(f"{session} holds no captures", "Collect some first: lce-rig collect --help")
     with show.progress_bar("detecting") as progress:
-        detections = pipeline.detect(opened, event_image=event_image, progress=progress)
+        detections = lce.detect(opened, event_image=event_image, progress=progress)
     if debug_images:
         with show.progress_bar("drawing") as progress:
-            folder = pipeline.write_debug_images(
-                opened, detections, event_image=event_image, progress=progress
-            )
+            folder = write_debug_images(opened, detections, event_image=event_image, progress=progress)
         show.note(f"pictures of every capture: {folder}")
-    refusals = {pair: pipeline.refusals(opened.rig, detections, pair) for pair in detections.pairs}
+    refusals = {pair: refusals_of(opened.rig, detections, pair) for pair in detections.pairs}
     if as_json:
         show.print_json(
             {"format_version": 1, "rig": opened.rig.name, "pairs": _document(detections, refusals)}

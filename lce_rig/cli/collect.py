@@ -138,8 +138,8 @@ def collect(
 
     _refuse_options(tuple(live), "belongs to live collection", "leave --from out, or this option")
     from lce_rig.collect import CollectOptions
-    from lce_rig.collect import collect as fill
     from lce_rig.core.errors import NotEnoughDataError
+    from lce_rig.pipeline.collection import fill_session
     from lce_rig.rig import load_rig
     from lce_rig.session import Session
     from lce_rig.sources import open_recordings
@@ -155,14 +155,10 @@ def collect(
     )
     options = [SourceOptions(*names, pair, pair_tolerance, topics) for names in sensors]
     recordings = open_recordings(paths, rig, options)
-    with Session.resume(session, rig) as writer, show.progress_bar("collecting") as progress:
-        report = fill(
-            writer,
-            recordings,
-            CollectOptions(max_captures=max_captures, target=target),
-            lambda done, total, _message: progress(done, total),
-        )
-        n_captures = len(writer.captures)
+    wanted = CollectOptions(max_captures=max_captures, target=target)
+    with show.progress_bar("collecting") as progress:
+        report = fill_session(rig, recordings, session, wanted, progress)
+    n_captures = len(Session.open(session).captures)
     if topics and any(isinstance(recording, PairedRecording) for recording in recordings):
         show.warn("--topic means nothing for a folder of pictures and clouds")
     _tell(report, session, n_captures)

@@ -226,9 +226,32 @@ class OtherCamera:
     board_rms_m: float
 
 
+@dataclass(frozen=True)
+class CaptureResidual:
+    """How well one capture fits an extrinsic.
+
+    Attributes:
+        capture: its name.
+        plane_mean_m, plane_rms_m: distance of the LiDAR's board points from the camera's board plane.
+        edge_mean_m, edge_rms_m: distance in the board's plane of ring ends from the board's edges.
+        held_out_m: rms of both where the capture was not fitted; NaN without draws.
+        reprojection_px: rms corner residual of the board's pose.
+    """
+
+    capture: str
+    plane_mean_m: float
+    plane_rms_m: float
+    edge_mean_m: float
+    edge_rms_m: float
+    held_out_m: float
+    reprojection_px: float
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """The extrinsic of one camera and one LiDAR, with everything needed to judge it.
+
+    result.json keeps all of it but the last four attributes, which are empty where it is read back.
 
     Attributes:
         channel: of the camera, or several joined by "+".
@@ -244,6 +267,10 @@ class Calibration:
         uncertainty: what `cov` means for points at several distances; empty where no lens was at hand.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         other_cameras: those that saw the same boards held still.
+        weak_direction: the least certain motion, with its standard deviation.
+        held_out_m: rms residual of captures where they were not fitted; NaN where no method knows it.
+        residuals: of each capture used.
+        observations: capture -> the boards that were paired, as measured, for each capture used.
     """
 
     camera: str
@@ -267,6 +294,10 @@ class Calibration:
     uncertainty: tuple[PointUncertainty, ...] = ()
     estimated_with: tuple[str, ...] = ()
     other_cameras: tuple[OtherCamera, ...] = ()
+    weak_direction: str = ""
+    held_out_m: float = float("nan")
+    residuals: tuple[CaptureResidual, ...] = ()
+    observations: Mapping[str, Observation] = field(default_factory=dict)
 
     @property
     def channels(self) -> tuple[str, ...]:

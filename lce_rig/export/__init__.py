@@ -35,10 +35,10 @@ def load_exporter(name: str) -> Exporter:
     return exporter
 
 
-def write_exports(
+def export(
     calibrations: Sequence[Calibration],
     rig: Rig,
-    folder: Path,
+    folder: Path | str,
     *,
     formats: Iterable[str] | None = None,
     is_forced: bool = False,
@@ -63,6 +63,7 @@ def write_exports(
         ResultRefusedError: a verdict is "fail"; nothing is written.
         LceRigError: a file does not say what was calibrated; it and all others are removed again.
     """
+    folder = Path(folder)
     for calibration in calibrations:
         require_known(calibration, rig)
     exporters = [load_exporter(name) for name in (EXPORTS if formats is None else formats)]

@@ -27,13 +27,13 @@ class SavedResult:
     Attributes:
         rig: its name.
         made_by: the program and its version.
-        calibrations: one for each camera and LiDAR.
+        pairs: one for each camera and LiDAR.
         inputs_sha256: SHA-256 of the session's files that the result was made from, by their path in it.
     """
 
     rig: str
     made_by: str
-    calibrations: tuple[Calibration, ...]
+    pairs: tuple[Calibration, ...]
     inputs_sha256: Mapping[str, str]
 
 
@@ -145,7 +145,12 @@ def result_text(
     rig_name: str, calibrations: Sequence[Calibration], inputs_sha256: Mapping[str, str] | None = None
 ) -> str:
     """Write the content of result.json: deterministic, floats to the last digit, a matrix row a line."""
-    return _layout(to_json_dict(rig_name, calibrations, inputs_sha256), "") + "\n"
+    return layout(to_json_dict(rig_name, calibrations, inputs_sha256))
+
+
+def layout(document: Mapping[str, Any]) -> str:
+    """Lay the content of result.json out as its text."""
+    return _layout(document, "") + "\n"
 
 
 def _layout(value: Any, indent: str) -> str:
@@ -177,12 +182,13 @@ def write_result(
     write_atomically(path, result_text(rig_name, calibrations, inputs_sha256))
 
 
-def read_result(path: Path) -> SavedResult:
+def read_result(path: Path | str) -> SavedResult:
     """Read result.json back, exactly as it was written; keys that later versions may add are ignored.
 
     Raises:
         SessionError: no such file, or not a result that can be trusted; with the key at fault.
     """
+    path = Path(path)
     try:
         data = read_json(path)
     except FileNotFoundError as error:

@@ -14,22 +14,62 @@ from lce_rig.core.results import Calibration, Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.pipeline.cameras import InCompany, bring_cameras_together
+from lce_rig.pipeline.detection import detect
 from lce_rig.pipeline.progress import Progress, silent
+from lce_rig.pipeline.result_files import Result
 from lce_rig.pipeline.solving import solve
 from lce_rig.rig import Rig
+from lce_rig.session import Session
 
 
 def calibrate(
+    session: Session,
+    detections: Detections | None = None,
+    *,
+    options: CalibrateOptions | None = None,
+    cameras: Sequence[str] | None = None,
+    channels: Sequence[str] | None = None,
+    reference: Reference | None = None,
+    progress: Progress = silent,
+) -> Result:
+    """Estimate and judge the extrinsic of every camera with every LiDAR of a session; nothing is written.
+
+    Args:
+        session: open for reading is enough.
+        detections: of the session; None detects the board first, as `detect` does by default.
+        options: of the estimate; None takes the usual ones.
+        cameras: to calibrate, as if the session held no others; None takes all.
+        channels: of the cameras, to use; None takes all that the session holds.
+        reference: extrinsics to report errors against; they never enter the estimate or the verdict.
+        progress: called with (done, total) for each camera and LiDAR in turn.
+
+    Raises:
+        NotEnoughDataError: every pair has too few captures or leaves a direction open; the causes are named.
+        UsageError: no capture holds one of the channels.
+    """
+    pairs, shortages = calibrate_detections(
+        session.rig,
+        detect(session) if detections is None else detections,
+        options,
+        cameras=cameras,
+        channels=channels,
+        reference=reference,
+        progress=progress,
+    )
+    return Result(session, tuple(pairs), tuple(shortages))
+
+
+def calibrate_detections(
     rig: Rig,
     detections: Detections,
-    options: CalibrateOptions,
+    options: CalibrateOptions | None = None,
     *,
     cameras: Sequence[str] | None = None,
     channels: Sequence[str] | None = None,
     reference: Reference | None = None,
     progress: Progress = silent,
-) -> tuple[list[tuple[Calibration, CalibrationEstimate]], list[NotEnoughDataError]]:
-    """Estimate and judge the extrinsic of every camera with every LiDAR.
+) -> tuple[list[Calibration], list[NotEnoughDataError]]:
+    """Estimate and judge the extrinsic of every camera with every LiDAR from what they saw of the board.
 
     Channels of one camera share pixels and lens: together they give one extrinsic. Cameras that saw the same
     boards are held against each other, and with method "ml" estimated together.
@@ -37,11 +77,7 @@ def calibrate(
     Args:
         rig: thresholds, targets and nominal extrinsics.
         detections: of one session.
-        options: switches of the algorithm.
-        cameras: to calibrate, as if the session held no others; None takes all.
-        channels: of the cameras, to use; None takes all that the session holds.
-        reference: extrinsics to report errors against; they never enter the estimate or the verdict.
-        progress: called with (done, total) for each camera and LiDAR in turn.
+        options, cameras, channels, reference, progress: as of `calibrate`.
 
     Returns:
         The sensors that could be calibrated; and for each other pair why not.
@@ -53,13 +89,13 @@ def calibrate(
     solved, troubles = [], []
     for pairs in _pairs_by_sensors(detections, cameras, channels):
         try:
-            solved.append(solve(rig, detections, pairs, options, progress))
+            solved.append(solve(rig, detections, pairs, options or CalibrateOptions(), progress))
         except NotEnoughDataError as error:
             troubles.append(error)
     if not solved:
         raise _nothing_solved(troubles, cameras)
     members = bring_cameras_together(rig, detections, solved)
-    return [(_judged(rig, detections, each, reference), each.solved.estimate) for each in members], troubles
+    return [_judged(rig, detections, each, reference) for each in members], troubles
 
 
 def _nothing_solved(
@@ -131,6 +167,10 @@ def _judged(rig: Rig, detections: Detections, member: InCompany, reference: Refe
         uncertainty=point_uncertainties(estimate.T_cam_lidar, estimate.cov, lens),
         estimated_with=estimate.estimated_with,
         other_cameras=member.others,
+        weak_direction=estimate.weak_direction,
+        held_out_m=estimate.held_out_m,
+        residuals=estimate.residuals,
+        observations=estimate.observations,
     )
     truth = reference.of(camera, lidar) if reference else None
     return calibration if truth is None else compare_with_reference(calibration, truth)

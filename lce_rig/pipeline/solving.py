@@ -171,7 +171,7 @@ def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandida
     return candidates, refused
 
 
-def refusals(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refusal]:
+def refusals_of(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refusal]:
     """Say why captures of a pair cannot be used: a sensor saw no board, or both sensors disagree."""
     candidates, refused = _candidates(detections, pair)
     consensus = find_consensus(candidates, rig.board.to_board()) if len(candidates) >= 3 else None

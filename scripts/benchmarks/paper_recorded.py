@@ -11,10 +11,10 @@ from benchmarks.paper_runs import paper_mge_m
 from benchmarks.recordings import SETS, RecordedSet, detect
 from benchmarks.tables import compare
 from lce_rig import pipeline
-from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate, CaptureCandidates, calibrate
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageBoard
+from lce_rig.core.results import Calibration, ImageBoard
 from lce_rig.pipeline import Detections
 from lce_rig.rig import Rig
 
@@ -62,16 +62,16 @@ class Recording:
             if isinstance(image, ImageBoard) and isinstance(scan, list)
         ]
 
-    def estimate(self, channels: Sequence[str], options: CalibrateOptions) -> CalibrationEstimate:
+    def estimate(self, channels: Sequence[str], options: CalibrateOptions) -> Calibration:
         """Calibrate as `lce-rig calibrate` does.
 
         Raises:
             NotEnoughDataError: the captures are too few or leave a direction undetermined.
         """
-        results, _ = pipeline.calibrate(self.rig, self.detections, options, channels=channels)
-        return results[0][1]
+        pairs, _ = pipeline.calibrate_detections(self.rig, self.detections, options, channels=channels)
+        return pairs[0]
 
-    def errors(self, estimate: CalibrationEstimate) -> tuple[float, float, float, float]:
+    def errors(self, estimate: Calibration) -> tuple[float, float, float, float]:
         """Give EGT in deg and mm, and MGE in mm, ours and as the paper counts it."""
         deg, mm = compare(estimate.T_cam_lidar, self.reference)
         board = self.rig.board.to_board()

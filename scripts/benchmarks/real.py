@@ -58,7 +58,7 @@ def _row(
     pairs = [pair for pair in detections.pairs if pair.channel in channels]
     seen = [detections.of(pair, name) for pair in pairs for name in detections.captures(pair)]
     options = CalibrateOptions(method=method)
-    calibration, _ = pipeline.calibrate(rig, detections, options, channels=channels)[0][0]
+    (calibration, *_), _ = pipeline.calibrate_detections(rig, detections, options, channels=channels)
     deg, mm = compare(calibration.T_cam_lidar, recorded.reference())
     split_deg, split_mm = _split_halves(rig, detections, channels, n_splits, method)
     return (
@@ -95,12 +95,12 @@ def _split_halves(
         halves = [{keys[i] for i in part} for part in np.array_split(order, 2)]
         try:
             T = [
-                pipeline.calibrate(
+                pipeline.calibrate_detections(
                     rig,
                     _only(detections, {n for n, key in prints.items() if key in half}),
                     CalibrateOptions(n_draws=0, method=method),
                     channels=channels,
-                )[0][0][0].T_cam_lidar
+                )[0][0].T_cam_lidar
                 for half in halves
             ]
         except NotEnoughDataError:
@@ -118,7 +118,7 @@ def _only(detections: Detections, names: set[str]) -> Detections:
 
 
 def _clock_rows(recorded: RecordedSet, rig: Rig, detections: Detections) -> Iterator[tuple[object, ...]]:
-    calibration, _ = pipeline.calibrate(rig, detections, CalibrateOptions())[0][0]
+    (calibration, *_), _ = pipeline.calibrate_detections(rig, detections)
     figures = calibration.diagnostics
     apart = f"{figures['channels_rotation_deg']:.2f} / {1000 * figures['channels_translation_m']:.1f}"
     for result in calibration.channel_results:

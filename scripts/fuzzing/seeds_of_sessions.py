@@ -162,10 +162,10 @@ def truth(samples: Samples) -> list[Files]:
 
 def exports(_samples: Samples) -> list[Files]:
     """Every file of a result."""
-    from lce_rig.export import write_exports
+    from lce_rig.export import export
 
     with tempfile.TemporaryDirectory() as folder:
-        write_exports([calibration()], small_rig(), Path(folder))
+        export([calibration()], small_rig(), Path(folder))
         return [files_in(Path(folder))]
 
 

@@ -34,7 +34,7 @@ def names(folder):
 
 
 def pose_in(folder):
-    return read_result(folder / "result.json").calibrations[0].T_cam_lidar
+    return read_result(folder / "result.json").pairs[0].T_cam_lidar
 
 
 def test_the_earlier_result_becomes_the_previous_one_with_its_exports(session, folder):
@@ -82,17 +82,17 @@ def test_no_number_of_runs_of_one_camera_takes_the_other_ones_result_away(tmp_pa
     for k in range(3):
         again = replace(OTHER, camera="left", reasons=(f"{k}",))
         assert write_results(session, [again], force=False).only_previous == ("right and lidar",)
-        kept = read_result(folder / "previous" / "result.json").calibrations
+        kept = read_result(folder / "previous" / "result.json").pairs
         assert [c.camera for c in kept] == ["left", "right"]
     assert write_results(session, [left, right], force=False).only_previous == ()
-    assert [c.camera for c in read_result(folder / "previous" / "result.json").calibrations] == ["left"]
+    assert [c.camera for c in read_result(folder / "previous" / "result.json").pairs] == ["left"]
 
 
 def test_without_a_usable_result_the_last_failed_one_is_kept(session, folder):
     write_results(session, [FAILED], force=False)
     written = write_results(session, [calibration(verdict="fail", captures_used=())], force=True)
     assert written.previous is not None and not written.has_usable_previous
-    assert read_result(folder / "previous" / "result.json").calibrations[0].reasons == ("too few",)
+    assert read_result(folder / "previous" / "result.json").pairs[0].reasons == ("too few",)
 
 
 def test_a_forced_failure_does_not_count_as_usable(session, folder):
