@@ -3,8 +3,8 @@
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import DriverSettings, Rig
 from lce_rig.rig.sync import BOARD
-from lce_rig.sources.live.base import LiveSource
 from lce_rig.sources.live.opening import driver_type, open_live
+from lce_rig.sources.live.reading import LiveSource
 
 # What to add for each driver that must be told where its sensor is.
 _LINES = {

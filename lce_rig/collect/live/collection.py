@@ -1,7 +1,8 @@
 """The live loop: see the board in the newest frame, say where it goes, capture it when it is there.
 
-Threads: one reads each sensor (its source), one forwards what it read (`Pumps`), one pairs (`FrameFeed`), one
-writes captures (`Keeper`); this loop alone looks for the board, decides and tells the views.
+Threads: one reads each sensor into one queue (`AttachedSensors`), one pairs (`FrameFeed`), one writes
+captures (`Keeper`); this loop alone decides and tells the views. Processes: one looks for the board
+(`BoardSearch`), one calibrates what was captured (`Learning`).
 """
 
 import sys
@@ -17,7 +18,6 @@ from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.live.monitor import Monitor
 from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_unseen
 from lce_rig.collect.live.options import Ending, Key, LiveOptions, LiveReport
-from lce_rig.collect.live.pumps import Pumps
 from lce_rig.collect.live.recorder import SampleRecorder
 from lce_rig.collect.live.search import BoardSearch
 from lce_rig.collect.live.state import LiveState
@@ -25,8 +25,8 @@ from lce_rig.collect.novelty import Placements, capture_poses
 from lce_rig.collect.watching import Moment, Sighting
 from lce_rig.core.errors import LceRigError
 from lce_rig.session import Capture, Session
-from lce_rig.sources.live.base import LiveSource
 from lce_rig.sources.live.opening import edge_cameras
+from lce_rig.sources.live.reading import AttachedSensors, LiveSource
 from lce_rig.timing.rig_clock import RigClock
 from lce_rig.timing.sync import pair_times
 from lce_rig.words import sentence
@@ -67,15 +67,15 @@ def collect_live(
         _count_in(capture, session, guides)
     # Leaving closes in turn: nothing new comes, what was decided is written, the devices are let go.
     search = BoardSearch(rig, options.search_interval_s)
-    with _swift_turns(), search, Pumps(sources) as pumps:
+    with _swift_turns(), search, AttachedSensors(sources) as sensors:
         clock = RigClock(rig, has_board=board is not None, edge_cameras=edge_cameras(rig))
         with (
             Learning(rig, guides) as learning,
             Keeper(session, learning) as keeper,
-            FrameFeed(rig, pumps, clock, board, None if recorder is None else recorder.put) as feed,
+            FrameFeed(rig, sensors, clock, board, None if recorder is None else recorder.put) as feed,
         ):
             loop = _Loop(
-                session, options, pumps, clock, feed, search, learning, keeper, guides, show, recorder
+                session, options, sensors, clock, feed, search, learning, keeper, guides, show, recorder
             )
             report = loop.run(keys)
         loop.take_kept()
@@ -119,7 +119,7 @@ class _Loop:
         self,
         session: Session,
         options: LiveOptions,
-        pumps: Pumps,
+        sensors: AttachedSensors,
         clock: RigClock,
         feed: FrameFeed,
         search: BoardSearch,
@@ -131,7 +131,7 @@ class _Loop:
     ) -> None:
         self.report = LiveReport()
         self._session, self._rig, self._options = session, session.rig, options
-        self._pumps, self._clock, self._feed, self._keeper = pumps, clock, feed, keeper
+        self._sensors, self._clock, self._feed, self._keeper = sensors, clock, feed, keeper
         self._guides = guides
         self._show = show
         self._recorder = recorder
@@ -143,7 +143,7 @@ class _Loop:
         self._first_number = int(names[-1]) + 1 if names else 0
         self._n_asked = 0
         self._captured_s = self._began_s
-        self._monitor = Monitor(session, options, pumps, clock)
+        self._monitor = Monitor(session, options, sensors, clock)
         self._last: Sighting | None = None
 
     def run(self, keys: Callable[[], Key | None]) -> LiveReport:
@@ -176,8 +176,8 @@ class _Loop:
         """Gather what was lost on the way, and write it into the session's journal."""
         report = self.report
         report.n_skipped = self._feed.n_skipped
-        report.lost = {name: error for name, (error, _) in self._pumps.lost().items()}
-        for name, status in self._pumps.statuses().items():
+        report.lost = {name: error for name, (error, _) in self._sensors.lost().items()}
+        for name, status in self._sensors.statuses().items():
             report.n_lost[name] = status.n_lost + status.n_dropped
         if report.ending == "exhausted":
             waited_s = time.monotonic() - self._captured_s
@@ -275,7 +275,7 @@ class _Loop:
 
     def _find_ending(self, key: Key | None) -> Ending | None:
         options, elapsed_s = self._options, time.monotonic() - self._began_s
-        lost = self._pumps.lost()
+        lost = self._sensors.lost()
         vital = {name: why for name, why in lost.items() if name in {*self._rig.lidars, *self._rig.cameras}}
         for error, since_s in vital.values():
             if time.monotonic() - since_s > options.lost_s:

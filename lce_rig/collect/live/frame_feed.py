@@ -7,12 +7,12 @@ from types import TracebackType
 from typing import Protocol, runtime_checkable
 
 from lce_rig.collect.event_pictures import with_event_pictures
-from lce_rig.collect.live.pumps import Pumps
 from lce_rig.collect.tally import Tally
 from lce_rig.core.data import Sample
 from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.rig import Rig
 from lce_rig.sources.live.base import Mailbox
+from lce_rig.sources.live.reading import AttachedSensors
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.rig_clock import SLOW_TRIGGERS_HZ, RigClock
 from lce_rig.timing.rig_time import event_channel
@@ -44,7 +44,7 @@ class SyncTimes(Protocol):
 
 
 class FrameFeed:
-    """Reads the pumps, places samples on the rig's clock and pairs them; open while its `with` block lasts.
+    """Reads the sensors, places samples on the rig's clock and pairs them; open while its `with` block lasts.
 
     Attributes:
         counts: how pairing goes.
@@ -54,7 +54,7 @@ class FrameFeed:
     def __init__(
         self,
         rig: Rig,
-        pumps: Pumps,
+        sensors: AttachedSensors,
         clock: RigClock,
         board: SyncTimes | None,
         record: Callable[[Sample], None] | None = None,
@@ -63,14 +63,14 @@ class FrameFeed:
 
         Args:
             rig: the profile.
-            pumps: open.
+            sensors: open.
             clock: ties the stamps.
             board: the sync board; None where there is none.
             record: takes every sample too, as it came but for its time; must not block.
         """
         self.counts = PairingCounts()
         self._rig = rig
-        self._pumps = pumps
+        self._sensors = sensors
         self._clock = clock
         self._board = board
         self._record = record
@@ -133,7 +133,7 @@ class FrameFeed:
         if time.monotonic() - self._refreshed_s < _REFRESH_S:
             return
         self._refreshed_s = time.monotonic()
-        states = {name: status.clock for name, status in self._pumps.statuses().items()}
+        states = {name: status.clock for name, status in self._sensors.statuses().items()}
         locked = [name for name, state in states.items() if state is not None and state.is_utc]
         board = self._board
         host, utc = (None, None) if board is None else (board.host_clock, board.utc_clock)
@@ -145,7 +145,7 @@ class FrameFeed:
     def _samples(self) -> Iterator[Sample]:
         while not self._stop.is_set():
             self._refresh_clock()
-            came = self._pumps.take(_WAIT_S)
+            came = self._sensors.take(_WAIT_S)
             if came is None:
                 continue
             for sample in self._clock.take(*came):

@@ -6,7 +6,7 @@ from typing import Any
 
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import DriverSettings, Rig
-from lce_rig.sources.live.base import LiveSource
+from lce_rig.sources.live.reading import LiveSource
 
 LIVE = {
     "vlp16": "lce_rig.sources.live.vlp16:Vlp16Source",
