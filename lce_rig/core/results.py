@@ -1,4 +1,4 @@
-"""What the stages hand to each other, as frozen dataclasses."""
+"""The data passed between stages, as frozen dataclasses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from lce_rig.core.geometry import Array, sigma_sizes
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why a capture is not used.
+    """The reason for refusing a capture.
 
     Attributes:
         stage: "read", "image", "lidar", "pair" (the two sensors disagree) or "calibrate" (outlier).
@@ -27,7 +27,7 @@ class Refusal:
 
 @dataclass(frozen=True, eq=False)
 class ImageBoard:
-    """The board as one picture shows it.
+    """The board detected in one image.
 
     Attributes:
         corners_px: (rows * cols, 2) in the order of `Board.corners()`.
@@ -63,7 +63,7 @@ class ImageBoard:
 
 @dataclass(frozen=True, eq=False)
 class LidarBoard:
-    """The board as one scan shows it, frame lidar.
+    """The board detected in one scan, frame lidar.
 
     Attributes:
         points: (N, 3) on the board as measured, m.
@@ -136,7 +136,7 @@ class PoseSolution:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Errors of an extrinsic; the definitions stand in docs/conventions.md.
+    """Errors of the extrinsics; docs/conventions.md defines them.
 
     Attributes:
         mpe_m: mean over captures of the mean distance of LiDAR board points from the camera's board plane.
@@ -157,7 +157,7 @@ class Metrics:
 
 @dataclass(frozen=True, eq=False)
 class ChannelResult:
-    """What one channel of a camera says alone, and how well it is timed.
+    """The result of one channel of a camera alone, with its time offset.
 
     Attributes:
         channel: its name.
@@ -185,7 +185,7 @@ class ChannelResult:
 
 @dataclass(frozen=True)
 class PointUncertainty:
-    """How far the LiDAR's points may be off, seen by the camera: standard deviations of the error's size.
+    """Errors of the LiDAR's points in the camera: standard deviations of the error's size.
 
     Attributes:
         distance_m: of the point from the camera.
@@ -202,7 +202,7 @@ class PointUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class OtherCamera:
-    """Where a camera sits to another one that saw the same boards in the same scans.
+    """The pose of a camera relative to another one that saw the same boards in the same scans.
 
     Attributes:
         camera: name of the other one.

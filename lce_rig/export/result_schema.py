@@ -44,7 +44,7 @@ class _Record(BaseModel):
 
 
 class RefusalRecord(_Record):
-    """Why a capture is not used."""
+    """The reason for refusing a capture."""
 
     stage: Literal["read", "image", "lidar", "pair", "calibrate"]
     cause: str
@@ -59,7 +59,7 @@ class CertificateRecord(_Record):
 
 
 class ChannelRecord(_Record):
-    """What one channel says alone; time offsets are null where nothing moved."""
+    """The result of one channel alone; time offsets are null if nothing moved."""
 
     channel: str
     n_captures: _Count
@@ -73,7 +73,7 @@ class ChannelRecord(_Record):
 
 
 class UncertaintyRecord(_Record):
-    """What the covariance means for a point at a distance, in the picture's centre and worst corner."""
+    """The covariance as the error of a point at a distance, in the image's centre and worst corner."""
 
     distance_m: Annotated[float, Field(gt=0)]
     centre_px: _NotNegative
@@ -83,7 +83,7 @@ class UncertaintyRecord(_Record):
 
 
 class OtherCameraRecord(_Record):
-    """Where a camera sits to another one; cov is null where they were not estimated together."""
+    """The pose of a camera relative to another one; cov is null if they were not estimated together."""
 
     camera: str
     n_captures: _Count
