@@ -95,7 +95,7 @@ class SyncBoard(LiveSource):
         self._busy_until_ns += _ASK_OFTEN_NS
         until_s = time.monotonic() + self._hello_s
         while not self._is_heard and not self.is_stopping:
-            self._early += self.read()
+            self._early = self.read()
             if not self._is_heard and time.monotonic() > until_s:
                 raise self._silent()
         self._check_version()

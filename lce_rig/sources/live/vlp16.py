@@ -88,7 +88,7 @@ class Vlp16Source(LiveSource):
         self._early = []
         until_s = time.monotonic() + self._silence_s
         while not self._stream.counts.n_data and not self.is_stopping:
-            self._early += self.read()
+            self._early = self.read()
             if not self._stream.counts.n_data and time.monotonic() > until_s:
                 raise self.explain_silence(has_sent=False)
 
