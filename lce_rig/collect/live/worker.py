@@ -1,10 +1,12 @@
 """An object in a process of its own, so that its work does not hold this process's interpreter.
 
 Threads that read sensors ask for the interpreter often and briefly; to search images for a board, or to
-calibrate, holds it for long. What goes to the object and comes back is pickled: 3 MB of an image take 3 ms.
+calibrate, holds it for long. Arrays go to the object through shared memory, a millisecond for an image and a
+scan; a pipe would take ten and need both processes at once. What comes back is small.
 """
 
 import os
+import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -12,6 +14,7 @@ from contextlib import contextmanager
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from multiprocessing.sharedctypes import RawArray
 from types import TracebackType
 from typing import Any
 
@@ -20,6 +23,9 @@ from lce_rig.core.errors import LceRigError, SourceError
 # One process already has two cores' worth of work: threads of its own would only wait for each other.
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 _CLOSE_S = 2.0
+# What does not fit goes through the pipe.
+_SHARED_BYTES = 1 << 25
+_Spans = list[tuple[int, int]]
 _starting = threading.Lock()
 
 
@@ -79,16 +85,17 @@ class Worker:
     def _ask(self, method: str, arguments: tuple[object, ...]) -> object:
         if self._process is None:
             self._start()
-        self._connection.send((method, arguments))
+        self._connection.send(_pack((method, arguments), self._shared))
         return self._connection.recv()
 
     def _start(self) -> None:
         # A forked process would share locks of this one's threads.
         context = get_context("spawn")
         ours, theirs = context.Pipe()
-        process = context.Process(
-            target=_serve, args=(theirs, self._nice, *self._made), name=self._name, daemon=True
-        )
+        shared = RawArray("B", _SHARED_BYTES)
+        self._shared = memoryview(shared).cast("B")
+        arguments = theirs, shared, self._nice, *self._made
+        process = context.Process(target=_serve, args=arguments, name=self._name, daemon=True)
         with _one_thread():
             start_without_interrupts(process)
         theirs.close()
@@ -122,17 +129,43 @@ def _one_thread() -> Iterator[None]:
                     os.environ[name] = value
 
 
+def _pack(request: object, shared: memoryview) -> tuple[bytes, _Spans]:
+    """Pickle a request, its arrays' content into shared memory where they fit; gives where each lies."""
+    buffers: list[pickle.PickleBuffer] = []
+    data = pickle.dumps(request, protocol=5, buffer_callback=buffers.append)
+    spans, end = _Spans(), 0
+    for buffer in buffers:
+        raw = buffer.raw()
+        if end + raw.nbytes > len(shared):
+            return pickle.dumps(request, protocol=5), []
+        shared[end : end + raw.nbytes] = raw
+        spans.append((end, end + raw.nbytes))
+        end += raw.nbytes
+    return data, spans
+
+
+def _unpack(data: bytes, spans: _Spans, shared: memoryview) -> Any:
+    """Undo `_pack`; what was shared is copied, for the next request to overwrite it."""
+    return pickle.loads(data, buffers=[bytearray(shared[start:end]) for start, end in spans])
+
+
 def _serve(
-    connection: Connection, nice: int, make: Callable[..., object], arguments: tuple[object, ...]
+    connection: Connection,
+    array: Any,
+    nice: int,
+    make: Callable[..., object],
+    arguments: tuple[object, ...],
 ) -> None:
     """Answer calls until the other end is gone."""
     # Whoever started this ends it; a closed terminal must not.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     os.nice(nice)
+    shared = memoryview(array).cast("B")
     try:
         subject = make(*arguments)
         while True:
-            method, given = connection.recv()
+            data, spans = connection.recv()
+            method, given = _unpack(data, spans, shared)
             answer: object
             try:
                 answer = getattr(subject, method)(*given)
