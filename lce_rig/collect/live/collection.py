@@ -152,8 +152,11 @@ class _Loop:
             frame = self._feed.take(_WAIT_S)
             self.take_kept()
             if frame is not None:
+                sighting = self._search.sight(frame)
+                if not self.report.n_frames:
+                    self._captured_s = time.monotonic()  # The search had to start first.
                 self.report.n_frames += 1
-                self._see(self._search.sight(frame))
+                self._see(sighting)
             key = keys()
             self._obey(key)
             ending = self._find_ending(key)
