@@ -37,6 +37,7 @@ from lce_rig.pipeline.detection import Progress, detect, silent
 from lce_rig.pipeline.result_files import Result
 from lce_rig.rig import Rig
 from lce_rig.session import Session
+from lce_rig.words import sentence
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,10 +248,8 @@ def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandida
 
 def _commonest(refused: dict[str, Refusal]) -> str:
     """List the commonest causes of refusal, one a line."""
-    counts = Counter((why.stage, why.cause, why.action) for why in refused.values())
-    return "\n".join(
-        f"{n} x {stage}: {cause}: {action}" for (stage, cause, action), n in counts.most_common(3)
-    )
+    counts = Counter(f"{why.stage}: {sentence(why)}" for why in refused.values())
+    return "\n".join(f"{n} x {text}" for text, n in counts.most_common(3))
 
 
 def _links(rig: Rig, sensors: Sequence[_Sensors], alone: Sequence[CalibrationEstimate]) -> Iterator[_Link]:

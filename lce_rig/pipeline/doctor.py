@@ -135,7 +135,7 @@ def _sight_in_picture(rig: Rig, image: Image) -> Sight:
     try:
         found = BoardFinder(rig).image(image)
     except LceRigError as error:
-        found = Refusal("image", error.what, error.hint)
+        found = Refusal.of_error("image", error)
     if isinstance(found, Refusal):
         return Sight("", found, {})
     q = found.quality
@@ -160,7 +160,7 @@ def _sight_in_events(rig: Rig, seen: Observation) -> Sight:
             rig.quality,
         ).board
     except LceRigError as error:
-        found = Refusal("image", error.what, error.hint)
+        found = Refusal.of_error("image", error)
     if isinstance(found, Refusal):
         return Sight("", found, {})
     figure = f"{found.quality['distance_m']:.2f} m away, seen through its events"

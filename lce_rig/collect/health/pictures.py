@@ -4,10 +4,10 @@ import numpy as np
 
 from lce_rig.collect.health.check import Check, Severity
 from lce_rig.collect.health.examination import Examination
-from lce_rig.core.results import Refusal
-from lce_rig.detect.event_gate import explain_missing_board
+from lce_rig.detect.event_gate import events_problem
 from lce_rig.detect.image_quality import strongest_edge_px
 from lce_rig.timing.event_buffer import join_events
+from lce_rig.words import describe, recommend
 
 _BLACK, _WHITE = 5, 250
 _MAX_WHITE, _MAX_BLACK = 0.2, 0.6
@@ -50,11 +50,10 @@ def check_events(exam: Examination, sensor: str) -> Check | None:
     if not seen.events:
         return None
     events = join_events(list(seen.events))
-    fine = Refusal("image", "", "")
-    doubt = explain_missing_board(events, int(events.t_ns[-1]) + 1, fine, exam.rig.quality)
-    if doubt is fine:
+    problem = events_problem(events, int(events.t_ns[-1]) + 1, exam.rig.quality)
+    if problem is None:
         return Check(sensor, "events", "green", "moving edges, no flicker, no hot pixels to speak of")
-    return Check(sensor, "events", "yellow", doubt.cause, doubt.action)
+    return Check(sensor, "events", "yellow", describe(problem), recommend(problem))
 
 
 def check_board(exam: Examination, sensor: str) -> Check | None:
@@ -65,4 +64,4 @@ def check_board(exam: Examination, sensor: str) -> Check | None:
     best = min(sights.values(), key=lambda sight: sight.refusal is not None)
     if best.refusal is None:
         return Check(sensor, "board", "green", best.figure, values=best.values)
-    return Check(sensor, "board", "yellow", best.refusal.cause, best.refusal.action)
+    return Check(sensor, "board", "yellow", describe(best.refusal), recommend(best.refusal))

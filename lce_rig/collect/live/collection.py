@@ -29,7 +29,7 @@ from lce_rig.sources.live.opening import edge_cameras
 from lce_rig.sources.live.reading import AttachedSensors, LiveSource
 from lce_rig.timing.rig_clock import RigClock
 from lce_rig.timing.sync import pair_times
-from lce_rig.words import sentence
+from lce_rig.words import describe, sentence
 
 _WAIT_S = 0.1
 _TURN_S = 0.0005
@@ -234,7 +234,7 @@ class _Loop:
                 self._capture(confirmed)
                 return Narration("saving", "captured")
             refusal = confirmed
-        self._monitor.cue("refused", f"not captured: {refusal.cause}")
+        self._monitor.cue("refused", f"not captured: {describe(refusal)}")
         guide.note_refusal(present)
         guide.plan(present, _time_s(sighting))
         return narrate_refused(guide, present, refusal)
@@ -274,7 +274,7 @@ class _Loop:
         if isinstance(confirmed, Moment):
             self._capture(confirmed)
         else:
-            self._monitor.cue("refused", f"not captured: {confirmed.cause}: {confirmed.action}")
+            self._monitor.cue("refused", f"not captured: {sentence(confirmed)}")
 
     def _find_ending(self, key: Key | None) -> Ending | None:
         options, elapsed_s = self._options, time.monotonic() - self._began_s

@@ -1,10 +1,8 @@
 """The board searched for in a process of its own, while this one reads sensors."""
 
-from collections import Counter
 from dataclasses import replace
 
 from lce_rig.collect.live.worker import Worker
-from lce_rig.collect.tally import Tally
 from lce_rig.collect.watching import BoardWatcher, Moment, Sighting
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
@@ -46,7 +44,9 @@ class _Search:
     """What runs there: what was searched is not sent back."""
 
     def __init__(self, rig: Rig, search_interval_s: float) -> None:
-        self._watcher = BoardWatcher(rig, search_interval_s, Counter(), Tally(), THOROUGH_S, RESCAN_S)
+        self._watcher = BoardWatcher(
+            rig, search_interval_s, thorough_interval_s=THOROUGH_S, rescan_interval_s=RESCAN_S
+        )
 
     def sight(self, frame: Frame) -> Sighting:
         return _without_samples(self._watcher.sight(frame))
