@@ -287,12 +287,21 @@ _PULSES: Mapping[str, Phrase] = {
     ),
     "edges.not_the_pulses": Phrase("the edges seen are not the board's pulses", "check the wire"),
     "sync.boards_may_move": Phrase("boards may move while they are captured"),
-    "sync.boards_must_stand": Phrase("boards must stand still while they are captured"),
+    "sync.boards_must_stand": Phrase(
+        "boards must stand still while they are captured",
+        actions={
+            "add_board": "add `sync` to the profile (docs/wiring-and-sync.md) to let boards move",
+            "see_lines": "see the lines of these sensors and of the sync board",
+        },
+    ),
     "sync.no_board": Phrase("no sync board ties the cameras' clocks to the LiDAR's"),
-    "sync.none_in_profile": Phrase("{key} is none"),
-    "sync.not_tied": Phrase("the clock of {subject} is not tied to the rig's", "run `lce-rig doctor`"),
+    "sync.none_in_profile": Phrase("{key} is none", actions={"named": ""}),
+    "sync.not_tied": Phrase(
+        "the clock of {subject} is not tied to the rig's", "run `lce-rig doctor`", {"named": ""}
+    ),
     "sync.too_uncertain": Phrase(
-        "time of {subject}: standard deviation {sigma_ms:.1f} ms (limit {limit_ms:.1f} ms)"
+        "time of {subject}: standard deviation {sigma_ms:.1f} ms (limit {limit_ms:.1f} ms)",
+        actions={"named": ""},
     ),
 }
 _SETTINGS: Mapping[str, Phrase] = {

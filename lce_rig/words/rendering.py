@@ -10,7 +10,7 @@ from typing import Any
 
 from lce_rig.core.findings import Figure, Finding
 
-FAMILIES: tuple[str, ...] = ("drivers",)
+FAMILIES: tuple[str, ...] = ("drivers", "doctor")
 """Modules of this package with a table PHRASES of their own."""
 
 Template = str | Callable[[Finding], str]
