@@ -28,7 +28,7 @@ from lce_rig.residuals.features import CaptureFeatures, extract_features
 from lce_rig.residuals.moments import Problem, Solutions, Weights
 from lce_rig.residuals.placements import group_placements
 from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS
-from lce_rig.solvers.covariance import systematic_covariance
+from lce_rig.solvers.covariance import systematic_covariances
 
 # Weights given by the user count in captures with residuals of this size, which sets the scale of the prior.
 NOMINAL_SIGMA_M = 0.01
@@ -153,7 +153,8 @@ def _covariances(
     sensitivities = ring_sensitivities(
         observations, board, options.features, problem, x, edge_ids, cost.information
     )
-    return scatter, systematic_covariance(sensitivities, laser_m, offset_m)
+    lasers, offset = systematic_covariances(sensitivities, laser_m, offset_m)
+    return scatter, lasers + offset
 
 
 def _diagnostics(

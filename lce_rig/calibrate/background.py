@@ -15,21 +15,18 @@ from lce_rig.calibrate.expansion import SHIFT
 from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import LidarBoard, Observation
+from lce_rig.core.results import Observation
+from lce_rig.residuals.along_rays import describe_background
 from lce_rig.residuals.features import CaptureFeatures
 from lce_rig.residuals.plane_and_ends import end_residuals, end_rows
 from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.solvers.covariance import symmetric_inverse
 
-BLENDS_M = 0.35
-"""Echoes from surfaces nearer to each other than this blend into one."""
 BACKGROUND_SIGMAS_M = (0.015, 0.01, 0.015)
 """What is believed of the shifts by the background, in the order of `describe_background`."""
 # What is believed of the extrinsic near which the shifts are sought.
 _SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD = 0.02, 0.01
 _N_SHIFTS = len(BACKGROUND_SIGMAS_M)
-BLENDS = 1
-"""Column of `describe_background` that tells whether the background's echo blends into the board's."""
 # Noise of a ring end, and beyond how many sigmas one counts less.
 _END_SIGMA_M, _HUBER = 0.003, 1.5
 _ROUNDS = 5
@@ -39,22 +36,6 @@ _TOGETHER = ((0, 1, 2), (0,), (1, 2))
 _MIN_CAPTURES = 5
 # They count if they would come about by chance in one session of so many.
 _ONE_IN = 1000
-
-
-def is_blended(lidar: LidarBoard) -> NDArray[np.bool_]:
-    """Tell of each ring end (M,) whether something stands close behind the board, along the beam."""
-    cosine = np.abs(lidar.edge_points @ lidar.plane[:3]) / np.linalg.norm(lidar.edge_points, axis=1)
-    return np.asarray(lidar.edge_behind_m < BLENDS_M * cosine)
-
-
-def describe_background(lidar: LidarBoard) -> Array:
-    """Tell what is behind each ring end (M, 3).
-
-    Columns are the background's share of the power where it is far behind, whether it blends, and its share
-    where it does.
-    """
-    blends = is_blended(lidar)
-    return np.stack([lidar.edge_echo * ~blends, blends, lidar.edge_echo * blends], axis=1)
 
 
 def estimate_shifts(

@@ -1,6 +1,5 @@
 """The moments of a recording that are worth a capture."""
 
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
@@ -43,7 +42,6 @@ class MomentSearch:
     min_turn_deg: float
     _pairing: PairingCounts = field(default_factory=PairingCounts)
     _tally: Tally = field(default_factory=Tally)
-    _counts: Counter[str] = field(default_factory=Counter)
 
     @property
     def has_events(self) -> bool:
@@ -72,7 +70,7 @@ class MomentSearch:
             samples = with_event_pictures(samples, self.rig, cameras, self._tally)
         stillness = self.stillness or StillnessOptions(max_motion_m=self.rig.quality.max_motion_m)
         interval_s = self.motion.search_interval_s if self.has_events else stillness.search_interval_s
-        watcher = BoardWatcher(self.rig, interval_s, self._counts, self._tally, _THOROUGH_S)
+        watcher = BoardWatcher(self.rig, interval_s, self._tally, _THOROUGH_S)
         frames = pair_by_time(samples, self.rig, self._pairing)
         sightings = (watcher.sight(frame) for frame in frames)
         if self.has_events:
@@ -92,12 +90,14 @@ class MomentSearch:
         images = moment.sighting.frame.images
         return [image for image in images if (image.sensor, image.channel) not in self.reconstructed]
 
-    def counts(self) -> Counter[str]:
-        """Count by cause what became no moment so far."""
+    def counts(self) -> Tally:
+        """Count what became no moment so far."""
         # Why a picture could not be made of events is in the tally.
         n_alone = 0 if self.reconstructed else self._pairing.n_alone
-        alone = Counter({"no picture at the time of the scan": n_alone})
-        return alone + self._counts + self._tally.counts()
+        total = Tally()
+        total.add(Refusal("read.no_image_at_scan"), n_alone)
+        total.update(self._tally)
+        return total
 
     def notes(self) -> list[str]:
         """Say how scans and pictures came together."""

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from lce_rig.collect.event_buffer import BEFORE_NS, EventCut
-from lce_rig.collect.event_moment import look_for_flicker
 from lce_rig.core.data import Events
+from lce_rig.detect.event_gate import look_for_flicker
+from lce_rig.words import sentence
 
 
 @dataclass
@@ -28,7 +29,7 @@ class StoredEvents:
                 self._shortest_ns[cut.sensor] = min(before_ns, self._shortest_ns.get(cut.sensor, before_ns))
             lamps = look_for_flicker(events)
             if lamps is not None:
-                self._lamps[cut.sensor, f"{lamps.cause}: {lamps.action}"] += 1
+                self._lamps[cut.sensor, sentence(lamps)] += 1
             joined.append(events)
         return joined
 

@@ -1,4 +1,4 @@
-"""One clock read on another: offset and drift, how well both are known, and what time it is elsewhere."""
+"""The relation of two clocks: offset and drift with their standard deviations, and time conversion."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Clock models from readings: time requests and their answers, edges that two clocks saw, plain arrivals."""
+"""Clock models from readings: time requests and replies, edges timestamped by two clocks, arrivals."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ Stamps = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class TimePairs:
-    """Moments, each read on two clocks.
+    """Times, each read on two clocks.
 
     Attributes:
         source_ns: (N,) reading of the clock to be modelled; rising.

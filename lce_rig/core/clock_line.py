@@ -1,4 +1,4 @@
-"""A line through readings of two clocks, some of which were delayed."""
+"""A robust line through readings of two clocks, some of them delayed."""
 
 from dataclasses import dataclass, replace
 

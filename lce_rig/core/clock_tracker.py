@@ -1,4 +1,4 @@
-"""A clock followed while it runs: a model of the last minute, and a word when one of the clocks jumps."""
+"""Tracking of a running clock: a model of the last minute, and a report when one of the clocks jumps."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ _STEP_SIGMAS = 8.0
 
 @dataclass(frozen=True)
 class ClockStep:
-    """A jump of one clock against the other.
+    """A jump of one clock relative to the other.
 
     Attributes:
         source_ns: first reading of the source's clock after it.
@@ -34,7 +34,7 @@ class _Pair:
 
 
 class ClockTracker:
-    """Readings of two clocks as they come, and the model that fits the last of them.
+    """Incoming readings of two clocks, and the model fitted to the latest ones.
 
     A reading far off the model is held back. One alone is forgotten as an outlier; three in a row that agree
     with each other mean that a clock has jumped, and begin a new model.

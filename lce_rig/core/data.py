@@ -1,4 +1,4 @@
-"""What sensors deliver, as frozen samples."""
+"""Sensor data as frozen samples."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """One picture.
+    """One image.
 
     Attributes:
         sensor: name of the camera in the rig profile.
@@ -74,7 +74,7 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class Events:
-    """A stretch of an event camera's stream.
+    """A range of an event camera's stream.
 
     Attributes:
         sensor: name of the camera in the rig profile.

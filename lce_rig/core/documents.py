@@ -1,4 +1,4 @@
-"""JSON documents from files: one place for what is read of them, whoever wrote them."""
+"""Checked reading of JSON documents from files."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Ctrl-C: the program ends soon, whatever it is doing, in one line and with one exit code."""
+"""Ctrl-C: the program ends soon, in any state, with one line and one exit code."""
 
 import atexit
 import os

@@ -1,4 +1,4 @@
-"""How much a file may ask for: one place for what a real sensor can reach.
+"""Limits on file contents, from what a real sensor can deliver.
 
 Sizes that a file declares are checked against these limits before memory is taken, and unpacking stops at
 them. A reader reports a limit as it reports damage, by a ValueError with words that follow the file's name.

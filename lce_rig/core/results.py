@@ -1,33 +1,45 @@
-"""What the stages hand to each other, as frozen dataclasses."""
+"""The data passed between stages, as frozen dataclasses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.errors import LceRigError
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, sigma_sizes
+
+Stage = Literal["read", "image", "lidar", "pair", "calibrate"]
+STAGES: tuple[Stage, ...] = ("read", "image", "lidar", "pair", "calibrate")
 
 
 @dataclass(frozen=True)
-class Refusal:
-    """Why a capture is not used.
+class Refusal(Finding):
+    """The reason for refusing a capture; its code begins with the stage, as "lidar.too_few_rings".
 
-    Attributes:
-        stage: "read", "image", "lidar", "pair" (the two sensors disagree) or "calibrate" (outlier).
-        cause: what was seen, with its figure: "2 rings on the board".
-        action: what to do: "come 0.8 m closer".
+    Stages are "read", "image", "lidar", "pair" (the two sensors disagree) and "calibrate" (an outlier).
     """
 
-    stage: Literal["read", "image", "lidar", "pair", "calibrate"]
-    cause: str
-    action: str
+    def __post_init__(self) -> None:
+        if self.code.partition(".")[0] not in STAGES:
+            raise ValueError(f"{self.code} names no stage")
+
+    @property
+    def stage(self) -> Stage:
+        """The stage that refuses the capture."""
+        return cast(Stage, self.code.partition(".")[0])
+
+    @staticmethod
+    def of_error(stage: Stage, error: LceRigError, action: str = "") -> "Refusal":
+        """Refuse a capture for an error that was raised about it."""
+        return Refusal(f"{stage}.error", figures={"what": error.what, "hint": error.hint}, action=action)
 
 
 @dataclass(frozen=True, eq=False)
 class ImageBoard:
-    """The board as one picture shows it.
+    """The board detected in one image.
 
     Attributes:
         corners_px: (rows * cols, 2) in the order of `Board.corners()`.
@@ -63,7 +75,7 @@ class ImageBoard:
 
 @dataclass(frozen=True, eq=False)
 class LidarBoard:
-    """The board as one scan shows it, frame lidar.
+    """The board detected in one scan, frame lidar.
 
     Attributes:
         points: (N, 3) on the board as measured, m.
@@ -136,7 +148,7 @@ class PoseSolution:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Errors of an extrinsic; the definitions stand in docs/conventions.md.
+    """Errors of the extrinsics; docs/conventions.md defines them.
 
     Attributes:
         mpe_m: mean over captures of the mean distance of LiDAR board points from the camera's board plane.
@@ -157,7 +169,7 @@ class Metrics:
 
 @dataclass(frozen=True, eq=False)
 class ChannelResult:
-    """What one channel of a camera says alone, and how well it is timed.
+    """The result of one channel of a camera alone, with its time offset.
 
     Attributes:
         channel: its name.
@@ -185,7 +197,7 @@ class ChannelResult:
 
 @dataclass(frozen=True)
 class PointUncertainty:
-    """How far the LiDAR's points may be off, seen by the camera: standard deviations of the error's size.
+    """Errors of the LiDAR's points in the camera: standard deviations of the error's size.
 
     Attributes:
         distance_m: of the point from the camera.
@@ -202,7 +214,7 @@ class PointUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class OtherCamera:
-    """Where a camera sits to another one that saw the same boards in the same scans.
+    """The pose of a camera relative to another one that saw the same boards in the same scans.
 
     Attributes:
         camera: name of the other one.

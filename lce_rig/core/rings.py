@@ -1,4 +1,4 @@
-"""Which laser of a spinning LiDAR measured each point, from the points alone."""
+"""The laser of each point of a spinning LiDAR, inferred from the points alone."""
 
 from typing import Any
 

@@ -53,7 +53,7 @@ def read_table(
 
 
 class _BadRowsError(ValueError):
-    """The lines themselves are wrong, whatever figures they hold."""
+    """Malformed lines, whatever figures they hold."""
 
 
 class _Rows:

@@ -29,7 +29,7 @@ _DECOMPRESSORS = {
 
 
 class _Decompressor(Protocol):
-    """What bz2, lzma, zlib's like, zstd and lz4.frame have in common."""
+    """The common interface of bz2, lzma, zlib, zstd and lz4.frame."""
 
     @property
     def eof(self) -> bool: ...

@@ -1,4 +1,4 @@
-"""Probe points: what was written must put the same LiDAR points on the same pixels."""
+"""Probe points: a written file must project the same LiDAR points to the same pixels."""
 
 from pathlib import Path
 

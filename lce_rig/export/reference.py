@@ -1,4 +1,4 @@
-"""A reference extrinsic from outside, to report errors against."""
+"""Reference extrinsics from a file, for reporting errors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

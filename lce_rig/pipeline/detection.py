@@ -143,7 +143,7 @@ class _Finder:
             try:
                 return self._boards.image(capture.image(camera, channel))
             except ProfileError as error:
-                return Refusal("image", error.what, error.hint)
+                return Refusal.of_error("image", error)
 
         found: ImageDetection = self._remembered(
             self._digest, capture, f"{camera}.{channel}", ImageBoard, find
@@ -212,7 +212,7 @@ class _Finder:
                     return self._require(from_arrays(cached.arrays), kind)
             detection = find()
         except SessionError as error:
-            return Refusal("read", error.what, error.hint or "collect this placement again")
+            return Refusal.of_error("read", error)
         self._keep(key, detection)
         return detection
 

@@ -21,6 +21,7 @@ from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.pipeline.progress import Progress
 from lce_rig.rig import Rig
+from lce_rig.words import sentence
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +181,5 @@ def refusals_of(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refus
 
 def _commonest(refused: dict[str, Refusal]) -> str:
     """List the commonest causes of refusal, one a line."""
-    counts = Counter((why.stage, why.cause, why.action) for why in refused.values())
-    return "\n".join(
-        f"{n} x {stage}: {cause}: {action}" for (stage, cause, action), n in counts.most_common(3)
-    )
+    counts = Counter(f"{why.stage}: {sentence(why)}" for why in refused.values())
+    return "\n".join(f"{n} x {text}" for text, n in counts.most_common(3))

@@ -94,8 +94,15 @@ def end_residuals(f: CaptureFeatures, T_cam_lidar: Array, board: Board) -> tuple
     Returns:
         Distances inside the edge (..., M), and the edges' numbers.
     """
-    edge = board.nearest_edge(ends_on_board(f, T_cam_lidar))
-    return along_normals(f.edge_normals[edge], f.edge_anchors[edge], f.edge_points, T_cam_lidar), edge
+    ends = ends_on_board(f, T_cam_lidar)
+    edge = board.nearest_edge(ends)
+    return distance_inside(board, ends, edge), edge
+
+
+def distance_inside(board: Board, xy_m: Array, edge: NDArray[np.intp]) -> Array:
+    """Measure how far points (..., 2 or 3) of the board's plane lie inside edges (...) by number: (...)."""
+    anchors, normals = (of_edges[edge, :2] for of_edges in board.edges())
+    return np.asarray(np.sum((anchors - xy_m[..., :2]) * normals, axis=-1))
 
 
 def ends_on_board(f: CaptureFeatures, T_cam_lidar: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Edits of a profile's text that leave comments and layout as they are."""
+"""Edits of a profile's text that keep comments and layout."""
 
 import json
 from collections.abc import Sequence

@@ -17,7 +17,7 @@ _MOST_SENSORS = 64
 
 
 class Rig(Settings):
-    """A rig: which sensors it carries and which board they look at.
+    """A rig: its sensors and its board.
 
     Attributes:
         format_version: version of this schema.

@@ -28,7 +28,7 @@ _COUNTS = {"radtan": ((0, 4, 5, 8), "4, 5 or 8 (or none)"), "equidistant": ((4,)
 
 
 class TimestampSettings(Settings):
-    """What a sensor's time stamps mean.
+    """The meaning of a sensor's timestamps.
 
     Attributes:
         clock: whose clock is read: the sensor's own, the computer's, or UTC by GPS or PTP.
@@ -46,7 +46,7 @@ class TimestampSettings(Settings):
 
 
 class FrameTimingSettings(Settings):
-    """What the kernel's stamp of a picture means, where the camera's driver does not say, or says wrong.
+    """The meaning of the kernel's timestamp of an image, if the camera's driver does not report it correctly.
 
     Attributes:
         clock: the clock that stamps pictures; "auto" tries which one fits.
@@ -64,7 +64,7 @@ class FrameTimingSettings(Settings):
 
 
 class DriverSettings(Settings):
-    """How a live sensor is reached.
+    """The connection to a live sensor.
 
     Attributes:
         type: which of the program's drivers; None takes the one that goes with the model.

@@ -1,4 +1,4 @@
-"""The sync board's block of a profile: how it is reached, and which camera each of its lines triggers."""
+"""The sync board's block of a profile: its connection, and the camera that each line triggers."""
 
 from typing import Annotated, Literal
 
@@ -39,7 +39,7 @@ class TriggerSettings(Settings):
 
 
 class SyncSettings(Settings):
-    """A board that makes the pulse per second and triggers cameras.
+    """A board that generates the pulse per second and triggers cameras.
 
     Attributes:
         type: how it talks: lce-rig's own protocol, plain NMEA, SimpleSensorSync's JSON, or lines `T,n,us`.

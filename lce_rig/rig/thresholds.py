@@ -1,4 +1,4 @@
-"""Thresholds and weights of a profile; every one has a default and may be left out."""
+"""Thresholds and weights of a profile; each is optional and has a default."""
 
 from typing import Annotated
 
@@ -10,7 +10,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class QualitySettings(Settings):
-    """From which figures on a capture is used, and a result passes.
+    """Limits for using a capture and for passing a result.
 
     Attributes:
         min_square_px: least side of a square in the picture; below it corners are blurred together.
@@ -62,7 +62,7 @@ class QualitySettings(Settings):
 
 
 class CalibrationSettings(Settings):
-    """Weights of the cost, and how sure the result has to be.
+    """Weights of the cost, and target standard deviations.
 
     Attributes:
         plane_weight: weight of a point's distance from the board's plane.
@@ -82,7 +82,7 @@ class CalibrationSettings(Settings):
 
 
 class VerdictSettings(Settings):
-    """When a result passes; what is beyond a limit is marginal, and fails where a second limit says so.
+    """Limits of the verdict: beyond a limit a result is marginal, beyond a second limit it fails.
 
     Attributes:
         fail_factor: a deviation, or a difference between two answers, this many times the target fails.

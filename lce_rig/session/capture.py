@@ -1,4 +1,4 @@
-"""One capture of a session: a folder of plain files and the manifest that vouches for them."""
+"""One capture of a session: a folder of plain files and a manifest with their checksums."""
 
 import hashlib
 import os
@@ -30,7 +30,7 @@ _MAX_OFFSET_NS = 3600 * 10**9
 
 @dataclass(frozen=True)
 class Capture:
-    """One board placement as the sensors saw it.
+    """One board placement as the sensors recorded it.
 
     Attributes:
         path: the capture's folder; its name is the capture's.

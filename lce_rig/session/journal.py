@@ -1,4 +1,4 @@
-"""What happened to a session, line by line."""
+"""A session's journal, one event per line."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""A session folder: the frozen rig profile, captures, a journal and a cache of detections.
+"""A session folder: the copied rig profile, captures, a journal and a cache of detections.
 
 Layout, every file plain: rig.yaml, session.json, journal.jsonl, detections/ and
 captures/000012/{meta.json, cam.frames.png, lidar.pcd, cam.events.npz}. A capture is written to

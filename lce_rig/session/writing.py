@@ -1,4 +1,4 @@
-"""A capture on its way to the disk: samples as plain files, and the manifest that vouches for them."""
+"""Writing a capture: samples as plain files, and a manifest with their checksums."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""What a camera sees of the standing room: the costly half of a picture, computed once a session."""
+"""The static room in a camera's image: the costly half of rendering, computed once per session."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ _CHUNK = 1 << 18
 
 @dataclass(frozen=True, eq=False)
 class Backdrop:
-    """A camera at its place in the room, and what it sees of it.
+    """A camera at its pose in the room, with its image of the room.
 
     Attributes:
         intrinsics: the lens.

@@ -1,4 +1,4 @@
-"""Beams of finite width: which surfaces one touches, and what single range it reports of several."""
+"""Beams of finite width: the surfaces that a beam hits, and the single range that it reports."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from lce_rig.simulate.scene import Hits, Scene
 
 @dataclass(frozen=True, eq=False)
 class Returns:
-    """What beams bring back.
+    """The returns of beams.
 
     Attributes:
         range_m: (N,), inf where nothing.

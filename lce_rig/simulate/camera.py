@@ -1,4 +1,4 @@
-"""A camera of any lens model: board and carrier before the backdrop, anti-aliased, blurred and noisy."""
+"""A camera of any lens model: board and carrier in front of the room, anti-aliased, blurred and noisy."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -117,7 +117,7 @@ def _paint_mirror_images(radiance: Array, scene: Scene, backdrop: Backdrop) -> N
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """The part of a picture that board and carrier can touch, h by w pixels.
+    """The part of an image that board and carrier can cover, h by w pixels.
 
     Attributes:
         corner_rays: (h + 1, w + 1, 3) unit, world.

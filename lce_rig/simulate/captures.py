@@ -1,4 +1,4 @@
-"""A simulated session: captures of the board among its decoys, held still or moved by hand."""
+"""A simulated session: captures of the board among decoys, still or hand-held."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

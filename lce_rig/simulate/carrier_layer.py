@@ -1,4 +1,4 @@
-"""The board's carrier as event cameras see it: rendered now and then, shifted and blended in between."""
+"""The board's carrier for event cameras: rendered at intervals, shifted and blended in between."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True, eq=False)
 class CarrierLayer:
-    """A picture of the carrier at one moment, cut out.
+    """A cut-out image of the carrier at one time.
 
     Attributes:
         layers: (h, w, 4) float32: the carrier's radiance times its cover, and its cover; then both again of

@@ -1,4 +1,4 @@
-"""An event camera's pixels: each tells when its own slow view of ln(intensity) has changed enough.
+"""An event camera's pixels: each fires when its low-pass filtered ln(intensity) crosses a threshold.
 
 References:
     P. Lichtsteiner, C. Posch and T. Delbruck, A 128x128 120 dB 15 us latency asynchronous temporal contrast
@@ -26,7 +26,7 @@ _HOT_ON_SHARE = 0.95
 
 @dataclass(frozen=True, eq=False)
 class EventPixels:
-    """What makes one pixel differ from the next, fixed for a sensor.
+    """The differences between pixels, fixed for a sensor.
 
     Attributes:
         width_px, height_px: of the sensor.
@@ -63,7 +63,7 @@ class _Raw:
 
 
 class EventCamera:
-    """An event camera at work: give it the scene's intensities in order of time, it gives events.
+    """An event camera: takes the scene's intensities in order of time and returns events.
 
     Args:
         pixels: the sensor.

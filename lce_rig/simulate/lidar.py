@@ -114,7 +114,7 @@ def simulate_scan(
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """What the beams of one revolution met, before any error of measurement.
+    """The surfaces hit by the beams of one revolution, without measurement errors.
 
     Attributes:
         laser: (N,) of each firing, in firing order.

@@ -1,4 +1,4 @@
-"""How bright surfaces are: ceiling lamps, soft light from all walls, shadows and mirror images."""
+"""The brightness of surfaces: ceiling lamps, diffuse light from all walls, shadows and reflections."""
 
 from dataclasses import dataclass
 
@@ -54,7 +54,7 @@ def irradiance(lamps: Array, points: Array, normals: Array, occluders: Raycaster
 
 @dataclass(frozen=True, eq=False)
 class Mirrors:
-    """Which rays meet a shiny surface, and the mirror image of the standing room they see there.
+    """The rays that hit a shiny surface, and their reflection of the static room.
 
     Attributes:
         index: (M,) of the rays.

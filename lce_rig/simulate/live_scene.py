@@ -1,4 +1,4 @@
-"""A board before the simulated sensors, now held and now on its way, whenever somebody looks."""
+"""A board in front of the simulated sensors, still or moving, at any time."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ _SUBPIXELS_ON_THE_WAY = 2
 
 @dataclass(frozen=True, eq=False)
 class _Light:
-    """What falls onto a sensor, and its noise.
+    """The light on a sensor, and its noise.
 
     Attributes:
         linear: (H, W, 3), white is 1.
@@ -37,7 +37,7 @@ class _Light:
 
 
 class LiveScene:
-    """Takes pictures and scans of a board that somebody moves.
+    """Renders images and scans of a moving board.
 
     What is still is rendered once; each picture and scan has its own noise. The beams of a board that is held
     keep their phase from scan to scan.

@@ -1,4 +1,4 @@
-"""What surfaces look like to a camera and to a LiDAR; the prints on them are functions of position."""
+"""Materials for a camera and a LiDAR; their patterns are functions of position."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

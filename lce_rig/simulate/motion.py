@@ -1,4 +1,4 @@
-"""How a hand moves the board: smooth, seeded, and through every placement."""
+"""The motion of a hand-held board: smooth, seeded, through every placement."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ _PROBE_NS = 500_000
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Where the board is at any time: held at placements, carried between them, swaying all the while.
+    """The board's pose at any time: still at placements, moving between them, swaying throughout.
 
     Attributes:
         arrival_ns: (K,) when the board reaches each placement, increasing.

@@ -1,4 +1,4 @@
-"""What can be chosen about a simulated rig; defaults come from data sheets and real recordings."""
+"""Options of a simulated rig; defaults come from data sheets and real recordings."""
 
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -12,7 +12,7 @@ Motion = Literal["still", "moving"]
 
 @dataclass(frozen=True)
 class LidarNoise:
-    """How a spinning LiDAR errs.
+    """Errors of a spinning LiDAR.
 
     Attributes:
         range_sigma_m: white noise of each range.
@@ -61,7 +61,7 @@ class LidarNoise:
 
 @dataclass(frozen=True)
 class CameraNoise:
-    """How a camera errs.
+    """Errors of a camera.
 
     Attributes:
         blur_px: sigma of the lens's point spread.
@@ -85,7 +85,7 @@ class CameraNoise:
 
 @dataclass(frozen=True)
 class EventNoise:
-    """How an event camera errs; the defaults are a DAVIS346's indoors.
+    """Errors of an event camera; the defaults are those of a DAVIS346 indoors.
 
     Attributes:
         threshold_on, threshold_off: mean change of ln(intensity) that makes an event.
@@ -128,7 +128,7 @@ class EventNoise:
 
 @dataclass(frozen=True)
 class HandMotion:
-    """How a hand moves the board.
+    """The motion of a hand-held board.
 
     Attributes:
         speed_mps: range of the board's mean speed, drawn anew for each capture; from the slowest that events
@@ -152,7 +152,7 @@ class HandMotion:
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """What a simulated session shows and how its sensors err.
+    """The content of a simulated session and the errors of its sensors.
 
     Attributes:
         carrier: what carries the board.

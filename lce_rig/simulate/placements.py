@@ -1,4 +1,4 @@
-"""Where the board is shown: spread over the picture, near and far, tilted, and seen by the LiDAR."""
+"""Placements of the board: all over the image, near and far, tilted, and visible to the LiDAR."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ _SPREAD = (1 / 1.2207440846057596) ** np.arange(1, 4)
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera and a LiDAR that both must see the board."""
+    """A camera and a LiDAR; the board must be visible to both."""
 
     camera: str
     intrinsics: Intrinsics

@@ -1,4 +1,4 @@
-"""A simulated recording: pictures, scans and events of a board carried from place to place."""
+"""A simulated recording: images, scans and events of a board moved between placements."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ _PACKET_NS = 20_000_000
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRecording:
-    """A recording with its truth: iterate over it for its samples, in order of their stamps.
+    """A recording with its truth; iterating yields its samples in order of their timestamps.
 
     Attributes:
         stage: the rig's true geometry and the room.

@@ -1,4 +1,4 @@
-"""The scene a ray meets: meshes that stand still, meshes that move with the board, and the board itself."""
+"""The scene for ray casting: static meshes, meshes that move with the board, and the board."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What rays meet first.
+    """The first hits of rays.
 
     Attributes:
         range_m: (N,) distance along the unit ray; inf where nothing is met.
@@ -45,7 +45,7 @@ class Hits:
 
 
 class Raycaster:
-    """Finds the first of a fixed set of surfaces along rays (Embree, float32)."""
+    """Finds the first hit of rays on a fixed set of surfaces (Embree, float32)."""
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
         self.surfaces = tuple(surfaces)
@@ -121,7 +121,7 @@ def _unit_towards(normals: Array, directions: Array) -> Array:
 
 
 class Scene:
-    """Everything one capture shows.
+    """The scene of one capture.
 
     Args:
         static: what stands still over a session.

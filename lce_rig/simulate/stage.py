@@ -1,4 +1,4 @@
-"""What stays the same over a simulated session: the room, the sensors' true places and their own errors."""
+"""The constants of a simulated session: the room, the sensors' true poses and their own errors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ _FORWARD = pose(
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """What stays the same over a session.
+    """The constants of a session.
 
     Attributes:
         rig: the profile.

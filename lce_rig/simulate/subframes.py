@@ -1,4 +1,4 @@
-"""Grey sub-frames of the moving board: fast enough for hundreds a second, smooth enough for event pixels.
+"""Grey images of the moving board: hundreds per second, smooth enough for event pixels.
 
 `render_image` draws single pictures with shadows and mirror images. Here the room is one fixed picture, the
 board is drawn analytically, and its carrier is a cut-out that shifts. Edges are smoothed by their distance
@@ -41,7 +41,7 @@ _PIXEL_AREA_PX2 = 1 / 12
 
 @dataclass(frozen=True, eq=False)
 class _Key:
-    """What is computed only now and then: the carrier's picture, and the light on the board.
+    """The parts computed at intervals: the carrier's image, and the light on the board.
 
     Attributes:
         carrier: None where there is none to be seen.
@@ -54,7 +54,7 @@ class _Key:
 
 @dataclass(eq=False)
 class MovingView:
-    """What one camera sees of the board on its way.
+    """One camera's view of the moving board.
 
     Attributes:
         backdrop: the camera and the standing room.

@@ -1,4 +1,4 @@
-"""One sample of one sensor: of a board that is held still, or of one on its way."""
+"""One sample of one sensor, of a still or moving board."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ def take_scan(
 
 @dataclass(frozen=True, eq=False)
 class MovingBoard:
-    """A board on its way before the sensors of a stage, and whoever carries it.
+    """A moving board and its carrier in front of the sensors of a stage.
 
     Attributes:
         stage: the session.

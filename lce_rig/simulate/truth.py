@@ -1,4 +1,4 @@
-"""The truth of a simulation as values of JSON, for files that stand beside what was simulated."""
+"""The truth of a simulation as JSON values, for files beside the simulated data."""
 
 from typing import Any
 

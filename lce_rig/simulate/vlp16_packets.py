@@ -1,4 +1,4 @@
-"""Scans as the packets a VLP-16 would have sent: data packets, and position packets with PPS and NMEA."""
+"""Scans as VLP-16 packets: data packets, and position packets with PPS and NMEA."""
 
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -39,7 +39,7 @@ class SensorPacket:
 
 @dataclass(frozen=True)
 class Vlp16Clock:
-    """How the sensor's clock is kept.
+    """The sensor's clock.
 
     Attributes:
         pps: one of PPS_STATES.
@@ -56,7 +56,7 @@ class Vlp16Clock:
 
 
 class Vlp16Packets:
-    """Cuts scans into packets; what does not fill one waits for the next scan.
+    """Cuts scans into packets; an incomplete packet waits for the next scan.
 
     Scans simulated with STREAMED_VLP16 and stamped one period apart come out as they went in, within the
     steps of range and azimuth, but for the first 12 deg behind the cut: there the azimuth is eased from

@@ -1,4 +1,4 @@
-"""Pose of a planar board from its corners in one picture: both local minima, with covariance."""
+"""Pose of a planar board from its corners in one image: both local minima, with covariance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Recordings and sensors behind one door: `open_recording` finds the reader for a path."""
+"""Recordings of all kinds: `open_recording` finds the reader for a path."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Pictures and scans as ROS messages, with the fields and conventions that other programs expect.
+"""Images and scans as ROS messages, with the fields and conventions that other programs expect.
 
 References:
     https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/Image.html

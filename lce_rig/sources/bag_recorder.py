@@ -1,4 +1,4 @@
-"""A bag that grows as samples come: what a rig's sensors deliver, on the topics of its profile."""
+"""A bag written as samples arrive, on the topics of the rig's profile."""
 
 from collections import Counter
 from collections.abc import Iterator

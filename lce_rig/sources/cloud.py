@@ -1,4 +1,4 @@
-"""From a cloud with whatever fields to a `Scan`: names, units and conventions are settled here, once."""
+"""Conversion of a point cloud with any fields to a `Scan`: names, units and conventions."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +26,7 @@ NS_PER_UNIT = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
 @dataclass(frozen=True, eq=False)
 class CloudReading:
-    """A scan, and what had to be done to get it.
+    """A scan, and the conversions applied to it.
 
     Attributes:
         n_not_finite: points dropped because a coordinate is NaN or infinite.

@@ -1,4 +1,4 @@
-"""UDP datagrams inside the frames that network recorders keep, out of them and into them.
+"""UDP datagrams in the frames of network recordings: unpacking and packing.
 
 References:
     https://www.tcpdump.org/linktypes.html; RFC 791 (IPv4), RFC 768 (UDP); IEEE 802.1Q (VLAN tags)

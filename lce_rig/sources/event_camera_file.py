@@ -1,4 +1,4 @@
-"""A file of an event camera's own recorder: its events and, in AEDAT4, the frames it took beside them."""
+"""A file of an event camera's own recorder: its events and, in AEDAT4, its frames."""
 
 from collections.abc import Iterator
 from pathlib import Path

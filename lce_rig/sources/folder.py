@@ -1,4 +1,4 @@
-"""A folder of pictures and clouds: for every board placement a cloud, and a picture of each camera."""
+"""A folder of images and point clouds: per board placement one point cloud, and one image per camera."""
 
 import hashlib
 from collections import Counter
@@ -20,7 +20,7 @@ from lce_rig.sources.sensors import choose_camera, choose_lidar
 
 @dataclass(frozen=True)
 class PictureOnDisk:
-    """A picture that has not been read yet; the stamp is that in its name.
+    """An image that has not been read yet; the timestamp comes from its name.
 
     Attributes:
         label: its name, for messages; with its folder's where several cameras may have the same names.
@@ -43,7 +43,7 @@ class PictureOnDisk:
 
 @dataclass(frozen=True)
 class PairOnDisk:
-    """Pictures and a cloud that have not been read yet; the cloud's stamp is that in its name."""
+    """Images and a point cloud that have not been read yet; the timestamp comes from the file name."""
 
     pictures: tuple[PictureOnDisk, ...]
     cloud_path: Path

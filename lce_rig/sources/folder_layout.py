@@ -1,4 +1,4 @@
-"""Where a folder keeps its pictures and clouds, and which camera a folder of pictures belongs to."""
+"""The layout of a folder: its images and point clouds, and the camera of each image folder."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Everything that a rig's sensors deliver, as files in one folder that other programs read."""
+"""Recording of all sensor data, as files in one folder that other programs read."""
 
 from contextlib import ExitStack
 from pathlib import Path

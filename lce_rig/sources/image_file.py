@@ -1,4 +1,4 @@
-"""Pictures from files, as they were taken: no rotation by EXIF, no colour management."""
+"""Images from files, unchanged: no rotation by EXIF, no colour management."""
 
 from pathlib import Path
 from typing import Any

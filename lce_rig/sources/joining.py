@@ -1,4 +1,4 @@
-"""Recordings of one moment by several recorders, read as one."""
+"""Simultaneous recordings of several recorders, read as one."""
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -48,7 +48,7 @@ def require_sensors(recording: ContinuousRecording) -> None:
 
 
 class JoinedRecording:
-    """Several recordings of one moment; see `ContinuousRecording`.
+    """Several simultaneous recordings; see `ContinuousRecording`.
 
     Attributes:
         path: of the first.

@@ -1,4 +1,4 @@
-"""Several streams as one, by the rig's time."""
+"""Merging of several streams by the rig's time."""
 
 from collections.abc import Iterable, Iterator
 from heapq import merge

@@ -1,4 +1,4 @@
-"""Whether the streams of one moment were recorded at the same time, by their own clocks."""
+"""The check that streams overlap in time, by their own clocks."""
 
 from collections.abc import Mapping
 

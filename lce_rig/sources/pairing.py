@@ -1,4 +1,4 @@
-"""Which picture belongs to which cloud, from file names alone."""
+"""Image-scan matching from file names alone."""
 
 import re
 from collections.abc import Sequence

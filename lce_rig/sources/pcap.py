@@ -1,4 +1,4 @@
-"""A recording of the network as a stream of scans of a VLP-16, through the decoding that is used live."""
+"""A network recording as a stream of VLP-16 scans, with the live decoder."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -27,7 +27,7 @@ _MAX_SHOWN = 6
 
 @dataclass
 class _Survey:
-    """What the beginning of a recording holds.
+    """The contents of a recording's start.
 
     Attributes:
         senders: data packets of VLP-16s by IP address.

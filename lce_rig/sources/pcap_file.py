@@ -1,4 +1,4 @@
-"""Files of network recorders: pcap (tcpdump, VeloView) and pcapng (Wireshark), whole or torn.
+"""Files of network recorders: pcap (tcpdump, VeloView) and pcapng (Wireshark), complete or truncated.
 
 References:
     https://www.ietf.org/archive/id/draft-ietf-opsawg-pcap-05.html
@@ -26,7 +26,7 @@ _RESOLUTION_OPTION, _OFFSET_OPTION = 9, 14
 
 
 class _TornError(Exception):
-    """The file ends, or turns to nonsense, within a record."""
+    """The file ends, or becomes invalid, within a record."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A folder in which several recorders kept one moment: a bag, packets of LiDARs, files of event cameras."""
+"""A folder of simultaneous recordings: a bag, packets of LiDARs, files of event cameras."""
 
 from collections.abc import Collection
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The rig's clock, on which the stamps of different sensors meet."""
+"""The rig's clock, the common time base of all sensors."""
 
 from lce_rig.core.data import Events, Image
 from lce_rig.rig import Rig

@@ -1,4 +1,4 @@
-"""sensor_msgs/Image and CompressedImage as grey or BGR pictures.
+"""sensor_msgs/Image and CompressedImage as grey or BGR images.
 
 References:
     https://docs.ros.org/en/noetic/api/sensor_msgs/html/image__encodings_8h_source.html

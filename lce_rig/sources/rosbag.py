@@ -1,4 +1,4 @@
-"""A bag as a stream of pictures, scans and events, by the stamps in their headers."""
+"""A bag as a stream of images, scans and events, by the timestamps in their headers."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -34,7 +34,7 @@ _N_PROBED = 500
 
 @dataclass
 class _Stream:
-    """What was seen of one topic so far."""
+    """The messages of one topic so far."""
 
     last_ns: int | None = None
     n_yielded: int = 0

@@ -1,4 +1,4 @@
-"""Which sensor of the rig a recording's data belongs to."""
+"""Assignment of a recording's data to the sensors of the rig."""
 
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig

@@ -1,4 +1,4 @@
-"""Which topic of a bag belongs to which sensor of the rig."""
+"""Assignment of a bag's topics to the sensors of the rig."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Whether a VLP-16's time can be trusted, and what to stamp its scans with where it cannot.
+"""The check of a VLP-16's time, and the timestamps of its scans if it fails.
 
 The counter in the packets runs free from power-up, and looks no different then: only pulses and sentences,
 which the position packets report, tie it to UTC. The hour is never sent.

@@ -17,7 +17,7 @@ _SPEED_WEIGHT = 0.1
 
 
 class Place(Enum):
-    """Where a packet belongs."""
+    """The position of a packet."""
 
     NEXT = "next"
     HELD = "held back"
@@ -26,7 +26,7 @@ class Place(Enum):
 
 @dataclass
 class OrderCounts:
-    """What the sensor's counter told.
+    """Counts from the sensor's counter.
 
     Attributes:
         n_lost: packets that never arrived.

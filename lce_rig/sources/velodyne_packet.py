@@ -1,4 +1,4 @@
-"""Packets of a VLP-16, checked before they are believed: UDP carries whatever anybody sends to its port."""
+"""Checked packets of a VLP-16: UDP delivers anything sent to the port."""
 
 import re
 import struct
@@ -24,7 +24,7 @@ _RMC = re.compile(
 
 
 class BadPacketError(ValueError):
-    """A payload that is no packet of a VLP-16.
+    """A payload that is not a packet of a VLP-16.
 
     Attributes:
         code: what is wrong, one of a few: they are counted by it, and must not grow with what anybody sends.
@@ -36,7 +36,7 @@ class BadPacketError(ValueError):
 
 
 class OtherModelError(BadPacketError):
-    """A sound packet of another Velodyne."""
+    """A valid packet of another Velodyne."""
 
     def __init__(self, model: str) -> None:
         super().__init__("packet.other_model")
@@ -76,7 +76,7 @@ class DataPacket:
 
 @dataclass(frozen=True)
 class PositionPacket:
-    """What the sensor says of its clock.
+    """The sensor's report on its clock.
 
     Attributes:
         host_ns: arrival at the host; 0 where unknown.

@@ -50,7 +50,7 @@ class _Piece:
 
 @dataclass
 class StreamCounts:
-    """What came, and what became of it.
+    """Counts of received packets and scans.
 
     Attributes:
         n_data: data packets that passed the checks.
@@ -94,7 +94,7 @@ class StreamCounts:
 
 
 class Vlp16Stream:
-    """Puts packets of one sensor together.
+    """Assembles the packets of one sensor into scans.
 
     Attributes:
         counts: what came so far.

@@ -18,7 +18,7 @@ def _listed(figure: Figure, separator: str = ", ") -> str:
 
 
 def _packages(finding: Finding) -> str:
-    """All {n} packages are installed, with OpenCV {opencv} and, for a DAVIS, dv-processing {dv_processing}."""
+    """All {n} packages are installed; OpenCV {opencv}, for a DAVIS dv-processing {dv_processing}."""
     opencv = finding.figures["opencv"] or "another build"
     davis = finding.figures["dv_processing"]
     more = f", dv-processing {davis}" if davis else ""
@@ -139,9 +139,9 @@ def _offset(finding: Finding) -> str:
 
 
 def _in_scan(finding: Finding) -> str:
-    """The board is {distance_m} away, {n_rings} rings and {n_points} points; {n_candidates} things of its size."""
-    text = "{distance_m:.2f} m away, {n_rings:.0f} rings, {n_points:.0f} points".format(**finding.figures)
-    n = finding.figure("n_candidates")
+    """The board is {distance_m} away: {n_rings} rings, {n_points} points, {n_candidates} candidates."""
+    n_rings, n_points, n = (finding.figure(name) for name in ("n_rings", "n_points", "n_candidates"))
+    text = f"{finding.figure('distance_m'):.2f} m away, {n_rings:.0f} rings, {n_points:.0f} points"
     return f"{text}; {n:.0f} objects of its size" if n > 1 else text
 
 
@@ -228,7 +228,9 @@ _CLOCKS: Mapping[str, Phrase] = {
         {"pps": "reset the board"},
     ),
     "pulses.line_none": Phrase(
-        "{line} none ({expected_hz:g} Hz expected)", "check sync.triggers.{line}, reset the board", {"pps": ""}
+        "{line} none ({expected_hz:g} Hz expected)",
+        "check sync.triggers.{line}, reset the board",
+        {"pps": ""},
     ),
     "pulses.lost": Phrase("{n} lost"),
     "pulses.frames": Phrase("{n_frames} frames of {n_pulses} pulses"),
@@ -255,7 +257,8 @@ _IMAGES: Mapping[str, Phrase] = {
     "exposure.events": Phrase("moving edges, no flicker, hardly any hot pixels"),
     "board.in_scan": Phrase(_in_scan),
     "board.in_image": Phrase(
-        "{distance_m:.2f} m away, {n_corners:.0f} corners to {corner_rms_px:.2f} px, sharpness {sharpness:.1f}"
+        "{distance_m:.2f} m away, {n_corners:.0f} corners to {corner_rms_px:.2f} px rms, "
+        "sharpness {sharpness:.1f}"
     ),
     "board.in_events": Phrase("{distance_m:.2f} m away, seen in its events"),
 }

@@ -129,8 +129,8 @@ def test_a_board_that_moved_between_the_sensors_is_refused_with_its_figures():
     estimate = calibrate(spoilt, BOARD, FAST)
     assert set(estimate.refused) == {"000004"}
     refusal = estimate.refused["000004"]
-    assert refusal.stage == "calibrate"
-    assert "mm" in refusal.cause
+    assert refusal.code == "calibrate.outlier"
+    assert refusal.figure("edges_m") > 0.02 > refusal.figure("edges_median_m")
     assert "000004" not in estimate.used
     assert error_to_reference(estimate.T_cam_lidar, T_FORWARD)[0] < 0.15
 

@@ -90,9 +90,9 @@ def test_a_result_far_from_the_nominal_extrinsic_fails_with_both_figures(estimat
 
 
 def test_sensors_that_disagree_in_many_captures_are_a_doubt(estimate, verdict_of):
-    refused = {f"x{k}": Refusal("pair", "elsewhere", "hold still") for k in range(10)}
+    refused = {f"x{k}": Refusal("pair.no_candidate") for k in range(10)}
     assert verdict_of(replace(estimate, refused=refused))[0] == "marginal"
-    refused |= {f"y{k}": Refusal("calibrate", "off", "hold still") for k in range(20)}
+    refused |= {f"y{k}": Refusal("calibrate.outlier") for k in range(20)}
     verdict, reasons = verdict_of(replace(estimate, refused=refused))
     assert verdict == "fail"
     assert "30 of 50 captures" in reasons[0]

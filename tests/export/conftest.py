@@ -50,8 +50,13 @@ def calibration(T_cam_lidar: Array | None = None, **changes: Any) -> Calibration
         "n_detected": 3,
         "captures_used": ("000000", "000002"),
         "captures_refused": {
-            "000003": Refusal("calibrate", "12 cm off", "repeat it"),
-            "000001": Refusal("lidar", "2 rings on the board", "come 0.8 m closer – näher"),
+            "000003": Refusal(
+                "calibrate.known_placement", figures={"capture": "000002", "instruction": "näher – ¼ m"}
+            ),
+            "000001": Refusal(
+                "lidar.too_few_rings",
+                figures={"n_rings": 2, "min_rings": 4, "distance_m": 1.6, "closer_m": 0.8},
+            ),
         },
         "verdict": "pass",
         "reasons": (),

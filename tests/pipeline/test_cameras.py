@@ -26,7 +26,7 @@ TURNED = np.array([0, 0, 0, 0, np.radians(0.6), 0])
 
 def detections(session, **kept):
     """What detectors would have seen; `kept` names captures by camera in which it saw the board."""
-    unseen = Refusal("image", "no board", "hold it into the picture")
+    unseen = Refusal("image.too_dark", figures={"grey_99": 20.0})
     images = {
         (name, "frames"): {
             c.capture: c.image if k in kept.get(name, range(len(captures))) else unseen

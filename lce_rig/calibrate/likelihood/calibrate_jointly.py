@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.refine import JointEstimate, refine
 from lce_rig.calibrate.likelihood.spread import inflate
@@ -19,6 +18,7 @@ from lce_rig.calibrate.report import name_sigmas, report_estimate
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
+from lce_rig.residuals.along_rays import N_SHIFTS, SHIFTS
 from lce_rig.residuals.features import extract_features
 from lce_rig.residuals.placements import group_placements
 from lce_rig.residuals.quadratics import Quadratics

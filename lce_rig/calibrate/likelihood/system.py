@@ -15,13 +15,22 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, EdgeRows, edge_rows, edge_system
+from lce_rig.calibrate.likelihood.end_density import edge_system
 from lce_rig.calibrate.likelihood.levels import Levels, PoseLevels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import Pictures, picture_rows
-from lce_rig.calibrate.likelihood.range_terms import RangeSums, range_system, sum_ranges, weigh_ranges
-from lce_rig.calibrate.likelihood.scans import N_FIELDS, StackedScans
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, perturb
+from lce_rig.residuals.along_rays import (
+    N_FIELDS,
+    N_SHIFTS,
+    EdgeRows,
+    RangeSums,
+    StackedScans,
+    edge_rows,
+    range_system,
+    sum_ranges,
+    weigh_ranges,
+)
 
 PER_CAMERA = 7
 # The mean of the lasers' own offsets is not theirs but the common one: this much of it is left.

@@ -27,7 +27,7 @@ from lce_rig.core.errors import LceRigError
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.sources.live.base import LiveSource
-from lce_rig.words import sentence
+from lce_rig.words import describe, sentence
 
 #: How often a picture without a board is searched thoroughly, during which nothing is said.
 THOROUGH_S = 3.0
@@ -236,7 +236,7 @@ class _Loop:
                 self._capture(confirmed)
                 return Narration("saving", "captured")
             refusal = confirmed
-        self._monitor.cue("refused", f"not captured: {refusal.cause}")
+        self._monitor.cue("refused", f"not captured: {describe(refusal)}")
         guide.note_refusal(present)
         guide.plan(present, _time_s(sighting))
         return narrate_refused(guide, present, refusal)
@@ -276,7 +276,7 @@ class _Loop:
         if isinstance(confirmed, Moment):
             self._capture(confirmed)
         else:
-            self._monitor.cue("refused", f"not captured: {confirmed.cause}: {confirmed.action}")
+            self._monitor.cue("refused", f"not captured: {sentence(confirmed)}")
 
     def _find_ending(self, key: Key | None) -> Ending | None:
         options, elapsed_s = self._options, time.monotonic() - self._began_s

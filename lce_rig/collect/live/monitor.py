@@ -219,7 +219,7 @@ class Monitor:
         board = sighting.images.get((camera, channel))
         if board is None or (camera, channel) in sighting.unfit:
             why = self.reasons.get(name)
-            reason = self._trouble(camera) or (f"{why.cause}: {why.action}" if why else "no board")
+            reason = self._trouble(camera) or (sentence(why) if why else "no board")
             return StreamState(name, rate_hz, n_lost, False, reason)
         return StreamState(name, rate_hz, n_lost, True, self._trouble(camera), image_figures(board))
 
@@ -230,7 +230,7 @@ class Monitor:
         boards = sighting.lidars.get(lidar)
         if not boards:
             why = self.reasons.get(lidar)
-            reason = self._trouble(lidar) or (f"{why.cause}: {why.action}" if why else "no board")
+            reason = self._trouble(lidar) or (sentence(why) if why else "no board")
             return StreamState(lidar, status.rate_hz, n_lost, False, reason)
         return StreamState(lidar, status.rate_hz, n_lost, True, self._trouble(lidar), scan_figures(boards[0]))
 

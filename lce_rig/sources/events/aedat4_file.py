@@ -33,7 +33,7 @@ _STREAM_NUMBER = re.compile("[0-9]{1,9}")
 
 @dataclass(frozen=True)
 class Aedat4Header:
-    """What the head of a file says.
+    """The header of a file.
 
     Attributes:
         begin: where the packets begin.
@@ -48,7 +48,7 @@ class Aedat4Header:
 
 @dataclass(frozen=True)
 class PacketPlace:
-    """Where a packet lies.
+    """The position of a packet.
 
     Attributes:
         stream: number of its stream.

@@ -1,4 +1,4 @@
-"""Frames of iniVation's AEDAT4 files, stamped at the middle of their exposure.
+"""Frames of iniVation's AEDAT4 files, with timestamps at the middle of their exposure.
 
 What a frame's own stamp means has changed: DV's stamps were the middle of the exposure, dv-processing's are
 its start. Both also write its start and end, which mean the same in every file, and are taken.
@@ -35,7 +35,7 @@ _CHANNELS = {0: 1, 16: 3, 24: 4}
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One picture of a file.
+    """One image of a file.
 
     Attributes:
         mid_exposure_ns: device time; the frame's own stamp where the exposure is not known.

@@ -1,4 +1,4 @@
-"""The high part of a camera's clock, sent now and then as a counter that wraps."""
+"""The high part of a camera's clock, sent at intervals as a wrapping counter."""
 
 from dataclasses import dataclass
 

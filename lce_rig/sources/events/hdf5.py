@@ -105,7 +105,7 @@ class Hdf5Events:
 
 
 class _Column:
-    """A column of events, read in stretches.
+    """A column of events, read in ranges.
 
     HDF5 takes what memory a deflated chunk unpacks to, however much more that is than it should. Chunks large
     enough for that to matter are unpacked here.

@@ -1,4 +1,4 @@
-"""Putting a stream of events in the order of time, with as little held in memory as that needs."""
+"""Sorting a stream of events by time, with minimal memory."""
 
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -58,7 +58,7 @@ def _on_any_clock(stretch: EventColumns, findings: Findings) -> EventColumns:
 
 
 class _Sorter:
-    """Holds a stretch back until the next has shown that nothing earlier follows.
+    """Holds a range back until the next one shows that nothing earlier follows.
 
     Attributes:
         held: ordered events that have not been yielded.

@@ -1,4 +1,4 @@
-"""A recording of events: checked, in the order of time, with an account of what was wrong."""
+"""A recording of events: checked, sorted by time, with a count of faults."""
 
 from collections.abc import Iterator
 from itertools import islice
@@ -213,7 +213,7 @@ class EventRecording:
 
 
 class _Window:
-    """The stretches that the last window touched, and the pass through the recording that goes on there."""
+    """The ranges of the last window, and the pass through the recording that continues there."""
 
     def __init__(self, recording: EventRecording) -> None:
         self._recording = recording

@@ -1,4 +1,4 @@
-"""What the readers of event files share: columns of events, and the account of what was lost on the way."""
+"""The common interface of event readers: columns of events, and counts of losses."""
 
 import re
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ class NoEventsError(SourceError):
 
 @dataclass(frozen=True, eq=False)
 class EventColumns:
-    """Events as a reader finds them: not checked against a resolution, not yet put in order.
+    """Events as read: not checked against a resolution, not sorted.
 
     Attributes:
         t_ns: (N,) int64 device time.
@@ -79,7 +79,7 @@ def join_small(stretches: Iterator[EventColumns], n_events: int) -> Iterator[Eve
 
 @dataclass
 class Findings:
-    """What was left out or repaired while reading: how many, and where first.
+    """Events skipped or repaired while reading: their number, and the first position.
 
     Attributes:
         counts: how many by kind ("broken packets").
@@ -139,7 +139,7 @@ class EventStream(Protocol):
 
 @runtime_checkable
 class KnowsItsLength(Protocol):
-    """A stream that can tell how long it is without being read."""
+    """A stream whose duration is known without reading it."""
 
     def duration_ns(self) -> int | None:
         """Tell the time from the first event to the last, about; None where damage hides it."""

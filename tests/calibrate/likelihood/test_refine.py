@@ -7,12 +7,11 @@ import pytest
 
 from lce_rig.calibrate import CalibrateOptions, calibrate, error_to_reference
 from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.likelihood.edge_terms import SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.refine import refine
-from lce_rig.calibrate.likelihood.scans import turn_about_z
 from lce_rig.calibrate.likelihood.spread import inflate
 from lce_rig.core.geometry import difference, exp_so3, invert, perturb, pose
+from lce_rig.residuals.along_rays import SHIFTS, turn_about_z
 from lce_rig.residuals.placements import group_placements
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, simulate
 

@@ -117,7 +117,8 @@ def test_captures_whose_scan_the_cameras_use_differently_are_left_out(runs):
     for estimate in together.estimates.values():
         assert "000002" not in estimate.used
         assert len(estimate.residuals) == len(estimate.used)
-        assert "left and right put the board at different places" in estimate.refused["000002"].cause
+        refusal = estimate.refused["000002"]
+        assert (refusal.code, refusal.figures) == ("pair.two_places", {"first": "left", "second": "right"})
 
 
 def test_placements_are_those_of_any_camera():
