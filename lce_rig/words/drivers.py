@@ -19,7 +19,7 @@ def _lidar_utc(finding: Finding) -> str:
 
 
 def _nmea_of_other_second(finding: Finding) -> str:
-    """PPS is locked, but the sentences' time is {nmea_past_hour_s} past the hour, not the LiDAR's."""
+    """The sentences' time is {nmea_past_hour_s} past the hour, not the LiDAR's."""
     minute, second = divmod(round(finding.figure("nmea_past_hour_s")), 60)
     return f"{_BY_ARRIVAL}NMEA time {minute:02d}:{second:02d} past the hour is not the LiDAR's"
 
@@ -189,11 +189,9 @@ _LIDAR_CLOCK: Mapping[str, Phrase] = {
         f"{_BY_ARRIVAL}PPS is {{pps}}",
         "check the pulse at the LiDAR's interface box: 1 Hz, 3 to 15 V, rising edge",
     ),
-    "clock.no_nmea": Phrase(
-        f"{_BY_ARRIVAL}PPS is locked, no NMEA", "send $GPRMC at 9600 baud with RS-232 polarity"
-    ),
+    "clock.no_nmea": Phrase(f"{_BY_ARRIVAL}no NMEA", "send $GPRMC at 9600 baud with RS-232 polarity"),
     "clock.nmea_damaged": Phrase(
-        f"{_BY_ARRIVAL}PPS is locked, NMEA is damaged", "send $GPRMC at 9600 baud with RS-232 polarity"
+        f"{_BY_ARRIVAL}NMEA is damaged", "send $GPRMC at 9600 baud with RS-232 polarity"
     ),
     "clock.nmea_of_other_second": Phrase(
         _nmea_of_other_second, "send each sentence after its pulse, within a second"
