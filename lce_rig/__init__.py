@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from lce_rig.core.results import Calibration, Refusal
     from lce_rig.detect.detection import Detections
     from lce_rig.export import export
+    from lce_rig.export.reference import Reference, read_reference
     from lce_rig.export.result import SavedResult, read_result
     from lce_rig.pipeline.calibration import calibrate
     from lce_rig.pipeline.collection import collect_from
@@ -54,6 +55,7 @@ __all__ = [
     "LceRigError",
     "NotEnoughDataError",
     "ProfileError",
+    "Reference",
     "Refusal",
     "Repeat",
     "Result",
@@ -72,6 +74,7 @@ __all__ = [
     "detect",
     "export",
     "load_rig",
+    "read_reference",
     "read_result",
     "repeat",
     "verify",
@@ -92,6 +95,7 @@ _HOMES = {
     "lce_rig.core.results": ("Calibration", "Refusal"),
     "lce_rig.detect.detection": ("Detections",),
     "lce_rig.export": ("export",),
+    "lce_rig.export.reference": ("Reference", "read_reference"),
     "lce_rig.export.result": ("SavedResult", "read_result"),
     "lce_rig.pipeline.calibration": ("calibrate",),
     "lce_rig.pipeline.collection": ("collect_from",),

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lce_rig.calibrate.channels import ChannelsEstimate
 from lce_rig.calibrate.control import doubt_control
 from lce_rig.calibrate.doubt import SURPRISING_CHI2, Doubt, Verdict, weigh
 from lce_rig.calibrate.estimate import CalibrationEstimate
@@ -13,7 +12,7 @@ from lce_rig.calibrate.halves import doubt_halves
 from lce_rig.calibrate.intrinsics_check import explain
 from lce_rig.calibrate.nuisances import doubt_nuisances
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import rotation_angle, tangent_sizes
+from lce_rig.core.geometry import Array, rotation_angle, tangent_sizes
 from lce_rig.core.results import Metrics
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 
@@ -28,7 +27,7 @@ MEASURE_RANGES = (
 
 
 def judge(
-    result: ChannelsEstimate,
+    estimate: CalibrationEstimate,
     examination: Examination,
     rig: Rig,
     camera: str,
@@ -39,8 +38,8 @@ def judge(
     """Weigh everything known about an extrinsic.
 
     Args:
-        result: what each channel says.
-        examination: the extrinsic with its residuals and refusals, and what checks on its captures found.
+        estimate: the extrinsic with its residuals and refusals, and what each channel says.
+        examination: what checks on its captures found.
         rig: thresholds, targets and the nominal extrinsic.
         camera: name of the camera.
         lidar: name of the LiDAR.
@@ -51,7 +50,6 @@ def judge(
         The verdict, and the reasons for anything but a pass: worst first, causes before symptoms. A remark on
         a widened standard deviation may stand beside a pass.
     """
-    estimate = examination.estimate
     doubts = [
         *_certificate(estimate),
         *_intrinsics(examination, rig),
@@ -59,15 +57,15 @@ def judge(
         *_shared(examination, rig, lidar),
         *doubt_halves(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
         *between_cameras,
-        *_motion(result, estimate, rig.verdict.max_plane_misfit_m),
-        *_channels(result, rig),
+        *_motion(estimate, rig.verdict.max_plane_misfit_m),
+        *_channels(estimate, rig),
         *_residuals(estimate, rig),
         *_control(examination),
         *_refusals(estimate),
         *_detected(estimate, n_captures, rig.quality.min_detected_fraction),
         *_placements(estimate, rig.quality.min_captures),
         *_nominal(estimate, rig.nominal(camera, lidar)),
-        *_precision(estimate, rig),
+        *_precision(estimate, examination.cov, rig),
     ]
     if examination.remark:
         doubts.append(Doubt("pass", examination.remark))
@@ -101,10 +99,10 @@ def _certificate(estimate: CalibrationEstimate) -> list[Doubt]:
     return [Doubt("fail", text)]
 
 
-def _precision(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
+def _precision(estimate: CalibrationEstimate, cov: Array, rig: Rig) -> list[Doubt]:
     doubts = []
     target = rig.calibration
-    sigmas = np.sqrt(np.diag(estimate.cov))
+    sigmas = np.sqrt(np.diag(cov))
     for axes, goal, what, unit, scale in (
         (np.degrees(sigmas[3:]), target.target_sigma_deg, "rotation", "deg", 1.0),
         (sigmas[:3], target.target_sigma_m, "translation", "mm", 1000.0),
@@ -145,11 +143,11 @@ def _residuals(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
     return doubts
 
 
-def _motion(result: ChannelsEstimate, estimate: CalibrationEstimate, limit_m: float) -> list[Doubt]:
+def _motion(estimate: CalibrationEstimate, limit_m: float) -> list[Doubt]:
     rms_m = estimate.diagnostics.get("fit_plane_rms_m", 0.0)
     if rms_m <= limit_m:
         return []
-    is_compensated = any(channel.time_offset_s is not None for channel in result.channels)
+    is_compensated = any(channel.time_offset_s is not None for channel in estimate.channels)
     still = "with their motion taken off" if is_compensated else "under 10 mm for still boards"
     text = f"camera and LiDAR see the planes {1000 * rms_m:.0f} mm apart (rms; {still})"
     advice = "did the board move, or do pictures and scans not belong together in time?"
@@ -158,17 +156,17 @@ def _motion(result: ChannelsEstimate, estimate: CalibrationEstimate, limit_m: fl
     return [Doubt("marginal", f"{text}: {advice}")]
 
 
-def _channels(result: ChannelsEstimate, rig: Rig) -> list[Doubt]:
+def _channels(estimate: CalibrationEstimate, rig: Rig) -> list[Doubt]:
     """Hold the channels of one camera against each other: it cannot sit in two places."""
-    if result.difference is None or result.difference_cov is None:
+    apart, cov = estimate.channel_difference, estimate.channel_difference_cov
+    if apart is None or cov is None:
         return []
-    apart = result.difference
-    surprise = float(apart @ np.linalg.solve(result.difference_cov, apart))
+    surprise = float(apart @ np.linalg.solve(cov, apart))
     rotation_deg, translation_m = tangent_sizes(apart)
     excess = rig.calibration.in_targets(rotation_deg, translation_m)
     if surprise <= SURPRISING_CHI2 or excess <= 1:
         return []
-    names = " and ".join(channel.channel for channel in result.channels)
+    names = " and ".join(channel.channel for channel in estimate.channels)
     verdict: Verdict = "fail" if excess > rig.verdict.fail_factor else "marginal"
     text = f"{names} of one camera disagree by {rotation_deg:.2f} deg, {1000 * translation_m:.0f} mm"
     advice = (

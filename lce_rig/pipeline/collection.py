@@ -7,7 +7,7 @@ from pathlib import Path
 from lce_rig.collect import CollectOptions, CollectReport, collect
 from lce_rig.collect.tally import Tally
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.pipeline.progress import Progress, silent
+from lce_rig.pipeline.detection import Progress, silent
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.sources import open_recordings

@@ -15,11 +15,16 @@ from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection,
 from lce_rig.detect.event_board import EventImage
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.pipeline.event_detection import event_channels, event_digest, see_events
-from lce_rig.pipeline.progress import Progress, silent
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session, check_capture
 
 Key = tuple[str, str]
+Progress = Callable[[int, int], None]
+"""Called with (done, total)."""
+
+
+def silent(done: int, total: int) -> None:
+    """Report no progress."""
 
 
 def detect(

@@ -21,8 +21,7 @@ from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.detect.detection import ImageDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image_board import crop_to_intrinsics
-from lce_rig.pipeline.detection import detect
-from lce_rig.pipeline.progress import Progress, silent
+from lce_rig.pipeline.detection import Progress, detect, silent
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.words import describe

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, calibrate
+from lce_rig.calibrate import CalibrateOptions, fit_extrinsic
 from lce_rig.calibrate.camera_pairs import doubt_cameras, pose_from_pictures, relate, shared_boards
 from lce_rig.core.geometry import difference, invert, perturb
 from lce_rig.core.results import Observation
@@ -31,7 +31,7 @@ def observed(session):
 
 
 def related(session):
-    left, right = (calibrate(session[name], BOARD, OPTIONS) for name in (LEFT, RIGHT))
+    left, right = (fit_extrinsic(session[name], BOARD, OPTIONS) for name in (LEFT, RIGHT))
     return relate(left, right)
 
 
@@ -90,7 +90,7 @@ def test_a_camera_that_is_nudged_on_the_way_is_found_by_the_pictures(seed, nudge
 def test_extrinsics_that_contradict_the_pictures_are_told_with_how_far_apart_they_put_boards(seed):
     """An extrinsic made before the camera was turned, captures of both from after it."""
     session = simulate_two(12, seed)
-    left, right = (calibrate(session[name], BOARD, OPTIONS) for name in (LEFT, RIGHT))
+    left, right = (fit_extrinsic(session[name], BOARD, OPTIONS) for name in (LEFT, RIGHT))
     stale = replace(right, T_cam_lidar=perturb(right.T_cam_lidar, 2 * TURNED))
     (text,) = doubts(relate(left, stale))
     assert text.startswith("left and right put the same board ")
@@ -125,10 +125,10 @@ def test_a_board_seen_wrongly_hardly_matters(sound):
 def test_few_boards_tell_nothing_and_none_no_pair(sound):
     session = sound[2]
     assert pose_from_pictures(observed(session)[:3]) is None
-    left = calibrate(session[LEFT][:6], BOARD, OPTIONS)
-    right = calibrate(session[RIGHT][6:], BOARD, OPTIONS)
+    left = fit_extrinsic(session[LEFT][:6], BOARD, OPTIONS)
+    right = fit_extrinsic(session[RIGHT][6:], BOARD, OPTIONS)
     assert relate(left, right) is None
-    three = relate(left, calibrate(session[RIGHT][3:], BOARD, OPTIONS))
+    three = relate(left, fit_extrinsic(session[RIGHT][3:], BOARD, OPTIONS))
     assert three.pictures is None
     assert len(three.captures) == 3
     assert doubts(three) == []

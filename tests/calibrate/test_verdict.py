@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, ChannelsEstimate, calibrate
+from lce_rig.calibrate import CalibrateOptions, fit_extrinsic
 from lce_rig.calibrate.examination import examine
 from lce_rig.calibrate.intrinsics_estimate import View
 from lce_rig.calibrate.report import NO_CERTIFICATE
@@ -21,7 +21,7 @@ RIG = load_rig("rlfs")
 
 @pytest.fixture(scope="module")
 def estimate():
-    return calibrate(simulate(20, seed=1), BOARD, CalibrateOptions(n_draws=3))
+    return fit_extrinsic(simulate(20, seed=1), BOARD, CalibrateOptions(n_draws=3))
 
 
 @functools.cache
@@ -35,15 +35,13 @@ def verdict_of(estimate):
     """Judge a changed estimate by what the checks found on the sound one."""
 
     def judged(changed, n_captures=20):
-        examination = replace(examined(estimate), estimate=changed)
-        return judge(ChannelsEstimate(changed, ()), examination, RIG, "cam", "lidar", n_captures)
+        return judge(changed, replace(examined(estimate), cov=changed.cov), RIG, "cam", "lidar", n_captures)
 
     return judged
 
 
 def examined_verdict_of(estimate, lens=CAMERA):
-    examination = examined(estimate, lens)
-    return judge(ChannelsEstimate(estimate, ()), examination, RIG, "cam", "lidar", len(estimate.used))
+    return judge(estimate, examined(estimate, lens), RIG, "cam", "lidar", len(estimate.used))
 
 
 def test_a_sound_result_passes_without_reasons(estimate, verdict_of):
@@ -146,7 +144,7 @@ def test_squares_of_the_wrong_size_are_told_from_the_distances():
         T[:3, 3] /= 1.05
         image = replace(item.image, T_cam_board=T, T_cam_board_alternative=None)
         captures.append(replace(item, image=image))
-    wrong = calibrate(captures, BOARD, CalibrateOptions(n_draws=3))
+    wrong = fit_extrinsic(captures, BOARD, CalibrateOptions(n_draws=3))
     verdict, reasons = examined_verdict_of(wrong)
     assert verdict == "fail"
     assert any("the squares measure 73." in reason for reason in reasons)

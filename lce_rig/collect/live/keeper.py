@@ -9,7 +9,7 @@ from types import TracebackType
 
 import numpy as np
 
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, fit_extrinsic
 from lce_rig.collect.event_buffer import EventCut
 from lce_rig.collect.guidance import Planner
 from lce_rig.collect.live.guide import Guide, Learned
@@ -181,7 +181,7 @@ class Keeper:
                 continue
             try:
                 board = self._session.rig.board.to_board()
-                estimate = calibrate(self._candidates[k], board, CalibrateOptions(n_draws=0))
+                estimate = fit_extrinsic(self._candidates[k], board, CalibrateOptions(n_draws=0))
             except (NotEnoughDataError, np.linalg.LinAlgError):
                 continue  # More captures will tell.
             figures = estimate.diagnostics
