@@ -85,7 +85,7 @@ class LineFit:
         return np.asarray(max(ratio, 1.0) * independent)
 
     def inliers(self) -> NDArray[np.bool_]:
-        """Find the readings (N,) within 3.5 times the usual of the line through them, each by its sigma."""
+        """Find the readings (N,) within 3.5 times the typical residual of their line, each by its sigma."""
         sigma_ns = self.sigma_ns
         residual = self.y_ns - median_slope(self.x_s, self.y_ns) * self.x_s
         residual = (residual - np.median(residual)) / sigma_ns
