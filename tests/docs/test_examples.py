@@ -98,4 +98,5 @@ def test_the_notebook_runs_from_top_to_bottom(workplace):
     for cell in cells:
         exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
     assert (workplace / "session" / "calibration" / "result.json").exists()
-    assert names["checks"][0].contact_sheet.exists()
+    sheet = names["checks"][0].contact_sheet
+    assert sheet.exists() and sheet.parent.parent.name == "calibration"

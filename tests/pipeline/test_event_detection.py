@@ -11,7 +11,7 @@ from lce_rig import pipeline
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.results import ImageBoard, Refusal
-from lce_rig.pipeline.event_detection import picture_stamp_ns
+from lce_rig.pipeline.detection import picture_stamp_ns
 from lce_rig.rig import Rig, load_rig, parse_rig
 from lce_rig.session import Session
 from tests.calibrate.boards import simulate
