@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from lce_rig.collect.event_buffer import join_events
 from lce_rig.collect.health import Check
 from lce_rig.collect.health.clocks import check_clock, check_edges, check_offsets, check_sync
 from lce_rig.collect.health.computer import COMPUTER_CHECKS
@@ -15,7 +14,7 @@ from lce_rig.collect.health.examination import Examination
 from lce_rig.collect.health.observing import Observation, observe
 from lce_rig.collect.health.pictures import check_board, check_events, check_picture
 from lce_rig.collect.health.pulses import check_frames_of_pulses, check_pulses_sent
-from lce_rig.collect.health.sensors import SYNC, driver_of, sensors, source_of
+from lce_rig.collect.health.sensors import driver_of, sensors, source_of
 from lce_rig.collect.health.velodyne import check_pulse, check_settings, read_web
 from lce_rig.core.data import Image
 from lce_rig.core.errors import LceRigError, SourceError
@@ -24,7 +23,9 @@ from lce_rig.core.results import Refusal
 from lce_rig.detect.event_board import find_event_board, reconstructor_for
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
+from lce_rig.rig.sync import BOARD
 from lce_rig.sources.live.velodyne_web import WebReport
+from lce_rig.timing.event_buffer import join_events
 
 SensorCheck = Callable[[Examination, str], Check | None]
 
@@ -93,7 +94,7 @@ def examine(rig: Rig, options: DoctorOptions | None = None) -> list[Check]:
     for names, table in (
         (list(rig.lidars), LIDAR_CHECKS),
         (list(rig.cameras), CAMERA_CHECKS),
-        ([SYNC] if rig.sync is not None else [], SYNC_CHECKS),
+        ([BOARD] if rig.sync is not None else [], SYNC_CHECKS),
     ):
         for name in names:
             checks += _applying(table, exam, name)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from lce_rig.core import velodyne
-from lce_rig.core.data import Scan
+from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.simulate.vlp16_packets import SensorPacket
 from lce_rig.sources import open_recording
-from lce_rig.sources.base import ContinuousRecording, SourceOptions, Stream
+from lce_rig.sources.base import ContinuousRecording, SourceOptions
 from lce_rig.sources.datagrams import Datagram, build_frame
 from lce_rig.sources.pcap import PcapRecording
 from lce_rig.sources.pcap_file import PcapFile

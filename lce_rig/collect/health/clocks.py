@@ -4,22 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.collect.edge_clock import EdgeClock
 from lce_rig.collect.health.check import Check, problems_of
 from lce_rig.collect.health.examination import Examination
 from lce_rig.collect.health.observing import Observation
-from lce_rig.collect.health.sensors import SYNC, driver_of
-from lce_rig.collect.sync import CommonClock, judge_sync
-from lce_rig.core.clock import ClockModel
-from lce_rig.core.clock_fit import fit_arrivals
+from lce_rig.collect.health.sensors import driver_of
+from lce_rig.core.data import Image, Pulse
 from lce_rig.core.findings import Figure, Finding, Severity
+from lce_rig.rig.sync import BOARD
+from lce_rig.timing.clock import ClockModel
+from lce_rig.timing.clock_fit import fit_arrivals
+from lce_rig.timing.rig_clock import RigClock, edge_line
 
 _RIG = "rig"
-_PPS_LINE = "pps"
-# A locked VLP-16 counts whole microseconds.
-_LOCKED_SIGMA_NS = 1_000.0
-# A DAVIS takes the computer's time when it is opened; as `collect` has it.
-_COARSE_EDGE_NS = 100_000_000.0
 _MAX_DRIFT_PPM = 200.0
 _STREAMS = ("scans", "events", "frames")
 
@@ -37,7 +33,11 @@ def check_edges(exam: Examination, sensor: str) -> Check | None:
     """Fit the clock of a camera that sees the board's pulses to them."""
     if not _sees_edges(exam, sensor):
         return None
-    model, problem, n_sent = _fit_edges(exam, sensor)
+    board, line = exam.seen[BOARD], edge_line(exam.rig, sensor)
+    model, problem = tie(exam).edge_clock(sensor)
+    if board.host_clock is None:
+        problem = Finding("clock.board_not_tied")
+    n_sent = sum(pulse.sensor == line for pulse in board.pulses)
     figures: dict[str, Figure] = {"n_edges": len(exam.seen[sensor].pulses), "n_pulses": n_sent}
     if model is None:
         return Check.of(sensor, "edges", Finding("edges.not_fitted", figures=figures), problem)
@@ -49,7 +49,7 @@ def check_offsets(exam: Examination) -> Check | None:
     """Measure every stream's offset and drift against this computer's clock, by when its samples arrive."""
     offsets, strays = list[Finding](), list[Finding]()
     for sensor, seen in exam.seen.items():
-        model = seen.host_clock if sensor == SYNC else _by_arrivals(exam, seen)
+        model = seen.host_clock if sensor == BOARD else _by_arrivals(exam, seen)
         if model is None:
             continue
         # The model has the computer's time on the sensor's clock: its drift is the other way round.
@@ -63,16 +63,16 @@ def check_offsets(exam: Examination) -> Check | None:
         if abs(drift_ppm) > _MAX_DRIFT_PPM + 3 * sigma_ppm:
             limit = {"drift_ppm": drift_ppm, "limit_ppm": _MAX_DRIFT_PPM}
             strays.append(Finding("clock.drifts", "warning", sensor, limit))
-    is_empty = all(found.subject == SYNC for found in offsets)  # the board's own line says as much
+    is_empty = all(found.subject == BOARD for found in offsets)  # the board's own line says as much
     return None if is_empty else Check.of(_RIG, "clocks", *offsets, *strays)
 
 
 def check_sync(exam: Examination) -> Check | None:
     """Judge whether boards may move while they are captured; absent sensors are left out of it."""
-    rig, verdict = exam.rig, judge_sync(exam.rig, tie(exam))
-    if not verdict.requires_still_boards:
-        return Check.of(_RIG, "sync", verdict.finding)
+    rig, verdict = exam.rig, tie(exam).verdict()
     absent = [sensor for sensor, seen in exam.seen.items() if not seen.has_opened]
+    if not verdict.requires_still_boards:
+        return None if absent else Check.of(_RIG, "sync", verdict.finding)
     reasons = [each for each in verdict.reasons if each.code != "sync.not_tied" or each.subject not in absent]
     if not reasons:
         return None
@@ -84,24 +84,21 @@ def check_sync(exam: Examination) -> Check | None:
     return Check.of(_RIG, "sync", judged, *named)
 
 
-def tie(exam: Examination) -> CommonClock:
-    """Put every sensor that can be onto the rig's clock: UTC as the sync board or this computer has it."""
-    clock, board = CommonClock(), exam.seen.get(SYNC)
-    host = None
-    if board is not None and board.host_clock is not None and board.utc_clock is not None:
-        host = board.host_clock.inverse().then(board.utc_clock)
-    for sensor, seen in exam.seen.items():
-        if seen.status is None or sensor == SYNC:
-            continue
-        model = host
-        if _is_utc(seen):
-            model = ClockModel.identity(_LOCKED_SIGMA_NS, "UTC by PPS and NMEA")
-        elif _sees_edges(exam, sensor):
-            fitted, _, _ = _fit_edges(exam, sensor)
-            utc = None if board is None else board.utc_clock
-            model = None if fitted is None or utc is None else fitted.then(utc)
-        if model is not None:
-            clock.tie(sensor, model)
+def tie(exam: Examination) -> RigClock:
+    """Put every sensor that can be onto the rig's clock, as `collect` does with the same samples."""
+    board = exam.seen.get(BOARD)
+    has_board = board is not None and board.status is not None
+    cameras = [name for name in exam.rig.cameras if driver_of(exam.rig, name) == "davis"]
+    clock = RigClock(exam.rig, has_board=has_board, edge_cameras=cameras)
+    models = (None, None) if board is None else (board.host_clock, board.utc_clock)
+    locked = [name for name, seen in exam.seen.items() if _is_utc(seen)]
+    clock.refresh(*models, locked)
+    came: list[tuple[str, Pulse | Image]] = []
+    for name, seen in exam.seen.items():
+        came += [(name, pulse) for pulse in seen.pulses] + [(name, image) for image in seen.frames]
+    for name, sample in sorted(came, key=lambda pair: pair[1].host_ns or 0):
+        clock.take(name, sample)
+    clock.refresh(*models, locked)
     return clock
 
 
@@ -118,26 +115,9 @@ def _promises(exam: Examination) -> list[str]:
 
 
 def _sees_edges(exam: Examination, sensor: str) -> bool:
-    board, seen = exam.seen.get(SYNC), exam.seen[sensor]
+    board, seen = exam.seen.get(BOARD), exam.seen[sensor]
     is_davis = driver_of(exam.rig, sensor) == "davis"
     return is_davis and seen.status is not None and board is not None and board.status is not None
-
-
-def _fit_edges(exam: Examination, sensor: str) -> tuple[ClockModel | None, Finding | None, int]:
-    """Fit the board's time on a sensor's clock; gives why not as well, and how many pulses were sent."""
-    board, seen = exam.seen[SYNC], exam.seen[sensor]
-    assert exam.rig.sync is not None
-    line = sensor if sensor in exam.rig.sync.triggers else _PPS_LINE
-    sent = [pulse for pulse in board.pulses if pulse.sensor == line]
-    edges = EdgeClock(sensor, _COARSE_EDGE_NS)
-    if board.host_clock is None:
-        return None, Finding("clock.board_not_tied"), len(sent)
-    edges.set_clock(board.host_clock.inverse())
-    for pulse in sent:
-        edges.take_sent(pulse)
-    for pulse in seen.pulses:
-        edges.take_seen(pulse)
-    return edges.fit(), edges.problem, len(sent)
 
 
 def _by_arrivals(exam: Examination, seen: Observation) -> ClockModel | None:
@@ -161,7 +141,7 @@ def _offset_ms(seen: Observation, model: ClockModel) -> float | None:
     whose clock counts from when it was switched on.
     """
     assert seen.status is not None
-    if seen.sensor == SYNC:
+    if seen.sensor == BOARD:
         return None
     if "scans" in seen.stamps:
         clock = seen.status.clock

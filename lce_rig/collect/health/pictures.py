@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.collect.event_buffer import join_events
 from lce_rig.collect.health.check import Check
 from lce_rig.collect.health.examination import Examination
 from lce_rig.core.findings import Finding
 from lce_rig.core.results import Refusal
 from lce_rig.detect.event_gate import events_problem
 from lce_rig.detect.image_quality import strongest_edge_px
+from lce_rig.timing.event_buffer import join_events
 
 _BLACK, _WHITE = 5, 250
 _MAX_WHITE, _MAX_BLACK = 0.2, 0.6

@@ -7,14 +7,13 @@ import numpy as np
 from lce_rig.collect.health.check import Check, problems_of
 from lce_rig.collect.health.examination import Examination
 from lce_rig.collect.health.observing import Observation
-from lce_rig.collect.health.sensors import SYNC, driver_of
-from lce_rig.collect.triggers import TriggeredImage, TriggerMatcher
-from lce_rig.core.data import Image
+from lce_rig.collect.health.sensors import driver_of
+from lce_rig.core.data import Image, Pulse
 from lce_rig.core.findings import Figure, Finding, Severity
-from lce_rig.sources.live.base import Pulse
+from lce_rig.rig.sync import BOARD, PPS_LINE
 from lce_rig.sources.live.sync_lines import DIALECTS
+from lce_rig.timing.triggers import TriggeredImage, TriggerMatcher
 
-_PPS_LINE = "pps"
 _SIGMA_PER_MAD = 1.4826
 _MAX_OFF_RATE = 0.02
 # Frames and lines come in bursts: how many are still on their way differs.
@@ -23,32 +22,32 @@ _ROOM, _MAX_UNLIKE = 2, 0.01
 
 def check_pulses_sent(exam: Examination) -> Check | None:
     """Count the board's pulses by line, and compare their rates with the profile."""
-    board, sync = exam.seen[SYNC], exam.rig.sync
+    board, sync = exam.seen[BOARD], exam.rig.sync
     if board.status is None or sync is None or not DIALECTS[sync.type]().has_triggers:
         return None
-    wanted = {_PPS_LINE: 1.0} | {name: trigger.rate_hz for name, trigger in sync.triggers.items()}
+    wanted = {PPS_LINE: 1.0} | {name: trigger.rate_hz for name, trigger in sync.triggers.items()}
     lines = [_judge_line(board, line, expected_hz) for line, expected_hz in wanted.items()]
     lost = Finding("pulses.lost", "note", figures={"n": board.status.n_lost})
-    return Check.of(SYNC, "pulses", *lines, lost, *problems_of(board.status, "stream"))
+    return Check.of(BOARD, "pulses", *lines, lost, *problems_of(board.status, "stream"))
 
 
 def _judge_line(board: Observation, line: str, expected_hz: float) -> Finding:
     rate_hz = _rate_hz(board, line)
     figures: dict[str, Figure] = {"line": line, "rate_hz": rate_hz, "expected_hz": expected_hz}
-    action = "pps" if line == _PPS_LINE else ""
+    action = "pps" if line == PPS_LINE else ""
     if rate_hz:
         is_off = abs(rate_hz / expected_hz - 1) > _MAX_OFF_RATE
         if is_off:
             return Finding("pulses.line_off", "warning", figures=figures, action=action)
         return Finding("pulses.line", "note", figures=figures)
     # Boards of others make no pulse per second; that one of ours is missing, the driver says.
-    severity: Severity = "note" if line == _PPS_LINE else "error"
+    severity: Severity = "note" if line == PPS_LINE else "error"
     return Finding("pulses.line_none", severity, figures=figures, action=action)
 
 
 def check_frames_of_pulses(exam: Examination, sensor: str) -> Check | None:
     """See whether each pulse made a frame of a triggered camera."""
-    sync, board, seen = exam.rig.sync, exam.seen.get(SYNC), exam.seen[sensor]
+    sync, board, seen = exam.rig.sync, exam.seen.get(BOARD), exam.seen[sensor]
     is_triggered = sync is not None and sensor in sync.triggers and driver_of(exam.rig, sensor) != "davis"
     if sync is None or board is None or not is_triggered or board.status is None or seen.status is None:
         return None

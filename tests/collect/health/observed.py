@@ -8,11 +8,11 @@ import numpy as np
 from lce_rig.collect.health import Check
 from lce_rig.collect.health.examination import Examination
 from lce_rig.collect.health.observing import Observation
-from lce_rig.core.clock import ClockModel
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Image, Pulse, Scan
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.rig import Rig
-from lce_rig.sources.live.base import ClockState, Pulse, SourceStatus
+from lce_rig.sources.live.base import ClockState, SourceStatus
+from lce_rig.timing.clock import ClockModel
 
 S = 1_000_000_000
 START_NS = 1_753_000_000 * S
