@@ -30,9 +30,11 @@ if TYPE_CHECKING:
         SourceError,
         UsageError,
     )
+    from lce_rig.core.findings import Finding
     from lce_rig.core.results import Calibration, Refusal
     from lce_rig.detect.detection import Detections
     from lce_rig.export import export
+    from lce_rig.export.reference import Reference, read_reference
     from lce_rig.export.result import SavedResult, read_result
     from lce_rig.pipeline.calibration import calibrate
     from lce_rig.pipeline.collection import collect_from
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
     from lce_rig.rig import Rig, load_rig
     from lce_rig.session import Session
     from lce_rig.sources.base import SourceOptions
+    from lce_rig.words import describe, recommend
 
 __all__ = [
     "CalibrateOptions",
@@ -50,10 +53,12 @@ __all__ = [
     "CollectOptions",
     "Detections",
     "Events",
+    "Finding",
     "Image",
     "LceRigError",
     "NotEnoughDataError",
     "ProfileError",
+    "Reference",
     "Refusal",
     "Repeat",
     "Result",
@@ -69,10 +74,13 @@ __all__ = [
     "Verification",
     "calibrate",
     "collect_from",
+    "describe",
     "detect",
     "export",
     "load_rig",
+    "read_reference",
     "read_result",
+    "recommend",
     "repeat",
     "verify",
 ]
@@ -89,9 +97,11 @@ _HOMES = {
     "lce_rig.collect": ("CollectOptions",),
     "lce_rig.core.data": ("Events", "Image", "Scan"),
     "lce_rig.core.errors": tuple(name for name in __all__ if name.endswith("Error")),
+    "lce_rig.core.findings": ("Finding",),
     "lce_rig.core.results": ("Calibration", "Refusal"),
     "lce_rig.detect.detection": ("Detections",),
     "lce_rig.export": ("export",),
+    "lce_rig.export.reference": ("Reference", "read_reference"),
     "lce_rig.export.result": ("SavedResult", "read_result"),
     "lce_rig.pipeline.calibration": ("calibrate",),
     "lce_rig.pipeline.collection": ("collect_from",),
@@ -102,6 +112,7 @@ _HOMES = {
     "lce_rig.rig": ("Rig", "load_rig"),
     "lce_rig.session": ("Session",),
     "lce_rig.sources.base": ("SourceOptions",),
+    "lce_rig.words": ("describe", "recommend"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -38,7 +38,9 @@ def main(rig_name: str, folder: str, session_folder: str) -> None:
     with lce.Session.resume(session_folder, rig) as session:
         for path in sorted(Path(folder).glob("*.npy")):
             pixels = cv2.imread(str(path.with_suffix(".png")))
-            image = lce.Image(sensor=camera, channel="frames", stamp_ns=None, pixels=pixels)
+            if pixels is None:
+                raise SystemExit(f"{path.with_suffix('.png')} cannot be read")
+            image = lce.Image(camera, "frames", stamp_ns=None, pixels=pixels.astype(np.uint8))
             scan = read_scan(path, lidar)
             # A second run stores nothing twice.
             if session.find_duplicate([image], [scan]) is None:

@@ -27,7 +27,7 @@ METHODS: Mapping[
 """Name -> what estimates T_cam_lidar from boards whose pairing is settled."""
 
 
-def calibrate(
+def fit_extrinsic(
     candidates: Sequence[CaptureCandidates],
     board: Board,
     options: CalibrateOptions | None = None,

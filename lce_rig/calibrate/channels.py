@@ -40,30 +40,13 @@ _MOVED = 1.0
 _N_SHARES = 7
 
 
-@dataclass(frozen=True, eq=False)
-class ChannelsEstimate:
-    """An extrinsic from all channels.
-
-    Attributes:
-        estimate: from all of them together.
-        channels: what each says alone, by name.
-        difference: (6,) tangent between the two channels' extrinsics; None with one channel.
-        difference_cov: (6, 6) of it.
-    """
-
-    estimate: CalibrationEstimate
-    channels: tuple[ChannelResult, ...]
-    difference: Array | None = None
-    difference_cov: Array | None = None
-
-
 def calibrate_channels(
     candidates: Mapping[str, Sequence[CaptureCandidates]],
     board: Board,
     options: CalibrateOptions,
     clocks: Clocks,
     progress: Callable[[int, int], None] | None = None,
-) -> ChannelsEstimate:
+) -> CalibrationEstimate:
     """Estimate T_cam_lidar from what the channels of one camera and a LiDAR saw of the board.
 
     Args:
@@ -88,7 +71,7 @@ def calibrate_channels(
         estimate = with_consensus(estimate, consensus)
         n_captures = len(consensus.observations)
         result = _channel_result(name, n_captures, noise_px[name], estimate, estimate, None)
-        return ChannelsEstimate(estimate, (result,))
+        return replace(estimate, channels=(result,))
     still = {name: _alone(consensus, board, options) for name, consensus in agreed.items()}
     start = next(iter(still.values()))
     offsets = _offsets(samples, scans, board, options, clocks, start) if is_moving else None
@@ -104,7 +87,8 @@ def calibrate_channels(
         )
         for name in sorted(agreed)
     )
-    return ChannelsEstimate(estimate, results, *_difference(mover, results, board, options))
+    apart, cov = _difference(mover, results, board, options)
+    return replace(estimate, channels=results, channel_difference=apart, channel_difference_cov=cov)
 
 
 @dataclass(frozen=True, eq=False)

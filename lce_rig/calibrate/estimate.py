@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import CaptureResidual, Certificate, Metrics, Observation, Refusal
+from lce_rig.core.results import CaptureResidual, Certificate, ChannelResult, Metrics, Observation, Refusal
 from lce_rig.residuals.quadratics import Quadratics
 
 
@@ -32,6 +32,9 @@ class CalibrationEstimate:
         expansion: the method's own cost about its result, capture by capture, in the extrinsic (and those of
             cameras estimated with it) alone; None of methods that give none.
         estimated_with: cameras whose extrinsics were estimated together with this one.
+        channels: what each channel of the camera says alone; empty where they were not told apart.
+        channel_difference: (6,) tangent between the extrinsics of two channels; None with one channel.
+        channel_difference_cov: (6, 6) of it.
     """
 
     T_cam_lidar: Array
@@ -49,3 +52,6 @@ class CalibrationEstimate:
     method: str = "paper"
     expansion: Quadratics | None = None
     estimated_with: tuple[str, ...] = ()
+    channels: tuple[ChannelResult, ...] = ()
+    channel_difference: Array | None = None
+    channel_difference_cov: Array | None = None

@@ -64,9 +64,11 @@ def _typical(errors: Array) -> float:
 
 def _refusal(plane: Array, edge: Array, k: int) -> Refusal:
     return Refusal(
-        "calibrate",
-        f"the LiDAR sees the board's plane {1e3 * plane[k]:.0f} mm and its edges {1e3 * edge[k]:.0f} mm "
-        f"(rms) from where the other captures predict them; they agree to {1e3 * np.median(plane):.0f} and "
-        f"{1e3 * np.median(edge):.0f} mm",
-        "hold the board still while capturing, with nothing in front of it or close behind its rim",
+        "calibrate.outlier",
+        figures={
+            "plane_m": float(plane[k]),
+            "edges_m": float(edge[k]),
+            "plane_median_m": float(np.median(plane)),
+            "edges_median_m": float(np.median(edge)),
+        },
     )

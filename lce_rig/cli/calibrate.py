@@ -20,6 +20,7 @@ from lce_rig.cli.options import (
 from lce_rig.cli.uncertainty import uncertainty_lines
 from lce_rig.core.results import Calibration
 from lce_rig.detect.detection import Pair
+from lce_rig.words import sentence
 
 if TYPE_CHECKING:
     from lce_rig.pipeline.result_files import WrittenResults
@@ -252,7 +253,7 @@ def _lines(calibration: Calibration) -> list[str]:
             f"  reference    off by {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
         )
     for name, why in c.captures_refused.items():
-        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.cause}: {why.action}')}[/]")
+        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {sentence(why)}')}[/]")
     lines += [f"  [{colour}]{show.escape(reason)}[/]" for reason in c.reasons]
     return lines
 

@@ -12,6 +12,7 @@ from lce_rig.cli import show
 from lce_rig.cli.options import event_image_option, json_option, session_argument
 from lce_rig.core.results import Refusal
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
+from lce_rig.words import describe, recommend, refusal_as_json
 
 
 @click.command()
@@ -72,7 +73,7 @@ def _record(image: ImageDetection, lidar: LidarDetection, refusal: Refusal | Non
     best = lidar[0] if isinstance(lidar, list) else lidar
     return {
         "is_usable": refusal is None,
-        "refusal": None if refusal is None else vars(refusal),
+        "refusal": None if refusal is None else refusal_as_json(refusal),
         "image": _figures(image),
         "lidar": _figures(best),
         "n_surfaces": len(lidar) if isinstance(lidar, list) else 0,
@@ -144,11 +145,12 @@ def _cell(figures: Mapping[str, float | None] | None, key: str, scale: float, di
 def _summarise(n_captures: int, refused: Mapping[str, Refusal]) -> None:
     """Print each cause once, with the captures it holds for."""
     show.say(f"{n_captures - len(refused)} of {n_captures} captures can be used")
-    names: dict[Refusal, list[str]] = {}
+    names: dict[str, list[str]] = {}
     for name, refusal in sorted(refused.items()):
-        names.setdefault(refusal, []).append(name)
-    for refusal, captures in names.items():
-        show.say(f"  {', '.join(captures)}: {refusal.stage}: {refusal.cause}\n    -> {refusal.action}")
+        text = f"{refusal.stage}: {describe(refusal)}\n    -> {recommend(refusal)}"
+        names.setdefault(text, []).append(name)
+    for text, captures in names.items():
+        show.say(f"  {', '.join(captures)}: {text}")
     by_stage = Counter(refusal.stage for refusal in refused.values())
     if len(by_stage) > 1:
         show.say("  refused by stage: " + ", ".join(f"{stage} {n}" for stage, n in sorted(by_stage.items())))

@@ -8,6 +8,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, require_sensors
+from lce_rig.words import sentence
 
 
 def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
@@ -236,9 +237,10 @@ def _tell(report: Any, session: Path, n_captures: int) -> None:
     for label, capture in report.duplicates.items():
         show.note(f"{label}: duplicate of {capture}, left out")
     for label, refusal in report.refused.items():
-        show.warn(f"{label}: {refusal.cause}: {refusal.action}")
-    if report.counts:
-        show.note("not captured:\n" + "\n".join(f"  {n} x {why}" for why, n in report.counts.most_common()))
+        show.warn(f"{label}: {sentence(refusal)}")
+    counts = report.counts.counts()
+    if counts:
+        show.note("not captured:\n" + "\n".join(f"  {n} x {sentence(why)}" for why, n in counts))
     if report.n_missing:
         show.warn(f"{report.n_missing} captures short of the target")
     new = f"{len(report.captured)} new" + (f", {report.n_resumed} known already" if report.n_resumed else "")

@@ -1,7 +1,7 @@
 """Sensor data as frozen samples."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,3 +115,42 @@ class Events:
             self.height_px,
             self.host_ns,
         )
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """One edge that a trigger line made or a sensor saw.
+
+    Attributes:
+        sensor: name of the line: a camera that it triggers, or the sensor that saw it.
+        stamp_ns: device time of the board or sensor that reports it.
+        count: running number of its line; gaps are lost pulses.
+        host_ns: arrival at the host.
+    """
+
+    sensor: str
+    stamp_ns: int
+    count: int
+    host_ns: int
+
+
+@dataclass(frozen=True, order=True)
+class Stream:
+    """What one sensor sends.
+
+    Attributes:
+        sensor: the camera or LiDAR.
+        channel: of a camera; "" for a LiDAR.
+        kind: a channel of events may also bring pictures that others reconstructed.
+    """
+
+    sensor: str
+    channel: str
+    kind: Literal["pictures", "events", "scans"]
+
+    def __str__(self) -> str:
+        return f"{self.sensor}.{self.channel}" if self.channel else self.sensor
+
+
+Sample: TypeAlias = Image | Scan | Events
+LiveSample: TypeAlias = Image | Scan | Events | Pulse

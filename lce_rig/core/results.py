@@ -2,27 +2,39 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.errors import LceRigError
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, sigma_sizes
+
+Stage = Literal["read", "image", "lidar", "pair", "calibrate"]
+STAGES: tuple[Stage, ...] = ("read", "image", "lidar", "pair", "calibrate")
 
 
 @dataclass(frozen=True)
-class Refusal:
-    """The reason for refusing a capture.
+class Refusal(Finding):
+    """The reason for refusing a capture; its code begins with the stage, as "lidar.too_few_rings".
 
-    Attributes:
-        stage: "read", "image", "lidar", "pair" (the two sensors disagree) or "calibrate" (outlier).
-        cause: what was seen, with its figure: "2 rings on the board".
-        action: what to do: "come 0.8 m closer".
+    Stages are "read", "image", "lidar", "pair" (the two sensors disagree) and "calibrate" (an outlier).
     """
 
-    stage: Literal["read", "image", "lidar", "pair", "calibrate"]
-    cause: str
-    action: str
+    def __post_init__(self) -> None:
+        if self.code.partition(".")[0] not in STAGES:
+            raise ValueError(f"{self.code} names no stage")
+
+    @property
+    def stage(self) -> Stage:
+        """The stage that refuses the capture."""
+        return cast(Stage, self.code.partition(".")[0])
+
+    @staticmethod
+    def of_error(stage: Stage, error: LceRigError, action: str = "") -> "Refusal":
+        """Refuse a capture for an error that was raised about it."""
+        return Refusal(f"{stage}.error", figures={"what": error.what, "hint": error.hint}, action=action)
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,7 +271,9 @@ class Calibration:
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
         egt_rotation_deg, egt_translation_m: error against a reference given by the user; None without.
-        verdict: "pass", "marginal" or "fail", with reasons.
+        verdict: "pass", "marginal" or "fail".
+        reasons: for it, worst first, in words.
+        findings: the same as codes and figures; empty in results of earlier versions.
         captures_used: names of the captures behind the estimate.
         captures_refused: why each other capture is not.
         diagnostics: further figures by name.
@@ -286,6 +300,7 @@ class Calibration:
     captures_refused: Mapping[str, Refusal]
     verdict: Literal["pass", "marginal", "fail"]
     reasons: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
     egt_rotation_deg: float | None = None
     egt_translation_m: float | None = None
     diagnostics: Mapping[str, float] = field(default_factory=dict)

@@ -25,12 +25,13 @@ class Reference:
         return self.by_pair.get((camera, lidar), self.default)
 
 
-def read_reference(path: Path) -> Reference:
+def read_reference(path: Path | str) -> Reference:
     """Read truth.json, result.json or any JSON with a 4x4 `T_cam_lidar`, at the top or in a list `pairs`.
 
     Raises:
         SessionError: there is none, or it is not a rigid transform.
     """
+    path = Path(path)
     try:
         document = read_json(path)
     except OSError as error:

@@ -1,17 +1,18 @@
 """Recordings into a session, unattended: by their paths, or by readers of one's own."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from lce_rig.collect import CollectOptions, CollectReport, collect
+from lce_rig.collect.tally import Tally
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.pipeline.progress import Progress, silent
+from lce_rig.pipeline.detection import Progress, silent
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.sources import open_recordings
 from lce_rig.sources.base import Recording, SourceOptions
+from lce_rig.words import describe
 
 Source = Path | str | Recording
 
@@ -54,11 +55,12 @@ def collect_from(
         raise report.errors[0]
     filled = Session.open(session)
     if not filled.captures:
-        causes = report.counts + Counter(refusal.cause for refusal in report.refused.values())
-        raise NotEnoughDataError(
-            f"{session}: no capture could be made",
-            "\n".join(f"{n} x {cause}" for cause, n in causes.most_common(3)),
-        )
+        refused = Tally()
+        refused.update(report.counts)
+        for refusal in report.refused.values():
+            refused.add(refusal)
+        causes = "\n".join(f"{n} x {describe(why)}" for why, n in refused.counts()[:3])
+        raise NotEnoughDataError(f"{session}: no capture could be made", causes)
     return filled
 
 

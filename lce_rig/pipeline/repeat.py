@@ -13,7 +13,7 @@ from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.results import Calibration
 from lce_rig.export.result import read_result
 from lce_rig.pipeline.calibration import calibrate
-from lce_rig.pipeline.progress import Progress, silent
+from lce_rig.pipeline.detection import Progress, silent
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.session import Session
 from lce_rig.session.identity import differing_keys

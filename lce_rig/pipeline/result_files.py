@@ -33,7 +33,7 @@ class Result:
     shortages: tuple[NotEnoughDataError, ...] = ()
 
     def of(self, camera: str, lidar: str | None = None) -> Calibration:
-        """Give the extrinsic of a camera with a LiDAR, by default the rig's first.
+        """Give the extrinsic of a camera with a LiDAR, by default the first that has one.
 
         Raises:
             NotEnoughDataError: they have none.

@@ -10,11 +10,9 @@ from lce_rig.core.results import Calibration, Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.detect.event_board import EventImage
 from lce_rig.export.result import SavedResult, read_result
-from lce_rig.pipeline.detection import detect, event_picture
-from lce_rig.pipeline.event_detection import event_channels
-from lce_rig.pipeline.progress import Progress, silent
+from lce_rig.pipeline.calibration import clocks_of
+from lce_rig.pipeline.detection import Progress, detect, event_channels, event_picture, silent
 from lce_rig.pipeline.result_files import OVERLAYS, RESULT, Result, keep_foreign, result_content
-from lce_rig.pipeline.solving import clocks_of
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.session.session import CALIBRATION, DEBUG

@@ -8,6 +8,9 @@ from lce_rig.rig.settings import Name, Settings, problem
 
 _BAUD = {"lce1": 115_200, "nmea": 9_600, "simplesensorsync": 921_600, "tline": 921_600}
 
+BOARD, PPS_LINE = "sync", "pps"
+"""Names of the sync board among the sensors, and of its pulses per second among the lines of cameras."""
+
 
 class TriggerSettings(Settings):
     """The pulses that trigger one camera.

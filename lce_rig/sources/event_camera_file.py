@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, Sample, Stream
 from lce_rig.rig import Rig
-from lce_rig.sources.base import Sample, SourceOptions, Span, Stream
+from lce_rig.sources.base import SourceOptions, Span
 from lce_rig.sources.events import open_events
 from lce_rig.sources.events.aedat4_file import Aedat4File
 from lce_rig.sources.events.aedat4_frames import Aedat4Frames

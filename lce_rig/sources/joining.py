@@ -4,12 +4,13 @@ import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+from lce_rig.core.data import Sample, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
-from lce_rig.sources.base import ContinuousRecording, Recording, Sample, Span, Stream
+from lce_rig.sources.base import ContinuousRecording, Recording, Span
 from lce_rig.sources.merging import merge_by_time
 from lce_rig.sources.overlap import check_overlap
-from lce_rig.sources.rig_time import stream_of
+from lce_rig.timing.rig_time import stream_of
 
 
 def join_recordings(recordings: Iterable[Recording], rig: Rig) -> list[Recording]:

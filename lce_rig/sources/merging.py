@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Iterator
 from heapq import merge
 
+from lce_rig.core.data import Sample
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
-from lce_rig.sources.base import Sample
-from lce_rig.sources.rig_time import rig_time_ns
+from lce_rig.timing.rig_time import rig_time_ns
 
 
 def merge_by_time(parts: Iterable[Iterable[Sample]], rig: Rig) -> Iterator[Sample]:

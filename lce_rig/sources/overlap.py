@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping
 
+from lce_rig.core.data import Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
-from lce_rig.sources.base import Span, Stream
-from lce_rig.sources.rig_time import rig_offset_ns
+from lce_rig.sources.base import Span
+from lce_rig.timing.rig_time import rig_offset_ns
 
 _MAX_OFFSET_S = 3600.0
 # Spans are told from a recording's ends, without reading what lies between.

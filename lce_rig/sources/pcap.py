@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lce_rig.core import velodyne
-from lce_rig.core.data import Scan
+from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.rig import LidarSettings, Rig
-from lce_rig.sources.base import SourceOptions, Span, Stream
+from lce_rig.sources.base import SourceOptions, Span
 from lce_rig.sources.datagrams import Datagram
 from lce_rig.sources.fingerprint import fingerprint
 from lce_rig.sources.pcap_file import PcapFile

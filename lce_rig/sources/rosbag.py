@@ -9,12 +9,12 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.sources.bag_file import BagFile, list_topics
 from lce_rig.sources.bag_storage import RawMessage
-from lce_rig.sources.base import Sample, SourceOptions, Span, Stream
+from lce_rig.sources.base import SourceOptions, Span
 from lce_rig.sources.cloud import to_scan
 from lce_rig.sources.events.bag import BagEvents
 from lce_rig.sources.events.camera import CameraEvents

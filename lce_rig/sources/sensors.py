@@ -3,7 +3,7 @@
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.sources.base import SourceOptions
-from lce_rig.sources.rig_time import event_channel
+from lce_rig.timing.rig_time import event_channel
 
 
 def choose_camera(

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
+from lce_rig.core.data import Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.sources.bag_file import list_topics
-from lce_rig.sources.base import SourceOptions, Stream
+from lce_rig.sources.base import SourceOptions
 from lce_rig.sources.events.bag import EVENT_TYPES
 
 CLOUD_TYPES = frozenset({"sensor_msgs/PointCloud2"})

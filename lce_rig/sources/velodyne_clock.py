@@ -7,9 +7,9 @@ which the position packets report, tie it to UTC. The hour is never sent.
 from collections import deque
 
 from lce_rig.core import velodyne
-from lce_rig.core.clock import resolve_hour
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.sources.velodyne_packet import DataPacket, PositionPacket
+from lce_rig.timing.clock import resolve_hour
 
 #: Clocks further apart than this do not both show UTC.
 MAX_DISAGREEMENT_NS = 100_000_000

@@ -11,7 +11,7 @@ from benchmarks.paper_runs import paper_mge_m
 from benchmarks.recordings import SETS, RecordedSet, detect
 from benchmarks.tables import compare
 from lce_rig import pipeline
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, fit_extrinsic
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Calibration, ImageBoard
@@ -101,7 +101,7 @@ def errors_by_frames(recording: Recording, counts: Sequence[int], methods: Seque
             for method in methods:
                 options = replace(recording.options, method=method, n_draws=0)
                 try:
-                    T = calibrate(subset, board, options).T_cam_lidar
+                    T = fit_extrinsic(subset, board, options).T_cam_lidar
                 except NotEnoughDataError:
                     continue
                 errors[method][k, j] = compare(T, recording.reference)

@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.kept import kept_folder
 from benchmarks.paper_sets import LEVELS, N_CAPTURES, PaperSet, paper_rig, paper_set
 from benchmarks.tables import compare
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate, capture_residual
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, capture_residual, fit_extrinsic
 from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array
@@ -80,7 +80,7 @@ def measure(
     """Calibrate the first captures of a set at a level and hold the result against the truth."""
     board = paper_rig().board.to_board()
     try:
-        estimate = calibrate(_candidates(seen, level, n_captures), board, options)
+        estimate = fit_extrinsic(_candidates(seen, level, n_captures), board, options)
     except NotEnoughDataError:
         return Run(name, level, n_captures, seed, *[float("nan")] * 4)
     deg, mm = compare(estimate.T_cam_lidar, seen.T_cam_lidar)

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, fit_extrinsic
 from lce_rig.calibrate.likelihood.end_density import density
 from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import stack_pictures
@@ -122,7 +122,7 @@ def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[R
     levels = _true_levels(case.options().lidar_noise, [terms.edges for terms in at_truth])
     priors = Priors(offset_m=options.range_offset_sigma_m, shift_m=options.edge_shift_sigma_m)
     for session, terms in zip(sessions, at_truth, strict=True):
-        estimate = calibrate(session.candidates, board, options)
+        estimate = fit_extrinsic(session.candidates, board, options)
         bound = cramer_rao_bound(terms, levels, priors, session.T_cam_lidar)
         yield Run(difference(estimate.T_cam_lidar, session.T_cam_lidar), estimate.cov, bound)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, fit_extrinsic
 from lce_rig.calibrate.systematic import ring_sensitivities, shift_rings
 from lce_rig.core.geometry import difference, fit_plane, perturb
 from lce_rig.core.results import Observation
@@ -78,7 +78,7 @@ def normalised_errors(options, n_seeds):
     for seed in range(n_seeds):
         offset_m = OFFSET_SIGMA_M * np.random.default_rng([seed, 2]).standard_normal()
         scenario = Scenario(laser_bias_sigma_m=LASER_SIGMA_M, range_offset_m=offset_m)
-        estimate = calibrate(simulate(20, seed, scenario), BOARD, options)
+        estimate = fit_extrinsic(simulate(20, seed, scenario), BOARD, options)
         error = difference(estimate.T_cam_lidar, T_FORWARD)
         nees.append(error @ np.linalg.solve(estimate.cov, error))
     return np.array(nees)
@@ -99,7 +99,7 @@ def test_range_errors_of_which_nothing_is_known_are_not_in_the_covariance():
 
 def test_a_common_offset_moves_the_lidar_by_about_its_size_and_is_claimed_so():
     options = replace(NO_DRAWS, range_offset_sigma_m=0.02)
-    estimate = calibrate(simulate(20, 3, Scenario(range_offset_m=0.02)), BOARD, options)
+    estimate = fit_extrinsic(simulate(20, 3, Scenario(range_offset_m=0.02)), BOARD, options)
     error = difference(estimate.T_cam_lidar, T_FORWARD)
     assert 0.01 < np.linalg.norm(error[:3]) < 0.03
     assert 0.01 < estimate.diagnostics["sigma_systematic_translation_m"] < 0.03
@@ -108,8 +108,8 @@ def test_a_common_offset_moves_the_lidar_by_about_its_size_and_is_claimed_so():
 
 def test_systematic_errors_add_to_the_scatter_and_change_nothing_else():
     captures = simulate(12, 6)
-    pure = calibrate(captures, BOARD, NO_DRAWS)
-    wider = calibrate(
+    pure = fit_extrinsic(captures, BOARD, NO_DRAWS)
+    wider = fit_extrinsic(
         captures, BOARD, replace(NO_DRAWS, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
     )
     assert pure.T_cam_lidar.tobytes() == wider.T_cam_lidar.tobytes()
@@ -127,6 +127,8 @@ def test_systematic_errors_add_to_the_scatter_and_change_nothing_else():
 def test_rays_start_from_the_lidar_wherever_it_sits():
     options = replace(NO_DRAWS, laser_bias_sigma_m=0.008)
     T = perturb(T_FORWARD, np.array([0.3, -0.1, 0.1, 0.0, 0.2, 0.0]))
-    estimate = calibrate(simulate(20, 3, Scenario(laser_bias_sigma_m=0.008), T_cam_lidar=T), BOARD, options)
+    estimate = fit_extrinsic(
+        simulate(20, 3, Scenario(laser_bias_sigma_m=0.008), T_cam_lidar=T), BOARD, options
+    )
     error = difference(estimate.T_cam_lidar, T)
     assert error @ np.linalg.solve(estimate.cov, error) < 16.8

@@ -44,7 +44,21 @@ def test_the_published_fields_are_there_in_order(make: Make) -> None:
     assert document["pairs"][0]["certificate"] == {"is_optimal": True, "gap": 1.25e-9}
     refused = document["pairs"][0]["captures_refused"]
     assert list(refused) == ["000001", "000003"]
-    assert refused["000003"] == {"stage": "calibrate", "cause": "12 cm off", "action": "repeat it"}
+    assert list(refused["000001"]) == ["stage", "code", "figures", "action_code", "cause", "action"]
+    assert (refused["000001"]["stage"], refused["000001"]["code"]) == ("lidar", "lidar.too_few_rings")
+    assert refused["000001"]["figures"] == make().captures_refused["000001"].figures
+
+
+def test_refusals_of_earlier_and_of_later_versions_are_kept_as_text(make: Make, tmp_path: Path) -> None:
+    document = to_json_dict("rles", [make()])
+    refused = document["pairs"][0]["captures_refused"]
+    refused["000001"] = {"stage": "lidar", "cause": "2 rings", "action": "come closer"}
+    refused["000003"] |= {"code": "calibrate.of_tomorrow"}
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(document))
+    first, second = read_result(path).pairs[0].captures_refused.values()
+    assert (first.code, first.figures) == ("lidar.text", {"text": "2 rings", "advice": "come closer"})
+    assert (second.code, second.figures["text"]) == ("calibrate.text", refused["000003"]["cause"])
 
 
 def test_the_method_is_told_and_read_back(make: Make, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from lce_rig.calibrate.likelihood.levels import PoseLevels
 from lce_rig.calibrate.likelihood.refine import refine
 from lce_rig.calibrate.likelihood.spread import inflate
 from lce_rig.calibrate.options import CalibrateOptions
-from lce_rig.calibrate.shared_scans import REMOVE_OTHERS, take_apart
+from lce_rig.calibrate.shared_scans import take_apart
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation, Refusal
@@ -124,8 +124,8 @@ def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
             for capture in sorted(take_apart([observation.capture])):
                 other, held = seen.setdefault(capture, (camera, key))
                 if held != key:
-                    cause = f"{other} and {camera} put the board at different places of the scan"
-                    found[capture] = Refusal("pair", cause, REMOVE_OTHERS)
+                    figures = {"first": other, "second": camera}
+                    found[capture] = Refusal("pair.two_places", figures=figures)
     return found
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lce_rig.collect.guidance.candidates import View, spread_candidates
 from lce_rig.collect.guidance.evidence import Evidence, weigh_placements
 from lce_rig.collect.guidance.precision import Precision, combine, combine_with_each, shortfall, sigmas
-from lce_rig.collect.guidance.words import NOWHERE_ELSE, instruct, is_there, say
+from lce_rig.collect.guidance.words import instruct, is_there, say
 from lce_rig.core.geometry import Array, rotation_angle
 from lce_rig.core.results import Refusal
 
@@ -140,21 +140,21 @@ class Planner:
         """
         guidance = self.guide(held, present, avoid)
         wanted = guidance.T_cam_board
-        action = NOWHERE_ELSE if wanted is None else say(instruct(self.view, present, wanted))
+        action = "nowhere" if wanted is None else ""
+        instruction = "" if wanted is None else say(instruct(self.view, present, wanted))
         alike = np.flatnonzero(self._is_like(held, present[None], guidance.spacing)[:, 0])
         if len(alike):
             name = str(alike[0] + 1) if names is None else names[alike[0]]
-            return Refusal("calibrate", f"the board stands where capture {name} shows it", action)
+            figures = {"capture": name, "instruction": instruction}
+            return Refusal("calibrate.known_placement", figures=figures, action=action)
         is_asked = asked is not None and is_there(self.view, present, asked)
         if wanted is None or guidance.is_enough or is_asked:
             return None
         own, best = self._gains(held, np.stack([present, wanted]))
         if best < LEAST_GAIN or own >= LEAST_SHARE * best:
             return None
-        cause = (
-            f"this placement makes the result {max(100 * own, 0.0):.1f} % better, another {100 * best:.0f} %"
-        )
-        return Refusal("calibrate", cause, action)
+        figures = {"gain": max(float(own), 0.0), "best_gain": float(best), "instruction": instruction}
+        return Refusal("calibrate.little_gain", figures=figures)
 
     def _gains(self, held: Array, placements: Array) -> Array:
         """Compute by which share each of some placements (N, 4, 4) shrinks what can be shrunk, (N,)."""

@@ -21,7 +21,6 @@ DEAD_BANDS = {"sideways": 0.12, "nearer": 0.15, "height": 0.10, "tilt": 8.0, "tu
 #: Within so many dead bands of every wanted figure the board is there.
 THERE = 1.5
 #: Where no reachable placement is known that was not captured.
-NOWHERE_ELSE = "no other place is left: you may stop"
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.core.clock import NS_PER_S, ClockModel
-from lce_rig.core.clock_fit import MIN_PAIRS, RESOLUTION_NS, TimePairs, fit_clock
+from lce_rig.timing.clock import NS_PER_S, ClockModel
+from lce_rig.timing.clock_fit import MIN_PAIRS, RESOLUTION_NS, TimePairs, fit_clock
 
 _MAX_PAIRS = 2048
 _N_WITNESSES = 3

@@ -1,9 +1,8 @@
 """The rig's clock, the common time base of all sensors."""
 
-from lce_rig.core.data import Events, Image
+from lce_rig.core.data import Events, Image, Sample, Stream
 from lce_rig.rig import Rig
 from lce_rig.rig.sensors import TimestampSettings
-from lce_rig.sources.base import Sample, Stream
 
 
 def event_channel(rig: Rig, camera: str) -> str | None:
