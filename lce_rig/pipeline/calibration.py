@@ -20,7 +20,6 @@ from lce_rig.calibrate import (
 )
 from lce_rig.calibrate.camera_pairs import CameraPair, doubt_cameras, relate
 from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.doubt import Doubt
 from lce_rig.calibrate.examination import Examination, examine
 from lce_rig.calibrate.intrinsics_estimate import View
 from lce_rig.calibrate.likelihood.calibrate_together import TogetherEstimate, calibrate_together
@@ -30,6 +29,7 @@ from lce_rig.calibrate.relative_pose import relative_pose
 from lce_rig.calibrate.shared_scans import take_apart
 from lce_rig.calibrate.verdict import judge
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
 from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal
 from lce_rig.detect.detection import Detections, Pair
@@ -73,7 +73,7 @@ class _Link:
     first: int
     second: int
     pair: CameraPair
-    doubts: tuple[Doubt, ...]
+    doubts: tuple[Finding, ...]
 
 
 def calibrate(
@@ -368,12 +368,12 @@ def _judged(
     sensors: _Sensors,
     estimate: CalibrationEstimate,
     examination: Examination,
-    between_cameras: Sequence[Doubt],
+    between_cameras: Sequence[Finding],
     others: tuple[OtherCamera, ...],
 ) -> Calibration:
     camera, lidar = sensors.camera, sensors.lidar
     n_captures = len({name for pair in sensors.pairs for name in detections.captures(pair)})
-    verdict, reasons = judge(estimate, examination, rig, camera, lidar, n_captures, between_cameras)
+    verdict, findings = judge(estimate, examination, rig, camera, lidar, n_captures, between_cameras)
     diagnostics = dict(estimate.diagnostics)
     if examination.widened_by != 1:
         diagnostics["sigma_widened"] = examination.widened_by
@@ -394,7 +394,8 @@ def _judged(
         captures_used=tuple(sorted(take_apart(estimate.used))),
         captures_refused=_still_refused(estimate, sensors.refused),
         verdict=verdict,
-        reasons=reasons,
+        reasons=tuple(sentence(finding) for finding in findings),
+        findings=findings,
         diagnostics=diagnostics,
         channel_results=estimate.channels,
         method=estimate.method,
