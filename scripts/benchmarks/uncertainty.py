@@ -16,6 +16,7 @@ from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import stack_pictures
 from lce_rig.calibrate.likelihood.refine import to_extrinsic
 from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, Terms, assemble, linearise
+from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.geometry import Array, difference, invert
 from lce_rig.residuals.along_rays import N_FIELDS, N_SHIFTS, SHIFTS, EdgeRows, interior, stack_scans
 from lce_rig.rig import Rig, load_rig
@@ -115,7 +116,7 @@ def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[R
     ]
     at_truth = [_at_truth(rig, session) for session in sessions]
     levels = _true_levels(case.options().lidar_noise, [terms.edges for terms in at_truth])
-    priors = Priors(offset_m=options.range_offset_sigma_m, shift_m=options.edge_shift_sigma_m)
+    priors = Priors(offset_m=options.range_offset_sigma_m, shift_m=EDGE_SHIFT_SIGMA_M)
     for session, terms in zip(sessions, at_truth, strict=True):
         estimate = fit_extrinsic(session.candidates, board, options)
         bound = cramer_rao_bound(terms, levels, priors, session.T_cam_lidar)
