@@ -5,17 +5,18 @@ The extrinsics of both cameras with one LiDAR say the same thing by another way.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate.doubt import SURPRISING_CHI2, Doubt, Verdict
+from lce_rig.calibrate.doubt import SURPRISING_CHI2, doubt
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.halves import contrast_halves, doubt_halves
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.picture_terms import stack_pictures
 from lce_rig.calibrate.mean_pose import mean_pose
 from lce_rig.calibrate.relative_pose import relative_covariance, relative_pose
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation
 from lce_rig.residuals.placements import group_placements
@@ -31,6 +32,11 @@ _MIN_JACKKNIFE = 10
 _STUDENT = 5.0
 # Boards scatter for a reason where they do so by this many times what is usual.
 _MAX_SCATTER = 2.0
+
+_BY_IMAGES = {
+    "verdict.changed": "verdict.camera_changed",
+    "verdict.shares_differ": "verdict.camera_shares_differ",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +185,7 @@ def _board_rms_m(shared: Sequence[tuple[Observation, Observation]], T_second_fir
 
 def doubt_cameras(
     pair: CameraPair, names: tuple[str, str], target: CalibrationSettings, limits: VerdictSettings
-) -> list[Doubt]:
+) -> list[Finding]:
     """Doubt the extrinsics of two cameras that contradict the cameras' own pictures.
 
     Args:
@@ -194,27 +200,19 @@ def doubt_cameras(
     strict = limits.model_copy(update={"max_change": limits.max_camera_difference})
     halves = contrast_halves(pair.pictures.expansion, pair.pictures.centres)
     changed = doubt_halves(halves, pair.pictures.captures, target, strict)
-    first, second = names
+    by_images = [replace(each, code=_BY_IMAGES[each.code], subject=" to ".join(names)) for each in changed]
     return [
-        *(
-            Doubt(doubt.verdict, f"{first} to {second}, by their pictures alone: {doubt.text}")
-            for doubt in changed
-        ),
+        *by_images,
         *_scattered(pair.pictures, names, limits),
         *_elsewhere(pair, pair.pictures, pair.apart, names, target, limits),
     ]
 
 
-def _scattered(pictures: PicturePose, names: tuple[str, str], limits: VerdictSettings) -> list[Doubt]:
+def _scattered(pictures: PicturePose, names: tuple[str, str], limits: VerdictSettings) -> list[Finding]:
     if pictures.scatter <= _MAX_SCATTER or pictures.board_rms_m <= limits.max_plane_misfit_m:
         return []
-    first, second = names
-    text = (
-        f"wherever {first} sits to {second}, their pictures put the same board "
-        f"{1000 * pictures.board_rms_m:.0f} mm apart (rms; {pictures.scatter:.1f} times what is usual): "
-        "did the board move between the pictures, or is an intrinsic wrong?"
-    )
-    return [Doubt("marginal", text)]
+    figures = {"rms_m": pictures.board_rms_m, "scatter": pictures.scatter}
+    return [doubt("verdict.cameras_scatter", figures, is_fail=False, subject=" to ".join(names))]
 
 
 def _elsewhere(
@@ -224,17 +222,16 @@ def _elsewhere(
     names: tuple[str, str],
     target: CalibrationSettings,
     limits: VerdictSettings,
-) -> list[Doubt]:
-    first, second = names
+) -> list[Finding]:
     rotation_deg, translation_m = tangent_sizes(apart)
     excess = target.in_targets(rotation_deg, translation_m) / limits.max_camera_difference
     if pair.surprise <= SURPRISING_CHI2 or excess <= 1:
         return []
-    verdict: Verdict = "fail" if excess > limits.fail_factor else "marginal"
-    text = (
-        f"{first} and {second} put the same board {1000 * pair.board_rms_m:.0f} mm apart "
-        f"({1000 * pictures.board_rms_m:.0f} mm by their pictures alone): extrinsics and pictures differ by "
-        f"{rotation_deg:.2f} deg, {1000 * translation_m:.0f} mm on where one camera sits to the other: "
-        "was one of them nudged, or is an intrinsic wrong?"
-    )
-    return [Doubt(verdict, text)]
+    figures = {
+        "rms_m": pair.board_rms_m,
+        "images_rms_m": pictures.board_rms_m,
+        "rotation_deg": rotation_deg,
+        "translation_m": translation_m,
+    }
+    is_fail = excess > limits.fail_factor
+    return [doubt("verdict.cameras_differ", figures, is_fail=is_fail, subject=" to ".join(names))]

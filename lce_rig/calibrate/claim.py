@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
 from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.rig import VerdictSettings
@@ -30,12 +31,12 @@ class Spread:
 
         Returns:
             By how much the largest of the three exceeds the claim, in standard deviations of rotation or of
-            translation, and which it is, in words.
+            translation, and which it is.
         """
         ways = {
-            "captures drawn anew": self.bootstrap,
-            "captures left out one by one": self.left_out,
-            "random halves of the captures": self.halves,
+            "bootstrap": self.bootstrap,
+            "left_out": self.left_out,
+            "halves": self.halves,
         }
         ratios = {
             words: float(
@@ -87,7 +88,7 @@ def _robust_cov(tangents: Array) -> Array:
     return np.asarray(kept.T @ kept / len(kept))
 
 
-def widening(cov: Array, spread: Spread, limits: VerdictSettings) -> tuple[float, str]:
+def widening(cov: Array, spread: Spread, limits: VerdictSettings) -> tuple[float, Finding | None]:
     """Compare a claimed covariance with the spread of resampled captures.
 
     Args:
@@ -97,9 +98,9 @@ def widening(cov: Array, spread: Spread, limits: VerdictSettings) -> tuple[float
 
     Returns:
         By how many times standard deviations are to be widened, 1 where the claim is large enough; and a
-        remark that says why, else empty.
+        note that says why, else None.
     """
-    ratio, words = spread.ratio_to(cov)
+    ratio, way = spread.ratio_to(cov)
     if ratio <= limits.max_spread_ratio:
-        return 1.0, ""
-    return ratio, f"standard deviations are {ratio:.1f} times what the method claims: {words} spread that far"
+        return 1.0, None
+    return ratio, Finding("verdict.widened", "note", figures={"ratio": ratio, "spread": way})

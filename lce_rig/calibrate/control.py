@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.calibrate.doubt import Doubt, Verdict
+from lce_rig.calibrate.doubt import doubt
 from lce_rig.calibrate.observability import lever_arm, name_direction
 from lce_rig.core.board import Board
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import Observation
 from lce_rig.residuals.features import extract_features
@@ -85,13 +86,16 @@ def run_control(
     return Control(moves, increase.mean(axis=0), increase.std(axis=0, ddof=1) / np.sqrt(len(observations)))
 
 
-def doubt_control(control: Control) -> list[Doubt]:
+def doubt_control(control: Control) -> list[Finding]:
     """Doubt a result that captures left out do not tell from a bad one."""
     worst = int(np.argmin(control.worse / control.worse_sigma))
     if control.worse[worst] > 0:
         return []
     move = control.moves[worst]
-    verdict: Verdict = "fail" if control.worse[worst] < -_SURE * control.worse_sigma[worst] else "marginal"
-    figures = f"{np.degrees(np.linalg.norm(move[3:])):.2f} deg and {1000 * np.linalg.norm(move[:3]):.0f} mm"
-    text = f"moved by {figures} ({name_direction(move)}) the result fits captures left out as well or better"
-    return [Doubt(verdict, f"{text}: collect more captures; if it stays, measure the board anew")]
+    figures: dict[str, Figure] = {
+        "rotation_deg": float(np.degrees(np.linalg.norm(move[3:]))),
+        "translation_m": float(np.linalg.norm(move[:3])),
+        "direction": name_direction(move),
+    }
+    is_fail = bool(control.worse[worst] < -_SURE * control.worse_sigma[worst])
+    return [doubt("verdict.control", figures, is_fail=is_fail)]

@@ -14,6 +14,7 @@ from lce_rig.calibrate.intrinsics_check import IntrinsicsCheck, check_intrinsics
 from lce_rig.calibrate.intrinsics_estimate import View
 from lce_rig.calibrate.nuisances import Nuisances, estimate_nuisances
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
 from lce_rig.rig import LidarSettings, Rig
 
@@ -30,7 +31,7 @@ class Examination:
     Attributes:
         cov: (6, 6) to report: the estimate's, widened where captures spread it farther than it claims.
         widened_by: by how many times the standard deviations were widened; 1 where they were not.
-        remark: why; empty where they were not.
+        remark: why; None where they were not.
         contrasts: shares of the captures that ought to agree.
         control: what happens to left-out captures when the result is moved.
         nuisances: what the captures share beside the extrinsic.
@@ -39,7 +40,7 @@ class Examination:
 
     cov: Array
     widened_by: float
-    remark: str
+    remark: Finding | None
     contrasts: tuple[Contrast, ...]
     control: Control | None
     nuisances: Nuisances | None
@@ -69,7 +70,7 @@ def examine(
         range_offset_sigma_m=lidar.range_offset_sigma_m,
     )
     if len(expansion.groups) < _MIN_PLACEMENTS:
-        return Examination(estimate.cov, 1.0, "", (), None, None, intrinsics)
+        return Examination(estimate.cov, 1.0, None, (), None, None, intrinsics)
     settled = expansion.hold(SCALE).settled()
     # A cost made anew scatters as it does itself: a claim is held against the scatter of its own method.
     widened_by, remark = widening(estimate.cov, resample(estimate.expansion or settled), rig.verdict)

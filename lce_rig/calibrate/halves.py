@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.calibrate.doubt import Doubt, Verdict
+from lce_rig.calibrate.doubt import doubt
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, tangent_sizes
 from lce_rig.residuals.quadratics import Quadratics
 from lce_rig.rig import CalibrationSettings, VerdictSettings
@@ -22,11 +23,6 @@ _N_LOTS = 400
 _MEDIAN_CHI2 = 5.348
 # Differences beyond this many limits leave nothing to be used.
 _FAIL = 2.0
-_CAUSES = {
-    "near": "is the squares' size or the focal length wrong, or the board bent?",
-    "left": "do the intrinsics belong to this lens? Is the board flat?",
-    "upper": "do the intrinsics belong to this lens? Is the board flat?",
-}
 
 
 @dataclass(frozen=True)
@@ -119,7 +115,7 @@ def doubt_halves(
     captures: Sequence[str],
     target: CalibrationSettings,
     limits: VerdictSettings,
-) -> list[Doubt]:
+) -> list[Finding]:
     """Doubt a result whose shares differ by more than the target, and more than lots make them.
 
     Args:
@@ -135,13 +131,12 @@ def doubt_halves(
         excess /= limits.max_change if is_change else limits.max_contrast
         if c.chance > limits.least_chance or excess <= 1:
             continue
-        verdict: Verdict = "fail" if excess > _FAIL else "marginal"
-        by = f"by {c.rotation_deg:.2f} deg and {1000 * c.translation_m:.0f} mm, more than by chance"
+        apart = {"rotation_deg": c.rotation_deg, "translation_m": c.translation_m, "chance": c.chance}
         if is_change:
-            text = (
-                f"captures before {captures[c.n_first]} and from it on differ {by}: was a sensor nudged then?"
-            )
-            doubts.append(Doubt(verdict, f"{text} Fasten it and collect anew"))
+            figures: dict[str, Figure] = {"capture": captures[c.n_first], **apart}
+            doubts.append(doubt("verdict.changed", figures, is_fail=excess > _FAIL))
         else:
-            doubts.append(Doubt(verdict, f"{c.first} and {c.second} boards differ {by}: {_CAUSES[c.first]}"))
+            figures = {"first": c.first, "second": c.second, **apart}
+            action = "near" if c.first == "near" else ""
+            doubts.append(doubt("verdict.shares_differ", figures, is_fail=excess > _FAIL, action=action))
     return doubts

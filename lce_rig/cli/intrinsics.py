@@ -151,7 +151,7 @@ def _findings(measured: "MeasuredIntrinsics") -> list[str]:
         verdict = measured.check.verdict()
         lines.append(f"  {describe(measured.check)}")
         if verdict != "pass":
-            lines.append(f"  [{show.COLOURS[verdict]}]{show.escape(explain(measured.check))}[/]")
+            lines.append(f"  [{show.COLOURS[verdict]}]{show.escape(sentence(explain(measured.check)))}[/]")
     lines += [f"  [yellow]{show.escape(text)}[/]" for text in measured.weaknesses]
     for name, why in measured.refused.items():
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {sentence(why)}')}[/]")

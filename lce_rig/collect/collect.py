@@ -10,11 +10,11 @@ from lce_rig.collect.stillness import StillnessOptions
 from lce_rig.collect.stored_events import StoredEvents
 from lce_rig.collect.tally import Tally
 from lce_rig.collect.watching import Moment
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.results import Refusal
 from lce_rig.session import Session
-from lce_rig.sources.base import ContinuousRecording, PairedRecording, PairFiles, Recording, Sample
+from lce_rig.sources.base import ContinuousRecording, PairedRecording, PairFiles, Recording
 from lce_rig.sources.joining import join_recordings, require_sensors
 from lce_rig.words import describe
 
@@ -225,7 +225,8 @@ class _Collector:
             self.report.counts.add(Refusal("calibrate.same_placement"))
             return
         self._note_sizes(images)
-        events = self._stored.join(frame.events)
+        self._stored.note(frame.events)
+        events = [cut.events for cut in frame.events]
         figures = {**moment.figures, **board_figures(boards)}
         self._store(key, label, images, frame.scans, figures, events)
         known.add(self._names_by_key.get(key, label), boards)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.collect.event_buffer import EventCut
 from lce_rig.collect.watching import ImageKey, Moment, Sighting
 from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array
@@ -21,7 +20,8 @@ from lce_rig.core.results import Refusal
 from lce_rig.detect.event_figures import MEMORY_NS, event_figures, outline_px
 from lce_rig.detect.event_gate import explain_missing_board, look_for_flicker, too_fast
 from lce_rig.rig import Rig
-from lce_rig.sources.rig_time import rig_time_ns
+from lce_rig.timing.event_buffer import EventCut
+from lce_rig.timing.rig_time import rig_time_ns
 
 _LEAST_SIGHTINGS = 3
 
@@ -128,7 +128,7 @@ def _events_before(key: ImageKey, sighting: Sighting, cut: EventCut, rig: Rig) -
     # Frames and events of one camera may have clocks, or delays, of their own.
     time_ns = rig_time_ns(image, rig)
     stamp_ns = (sighting.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
-    return cut.between(stamp_ns - MEMORY_NS, stamp_ns), stamp_ns
+    return cut.events.between(stamp_ns - MEMORY_NS, stamp_ns), stamp_ns
 
 
 def _events_on_board(key: ImageKey, sighting: Sighting, recent: Events, stamp_ns: int, rig: Rig) -> float:
@@ -143,6 +143,6 @@ def _explain_unseen(sighting: Sighting, cuts: Mapping[str, EventCut], rig: Rig) 
     for (camera, channel), refusal in sorted(sighting.unseen.items()):
         if rig.cameras[camera].channels[channel].kind == "events" and camera in cuts:
             stamp_ns = sighting.frame.time_ns - cuts[camera].offset_ns
-            recent = cuts[camera].between(stamp_ns - MEMORY_NS, stamp_ns)
+            recent = cuts[camera].events.between(stamp_ns - MEMORY_NS, stamp_ns)
             return explain_missing_board(recent, stamp_ns, refusal, rig.quality)
     return None

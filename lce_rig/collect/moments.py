@@ -7,14 +7,13 @@ from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.collect.motion import find_moving_moments
 from lce_rig.collect.novelty import Placements
-from lce_rig.collect.pairing import PairingCounts, pair_by_time
 from lce_rig.collect.stillness import StillnessOptions, find_still_moments
 from lce_rig.collect.tally import Tally
 from lce_rig.collect.watching import BoardWatcher, ImageKey, Moment
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, Sample, Stream
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
-from lce_rig.sources.base import Sample, Stream
+from lce_rig.timing.scan_pairing import PairingCounts, pair_by_time
 
 # How often an image without a board is searched thoroughly, which takes most of a second.
 _THOROUGH_S = 1.0

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass, field, replace
 
-from lce_rig.collect.pairing import Frame
 from lce_rig.collect.tally import Tally
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.detect.finder import BoardFinder, ImageSearch
 from lce_rig.detect.image_board import NOT_SEEN_AT_ONCE
 from lce_rig.rig import Rig
+from lce_rig.timing.scan_pairing import Frame
 
 ImageKey = tuple[str, str]
 

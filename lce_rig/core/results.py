@@ -271,7 +271,9 @@ class Calibration:
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
         egt_rotation_deg, egt_translation_m: error against a reference given by the user; None without.
-        verdict: "pass", "marginal" or "fail", with reasons.
+        verdict: "pass", "marginal" or "fail".
+        reasons: for it, worst first, in words.
+        findings: the same as codes and figures; empty in results of earlier versions.
         captures_used: names of the captures behind the estimate.
         captures_refused: why each other capture is not.
         diagnostics: further figures by name.
@@ -298,6 +300,7 @@ class Calibration:
     captures_refused: Mapping[str, Refusal]
     verdict: Literal["pass", "marginal", "fail"]
     reasons: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
     egt_rotation_deg: float | None = None
     egt_translation_m: float | None = None
     diagnostics: Mapping[str, float] = field(default_factory=dict)

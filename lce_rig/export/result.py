@@ -16,7 +16,7 @@ from lce_rig.core.limits import describe
 from lce_rig.core.results import Calibration, ChannelResult, OtherCamera, PointUncertainty
 from lce_rig.export.result_schema import ChannelRecord, OtherCameraRecord, PairRecord, ResultRecord
 from lce_rig.export.writing import MADE_BY, write_atomically
-from lce_rig.words import refusal_as_json
+from lce_rig.words import as_json, refusal_as_json
 
 FORMAT_VERSION = 1
 
@@ -89,6 +89,7 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
         "egt_translation_m": _figure(calibration.egt_translation_m),
         "verdict": calibration.verdict,
         "reasons": list(calibration.reasons),
+        "findings": [as_json(finding) for finding in calibration.findings],
         "diagnostics": {name: _figure(value) for name, value in sorted(calibration.diagnostics.items())},
         "channels": [_channel(result, calibration) for result in calibration.channel_results],
         "method": calibration.method,
@@ -240,6 +241,7 @@ def _calibration(pair: PairRecord) -> Calibration:
         captures_refused={name: record.refusal for name, record in pair.captures_refused.items()},
         verdict=pair.verdict,
         reasons=tuple(pair.reasons),
+        findings=tuple(record.finding for record in pair.findings),
         egt_rotation_deg=pair.egt_rotation_deg,
         egt_translation_m=pair.egt_translation_m,
         diagnostics={name: figure(value) for name, value in pair.diagnostics.items()},

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from lce_rig.core.findings import Figure
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import FARTHEST_M
 from lce_rig.core.results import Refusal
 from lce_rig.words import is_renderable
@@ -79,6 +79,26 @@ class RefusalRecord(_Record):
         return Refusal(f"{self.stage}.text", figures={"text": self.cause, "advice": self.action})
 
 
+class FindingRecord(_Record):
+    """One reason of a verdict, or a note."""
+
+    code: str
+    severity: Literal["note", "warning", "error"]
+    subject: str
+    figures: _Figures
+    action_code: str
+    text: str
+    action: str
+
+    @property
+    def finding(self) -> Finding:
+        """The finding; as plain text where this version has no words for its code."""
+        known = Finding(self.code, self.severity, self.subject, self.figures, self.action_code)
+        if is_renderable(known):
+            return known
+        return Finding("verdict.text", self.severity, figures={"text": self.text})
+
+
 class CertificateRecord(_Record):
     """Proof of optimality; gap is null where there is no bound."""
 
@@ -146,6 +166,7 @@ class PairRecord(_Record):
     egt_translation_m: _NotNegative | None
     verdict: Literal["pass", "marginal", "fail"]
     reasons: list[str]
+    findings: list[FindingRecord] = Field(default_factory=list)
     diagnostics: dict[str, float | None] = Field(default_factory=dict)
     channels: list[ChannelRecord] = Field(default_factory=list)
     method: str = "paper"

@@ -15,11 +15,11 @@ from lce_rig.calibrate import (
     CalibrationEstimate,
     CaptureCandidates,
     Clocks,
+    EstimateSettings,
     calibrate_channels,
 )
 from lce_rig.calibrate.camera_pairs import CameraPair, doubt_cameras, relate
 from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.doubt import Doubt
 from lce_rig.calibrate.examination import Examination, examine
 from lce_rig.calibrate.intrinsics_estimate import View
 from lce_rig.calibrate.likelihood.calibrate_together import TogetherEstimate, calibrate_together
@@ -29,6 +29,7 @@ from lce_rig.calibrate.relative_pose import relative_pose
 from lce_rig.calibrate.shared_scans import take_apart
 from lce_rig.calibrate.verdict import judge
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
 from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal
 from lce_rig.detect.detection import Detections, Pair
@@ -46,13 +47,13 @@ class _Sensors:
 
     Attributes:
         pairs: channels of the camera with the LiDAR.
-        options: of the algorithm, with what the profile says of the LiDAR.
+        settings: the user's options, with what the profile says of the LiDAR.
         candidates: by channel, of captures in which both sensors saw something.
         refused: why the other captures are unusable.
     """
 
     pairs: tuple[Pair, ...]
-    options: CalibrateOptions
+    settings: EstimateSettings
     candidates: Mapping[str, Sequence[CaptureCandidates]]
     refused: Mapping[str, Refusal]
 
@@ -72,7 +73,7 @@ class _Link:
     first: int
     second: int
     pair: CameraPair
-    doubts: tuple[Doubt, ...]
+    doubts: tuple[Finding, ...]
 
 
 def calibrate(
@@ -145,7 +146,7 @@ def calibrate_detections(
         try:
             own = _sensors(rig, detections, pairs, options or CalibrateOptions())
             clocks = clocks_of(rig, own.camera, own.lidar)
-            alone.append(calibrate_channels(own.candidates, board, own.options, clocks, progress))
+            alone.append(calibrate_channels(own.candidates, board, own.settings, clocks, progress))
             sensors.append(own)
         except NotEnoughDataError as error:
             shortages.append(error)
@@ -223,14 +224,9 @@ def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: C
     if not candidates and trouble is not None:
         raise trouble
     found = {item.capture for items in candidates.values() for item in items}
-    settings = rig.lidars[pairs[0].lidar]
-    options = replace(
-        options,
-        laser_bias_sigma_m=settings.laser_bias_sigma_m,
-        range_offset_sigma_m=settings.range_offset_sigma_m,
-    )
     refused = {name: why for name, why in refused.items() if name not in found}
-    return _Sensors(tuple(pairs), options, candidates, refused)
+    settings = EstimateSettings.of(options, rig.lidars[pairs[0].lidar])
+    return _Sensors(tuple(pairs), settings, candidates, refused)
 
 
 def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandidates], dict[str, Refusal]]:
@@ -277,10 +273,10 @@ def _estimate_together(
     """
     joint: dict[int, TogetherEstimate] = {}
     for group in _groups(len(sensors), links):
-        options = sensors[group[0]].options
-        if options.method == "ml":
+        settings = sensors[group[0]].settings
+        if settings.method == "ml":
             own = {sensors[k].camera: alone[k] for k in group}
-            joint |= dict.fromkeys(group, calibrate_together(own, rig.board.to_board(), options))
+            joint |= dict.fromkeys(group, calibrate_together(own, rig.board.to_board(), settings))
     return joint
 
 
@@ -372,12 +368,12 @@ def _judged(
     sensors: _Sensors,
     estimate: CalibrationEstimate,
     examination: Examination,
-    between_cameras: Sequence[Doubt],
+    between_cameras: Sequence[Finding],
     others: tuple[OtherCamera, ...],
 ) -> Calibration:
     camera, lidar = sensors.camera, sensors.lidar
     n_captures = len({name for pair in sensors.pairs for name in detections.captures(pair)})
-    verdict, reasons = judge(estimate, examination, rig, camera, lidar, n_captures, between_cameras)
+    verdict, findings = judge(estimate, examination, rig, camera, lidar, n_captures, between_cameras)
     diagnostics = dict(estimate.diagnostics)
     if examination.widened_by != 1:
         diagnostics["sigma_widened"] = examination.widened_by
@@ -398,7 +394,8 @@ def _judged(
         captures_used=tuple(sorted(take_apart(estimate.used))),
         captures_refused=_still_refused(estimate, sensors.refused),
         verdict=verdict,
-        reasons=reasons,
+        reasons=tuple(sentence(finding) for finding in findings),
+        findings=findings,
         diagnostics=diagnostics,
         channel_results=estimate.channels,
         method=estimate.method,

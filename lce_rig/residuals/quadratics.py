@@ -92,12 +92,16 @@ class Quadratics:
 
     def hold(self, unknown: int) -> "Quadratics":
         """Hold an unknown where it is: quadratics in the others."""
+        return self.of(np.delete(np.arange(len(self.prior)), unknown))
+
+    def of(self, unknowns: NDArray[np.intp]) -> "Quadratics":
+        """Hold all unknowns but these, by index, where they are."""
         return replace(
             self,
-            gradients=np.delete(self.gradients, unknown, axis=1),
-            hessians=np.delete(np.delete(self.hessians, unknown, axis=1), unknown, axis=2),
-            prior=np.delete(np.delete(self.prior, unknown, axis=0), unknown, axis=1),
-            prior_gradient=np.delete(self.prior_gradient, unknown),
+            gradients=self.gradients[:, unknowns],
+            hessians=self.hessians[:, unknowns[:, None], unknowns],
+            prior=self.prior[unknowns[:, None], unknowns],
+            prior_gradient=self.prior_gradient[unknowns],
         )
 
     def settled(self) -> "Quadratics":

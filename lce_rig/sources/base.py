@@ -5,30 +5,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Image, Sample, Scan, Stream
 
-Sample: TypeAlias = Image | Scan | Events
 PairMethod: TypeAlias = Literal["auto", "stem", "order", "time"]
 Span: TypeAlias = tuple[int, int]
 """First and last stamp, ns, the sensor's own clock."""
-
-
-@dataclass(frozen=True, order=True)
-class Stream:
-    """The data of one sensor.
-
-    Attributes:
-        sensor: the camera or LiDAR.
-        channel: of a camera; "" for a LiDAR.
-        kind: a channel of events may also bring pictures that others reconstructed.
-    """
-
-    sensor: str
-    channel: str
-    kind: Literal["pictures", "events", "scans"]
-
-    def __str__(self) -> str:
-        return f"{self.sensor}.{self.channel}" if self.channel else self.sensor
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from lce_rig.verify.event_picture import CameraView
 from lce_rig.verify.moving import Meeting, bring_together
 from lce_rig.verify.overlay import camera_part, draw_overlay
 from lce_rig.verify.writing import write_overlays
+from lce_rig.words import describe
 
 Progress = Callable[[int, int], None]
 # Boards that a wrong extrinsic puts a little off are measured; what lies farther away is another thing.
@@ -160,7 +161,8 @@ def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: 
             LiDAR missed among other things of its size is no contradiction, many are.
         n_seen: captures in which both sensors saw something.
     """
-    doubts = [] if metrics is None else residuals_beyond(metrics, rig.quality)
+    beyond = [] if metrics is None else residuals_beyond(metrics, rig.quality)
+    doubts = [describe(finding) for finding in beyond]
     if 4 * n_elsewhere > n_seen:
         text = (
             f"in {n_elsewhere} of {n_seen} captures nothing in the scan is where the extrinsic puts the board"

@@ -19,7 +19,7 @@ def _lidar_utc(finding: Finding) -> str:
 
 
 def _nmea_of_other_second(finding: Finding) -> str:
-    """PPS is locked, but the sentences' time is {nmea_past_hour_s} past the hour, not the LiDAR's."""
+    """The sentences' time is {nmea_past_hour_s} past the hour, not the LiDAR's."""
     minute, second = divmod(round(finding.figure("nmea_past_hour_s")), 60)
     return f"{_BY_ARRIVAL}NMEA time {minute:02d}:{second:02d} past the hour is not the LiDAR's"
 
@@ -189,11 +189,9 @@ _LIDAR_CLOCK: Mapping[str, Phrase] = {
         f"{_BY_ARRIVAL}PPS is {{pps}}",
         "check the pulse at the LiDAR's interface box: 1 Hz, 3 to 15 V, rising edge",
     ),
-    "clock.no_nmea": Phrase(
-        f"{_BY_ARRIVAL}PPS is locked, no NMEA", "send $GPRMC at 9600 baud with RS-232 polarity"
-    ),
+    "clock.no_nmea": Phrase(f"{_BY_ARRIVAL}no NMEA", "send $GPRMC at 9600 baud with RS-232 polarity"),
     "clock.nmea_damaged": Phrase(
-        f"{_BY_ARRIVAL}PPS is locked, NMEA is damaged", "send $GPRMC at 9600 baud with RS-232 polarity"
+        f"{_BY_ARRIVAL}NMEA is damaged", "send $GPRMC at 9600 baud with RS-232 polarity"
     ),
     "clock.nmea_of_other_second": Phrase(
         _nmea_of_other_second, "send each sentence after its pulse, within a second"
@@ -287,12 +285,21 @@ _PULSES: Mapping[str, Phrase] = {
     ),
     "edges.not_the_pulses": Phrase("the edges seen are not the board's pulses", "check the wire"),
     "sync.boards_may_move": Phrase("boards may move while they are captured"),
-    "sync.boards_must_stand": Phrase("boards must stand still while they are captured"),
+    "sync.boards_must_stand": Phrase(
+        "boards must stand still while they are captured",
+        actions={
+            "add_board": "add `sync` to the profile (docs/wiring-and-sync.md) to let boards move",
+            "see_lines": "see the lines of these sensors and of the sync board",
+        },
+    ),
     "sync.no_board": Phrase("no sync board ties the cameras' clocks to the LiDAR's"),
-    "sync.none_in_profile": Phrase("{key} is none"),
-    "sync.not_tied": Phrase("the clock of {subject} is not tied to the rig's", "run `lce-rig doctor`"),
+    "sync.none_in_profile": Phrase("{key} is none", actions={"named": ""}),
+    "sync.not_tied": Phrase(
+        "the clock of {subject} is not tied to the rig's", "run `lce-rig doctor`", {"named": ""}
+    ),
     "sync.too_uncertain": Phrase(
-        "time of {subject}: standard deviation {sigma_ms:.1f} ms (limit {limit_ms:.1f} ms)"
+        "time of {subject}: standard deviation {sigma_ms:.1f} ms (limit {limit_ms:.1f} ms)",
+        actions={"named": ""},
     ),
 }
 _SETTINGS: Mapping[str, Phrase] = {

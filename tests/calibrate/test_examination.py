@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, fit_extrinsic
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.claim import resample, widening
 from lce_rig.calibrate.control import doubt_control, run_control
 from lce_rig.calibrate.examination import examine
@@ -19,7 +19,7 @@ from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, simulate
 
 RIG = load_rig("rlfs")
 LIMITS, TARGET = VerdictSettings(), CalibrationSettings()
-FAST = CalibrateOptions(n_draws=0)
+FAST = EstimateSettings(n_draws=0)
 # Any method's result lies about as far from the truth.
 T_NEAR = perturb(T_FORWARD, np.array([0.003, -0.002, 0.004, 0.001, -0.001, 0.001]))
 
@@ -96,17 +96,17 @@ def test_what_cannot_be_is_doubted_and_what_can_is_not():
     found = nuisances(observed())
     lidar = RIG.lidars["lidar"]
     assert doubt_nuisances(found, BOARD, lidar, LIMITS) == []
-    for changed, words in (
-        (replace(found, scale=0.03, scale_sigma=0.001), "3.0 +- 0.1 % longer"),
-        (replace(found, edge_shift_m=0.05), "50 mm beyond the plate's edges"),
-        (replace(found, laser_offset_m=-0.06, laser=7), "laser ring 7 look 60 mm too short"),
+    for changed, code in (
+        (replace(found, scale=0.03, scale_sigma=0.001), "verdict.scale"),
+        (replace(found, edge_shift_m=0.05), "verdict.edge_shift"),
+        (replace(found, laser_offset_m=-0.06, laser=7), "verdict.laser_offset"),
     ):
         (doubt,) = doubt_nuisances(changed, BOARD, lidar, LIMITS)
-        assert words in doubt.text
+        assert doubt.code == code
 
 
-@pytest.mark.parametrize(("angle_deg", "verdict"), [(0.0, None), (0.6, "marginal"), (2.0, "fail")])
-def test_a_sensor_nudged_on_the_way_is_found_with_the_capture(angle_deg, verdict):
+@pytest.mark.parametrize(("angle_deg", "severity"), [(0.0, None), (0.6, "warning"), (2.0, "error")])
+def test_a_sensor_nudged_on_the_way_is_found_with_the_capture(angle_deg, severity):
     nudge = perturb(np.eye(4), np.array([0, 0, 0, np.radians(angle_deg), 0, 0]))
     nudged = [
         moved(seen, nudge @ seen.image.T_cam_board) if k >= 12 else seen
@@ -115,8 +115,8 @@ def test_a_sensor_nudged_on_the_way_is_found_with_the_capture(angle_deg, verdict
     contrasts = contrast_halves(expanded(nudged).settled(), middles(nudged))
     names = [seen.capture for seen in nudged]
     doubts = doubt_halves(contrasts[:1], names, TARGET, LIMITS)
-    assert [doubt.verdict for doubt in doubts] == ([] if verdict is None else [verdict])
-    if verdict is not None:
+    assert [doubt.severity for doubt in doubts] == ([] if severity is None else [severity])
+    if severity is not None:
         assert abs(contrasts[0].n_first - 12) <= 1
         assert abs(contrasts[0].rotation_deg - angle_deg) < 0.3 * angle_deg
 
@@ -131,7 +131,7 @@ def test_near_boards_that_say_something_else_than_far_ones_are_found():
     ]
     found = contrast_halves(expanded(boards).settled(), middles(boards))
     doubts = doubt_halves(found, [seen.capture for seen in boards], TARGET, LIMITS)
-    assert any(doubt.text.startswith("near and far boards differ by") for doubt in doubts)
+    assert any(doubt.figures.get("first") == "near" for doubt in doubts)
 
 
 def test_a_sound_session_shows_no_contrast_more_often_than_by_chance():
@@ -152,7 +152,7 @@ def test_moving_a_sound_result_makes_left_out_captures_worse_and_moving_a_bad_on
     assert doubt_control(good) == []
     bad = perturb(estimate.T_cam_lidar, good.moves[-1])
     doubts = doubt_control(run_control(observations, BOARD, bad, estimate.cov, settled, TARGET, 3.0))
-    assert [doubt.verdict for doubt in doubts] == ["fail"]
+    assert [doubt.severity for doubt in doubts] == ["error"]
 
 
 def test_the_control_moves_a_result_by_no_less_than_the_target():
@@ -170,10 +170,10 @@ def test_a_claim_that_captures_contradict_is_widened_with_the_reason():
     estimate = calibrated(20, 7)
     observations = [estimate.observations[name] for name in estimate.used]
     spread = resample(expanded(observations, estimate.T_cam_lidar).settled())
-    assert widening(estimate.cov, spread, LIMITS) == (1.0, "")
+    assert widening(estimate.cov, spread, LIMITS) == (1.0, None)
     bold = estimate.cov / 25
     factor, remark = widening(bold, spread, LIMITS)
-    assert f"{factor:.1f}" in remark
+    assert remark.code == "verdict.widened" and remark.figures["ratio"] == factor
     assert spread.ratio_to(factor**2 * bold)[0] == pytest.approx(1.0)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lce_rig.collect import CollectReport, collect
-from lce_rig.core.data import Events, Image
+from lce_rig.core.data import Events, Image, Sample
 from lce_rig.core.errors import SourceError
 from lce_rig.core.geometry import rotation_angle
 from lce_rig.core.results import ImageBoard
@@ -15,7 +15,6 @@ from lce_rig.detect.event_board import find_event_board, reconstructor_for
 from lce_rig.session import Session
 from lce_rig.sources import SourceOptions, open_recording
 from lce_rig.sources.bag_recorder import BagRecorder
-from lce_rig.sources.base import Sample
 from lce_rig.sources.events.aedat4_writer import write_aedat4
 from tests.sources.events.aedat4_files import RawFrame, write_davis
 

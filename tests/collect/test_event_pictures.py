@@ -8,10 +8,9 @@ import pytest
 
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.collect.tally import Tally
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.detect.event_board import reconstructor_for
 from lce_rig.rig import ReconstructionSettings, Rig, load_rig
-from lce_rig.sources.base import Sample
 from lce_rig.sources.merging import merge_by_time
 
 from .event_sightings import T0_NS, event_stream

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.collect.pairing import Frame
 from lce_rig.collect.stillness import StillnessOptions, find_still_moments
 from lce_rig.collect.watching import BoardWatcher, Moment, Sighting
 from lce_rig.core.geometry import transform
 from lce_rig.core.results import Refusal
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
+from lce_rig.timing.scan_pairing import Frame
 from tests.collect.live.replay import placements, rig
 
 T0_NS = 1_700_000_000_000_000_000

@@ -56,7 +56,7 @@ def test_refusals_of_earlier_and_of_later_versions_are_kept_as_text(make: Make, 
     refused["000003"] |= {"code": "calibrate.of_tomorrow"}
     path = tmp_path / "result.json"
     path.write_text(json.dumps(document))
-    first, second = read_result(path).calibrations[0].captures_refused.values()
+    first, second = read_result(path).pairs[0].captures_refused.values()
     assert (first.code, first.figures) == ("lidar.text", {"text": "2 rings", "advice": "come closer"})
     assert (second.code, second.figures["text"]) == ("calibrate.text", refused["000003"]["cause"])
 

@@ -8,14 +8,14 @@ import numpy as np
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.narration import Narration, image_figures, scan_figures, stream_name
 from lce_rig.collect.live.options import LiveOptions
-from lce_rig.collect.live.pumps import Pumps
-from lce_rig.collect.live.rig_clock import RigClock
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, Phase, Sound, StreamState
 from lce_rig.collect.watching import Sighting
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
 from lce_rig.session import Session
 from lce_rig.sources.live.base import SourceStatus
+from lce_rig.sources.live.reading import AttachedSensors
+from lce_rig.timing.rig_clock import RigClock
 from lce_rig.words import enumerated, sentence
 
 _EVERY_S = 0.5
@@ -35,12 +35,14 @@ class Monitor:
         reasons: why the board is not seen, by the stream's name.
     """
 
-    def __init__(self, session: Session, options: LiveOptions, pumps: Pumps, clock: RigClock) -> None:
+    def __init__(
+        self, session: Session, options: LiveOptions, sensors: AttachedSensors, clock: RigClock
+    ) -> None:
         """Begin with nothing seen."""
         self.reasons: dict[str, Refusal] = {}
         self._session = session
         self._options = options
-        self._pumps = pumps
+        self._sensors = sensors
         self._clock = clock
         self._began_s = self._told_s = self._asked_s = time.monotonic()
         self._statuses: dict[str, SourceStatus] = {}
@@ -151,7 +153,7 @@ class Monitor:
             return "ended", "collection has ended", said.headline if is_enough else ""
         if self._lost:
             name = sorted(self._lost)[0]
-            error = self._pumps.lost().get(name)
+            error = self._sensors.lost().get(name)
             return "lost", f"{name} is lost", "" if error is None else f"{error[0].what} {error[0].hint}"
         if is_enough and not self._options.is_open:
             return "enough", _ENOUGH, said.headline
@@ -178,8 +180,8 @@ class Monitor:
         """Ask how sensors do, and log those that go and come back."""
         if not self._statuses or time.monotonic() - self._asked_s > _EVERY_S:
             self._asked_s = time.monotonic()
-            self._statuses = self._pumps.statuses()
-        lost = self._pumps.lost()
+            self._statuses = self._sensors.statuses()
+        lost = self._sensors.lost()
         for name in sorted(lost.keys() - self._lost):
             self.cue("lost", f"{name} is lost: {lost[name][0].what}")
         for name in sorted(self._lost - lost.keys()):
@@ -236,7 +238,7 @@ class Monitor:
 
     def _trouble(self, sensor: str) -> str:
         """Say what is wrong with a sensor now; "" where nothing is."""
-        lost = self._pumps.lost().get(sensor)
+        lost = self._sensors.lost().get(sensor)
         return "" if lost is None else f"lost: {lost[0].what}"
 
     def _notes(self) -> tuple[str, ...]:

@@ -4,34 +4,12 @@ import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from types import TracebackType
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
-from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Pulse:
-    """One edge that a trigger line made or a sensor saw.
-
-    Attributes:
-        sensor: name of the line: a camera that it triggers, or the sensor that saw it.
-        stamp_ns: device time of the board or sensor that reports it.
-        count: running number of its line; gaps are lost pulses.
-        host_ns: arrival at the host.
-    """
-
-    sensor: str
-    stamp_ns: int
-    count: int
-    host_ns: int
-
-
-LiveSample = Image | Scan | Events | Pulse
 
 
 @dataclass(frozen=True)
@@ -80,42 +58,6 @@ class SourceStatus:
     rates_hz: Mapping[str, float] = field(default_factory=dict)
     n_packets: int | None = None
     n_lost_by_line: Mapping[str, int] = field(default_factory=dict)
-
-
-class LiveSource(Protocol):
-    """An attached sensor; open while its `with` block lasts.
-
-    Attributes:
-        sensor: its name in the profile.
-    """
-
-    sensor: str
-
-    def __enter__(self) -> "LiveSource":
-        """Open the device and start reading.
-
-        Raises:
-            SourceError: it is absent, busy or of another model; the hint says what to check.
-        """
-        ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop reading and close the device; never raises."""
-        ...
-
-    def samples(self) -> Iterator[LiveSample]:
-        """Yield samples as they come, until the source is closed.
-
-        Raises:
-            SourceError: the sensor fell silent, or failed for good.
-        """
-        ...
-
-    def status(self) -> SourceStatus:
-        """Say how the sensor does; may be called from any thread."""
-        ...
 
 
 class Mailbox(Generic[T]):

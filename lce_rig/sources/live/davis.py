@@ -6,18 +6,17 @@ clock can be fitted to that of the sync board which sends them.
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from types import TracebackType
+from collections.abc import Callable
 from typing import Any
 
+from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.rig import CameraSettings
-from lce_rig.sources.live.base import ClockState, LiveSample, SourceStatus
+from lce_rig.sources.live.base import ClockState, SourceStatus
 from lce_rig.sources.live.davis_device import OpenedCamera, open_davis
 from lce_rig.sources.live.davis_samples import DavisSamples
-from lce_rig.sources.live.reading import RateMeter, ReaderThread
+from lce_rig.sources.live.reading import LiveSource, RateMeter
 
 # A batch of events lasts 10 ms: ten seconds of a taker's absence at three streams.
 _N_SLOTS = 2048
@@ -26,7 +25,7 @@ _MAX_CLOCK_ERROR_MS = 500.0
 _SILENT_HINT = "Check the USB cable; unplug the camera for some seconds and start again."
 
 
-class DavisSource:
+class DavisSource(LiveSource):
     """A DAVIS346; see `LiveSource`. Yields `Events`, `Image` and `Pulse`.
 
     Args:
@@ -44,51 +43,36 @@ class DavisSource:
         open_camera: Callable[[str, CameraSettings], OpenedCamera] | None = None,
         silence_s: float = 5.0,
     ) -> None:
-        self.sensor = sensor
+        super().__init__(sensor, f"camera {sensor!r}", _N_SLOTS, silence_s, _SILENT_HINT)
         self._settings = settings
         self._open_camera = open_camera or open_davis
         self._samples = DavisSamples(sensor, settings)
-        self._reader = ReaderThread(f"camera {sensor!r}", self._read, _N_SLOTS, silence_s, _SILENT_HINT)
-        self._stack = ExitStack()
+        self._polls: list[Callable[[int], list[LiveSample]]] = []
         self._notes: tuple[Finding, ...] = ()
         self._device = ""
         self._n_imu = 0
         self._rates = {"events": RateMeter(), "frames": RateMeter(), "pulses": RateMeter()}
         self._delays_ns: deque[int] = deque(maxlen=100)
 
-    def __enter__(self) -> "DavisSource":
+    def open(self) -> None:
         """Open and set up the camera.
 
         Raises:
             SourceError: it is absent, busy, another model, or cannot do what the profile wants.
         """
         opened = self._open_camera(self.sensor, self._settings)
-        with ExitStack() as stack:
-            self._input: Any = opened.input
-            stack.callback(self._let_go)
-            self._notes = opened.notes
-            self._device = opened.device
-            self._polls = self._find_streams()
-            self._reader.start()
-            stack.callback(self._reader.stop)
-            self._stack = stack.pop_all()
-        return self
+        self._input: Any = opened.input
+        self._notes = opened.notes
+        self._device = opened.device
+        self._polls = self._find_streams()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop and close the camera."""
-        self._stack.close()
+    def close(self) -> None:
+        """Close the camera."""
+        # dv-processing closes a device with its last reference.
+        self._input = None
+        self._polls = []
 
-    def samples(self) -> Iterator[LiveSample]:
-        """Yield events, frames and pulses as they come.
-
-        Raises:
-            SourceError: the camera fell silent or is gone.
-        """
-        yield from self._reader.samples()
-
-    def status(self) -> SourceStatus:
+    def describe(self) -> SourceStatus:
         """Say how the camera does."""
         counted = self._samples
         figures = {
@@ -100,15 +84,12 @@ class DavisSource:
         }
         return SourceStatus(
             self.sensor,
-            self._reader.n_samples,
-            self._reader.n_dropped,
-            counted.n_frames_lost,
-            self._reader.rate_hz,
-            ClockState(Finding("clock.davis", "note", figures={"delay_ms": self._delay_ms()})),
-            tuple(self._problems()),
-            figures,
-            self._device,
-            {kind: self._rates[kind].rate_hz for kind in ("events", "frames")},
+            n_lost=counted.n_frames_lost,
+            clock=ClockState(Finding("clock.davis", "note", figures={"delay_ms": self._delay_ms()})),
+            problems=tuple(self._problems()),
+            figures=figures,
+            device=self._device,
+            rates_hz={kind: self._rates[kind].rate_hz for kind in ("events", "frames")},
         )
 
     def _find_streams(self) -> list[Callable[[int], list[LiveSample]]]:
@@ -131,7 +112,7 @@ class DavisSource:
         polls += [self._next_imu] if self._input.isImuStreamAvailable() else []
         return polls
 
-    def _read(self) -> list[LiveSample]:
+    def read(self) -> list[LiveSample]:
         """Ask every stream once: between them there is no order of time."""
         host_ns = time.time_ns()
         samples = [sample for poll in self._polls for sample in poll(host_ns)]
@@ -188,7 +169,3 @@ class DavisSource:
         if self._samples.n_resets:
             found.append(Finding("clock.restarted", "warning", figures={"n": self._samples.n_resets}))
         return found
-
-    def _let_go(self) -> None:
-        # dv-processing closes a device with its last reference.
-        del self._input

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 
-from lce_rig.core.clock import NS_PER_S
 from lce_rig.core.findings import Figure, Finding
+from lce_rig.rig.sync import PPS_LINE
 from lce_rig.sources.live.base import ClockState
-from lce_rig.sources.live.sync_board_state import PPS_LINE, BoardState
+from lce_rig.sources.live.sync_board_state import BoardState
 from lce_rig.sources.live.sync_lines import LineReader
 from lce_rig.sources.live.sync_lines.messages import LineFault, StatusFlag
+from lce_rig.timing.clock import NS_PER_S
 
 STALLED_S = 3.0
 

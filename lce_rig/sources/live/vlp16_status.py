@@ -24,8 +24,6 @@ class Reception:
 
     Attributes:
         address: whose packets are taken; "" before the first.
-        n_dropped: scans that nobody took in time.
-        rate_hz: scans a second.
         n_overflowed: datagrams that the kernel dropped because they were not taken in time.
         granted_bytes: receive buffer of a port.
         strangers: datagrams of other senders, by IP address; the first few.
@@ -33,8 +31,6 @@ class Reception:
     """
 
     address: str = ""
-    n_dropped: int = 0
-    rate_hz: float = 0.0
     n_overflowed: int = 0
     granted_bytes: int = 0
     strangers: Counter[str] = field(default_factory=Counter)
@@ -76,16 +72,13 @@ def to_status(
         problems += [recorder.failure] if recorder.failure is not None else []
     return SourceStatus(
         sensor,
-        counts.n_scans,
-        reception.n_dropped,
-        counts.order.n_lost,
-        reception.rate_hz,
-        ClockState(state, stream.clock.is_utc, None if ahead_ns is None else ahead_ns * 1e-9),
-        tuple(problems),
-        figures,
-        f"{velodyne.PRODUCTS[velodyne.VLP16]} at {reception.address}" if reception.address else "",
-        {"scans": stream.rotor_hz} if stream.rotor_hz else {},
-        counts.n_data,
+        n_lost=counts.order.n_lost,
+        clock=ClockState(state, stream.clock.is_utc, None if ahead_ns is None else ahead_ns * 1e-9),
+        problems=tuple(problems),
+        figures=figures,
+        device=f"{velodyne.PRODUCTS[velodyne.VLP16]} at {reception.address}" if reception.address else "",
+        rates_hz={"scans": stream.rotor_hz} if stream.rotor_hz else {},
+        n_packets=counts.n_data,
     )
 
 

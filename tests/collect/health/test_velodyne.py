@@ -11,7 +11,7 @@ from lce_rig.rig import Rig
 from lce_rig.sources.live.base import ClockState
 from lce_rig.sources.live.velodyne_web import WebReport
 
-from .observed import LOCKED, UNLOCKED, examination, lidar, make_rig
+from .observed import LOCKED, UNLOCKED, codes, examination, lidar, make_rig
 
 
 def with_timestamps(**timestamps: Any) -> Rig:
@@ -20,15 +20,17 @@ def with_timestamps(**timestamps: Any) -> Rig:
 
 def test_a_locked_sensor_is_green_with_the_time_it_was_told() -> None:
     line = check_pulse(examination(lidar(clock=LOCKED)), "lidar")
-    assert line is not None and line.severity == "green" and "12:34" in line.figure
+    assert line is not None and line.severity == "note"
+    assert codes(line) == ["clock.pulse", "clock.lidar_utc"]
+    assert (line.figures["pps"], line.figures["nmea_past_hour_s"]) == ("locked", 754)
 
 
 @pytest.mark.parametrize(
     ("timestamps", "severity"),
     [
-        ({"clock": "utc", "sync": "hardware"}, "red"),
-        ({"clock": "utc", "sync": "none"}, "yellow"),
-        ({"clock": "host", "sync": "none"}, "green"),
+        ({"clock": "utc", "sync": "hardware"}, "error"),
+        ({"clock": "utc", "sync": "none"}, "warning"),
+        ({"clock": "host", "sync": "none"}, "note"),
     ],
 )
 def test_a_sensor_without_pulses_is_judged_by_what_the_profile_promises(
@@ -37,13 +39,14 @@ def test_a_sensor_without_pulses_is_judged_by_what_the_profile_promises(
     seen = lidar(clock=UNLOCKED, problems=(UNLOCKED.finding,))
     line = check_pulse(examination(seen, rig=with_timestamps(**timestamps)), "lidar")
     assert line is not None and line.severity == severity
-    assert "1 Hz" in line.remedy
+    assert codes(line)[:2] == ["clock.pulse", "clock.pps_not_locked"]
 
 
 def test_without_position_packets_the_web_page_tells_of_the_pulse() -> None:
     seen = lidar(clock=ClockState(Finding("clock.no_position_packets", "warning")))
     line = check_pulse(examination(seen, web={"lidar": WebReport(pps="locked")}), "lidar")
-    assert line is not None and line.figure.startswith("locked")
+    assert line is not None and line.findings[0].figures["pps"] == "locked"
+    assert "clock.no_position_packets" in codes(line)
 
 
 def test_settings_that_differ_from_the_profile_are_named_once() -> None:
@@ -56,14 +59,13 @@ def test_settings_that_differ_from_the_profile_are_named_once() -> None:
         data_port=2369,
     )
     line = check_settings(examination(lidar(), web={"lidar": report}), "lidar")
-    assert line is not None and line.severity == "yellow"
-    assert line.figure == "1200 rpm, strongest, 10 to 350 deg, to :2369"
-    remedies = line.remedy.splitlines()
+    assert line is not None and line.severity == "warning"
     # The pulse has a line of its own.
-    assert len(remedies) == 3 and not any("PPS" in remedy for remedy in remedies)
+    wrong = ["settings.rotor_rate", "settings.fov_cut", "settings.data_port"]
+    assert codes(line) == ["settings.read", *wrong]
 
 
 def test_a_web_page_that_does_not_answer_is_no_fault_of_the_packets() -> None:
     web = {"lidar": SourceError("http://192.168.1.201 does not answer", "Check the network.")}
     line = check_settings(examination(lidar(), web=web), "lidar")
-    assert line is not None and line.severity == "yellow" and "stay unknown" in line.remedy
+    assert line is not None and line.severity == "warning" and codes(line) == ["settings.unknown"]

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Events, Image
+from lce_rig.core.data import Events, Image, LiveSample, Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.rig import CameraSettings, load_rig
 from lce_rig.sources.live import davis_device
-from lce_rig.sources.live.base import LiveSample, Pulse
 from lce_rig.sources.live.davis import DavisSource
 from lce_rig.sources.live.davis_device import OpenedCamera, bias_of, number_of
 from lce_rig.sources.live.davis_samples import DavisSamples

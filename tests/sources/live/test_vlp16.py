@@ -240,32 +240,6 @@ def test_an_open_source_ends_when_it_is_closed_and_can_be_opened_again(lidar: Li
         assert f"read {source.sensor}" not in {thread.name for thread in threading.enumerate()}
 
 
-def test_a_source_may_be_closed_while_another_thread_opens_it_again(lidar: LidarSettings) -> None:
-    source, failures = Vlp16Source("lidar", lidar, silence_s=0.01, web_port=9), list[Exception]()
-    has_ended = threading.Event()
-
-    def open_again() -> None:
-        while not has_ended.is_set():
-            try:
-                source.__enter__()
-                source.__exit__(None, None, None)  # As whoever opened it does when all is closed.
-            except SourceError:
-                continue
-            except Exception as failure:
-                failures.append(failure)
-
-    opener = threading.Thread(target=open_again)
-    opener.start()
-    try:
-        until_s = time.monotonic() + 1.0
-        while time.monotonic() < until_s:
-            source.__exit__(None, None, None)
-    finally:
-        has_ended.set()
-        opener.join()
-    assert failures == []
-
-
 # What does not come
 
 

@@ -1,24 +1,21 @@
 """Stamps of several sensors on one clock, as pulses and models of a sync board come in."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from lce_rig.collect.live.rig_clock import SLOW_TRIGGERS_HZ, RigClock
-from lce_rig.core.clock import ClockModel
-from lce_rig.core.clock_fit import TimePairs, fit_clock
-from lce_rig.core.data import Image, Scan
-from lce_rig.core.findings import Finding
+from lce_rig.core.data import Image, Pulse, Scan
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.sync import SyncSettings
-from lce_rig.sources.live.base import ClockState, Pulse, SourceStatus
+from lce_rig.timing.clock import ClockModel
+from lce_rig.timing.clock_fit import TimePairs, fit_clock
+from lce_rig.timing.rig_clock import RigClock
 
 T0_NS = 1_700_000_000_000_000_000
 HOST_AHEAD_NS = 37_000_000
 PERIOD_NS = 50_000_000
-UTC = ClockState(Finding("clock.lidar_utc", "note"), is_utc=True)
-LOCKED = {"lidar": SourceStatus("lidar", clock=UTC)}
+LOCKED = ["lidar"]
 
 
 def tie(source_ns: np.ndarray, reference_ns: np.ndarray) -> ClockModel:
@@ -31,9 +28,6 @@ def tie(source_ns: np.ndarray, reference_ns: np.ndarray) -> ClockModel:
 class Board:
     """A board whose clock counts from its power-up; the computer is ahead of its UTC by 37 ms."""
 
-    sensor: str = "sync"
-    started_hz: list[float | None] = field(default_factory=list)
-
     @property
     def host_clock(self) -> ClockModel:
         times_ns = np.arange(0, 20_000_000_000, 500_000_000)
@@ -44,8 +38,9 @@ class Board:
         times_ns = np.arange(0, 20_000_000_000, 500_000_000)
         return tie(times_ns, times_ns + T0_NS)
 
-    def start_triggers(self, rate_hz: float | None = None) -> None:
-        self.started_hz.append(rate_hz)
+
+def refresh(clock: RigClock, board: Board, locked: list[str]) -> None:
+    clock.refresh(board.host_clock, board.utc_clock, locked)
 
 
 def synced(rig_name: str, camera: str, max_delay_s: float = 0.03) -> Rig:
@@ -64,8 +59,8 @@ def scan(stamp_ns: int) -> Scan:
 
 
 def test_without_a_board_everything_keeps_its_time_and_boards_must_stand_still() -> None:
-    clock = RigClock(load_rig("rlfs"), None)
-    clock.refresh(dict)
+    clock = RigClock(load_rig("rlfs"), has_board=False)
+    clock.refresh(None, None, [])
     assert clock.take("cam", picture(T0_NS))[0].stamp_ns == T0_NS
     assert clock.take("lidar", scan(T0_NS))[0].stamp_ns == T0_NS
     assert clock.verdict().requires_still_boards
@@ -74,8 +69,8 @@ def test_without_a_board_everything_keeps_its_time_and_boards_must_stand_still()
 
 def test_a_locked_lidar_keeps_its_utc_and_pictures_of_the_computers_time_are_brought_to_it() -> None:
     rig = load_rig("rlfs").model_copy(update={"sync": synced("rlfs", "cam").sync})
-    clock = RigClock(rig, Board())
-    clock.refresh(lambda: LOCKED)
+    clock = RigClock(rig, has_board=True, edge_cameras=["davis"])
+    refresh(clock, Board(), LOCKED)
     assert clock.take("lidar", scan(T0_NS + 5_000_000_000))[0].stamp_ns == T0_NS + 5_000_000_000
     shown = clock.take("cam", picture(T0_NS + 5_000_000_000 + HOST_AHEAD_NS))[0]
     assert shown.stamp_ns == pytest.approx(T0_NS + 5_000_000_000, abs=2000)
@@ -83,15 +78,15 @@ def test_a_locked_lidar_keeps_its_utc_and_pictures_of_the_computers_time_are_bro
 
 
 def test_an_unlocked_lidar_counts_by_the_computers_clock() -> None:
-    clock = RigClock(synced("rlfs", "cam"), Board())
-    clock.refresh(lambda: {"lidar": SourceStatus("lidar", clock=ClockState(Finding("clock.no_nmea")))})
+    clock = RigClock(synced("rlfs", "cam"), has_board=True, edge_cameras=["davis"])
+    refresh(clock, Board(), [])
     placed = clock.take("lidar", scan(T0_NS + 2_000_000_000 + HOST_AHEAD_NS))[0]
     assert placed.stamp_ns == pytest.approx(T0_NS + 2_000_000_000, abs=2000)
 
 
 def test_pictures_take_the_time_of_the_pulses_that_made_them_not_of_their_arrival() -> None:
-    clock = RigClock(synced("rlfs", "cam"), Board())
-    clock.refresh(lambda: LOCKED)
+    clock = RigClock(synced("rlfs", "cam"), has_board=True, edge_cameras=["davis"])
+    refresh(clock, Board(), LOCKED)
     rng = np.random.default_rng(3)
     errors_ns = []
     for k in range(60):
@@ -110,8 +105,8 @@ def test_pictures_take_the_time_of_the_pulses_that_made_them_not_of_their_arriva
 
 
 def test_a_pulse_that_the_camera_missed_is_found_and_told() -> None:
-    clock = RigClock(synced("rlfs", "cam"), Board())
-    clock.refresh(lambda: LOCKED)
+    clock = RigClock(synced("rlfs", "cam"), has_board=True, edge_cameras=["davis"])
+    refresh(clock, Board(), LOCKED)
     number = 100
     for k in range(60):
         sent_ns = 1_000_000_000 + k * PERIOD_NS
@@ -126,23 +121,21 @@ def test_a_pulse_that_the_camera_missed_is_found_and_told() -> None:
 
 
 def test_lines_too_fast_for_their_delay_begin_slowly_and_then_run_at_full_rate() -> None:
-    board = Board()
-    clock = RigClock(synced("rlfs", "cam", max_delay_s=0.1), board)
-    assert board.started_hz == [SLOW_TRIGGERS_HZ]
-    clock.refresh(lambda: LOCKED)
+    clock = RigClock(synced("rlfs", "cam", max_delay_s=0.1), has_board=True, edge_cameras=["davis"])
+    assert clock.needs_slow_triggers
+    refresh(clock, Board(), LOCKED)
     for k in range(8):
         sent_ns = 1_000_000_000 + k * 250_000_000
         clock.take("sync", Pulse("cam", sent_ns, k, 0))
         clock.take("cam", picture(T0_NS + sent_ns + HOST_AHEAD_NS + 40_000_000, k))
-    clock._refreshed_s = -1e9
-    clock.refresh(lambda: LOCKED)
-    assert board.started_hz == [SLOW_TRIGGERS_HZ, None]
+    refresh(clock, Board(), LOCKED)
+    assert not clock.needs_slow_triggers
 
 
 def test_a_davis_is_tied_by_the_edges_it_saw() -> None:
     rig = synced("rles", "davis")
-    clock = RigClock(rig, Board())
-    clock.refresh(lambda: LOCKED)
+    clock = RigClock(rig, has_board=True, edge_cameras=["davis"])
+    refresh(clock, Board(), LOCKED)
     assert [found.code for found in clock.problems()] == ["edges.none_seen"]
     # Its clock was set on opening, 20 ms off, and gains 30 ppm.
     for k in range(40):
@@ -150,8 +143,7 @@ def test_a_davis_is_tied_by_the_edges_it_saw() -> None:
         clock.take("sync", Pulse("davis", sent_ns, k, 0))
         seen_ns = T0_NS + HOST_AHEAD_NS + 20_000_000 + round(sent_ns * (1 + 30e-6))
         clock.take("davis", Pulse("davis", seen_ns, k, 0))
-    clock._refreshed_s = -1e9
-    clock.refresh(lambda: LOCKED)
+    refresh(clock, Board(), LOCKED)
     assert clock.problems() == []
     stamp_ns = T0_NS + HOST_AHEAD_NS + 20_000_000 + round(8_000_000_000 * (1 + 30e-6))
     image = replace(picture(stamp_ns), sensor="davis")

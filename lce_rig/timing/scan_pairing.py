@@ -5,11 +5,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from lce_rig.collect.event_buffer import AFTER_NS, BEFORE_NS, EventBuffer, EventCut
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.rig import Rig
-from lce_rig.sources.base import Sample
-from lce_rig.sources.rig_time import rig_time_ns
+from lce_rig.timing.event_buffer import AFTER_NS, BEFORE_NS, EventBuffer, EventCut
+from lce_rig.timing.rig_time import rig_time_ns
 
 PATIENCE_NS = 1_000_000_000
 # Scans wait for others and come late in bags; what lies this far back no scan asks for any more.

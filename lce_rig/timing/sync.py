@@ -3,13 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from lce_rig.collect.pairing import Frame, middle_of_sweep_ns
-from lce_rig.core.clock import ClockModel
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, LiveSample, Scan
 from lce_rig.core.findings import Finding
 from lce_rig.rig import Rig
-from lce_rig.sources.live.base import LiveSample
-from lce_rig.sources.rig_time import rig_time_ns
+from lce_rig.timing.clock import ClockModel
+from lce_rig.timing.rig_time import rig_time_ns
+from lce_rig.timing.scan_pairing import Frame, middle_of_sweep_ns
 
 # A board that a person moves by hand, in haste.
 BOARD_SPEED_MPS = 1.0

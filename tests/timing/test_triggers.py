@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lce_rig.collect.triggers import TriggerMatcher
-from lce_rig.core.clock import ClockModel
-from lce_rig.core.data import Image
-from lce_rig.sources.live.base import Pulse
+from lce_rig.core.data import Image, Pulse
+from lce_rig.timing.clock import ClockModel
+from lce_rig.timing.triggers import TriggerMatcher
 
 MS = 1_000_000
 S = 1000 * MS

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.core.clock import HOUR_NS, ClockModel, resolve_hour
-from lce_rig.core.clock_fit import TimePairs, fit_arrivals, fit_clock, match_edges
-from lce_rig.core.clock_tracker import ClockTracker
+from lce_rig.timing.clock import HOUR_NS, ClockModel, resolve_hour
+from lce_rig.timing.clock_fit import TimePairs, fit_arrivals, fit_clock, match_edges
+from lce_rig.timing.clock_tracker import ClockTracker
 
 START_NS = 1_753_000_000_123_456_789
 S = 1_000_000_000

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from lce_rig.collect.pairing import Frame, PairingCounts, pair_by_time
-from lce_rig.collect.sync import CommonClock, judge_sync, pair_times
-from lce_rig.core.clock import ClockModel
-from lce_rig.core.clock_fit import TimePairs, fit_clock
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, Pulse, Scan
 from lce_rig.rig import load_rig
-from lce_rig.sources.live.base import Pulse
+from lce_rig.timing.clock import ClockModel
+from lce_rig.timing.clock_fit import TimePairs, fit_clock
+from lce_rig.timing.scan_pairing import Frame, PairingCounts, pair_by_time
+from lce_rig.timing.sync import CommonClock, judge_sync, pair_times
 
 MS, S = 1_000_000, 1_000_000_000
 UTC_NS = 1_753_000_000 * S

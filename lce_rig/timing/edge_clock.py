@@ -8,10 +8,10 @@ from collections import deque
 
 import numpy as np
 
-from lce_rig.core.clock import NS_PER_S, ClockModel
-from lce_rig.core.clock_fit import MIN_PAIRS, RESOLUTION_NS, Stamps, fit_clock, match_edges
+from lce_rig.core.data import Pulse
 from lce_rig.core.findings import Finding
-from lce_rig.sources.live.base import Pulse
+from lce_rig.timing.clock import NS_PER_S, ClockModel
+from lce_rig.timing.clock_fit import MIN_PAIRS, RESOLUTION_NS, Stamps, fit_clock, match_edges
 
 _N_EDGES = 2048
 _WINDOW_NS = 60 * NS_PER_S

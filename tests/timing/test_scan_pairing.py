@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from lce_rig.collect.pairing import PATIENCE_NS, PairingCounts, pair_by_time
 from lce_rig.core.data import Image, Scan
+from lce_rig.timing.scan_pairing import PATIENCE_NS, PairingCounts, pair_by_time
 
 MS = 1_000_000
 
