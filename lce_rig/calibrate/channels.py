@@ -16,7 +16,7 @@ from lce_rig.calibrate.calibrate import agree, calibrate_observations, with_cons
 from lce_rig.calibrate.consensus import Consensus
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.motion import PoseSamples, fit_motions
-from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates
+from lce_rig.calibrate.options import CaptureCandidates, EstimateSettings
 from lce_rig.calibrate.shared_scans import (
     Clocks,
     SharedScan,
@@ -43,7 +43,7 @@ _N_SHARES = 7
 def calibrate_channels(
     candidates: Mapping[str, Sequence[CaptureCandidates]],
     board: Board,
-    options: CalibrateOptions,
+    options: EstimateSettings,
     clocks: Clocks,
     progress: Callable[[int, int], None] | None = None,
 ) -> CalibrationEstimate:
@@ -60,7 +60,7 @@ def calibrate_channels(
     Raises:
         NotEnoughDataError: no channel has captures enough, or they leave a direction undetermined.
     """
-    agreed = _agree(candidates, board, options)
+    agreed = _agree(candidates, board)
     scans, conflicts = join_scans(agreed, candidates)
     noise_px = {name: pooled_noise_px([o.image for o in c.observations]) for name, c in agreed.items()}
     samples = sample_scans(scans, clocks, noise_px)
@@ -120,15 +120,13 @@ def _still_observation(scan: SharedScan, only: str | None) -> Observation:
     return scan.observation() if only is None else Observation(scan.capture, scan.images[only], scan.lidar)
 
 
-def _agree(
-    candidates: Mapping[str, Sequence[CaptureCandidates]], board: Board, options: CalibrateOptions
-) -> dict[str, Consensus]:
+def _agree(candidates: Mapping[str, Sequence[CaptureCandidates]], board: Board) -> dict[str, Consensus]:
     """Find each channel's consensus, the channel with the steadiest corners first."""
     agreed: dict[str, Consensus] = {}
     troubles: list[NotEnoughDataError] = []
     for channel, items in candidates.items():
         try:
-            agreed[channel] = agree(items, board, options)
+            agreed[channel] = agree(items, board)
         except NotEnoughDataError as error:
             troubles.append(error)
     if not agreed:
@@ -137,13 +135,15 @@ def _agree(
     return {name: agreed[name] for name in sorted(agreed, key=lambda name: noise[name])}
 
 
-def _alone(consensus: Consensus, board: Board, options: CalibrateOptions) -> CalibrationEstimate:
+def _alone(consensus: Consensus, board: Board, options: EstimateSettings) -> CalibrationEstimate:
     """Calibrate one channel by Algorithm 1 as if boards stood still, without draws."""
-    return calibrate_observations(consensus.observations, board, replace(options, method="paper", n_draws=0))
+    return calibrate_observations(
+        consensus.observations, board, replace(options, method="paper", estimator=None, n_draws=0)
+    )
 
 
 def _alone_moved(
-    mover: _Mover, channel: str, board: Board, options: CalibrateOptions, offsets: TimeOffsets | None
+    mover: _Mover, channel: str, board: Board, options: EstimateSettings, offsets: TimeOffsets | None
 ) -> CalibrationEstimate:
     only = channel if len(mover.samples.channels) > 1 else None
     return _widened(
@@ -155,7 +155,7 @@ def _offsets(
     samples: PoseSamples,
     scans: Sequence[SharedScan],
     board: Board,
-    options: CalibrateOptions,
+    options: EstimateSettings,
     clocks: Clocks,
     start: CalibrationEstimate,
 ) -> TimeOffsets | None:
@@ -164,7 +164,7 @@ def _offsets(
     weights = Weights(
         plane=start.diagnostics["plane_weight"] * unit,
         edge=start.diagnostics["edge_weight"] * unit,
-        shift_prior=options.edge_shift_precision,
+        shift_prior=options.parts.edge_shift_precision,
     )
     moving = np.flatnonzero(samples.tells_motion).tolist()
     offsets = estimate_time_offsets(
@@ -226,7 +226,7 @@ def depth_scatter_m(estimate: CalibrationEstimate) -> float:
 
 
 def _difference(
-    mover: _Mover, results: Sequence[ChannelResult], board: Board, options: CalibrateOptions
+    mover: _Mover, results: Sequence[ChannelResult], board: Board, options: EstimateSettings
 ) -> tuple[Array | None, Array | None]:
     """Hold two channels' extrinsics against each other: the tangent (6,) between them and its covariance.
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lce_rig.calibrate.options import CalibrateOptions
+from lce_rig.calibrate.options import Algorithm1Parts
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
 from lce_rig.residuals.features import CaptureFeatures
@@ -19,7 +19,7 @@ _SIGMA_FLOOR_M = 0.001
 
 
 def reject_outliers(
-    features: Sequence[CaptureFeatures], problem: Problem, T_start: Array, options: CalibrateOptions
+    features: Sequence[CaptureFeatures], problem: Problem, T_start: Array, parts: Algorithm1Parts
 ) -> tuple[dict[str, Refusal], tuple[float, float]]:
     """Refuse captures whose plane or edges lie far from where the other captures predict them, worst first.
 
@@ -27,7 +27,7 @@ def reject_outliers(
         features: of the captures in `problem`.
         problem: their moments, weighted alike.
         T_start: (4, 4) planar initialisation.
-        options: `reject_outliers` switches the refusal off.
+        parts: of Algorithm 1; `reject_outliers` switches the refusal off.
 
     Returns:
         The refusals by capture; and the typical predicted plane and edge error of the captures kept, m.
@@ -38,12 +38,12 @@ def reject_outliers(
         selection = np.zeros((len(kept), problem.n_captures))
         selection[:, kept] = 1
         selection[np.arange(len(kept)), kept] = 0
-        solutions = problem.solve(selection, T_start, options.n_rounds)
+        solutions = problem.solve(selection, T_start, parts.n_rounds)
         plane, edge = (error[np.arange(len(kept)), kept] for error in problem.errors(solutions.x))
         excess = np.maximum(_excess(plane), _excess(edge))
         worst = int(np.argmax(excess))
         n_refused = problem.n_captures - len(kept)
-        is_done = not options.reject_outliers or excess[worst] <= 1 or len(kept) <= 4
+        is_done = not parts.reject_outliers or excess[worst] <= 1 or len(kept) <= 4
         if is_done or n_refused >= _MAX_SHARE * problem.n_captures:
             return refusals, (_typical(plane), _typical(edge))
         refusals[features[kept[worst]].capture] = _refusal(plane, edge, worst)

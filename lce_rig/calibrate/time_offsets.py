@@ -16,7 +16,7 @@ from itertools import product
 import numpy as np
 
 from lce_rig.calibrate.motion import BoardMotions, PoseSamples, board_time_s, deskew, fit_motions
-from lce_rig.calibrate.options import CalibrateOptions
+from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, difference
 from lce_rig.core.results import Observation
@@ -87,7 +87,7 @@ def estimate_time_offsets(
     samples: PoseSamples,
     observations: Sequence[Observation],
     board: Board,
-    options: CalibrateOptions,
+    options: EstimateSettings,
     weights: Weights,
     T_start: Array,
     *,
@@ -110,7 +110,7 @@ def estimate_time_offsets(
     observations = deskew_points(observations, fit_motions(samples, offset_s), T_start)
     cost = _Cost(
         samples,
-        [extract_features(observation, board, options.features) for observation in observations],
+        [extract_features(observation, board, options.parts.features) for observation in observations],
         np.array([board_time_s(observation.lidar, sweep_s) for observation in observations]),
         board,
         weights,

@@ -44,11 +44,10 @@ if TYPE_CHECKING:
 @event_image_option
 @click.option(
     "--method",
-    type=click.Choice(["ml", "paper", "zhou", "corners"]),
+    type=click.Choice(["ml", "paper"]),
     default="paper",
     show_default=True,
-    help="How the extrinsic is found: maximum likelihood of everything together, Algorithm 1 of LCE-Calib "
-    "alone, or for comparison lines and planes (Zhou et al., 2018) or the plate's corners.",
+    help="Algorithm 1 of LCE-Calib, or from its solution on the maximum likelihood of everything together.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export a failed result too, marked as failed.")
@@ -63,42 +62,6 @@ if TYPE_CHECKING:
     type=click.IntRange(0, 10_000),
     help="Subsets drawn for each size (the paper's I).",
 )
-@click.option(
-    "--point-projection",
-    type=click.Choice(["ray", "normal", "none"]),
-    default="ray",
-    show_default=True,
-    help="How points come onto the board's plane: along the ray, along the normal (the paper), or not.",
-)
-@click.option(
-    "--uncertainty/--no-uncertainty",
-    "use_uncertainty",
-    default=True,
-    show_default=True,
-    help="Leave out the tenth of the terms with the largest propagated variance.",
-)
-@click.option("--ptpl/--no-ptpl", "use_ptpl", default=True, show_default=True, help="Point-to-plane terms.")
-@click.option("--ptl/--no-ptl", "use_ptl", default=True, show_default=True, help="Point-to-line terms.")
-@click.option(
-    "--half-step/--no-half-step",
-    default=True,
-    show_default=True,
-    help="Move ring ends outwards by half an azimuth step.",
-)
-@click.option(
-    "--edge-shift",
-    type=click.Choice(["free", "off"]),
-    default="free",
-    show_default=True,
-    help="Estimate how far returns reach beyond the plate's edges.",
-)
-@click.option(
-    "--weights",
-    type=click.Choice(["auto", "profile"]),
-    default="auto",
-    show_default=True,
-    help="Weights of the terms: from the data, or from the profile as the paper.",
-)
 def calibrate(
     session: Path,
     reference: Path | None,
@@ -107,8 +70,9 @@ def calibrate(
     event_image: Any,
     as_json: bool,
     force: bool,
-    weights: str,
-    **switches: Any,
+    method: Any,
+    seed: int,
+    n_draws: int,
 ) -> None:
     """Estimate where the LiDAR sits relative to each camera of SESSION (default: session/).
 
@@ -126,12 +90,7 @@ def calibrate(
     opened = lce.Session.open(session)
     rig = opened.rig
     require_sensors("camera", cameras, rig.cameras)
-    if weights == "profile":
-        settings = rig.calibration
-        switches |= {"plane_weight": settings.plane_weight, "edge_weight": settings.edge_weight}
-    if not (switches["use_ptpl"] or switches["use_ptl"]):
-        raise UsageError("--no-ptpl and --no-ptl together leave nothing to fit")
-    options = lce.CalibrateOptions(**switches)
+    options = lce.CalibrateOptions(method, n_draws, seed)
     wanted = [
         name
         for name, camera in rig.cameras.items()

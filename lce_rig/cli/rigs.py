@@ -141,7 +141,7 @@ def _board_table(rig: "Rig") -> Any:
 
 def _limit_table(rig: "Rig") -> Any:
 
-    table = screen.plain_table("", "threshold or weight", "value", "default")
+    table = screen.plain_table("", "threshold", "value", "default")
     for block in ("quality", "calibration", "verdict"):
         settings = getattr(rig, block)
         for key, field in type(settings).model_fields.items():

@@ -17,7 +17,7 @@ class Image:
         stamp_ns: mid exposure, device time; None where the recording carries no time.
         host_ns: arrival at the host; None where unknown.
         pixels: (H, W) grey or (H, W, 3) BGR, uint8.
-        count: the camera's running number of the picture; gaps are lost ones; None where it does not count.
+        count: the camera's running number of the image; gaps are lost ones; None where it does not count.
     """
 
     sensor: str
@@ -29,7 +29,7 @@ class Image:
 
     @property
     def grey(self) -> NDArray[np.uint8]:
-        """The picture as (H, W) uint8 grey values (ITU-R BT.601 weights)."""
+        """The image as (H, W) uint8 grey values (ITU-R BT.601 weights)."""
         if self.pixels.ndim == 2:
             return self.pixels
         weights = np.array([0.114, 0.587, 0.299], dtype=np.float32)
@@ -78,7 +78,7 @@ class Events:
 
     Attributes:
         sensor: name of the camera in the rig profile.
-        t_ns: (N,) int64 device time, never decreasing; microsecond stamps times 1000, kept exactly.
+        t_ns: (N,) int64 device time, never decreasing; microsecond timestamps times 1000, kept exactly.
         x: (N,) uint16 column.
         y: (N,) uint16 row.
         polarity: (N,) bool, True where it became brighter.

@@ -52,8 +52,8 @@ def export(
         calibrations: what to write, one for each camera channel and LiDAR.
         rig: the profile the calibrations belong to.
         folder: as a rule the session's `calibration/`.
-        formats: keys of EXPORTS; all where left out.
-        is_forced: write also what failed; every file then says so.
+        formats: keys of EXPORTS; all by default.
+        is_forced: write failed calibrations too; every file then says so.
 
     Returns:
         The files written, in the order of the formats.
@@ -100,7 +100,7 @@ def remove_exports(folder: Path) -> None:
 
 
 def is_export(path: Path) -> bool:
-    """Tell whether a file is an export that lce-rig wrote, by its first lines.
+    """Return whether a file is an export that lce-rig wrote, by its first lines.
 
     Raises:
         SessionError: it cannot be read.

@@ -29,7 +29,7 @@ def read_reference(path: Path | str) -> Reference:
     """Read truth.json, result.json or any JSON with a 4x4 `T_cam_lidar`, at the top or in a list `pairs`.
 
     Raises:
-        SessionError: there is none, or it is no rigid transform.
+        SessionError: there is none, or it is not a rigid transform.
     """
     path = Path(path)
     try:

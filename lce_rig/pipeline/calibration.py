@@ -15,6 +15,7 @@ from lce_rig.calibrate import (
     CalibrationEstimate,
     CaptureCandidates,
     Clocks,
+    EstimateSettings,
     calibrate_channels,
 )
 from lce_rig.calibrate.camera_pairs import CameraPair, doubt_cameras, relate
@@ -46,13 +47,13 @@ class _Sensors:
 
     Attributes:
         pairs: channels of the camera with the LiDAR.
-        options: of the algorithm, with what the profile says of the LiDAR.
+        settings: the user's options, with what the profile says of the LiDAR.
         candidates: by channel, of captures in which both sensors saw something.
         refused: why the other captures are unusable.
     """
 
     pairs: tuple[Pair, ...]
-    options: CalibrateOptions
+    settings: EstimateSettings
     candidates: Mapping[str, Sequence[CaptureCandidates]]
     refused: Mapping[str, Refusal]
 
@@ -145,7 +146,7 @@ def calibrate_detections(
         try:
             own = _sensors(rig, detections, pairs, options or CalibrateOptions())
             clocks = clocks_of(rig, own.camera, own.lidar)
-            alone.append(calibrate_channels(own.candidates, board, own.options, clocks, progress))
+            alone.append(calibrate_channels(own.candidates, board, own.settings, clocks, progress))
             sensors.append(own)
         except NotEnoughDataError as error:
             shortages.append(error)
@@ -223,14 +224,9 @@ def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: C
     if not candidates and trouble is not None:
         raise trouble
     found = {item.capture for items in candidates.values() for item in items}
-    settings = rig.lidars[pairs[0].lidar]
-    options = replace(
-        options,
-        laser_bias_sigma_m=settings.laser_bias_sigma_m,
-        range_offset_sigma_m=settings.range_offset_sigma_m,
-    )
     refused = {name: why for name, why in refused.items() if name not in found}
-    return _Sensors(tuple(pairs), options, candidates, refused)
+    settings = EstimateSettings.of(options, rig.lidars[pairs[0].lidar])
+    return _Sensors(tuple(pairs), settings, candidates, refused)
 
 
 def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandidates], dict[str, Refusal]]:
@@ -277,10 +273,10 @@ def _estimate_together(
     """
     joint: dict[int, TogetherEstimate] = {}
     for group in _groups(len(sensors), links):
-        options = sensors[group[0]].options
-        if options.method == "ml":
+        settings = sensors[group[0]].settings
+        if settings.method == "ml":
             own = {sensors[k].camera: alone[k] for k in group}
-            joint |= dict.fromkeys(group, calibrate_together(own, rig.board.to_board(), options))
+            joint |= dict.fromkeys(group, calibrate_together(own, rig.board.to_board(), settings))
     return joint
 
 

@@ -17,10 +17,10 @@ class TriggerSettings(Settings):
 
     Attributes:
         channel: number of the board's line.
-        rate_hz: pulses a second; boards that decide by themselves are not told.
+        rate_hz: pulses per second; not sent to boards that set their own rate.
         phase_us: first pulse of a second after that second's beginning.
         pulse_us: length of a pulse.
-        max_delay_s: latest stamp of a frame after its pulse; as short as the camera allows.
+        max_delay_s: latest timestamp of a frame after its pulse; as short as the camera allows.
     """
 
     channel: Annotated[int, Field(ge=0, le=15)]

@@ -15,7 +15,7 @@ def read_entries(path: Path) -> list[dict[str, Any]]:
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no regular file.
+        ValueError: it is not a regular file.
     """
     entries: list[dict[str, Any]] = []
     if not path.exists():

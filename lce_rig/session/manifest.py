@@ -64,7 +64,7 @@ class Manifest(_Record):
 
     @property
     def images(self) -> list[ImageEntry]:
-        """Entries of pictures."""
+        """Entries of images."""
         return [entry for entry in self.files if isinstance(entry, ImageEntry)]
 
     @property

@@ -20,7 +20,7 @@ PLAIN_VERSION, EVENTS_VERSION = 1, 2
 
 
 def content_hash(images: Iterable[Image], scans: Iterable[Scan], events: Iterable[Events] = ()) -> str:
-    """Fingerprint what the sensors saw, stamps left aside, whatever files it came from.
+    """Fingerprint what the sensors saw, timestamps left aside, whatever files it came from.
 
     Of events, the times between them count.
 
@@ -57,7 +57,7 @@ def write_capture(
 
     Raises:
         OSError: a full disk, no permission.
-        ValueError: a picture that is not 8-bit grey or BGR, events out of order or off their sensor, or
+        ValueError: an image that is not 8-bit grey or BGR, events out of order or off their sensor, or
             `meta` that is not JSON.
     """
     images, scans, events = list(images), list(scans), list(events)
@@ -79,7 +79,7 @@ def write_capture(
 
 
 def stamps_of(events: Events) -> dict[str, int | None]:
-    """Read the first and last stamp of events, null where there are none, as a manifest has them."""
+    """Read the first and last timestamp of events, null where there are none, as a manifest has them."""
     if not len(events):
         return {"first_ns": None, "last_ns": None}
     return {"first_ns": int(events.t_ns[0]), "last_ns": int(events.t_ns[-1])}
@@ -147,7 +147,7 @@ def _encode_scan(scan: Scan) -> bytes:
     }
     comments = ["frame of the lidar: x forward, y left, z up; m; ring 0 is the lowest"]
     if scan.offset_ns is not None:
-        # 32 bits hold 4.3 s and are all that many viewers know; a longer sweep needs 64.
+        # 32 bits hold 4.3 s and are all that many viewers know; a longer scan needs 64.
         fits = len(scan.offset_ns) == 0 or (scan.offset_ns.min() >= 0 and scan.offset_ns.max() < 2**32)
         columns["time"] = ("u4" if fits else "i8", scan.offset_ns)
         comments.append("time: ns after the first firing")

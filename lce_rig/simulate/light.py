@@ -41,7 +41,7 @@ def ambient_light(normals: Array) -> Array:
 
 
 def irradiance(lamps: Array, points: Array, normals: Array, occluders: Raycaster | None = None) -> Array:
-    """Sum soft and lamp light (N, 3) at points (N, 3), lamps hidden by `occluders` left out."""
+    """Sum soft and lamp light (N, 3) at points (N, 3), without lamps hidden by `occluders`."""
     share = lamp_light(lamps, points, normals)
     if occluders is not None:
         lifted = points + 2e-3 * normals

@@ -52,7 +52,7 @@ class Room:
     T_world_decoy: Array | None = None
 
     def is_free(self, points_world: Array, margin_m: float = 0.1) -> NDArray[np.bool_]:
-        """Tell which points (N, 3) lie in the room, at least `margin_m` from everything in it."""
+        """Find which points (N, 3) lie in the room, at least `margin_m` from everything in it."""
         points = transform(invert(self.T_world_room), points_world)
         free = np.all((points > _LOW + margin_m) & (points < _HIGH - margin_m), axis=1)
         for low, high in _OBSTACLES:

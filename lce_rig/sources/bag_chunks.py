@@ -41,7 +41,7 @@ class Chunk:
     connections: frozenset[int] | None = None
 
     def holds(self, numbers: frozenset[int]) -> bool:
-        """Tell whether it may hold messages of some connections."""
+        """Return whether it may hold messages of some connections."""
         return self.connections is None or not numbers.isdisjoint(self.connections)
 
 
@@ -123,7 +123,7 @@ class ChunkedBag(ABC):
 
         Raises:
             OSError: the file cannot be read.
-            ValueError: it is no file, or none of this kind.
+            ValueError: it is not a file, or none of this kind.
         """
         self.path = path
         self.contents = Contents()

@@ -51,12 +51,12 @@ class BagRecorder:
             self._writer.open()
 
     def write(self, sample: Sample) -> None:
-        """Add a picture, a scan or a packet of events.
+        """Add an image, a scan or a packet of events.
 
         Raises:
             SourceError: the disk is full, now or before; the rig lacks the sensor; or two sensors of the
                 profile share a topic and differ in kind.
-            ValueError: it carries no time at all.
+            ValueError: it has no timestamp at all.
         """
         if isinstance(sample, Events):
             self._write_events(sample)

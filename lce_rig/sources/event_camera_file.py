@@ -21,7 +21,7 @@ class EventCameraFile:
 
     Attributes:
         path: the file.
-        notes: what was assumed on opening, and after reading what was left out and why.
+        notes: what was assumed on opening, and after reading what was skipped and why.
         key: fingerprint of the file.
         n_samples: number of frames.
         streams: the camera's events and, where the file and the profile have them, its frames.

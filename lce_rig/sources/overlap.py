@@ -18,12 +18,12 @@ _USUAL_LAG_S = 2.0
 def check_overlap(
     scans: Mapping[Stream, Span | None], others: Mapping[Stream, Span | None], rig: Rig
 ) -> list[str]:
-    """Make sure that pictures and events run while the LiDAR does.
+    """Make sure that images and events run while the LiDAR does.
 
     Args:
         scans: streams of LiDARs.
         others: streams of cameras.
-        rig: its `expected_offset_s` are added to the stamps.
+        rig: its `expected_offset_s` are added to the timestamps.
 
     Returns:
         Notes on streams that cover only a part of the scans.

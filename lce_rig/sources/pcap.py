@@ -20,7 +20,7 @@ from lce_rig.sources.velodyne_points import DUAL_NOTE, OFFSETS_NOTE
 from lce_rig.sources.velodyne_stream import Vlp16Stream
 from lce_rig.words import describe
 
-# So many data packets, a second or less of one sensor, show which sensors were recorded.
+# So many data packets, per second or less of one sensor, show which sensors were recorded.
 _SURVEY_PACKETS = 800
 _MAX_SHOWN = 6
 
@@ -32,7 +32,7 @@ class _Survey:
     Attributes:
         senders: data packets of VLP-16s by IP address.
         others: data packets of other models by name.
-        refused: packets of the right length that are no data packets, by the code of what is wrong.
+        refused: packets of the right length that are not data packets, by the code of what is wrong.
         ports: all UDP packets by the port they were sent to.
         n_bytes: how much of the file this is.
     """
@@ -49,7 +49,7 @@ class PcapRecording:
 
     Attributes:
         path: the file.
-        notes: which sensor was taken, and after reading what was left out and why.
+        notes: which sensor was taken, and after reading what was skipped and why.
         key: fingerprint of the file.
         n_samples: number of scans to come, estimated from the file's size.
         streams: the LiDAR's scans; their span, by arrival, is found only where they are part of a recording.
@@ -59,8 +59,8 @@ class PcapRecording:
         """Find the sensor's packets.
 
         Raises:
-            SourceError: it is no recording of the network, holds no packets of a VLP-16, or those of several
-                of which none has the profile's address; velodyne-decoder is not installed.
+            SourceError: it is not a recording of the network, holds no packets of a VLP-16, or those of
+                several of which none has the profile's address; velodyne-decoder is not installed.
         """
         self.path = path
         self.notes: list[str] = []
@@ -178,7 +178,7 @@ def _push(stream: Vlp16Stream, datagram: Datagram) -> Scan | None:
 
 
 def _account(stream: Vlp16Stream) -> list[str]:
-    """Say what was lost or left out, in words."""
+    """Say what was lost or skipped, in words."""
     counts, order = stream.counts, stream.counts.order
     figures = {
         "data packets lost on the way": order.n_lost,

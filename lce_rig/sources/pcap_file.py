@@ -52,7 +52,7 @@ class PcapFile:
         """Look at the beginning.
 
         Raises:
-            SourceError: it is no recording of a network, or of a kind of network that is not read.
+            SourceError: it is not a recording of a network, or of a kind of network that is not read.
         """
         self.path = path
         self.flaws: Counter[str] = Counter()
@@ -134,7 +134,7 @@ def _whole(data: bytes, n_bytes: int) -> bytes:
 
 
 def _read_head(path: Path, head: bytes) -> tuple[str, int, int | None]:
-    """Tell byte order, ns per tick and link type; None for pcapng, where each card has its own."""
+    """Return byte order, ns per tick and link type; None for pcapng, where each card has its own."""
     magic = head[:4]
     for order in "<>":
         for value, ns_per_tick in ((_US_MAGIC, 1000), (_NS_MAGIC, 1)):

@@ -23,7 +23,7 @@ class Target:
     """A camera channel, or a LiDAR (channel None).
 
     Attributes:
-        has_events: whether the channel is of kind events: raw ones, or pictures that others made of them.
+        has_events: whether the channel is of kind events: raw ones, or images that others made of them.
     """
 
     sensor: str
@@ -61,7 +61,7 @@ def choose_topics(
         Sensor by topic; at least one camera channel and one LiDAR, one of the two in a part of a recording.
 
     Raises:
-        SourceError: a topic that was asked for is not there or of another type, or no picture or cloud is
+        SourceError: a topic that was asked for is not there or of another type, or no image or point cloud is
             left; the hint lists the topics that are there.
     """
     there = list_topics(topics)

@@ -13,7 +13,7 @@ from lce_rig.timing.clock import resolve_hour
 
 #: Clocks further apart than this do not both show UTC.
 MAX_DISAGREEMENT_NS = 100_000_000
-# Position packets come 50 to 150 times a second; a sentence stays until the next, a second later.
+# Position packets come 50 to 150 times per second; a sentence stays until the next, a second later.
 _MAX_AGE_S = 3
 _SENTENCE_LAG_S = (0, 1)
 # The least delayed arrival of a tenth of a second tells the host's time of a firing best. Of twenty of them
@@ -84,11 +84,11 @@ class VelodyneClock:
 
     @property
     def is_utc(self) -> bool:
-        """Whether scans are stamped with the sensor's own time, UTC."""
+        """Whether scans are timestamped with the sensor's own time, UTC."""
         return not self._doubt()
 
     def state(self) -> Finding:
-        """Find whose time scans are stamped with, and why it is not the sensor's.
+        """Find whose time scans are timestamped with, and why it is not the sensor's.
 
         The sensor's time is trusted where it is locked to pulses, the sentence it holds is of the second that
         its counter shows, and the host's clock agrees.

@@ -107,7 +107,7 @@ def read_data_packet(payload: bytes | memoryview, host_ns: int) -> DataPacket:
     """
     if len(payload) != velodyne.DATA_BYTES:
         raise BadPacketError("packet.wrong_length")
-    # Twelve numbers at a time are faster without NumPy; packets come 754 times a second.
+    # Twelve numbers at a time are faster without NumPy; packets come 754 times per second.
     *heads, us, mode, product = _HEADS.unpack_from(payload)
     flags, azimuth = heads[0::2], heads[1::2]
     if flags != _FLAGS:
@@ -127,7 +127,7 @@ def read_data_packet(payload: bytes | memoryview, host_ns: int) -> DataPacket:
 
 
 def _is_even(azimuth: list[int], is_dual: bool) -> bool:
-    """Tell whether 12 blocks advance as those of a turning rotor."""
+    """Return whether 12 blocks advance as those of a turning rotor."""
     steps = [(b - a) % velodyne.AZIMUTH_STEPS for a, b in pairwise(azimuth)]
     if is_dual:
         if any(steps[0::2]):
@@ -148,7 +148,7 @@ def read_position_packet(payload: bytes | memoryview, host_ns: int) -> PositionP
     """Read what the sensor says of its clock.
 
     Raises:
-        BadPacketError: it is no position packet.
+        BadPacketError: it is not a position packet.
     """
     if len(payload) != velodyne.POSITION_BYTES:
         raise BadPacketError("packet.wrong_length")

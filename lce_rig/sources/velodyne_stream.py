@@ -23,7 +23,8 @@ from lce_rig.sources.velodyne_points import Vlp16Decoder, keep_brighter
 
 # A scan with more of its packets lost is not worth looking at.
 _MIN_COVERAGE = 0.5
-# Stamps by arrival and by the sensor may differ by a tenth of a second when one takes over from the other.
+# Timestamps by arrival and by the sensor may differ by a tenth of a second when one takes over from the
+# other.
 _MAX_OVERLAP_NS = 1_000_000_000
 
 
@@ -56,14 +57,14 @@ class StreamCounts:
         n_data: data packets that passed the checks.
         n_position: position packets that did.
         n_scans: revolutions handed on.
-        n_partial: revolutions left out because they had begun before, or the sensor's clock was set.
-        n_thin: revolutions left out because more than half of their packets were lost.
+        n_partial: revolutions skipped because they began before, or the sensor's clock was set.
+        n_thin: revolutions skipped because more than half of their packets were lost.
         n_empty: revolutions without a single return.
-        n_not_rising: scans left out because it turned out that those before were stamped late.
-        bad: data packets left out, by the code of what is wrong with them.
-        bad_positions: position packets left out, likewise.
+        n_not_rising: scans skipped because it turned out that those before were timestamped late.
+        bad: data packets skipped, by the code of what is wrong with them.
+        bad_positions: position packets skipped, likewise.
         other_models: data packets of other models, by name.
-        order: what the sensor's counter told.
+        order: packet order by the sensor's counter.
     """
 
     n_data: int = 0
@@ -80,7 +81,7 @@ class StreamCounts:
 
     @property
     def n_bad(self) -> int:
-        """Packets of both kinds left out."""
+        """Packets of both kinds skipped."""
         return self.bad.total() + self.bad_positions.total()
 
     def flaws(self) -> list[Finding]:
@@ -98,7 +99,7 @@ class Vlp16Stream:
 
     Attributes:
         counts: what came so far.
-        clock: what scans are stamped with.
+        clock: what scans are timestamped with.
         mode: return mode of the packet that came last, of velodyne.RETURN_MODES; 0 before the first.
         rotor_hz: speed of the rotor as it was last; 0 before the first packet.
 
@@ -191,7 +192,7 @@ class Vlp16Stream:
         return closed or scan
 
     def _passed_cut_before(self, packet: DataPacket, elapsed_ns: int, past_cut: int) -> bool:
-        """Tell whether the rotor passed the cut between the last packet and this one."""
+        """Return whether the rotor passed the cut between the last packet and this one."""
         last = self._pieces[-1]
         before = self._past_cut(int(last.packet.azimuth[-1]))
         turned = packet.steps_per_ns * (elapsed_ns - last.elapsed_ns)
@@ -242,7 +243,7 @@ class Vlp16Stream:
         )
 
     def _rises(self, stamp_ns: int | None) -> bool:
-        """Tell whether a stamp follows the one before; where a clock is set back far, stamps start anew."""
+        """Return whether a timestamp follows the one before; a clock that is set back far starts again."""
         last_ns = self._last_stamp_ns
         if stamp_ns is None or (last_ns is not None and 0 <= last_ns - stamp_ns < _MAX_OVERLAP_NS):
             return stamp_ns is None

@@ -9,7 +9,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 
 MIN_PAIRS = 4
-# A stamp in whole microseconds cannot scatter by less than this says.
+# A timestamp in whole microseconds cannot scatter by less than this says.
 RESOLUTION_NS = 1000.0
 # A USB frame lasts 1 ms: what comes by USB may be as late as that every time.
 ARRIVAL_BIAS_NS = 1_000_000.0
@@ -42,7 +42,7 @@ class TimePairs:
 
     @staticmethod
     def from_edges(source_ns: Stamps, reference_ns: Stamps) -> "TimePairs":
-        """Take edges (N,) that both clocks stamped."""
+        """Take edges (N,) that both clocks timestamped."""
         return TimePairs(source_ns, reference_ns, np.zeros(len(source_ns)))
 
     @staticmethod
@@ -51,8 +51,9 @@ class TimePairs:
     ) -> "TimePairs":
         """Take time requests (N,) that a device answered; the device's clock is the source.
 
-        The middle between sending and receiving is the middle between the device's own two stamps, to within
-        half of what the round trip took beyond the device's own delay, whatever the two ways had of it.
+        The middle between sending and receiving is the middle between the device's own two timestamps, to
+        within half of what the round trip took beyond the device's own delay, whatever the two ways had of
+        it.
 
         Args:
             sent_ns, received_ns: when the host sent the request and had the answer.
@@ -133,7 +134,7 @@ def fit_arrivals(
 def match_edges(
     source_ns: Stamps, reference_ns: Stamps, coarse: ClockModel, tolerance_ns: float
 ) -> TimePairs | None:
-    """Find which edges that one clock stamped are which of another's, by a coarse model of the two.
+    """Find which edges that one clock timestamped are which of another's, by a coarse model of the two.
 
     Args:
         source_ns: (N,) edges on the one clock; rising.

@@ -42,7 +42,7 @@ class ClockTracker:
     Args:
         what: what the readings are, in words: "time requests".
         window_s: how long readings count: drift changes with temperature.
-        min_step_ns: what is smaller is no jump, however exact the readings are.
+        min_step_ns: what is smaller is not a jump, however exact the readings are.
         resolution_ns: step of the coarser clock.
     """
 
@@ -90,7 +90,7 @@ class ClockTracker:
         return self._latest(max_new=1)
 
     def restart(self) -> None:
-        """Forget all readings: the device began anew."""
+        """Forget all readings: the device restarted."""
         self._pairs.clear()
         self._suspects.clear()
         self._model = None

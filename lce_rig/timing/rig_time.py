@@ -11,7 +11,7 @@ def event_channel(rig: Rig, camera: str) -> str | None:
 
 
 def stamp_of(sample: Sample) -> int | None:
-    """Read a sample's stamp, a packet's first, ns on the sensor's own clock; None where it carries none."""
+    """Read a sample's timestamp, a packet's first, ns on the sensor's own clock; None without one."""
     if isinstance(sample, Events):
         return int(sample.t_ns[0]) if len(sample) else None
     return sample.stamp_ns
@@ -27,12 +27,12 @@ def stream_of(sample: Sample, rig: Rig) -> Stream:
 
 
 def rig_offset_ns(stream: Stream, rig: Rig) -> int:
-    """Tell what the profile adds to a stream's stamps to get the rig's time."""
+    """Return what the profile adds to a stream's timestamps to get the rig's time."""
     return round(_timestamps(stream, rig).expected_offset_s * 1e9)
 
 
 def rig_time_ns(sample: Sample, rig: Rig) -> int | None:
-    """Bring a sample's stamp to the rig's time; None where it carries none."""
+    """Bring a sample's timestamp to the rig's time; None where it carries none."""
     stamp_ns = stamp_of(sample)
     return None if stamp_ns is None else stamp_ns + rig_offset_ns(stream_of(sample, rig), rig)
 

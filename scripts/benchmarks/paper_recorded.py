@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.baselines import settings_of
 from benchmarks.paper_runs import paper_mge_m
 from benchmarks.recordings import SETS, RecordedSet, detect
 from benchmarks.tables import compare
 from lce_rig import pipeline
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, fit_extrinsic
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Calibration, ImageBoard
@@ -45,12 +46,10 @@ class Recording:
         return f"{n_found} of {len(names)}"
 
     @property
-    def options(self) -> CalibrateOptions:
+    def options(self) -> EstimateSettings:
         """What the profile says of the LiDAR's errors."""
         (lidar,) = self.rig.lidars.values()
-        return CalibrateOptions(
-            laser_bias_sigma_m=lidar.laser_bias_sigma_m, range_offset_sigma_m=lidar.range_offset_sigma_m
-        )
+        return EstimateSettings.of(CalibrateOptions(), lidar)
 
     def candidates(self) -> list[CaptureCandidates]:
         """Gather the captures of the only channel in which both sensors found a board."""
@@ -99,7 +98,7 @@ def errors_by_frames(recording: Recording, counts: Sequence[int], methods: Seque
         for j in range(N_SUBSETS if n < len(every) else 1):
             subset = [every[i] for i in np.sort(rng.choice(len(every), n, replace=False))]
             for method in methods:
-                options = replace(recording.options, method=method, n_draws=0)
+                options = settings_of(method, replace(recording.options, n_draws=0))
                 try:
                     T = fit_extrinsic(subset, board, options).T_cam_lidar
                 except NotEnoughDataError:

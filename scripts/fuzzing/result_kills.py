@@ -51,7 +51,7 @@ class Verb:
 
 
 VERBS = {
-    "calibrate": Verb("calibration", (("--draws", "5"), ("--draws", "5", "--no-half-step"))),
+    "calibrate": Verb("calibration", (("--draws", "5"), ("--draws", "5", "--method", "ml"))),
     "verify": Verb("calibration/overlays", ((), ())),
     "intrinsics": Verb("intrinsics", (("--model", "radtan5"), ("--model", "rational"))),
 }

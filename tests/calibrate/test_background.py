@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, capture_residual, fit_extrinsic
+from lce_rig.calibrate import EstimateSettings, capture_residual, fit_extrinsic
 from lce_rig.core.geometry import difference
 from lce_rig.core.results import Observation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
-OPTIONS = CalibrateOptions(n_draws=0)
+OPTIONS = EstimateSettings(n_draws=0)
 NAMES = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m")
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, fit_extrinsic
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.camera_pairs import doubt_cameras, pose_from_pictures, relate, shared_boards
 from lce_rig.core.geometry import difference, invert, perturb
 from lce_rig.core.results import Observation
@@ -13,7 +13,7 @@ from lce_rig.rig.thresholds import CalibrationSettings, VerdictSettings
 from tests.calibrate.boards import BOARD
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, simulate_two
 
-OPTIONS = CalibrateOptions(n_draws=0, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
+OPTIONS = EstimateSettings(n_draws=0, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
 TARGET, LIMITS = CalibrationSettings(), VerdictSettings()
 N_SOUND = 21
 TURNED = np.array([0, 0, 0, 0, np.radians(0.5), 0])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, fit_extrinsic
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.claim import resample, widening
 from lce_rig.calibrate.control import doubt_control, run_control
 from lce_rig.calibrate.examination import examine
@@ -19,7 +19,7 @@ from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, simulate
 
 RIG = load_rig("rlfs")
 LIMITS, TARGET = VerdictSettings(), CalibrationSettings()
-FAST = CalibrateOptions(n_draws=0)
+FAST = EstimateSettings(n_draws=0)
 # Any method's result lies about as far from the truth.
 T_NEAR = perturb(T_FORWARD, np.array([0.003, -0.002, 0.004, 0.001, -0.001, 0.001]))
 

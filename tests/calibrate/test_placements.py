@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.calibrate import CalibrateOptions, fit_extrinsic
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from tests.calibrate.boards import BOARD, simulate
 
 
 def test_the_same_placements_captured_again_claim_no_smaller_sigma():
     once = simulate(14, seed=4)
     again = [replace(item, capture=f"1{item.capture[1:]}") for item in once]
-    options = CalibrateOptions(n_draws=1)
+    options = EstimateSettings(n_draws=1)
     single, double = (
         fit_extrinsic(once, BOARD, options),
         fit_extrinsic([*once, *again], BOARD, options),

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, fit_extrinsic
+from lce_rig.calibrate import CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.systematic import ring_sensitivities, shift_rings
 from lce_rig.core.geometry import difference, fit_plane, perturb
 from lce_rig.core.results import Observation
@@ -13,7 +13,7 @@ from lce_rig.residuals.features import FeatureSettings, extract_features
 from lce_rig.residuals.moments import Problem, Weights
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
-NO_DRAWS = CalibrateOptions(n_draws=0)
+NO_DRAWS = EstimateSettings(n_draws=0)
 LASER_SIGMA_M, OFFSET_SIGMA_M = 0.008, 0.005
 RINGS = np.arange(16, dtype=np.int16)
 

@@ -5,12 +5,14 @@ model; where it exceeds the model's covariance by more than chance allows, error
 does not have, and the covariance is multiplied.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.likelihood.refine import JointEstimate
 from lce_rig.core.geometry import Array
-from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
+from lce_rig.residuals.quadratics import jackknife_scatter
 from lce_rig.solvers.covariance import symmetric_inverse
 
 # So many standard deviations of its own must the ratio of covariances lie above 1 to count.
@@ -42,7 +44,5 @@ def inflate(
 
 def jackknife(joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0) -> Array:
     """Compute the jackknife covariance (6, 6) of a camera's extrinsic over placements."""
-    system = joint.system
-    cost = Quadratics(system.gradients, system.hessians, system.prior, system.prior_gradient, placement)
-    moves = cost.without_each() - cost.optimum()
-    return jackknife_scatter(moves @ joint.to_extrinsics[camera].T)
+    cost = replace(joint.cost, placement=placement)
+    return jackknife_scatter(cost.moves() @ joint.to_extrinsics[camera].T)

@@ -65,7 +65,7 @@ class Planner:
     """Chooses placements of the board before one camera and one LiDAR.
 
     Args:
-        view: the sensors, and the extrinsic as far as it is known.
+        view: the sensors, and the extrinsics as far as known.
         novelty: which placements count as the same.
         n_places: how many places of the board's centre are considered, with eight tilts each.
     """
@@ -126,7 +126,7 @@ class Planner:
         """Refuse a placement that would hardly shrink the predicted covariance.
 
         Once the target is predicted to be met, and where nothing brings much any more, only a placement that
-        was captured before is refused: whoever goes on wants more captures.
+        was captured before is refused: a user who continues wants more captures.
 
         Args:
             held: (N, 4, 4) T_cam_board of the captures so far.
@@ -193,8 +193,8 @@ class Planner:
         return None, SPACINGS[-1]
 
     def _is_like(self, held: Array, others: Array, spacing: float) -> NDArray[np.bool_]:
-        """Tell which of others (M, 4, 4) stand where one of those held (N, 4, 4) does, (N, M)."""
-        # The print may be read from either end.
+        """Find which of others (M, 4, 4) stand where one of those held (N, 4, 4) does, (N, M)."""
+        # The pattern may be read from either end.
         R, R_others = held[:, None, :3, :3], others[None, :, :3, :3]
         turn = np.minimum(rotation_angle(R, R_others), rotation_angle(R @ _HALF_TURN, R_others))
         is_turned = turn >= np.radians(spacing * self.novelty.min_turn_deg)

@@ -7,7 +7,7 @@ from types import TracebackType
 
 import numpy as np
 
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, fit_extrinsic
+from lce_rig.calibrate import CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.collect.guidance import Planner
 from lce_rig.collect.live.guide import Guide, Learned, make_guides
 from lce_rig.collect.live.worker import Worker
@@ -101,7 +101,7 @@ class _Teacher:
     def learn(self, k: int, candidates: Sequence[CaptureCandidates]) -> Planner | None:
         """Calibrate what one guide's sensors have shown; None where more captures are needed."""
         try:
-            estimate = fit_extrinsic(list(candidates), self._board, CalibrateOptions(n_draws=0))
+            estimate = fit_extrinsic(list(candidates), self._board, EstimateSettings(n_draws=0))
         except (NotEnoughDataError, np.linalg.LinAlgError):
             return None
         figures = estimate.diagnostics

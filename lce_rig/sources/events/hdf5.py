@@ -283,7 +283,7 @@ def _integer(holder: Any, name: str) -> int | None:
     """Read a number that is an attribute or a dataset of one; None where it is not there.
 
     Raises:
-        ValueError: it is no whole number.
+        ValueError: it is not a whole number.
     """
     if name in holder.attrs:
         attribute = holder.attrs.get_id(name)

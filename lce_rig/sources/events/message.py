@@ -45,7 +45,7 @@ class MessageReader:
         return int(value)
 
     def text(self) -> str:
-        """Read a string; CDR's closing zero is left out."""
+        """Read a string; CDR's closing zero is skipped."""
         size = self.number("I")
         return bytes(self.block(size)).rstrip(b"\0").decode("utf-8", errors="replace")
 

@@ -358,6 +358,7 @@ class AttachedSensors:
             if failures:
                 raise _join(failures)
             self._stack = stack.pop_all()
+        self._inbox.n_dropped.clear()  # What came too soon, while others were being opened, is no loss.
         return self
 
     def __exit__(

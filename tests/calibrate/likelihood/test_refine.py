@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, error_to_reference, fit_extrinsic
+from lce_rig.calibrate import EstimateSettings, error_to_reference, fit_extrinsic
 from lce_rig.calibrate.consensus import find_consensus
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.refine import refine
@@ -15,7 +15,7 @@ from lce_rig.residuals.along_rays import SHIFTS, turn_about_z
 from lce_rig.residuals.placements import group_placements
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, simulate
 
-ML = CalibrateOptions(method="ml", n_draws=3, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
+ML = EstimateSettings(method="ml", n_draws=3, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
 REAL = Scenario(laser_bias_sigma_m=0.008, footprint_m=0.008, end_sigma_m=0.001)
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, fit_extrinsic
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.likelihood.calibrate_together import calibrate_together
 from lce_rig.calibrate.relative_pose import relative_pose
 from lce_rig.core.geometry import difference
@@ -14,7 +14,7 @@ from lce_rig.residuals.placements import group_placements, group_shared_placemen
 from tests.calibrate.boards import BOARD, simulate
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, only, simulate_two
 
-ML = CalibrateOptions(method="ml", n_draws=0, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
+ML = EstimateSettings(method="ml", n_draws=0, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
 FEW = 6
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions
+from lce_rig.calibrate import EstimateSettings
 from lce_rig.calibrate.calibrate import calibrate_observations
 from lce_rig.calibrate.systematic import ring_sensitivities
 from lce_rig.collect.guidance import combine, predict_covariance, sigmas, weigh_placements
@@ -78,7 +78,7 @@ def test_lasers_pull_as_in_the_calibration(poses, linearised):
 @pytest.mark.long
 def test_predicted_scatter_is_that_of_many_sessions(poses):
     scenario = Scenario(range_sigma_m=0.01, corner_sigma_px=0.1)
-    options = CalibrateOptions(n_draws=0)
+    options = EstimateSettings(n_draws=0)
     runs = [
         calibrate_observations(observe(poses, seed, scenario), BOARD, options) for seed in range(100, 125)
     ]

@@ -119,6 +119,18 @@ def test_one_of_several_sensors_that_fails_is_opened_again_and_nothing_of_the_ot
         assert {name: status.n_dropped for name, status in sensors.statuses().items()} == {"s": 0, "t": 0}
 
 
+def test_what_comes_while_others_are_being_opened_is_no_loss() -> None:
+    class Slow(Script):
+        def open(self) -> None:
+            while early.entries:
+                time.sleep(0.005)
+
+    early, late = Script([pulse(k) for k in range(100)], n_slots=1), Slow([pulse(0)], name="t")
+    with AttachedSensors([early, late]) as sensors:
+        assert sensors.take(5.0) == ("s", pulse(36))  # the newest 64 of 100
+        assert sensors.statuses()["s"].n_dropped == 0
+
+
 def test_a_sensor_that_stays_away_is_named_with_the_reason() -> None:
     with AttachedSensors([Script(SourceError("gone"))], reopen_every_s=60.0) as sensors:
         while not sensors.lost():
