@@ -92,7 +92,7 @@ def _fit_shifts(
     gradients = np.add.reduceat(A * (weights * (A @ x - inside_m))[:, None], first, axis=0)
     hessians = np.add.reduceat(A[:, :, None] * (weights[:, None] * A)[:, None, :], first, axis=0)
     cost = Quadratics(gradients, hessians, prior, prior @ x, np.arange(len(first)))
-    scatter = jackknife_scatter(cost.without_each() - cost.optimum())
+    scatter = jackknife_scatter(cost.moves())
     return x[-_N_SHIFTS:], scatter[-_N_SHIFTS:, -_N_SHIFTS:]
 
 

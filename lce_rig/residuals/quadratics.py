@@ -67,6 +67,17 @@ class Quadratics:
         """
         return self.solve(1 - self.groups)
 
+    def moves(self) -> Array:
+        """Compute by how much an estimate at the optimum moves without each placement: (G, p).
+
+            m_k = (P + sum_j H_j - H_k)^-1 g_k
+
+        with sums over a placement's captures for g_k and H_k. No other gradient enters: an estimate that
+        stopped short of its optimum shows in the scatter.
+        """
+        H = np.tensordot(1 - self.groups, self.hessians, axes=1) + self.prior
+        return np.asarray((symmetric_inverse(H) @ (self.groups @ self.gradients)[..., None])[..., 0])
+
     def covariance(self) -> Array:
         """Compute the covariance (p, p) of all captures' unknowns if every error is independent."""
         return symmetric_inverse(self.information)
@@ -88,7 +99,7 @@ class Quadratics:
         """
         n_groups, p = len(self.groups), len(self.prior)
         correction = (n_groups - 1) / max(n_groups - p - 2, 2)
-        return np.asarray(correction * jackknife_scatter(self.without_each() - self.optimum()))
+        return np.asarray(correction * jackknife_scatter(self.moves()))
 
     def hold(self, unknown: int) -> "Quadratics":
         """Hold an unknown where it is: quadratics in the others."""

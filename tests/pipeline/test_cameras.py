@@ -155,8 +155,8 @@ def test_a_nudged_camera_is_told_at_both_and_not_estimated_with_the_other(option
     for own in found.values():
         assert own.verdict in ("marginal", "fail")
         assert own.estimated_with == ()
-        (found,) = (each for each in own.findings if each.code == "verdict.camera_changed")
-        assert (found.subject, found.figures["capture"]) == ("left to right", "000006")
+        (change,) = (each for each in own.findings if each.code == "verdict.camera_changed")
+        assert (change.subject, change.figures["capture"]) == ("left to right", "000006")
     # The left camera, which nobody touched, is what it is without the other.
     error = difference(found[LEFT].T_cam_lidar, TRUTH[LEFT])
     assert error @ np.linalg.solve(found[LEFT].cov, error) < 25

@@ -45,5 +45,4 @@ def inflate(
 def jackknife(joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0) -> Array:
     """Compute the jackknife covariance (6, 6) of a camera's extrinsic over placements."""
     cost = replace(joint.cost, placement=placement)
-    moves = cost.without_each() - cost.optimum()
-    return jackknife_scatter(moves @ joint.to_extrinsics[camera].T)
+    return jackknife_scatter(cost.moves() @ joint.to_extrinsics[camera].T)
