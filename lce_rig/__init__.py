@@ -1,7 +1,89 @@
-"""lce-rig: extrinsic calibration of LiDARs and cameras, frame or event, with a checkerboard."""
+"""lce-rig: extrinsic calibration of LiDARs and cameras, frame or event, with a checkerboard.
+
+    import lce_rig as lce
+
+    rig = lce.load_rig("rlfs")
+    session = lce.collect_from(rig, "recording.bag", "session/")
+    result = lce.calibrate(session)                  # .pairs[0].T_cam_lidar, .cov, .verdict, .reasons
+    result.write()                                   # what `lce-rig calibrate` writes
+    lce.verify(session, result).write("overlays/")
+
+docs/python-api.md lists every public name. Each is imported when it is first used.
+"""
 
 import os
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
+if TYPE_CHECKING:
+    from lce_rig.calibrate import CalibrateOptions
+    from lce_rig.collect import CollectOptions
+    from lce_rig.core.data import Events, Image, Scan
+    from lce_rig.core.errors import (
+        LceRigError,
+        NotEnoughDataError,
+        ProfileError,
+        ResultRefusedError,
+        SessionError,
+        SourceError,
+        UsageError,
+    )
+    from lce_rig.core.findings import Finding
+    from lce_rig.core.results import Calibration, Refusal
+    from lce_rig.detect.detection import Detections
+    from lce_rig.export import export
+    from lce_rig.export.reference import Reference, read_reference
+    from lce_rig.export.result import SavedResult, read_result
+    from lce_rig.pipeline.calibration import calibrate
+    from lce_rig.pipeline.collection import collect_from
+    from lce_rig.pipeline.detection import detect
+    from lce_rig.pipeline.repeat import Repeat, repeat
+    from lce_rig.pipeline.result_files import Result
+    from lce_rig.pipeline.verification import Verification, verify
+    from lce_rig.rig import Rig, load_rig
+    from lce_rig.session import Session
+    from lce_rig.sources.base import SourceOptions
+    from lce_rig.words import describe, recommend
+
+__all__ = [
+    "CalibrateOptions",
+    "Calibration",
+    "CollectOptions",
+    "Detections",
+    "Events",
+    "Finding",
+    "Image",
+    "LceRigError",
+    "NotEnoughDataError",
+    "ProfileError",
+    "Reference",
+    "Refusal",
+    "Repeat",
+    "Result",
+    "ResultRefusedError",
+    "Rig",
+    "SavedResult",
+    "Scan",
+    "Session",
+    "SessionError",
+    "SourceError",
+    "SourceOptions",
+    "UsageError",
+    "Verification",
+    "calibrate",
+    "collect_from",
+    "describe",
+    "detect",
+    "export",
+    "load_rig",
+    "read_reference",
+    "read_result",
+    "recommend",
+    "repeat",
+    "verify",
+]
 __version__ = "0.1.0"
 
 # OpenCV reads this once, when it is first loaded: images that declare more are refused before any
@@ -9,3 +91,49 @@ __version__ = "0.1.0"
 # `core/image_codec.py` does the same in words, wherever OpenCV was loaded before. The figure is MAX_PIXELS of
 # `core/limits.py`.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))
+
+_HOMES = {
+    "lce_rig.calibrate": ("CalibrateOptions",),
+    "lce_rig.collect": ("CollectOptions",),
+    "lce_rig.core.data": ("Events", "Image", "Scan"),
+    "lce_rig.core.errors": tuple(name for name in __all__ if name.endswith("Error")),
+    "lce_rig.core.findings": ("Finding",),
+    "lce_rig.core.results": ("Calibration", "Refusal"),
+    "lce_rig.detect.detection": ("Detections",),
+    "lce_rig.export": ("export",),
+    "lce_rig.export.reference": ("Reference", "read_reference"),
+    "lce_rig.export.result": ("SavedResult", "read_result"),
+    "lce_rig.pipeline.calibration": ("calibrate",),
+    "lce_rig.pipeline.collection": ("collect_from",),
+    "lce_rig.pipeline.detection": ("detect",),
+    "lce_rig.pipeline.repeat": ("Repeat", "repeat"),
+    "lce_rig.pipeline.result_files": ("Result",),
+    "lce_rig.pipeline.verification": ("Verification", "verify"),
+    "lce_rig.rig": ("Rig", "load_rig"),
+    "lce_rig.session": ("Session",),
+    "lce_rig.sources.base": ("SourceOptions",),
+    "lce_rig.words": ("describe", "recommend"),
+}
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+
+
+class _FrontDoor(ModuleType):
+    """Imports public names when they are used, and keeps functions in front of packages of the same name."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in _HOME:
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+        value = getattr(import_module(_HOME[name]), name)
+        setattr(self, name, value)
+        return value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # Importing the package lce_rig.detect binds its name here, and would hide the function.
+        if name not in _HOME or not isinstance(value, ModuleType):
+            super().__setattr__(name, value)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *__all__})
+
+
+sys.modules[__name__].__class__ = _FrontDoor

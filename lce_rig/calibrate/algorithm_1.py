@@ -14,25 +14,24 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.background import estimate_shifts, move_ends
 from lce_rig.calibrate.draws import Draws, draw_subsets
 from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.features import CaptureFeatures, extract_features
 from lce_rig.calibrate.initial import drop_uncertain, solve_planes
 from lce_rig.calibrate.metrics import error_to_reference
-from lce_rig.calibrate.observability import linearise, require_observable
-from lce_rig.calibrate.options import CalibrateOptions
+from lce_rig.calibrate.observability import require_observable
+from lce_rig.calibrate.options import Algorithm1Parts, EstimateSettings
 from lce_rig.calibrate.outliers import reject_outliers
-from lce_rig.calibrate.placements import group_placements
-from lce_rig.calibrate.problem import Problem, Solutions, Weights
 from lce_rig.calibrate.report import name_sigmas, report_estimate
 from lce_rig.calibrate.systematic import ring_sensitivities
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Certificate, Observation
-from lce_rig.solvers.covariance import systematic_covariance
-from lce_rig.solvers.jackknife import jackknife_covariance, sum_by_group
+from lce_rig.residuals.features import CaptureFeatures, extract_features
+from lce_rig.residuals.moments import Problem, Solutions, Weights
+from lce_rig.residuals.placements import group_placements
+from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS
+from lce_rig.solvers.covariance import systematic_covariances
 
-# Weights given by the user count in captures with residuals of this size, which sets the scale of the prior.
+# Residuals that captures are first weighed by; weights are reported in units of it.
 NOMINAL_SIGMA_M = 0.01
-_PLANE_FREEDOMS = 3
 # Names of what `estimate_shifts` finds.
 _SHIFTS = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m")
 
@@ -40,7 +39,7 @@ _SHIFTS = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo
 def calibrate_by_algorithm_1(
     observations: Sequence[Observation],
     board: Board,
-    options: CalibrateOptions,
+    options: EstimateSettings,
     progress: Callable[[int, int], None] | None = None,
 ) -> CalibrationEstimate:
     """Estimate T_cam_lidar from boards whose pairing is settled.
@@ -54,29 +53,30 @@ def calibrate_by_algorithm_1(
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
-    features = [extract_features(observation, board, options) for observation in observations]
-    problem, T_planes = _start(features, board, _weights(options, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
+    parts = options.parts
+    features = [extract_features(observation, board, parts.features) for observation in observations]
+    problem, T_planes = _start(features, board, _weights(parts, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
     fitted, shifts = list(observations), dict.fromkeys(_SHIFTS, 0.0)
     if problem.n_shift:
         shifts_m = estimate_shifts(observations, features, T_planes, board)
         if shifts_m.any():
             fitted = move_ends(observations, features, T_planes, board, shifts_m)
-            features = [extract_features(observation, board, options) for observation in fitted]
+            features = [extract_features(observation, board, parts.features) for observation in fitted]
             problem = Problem(features, board, problem.weights)
         shifts = dict(zip(_SHIFTS, shifts_m.tolist(), strict=True))
 
-    outliers, sigmas = reject_outliers(features, problem, T_planes, options)
+    outliers, sigmas = reject_outliers(features, problem, T_planes, parts)
     observations, fitted = (
         [observation for observation in each if observation.capture not in outliers]
         for each in (observations, fitted)
     )
     features = [f for f in features if f.capture not in outliers]
-    keep = drop_uncertain(features, T_planes) if options.use_uncertainty else None
-    problem, T_planes = _start(features, board, _weights(options, features, *sigmas), keep)
+    keep = drop_uncertain(features, T_planes) if parts.use_uncertainty else None
+    problem, T_planes = _start(features, board, _weights(parts, features, *sigmas), keep)
 
-    draws = draw_subsets(problem, T_planes, options.n_draws, options.n_rounds, options.seed, progress)
+    draws = draw_subsets(problem, T_planes, options.n_draws, parts.n_rounds, options.seed, progress)
     # Draws judge the solution and do not choose it: all begin at the same place.
-    solution = problem.solve(np.ones((1, problem.n_captures)), T_planes, options.n_rounds)
+    solution = problem.solve(np.ones((1, problem.n_captures)), T_planes, parts.n_rounds)
     covariances = _covariances(fitted, board, options, problem, solution)
     held_out = np.full(len(features), np.nan) if draws is None else draws.capture_held_out_m
     certificates, cov = solution.certificates, covariances[0] + covariances[1]
@@ -112,31 +112,26 @@ def _start(
 
 
 def _weights(
-    options: CalibrateOptions, features: Sequence[CaptureFeatures], plane_sigma_m: float, edge_sigma_m: float
+    parts: Algorithm1Parts, features: Sequence[CaptureFeatures], plane_sigma_m: float, edge_sigma_m: float
 ) -> Weights:
-    """Weigh by the options where they give both weights, else by likelihood.
+    """Weigh by likelihood.
 
     The camera's and the LiDAR's plane differ in three ways, by an offset and two tilts, however many points
     the LiDAR's has; its ring ends err independently, by where their rays happen to fall. A capture's mean
     squares therefore count 3 / sigma_plane^2 and M / sigma_edge^2, with M ring ends.
     """
-    unit = 1 / NOMINAL_SIGMA_M**2
     n_ends = float(np.mean([len(f.edge_points) for f in features]))
-    if options.plane_weight is None or options.edge_weight is None:
-        plane, edge = _PLANE_FREEDOMS / plane_sigma_m**2, n_ends / edge_sigma_m**2
-    else:
-        plane, edge = options.plane_weight * unit, options.edge_weight * unit
     return Weights(
-        plane=plane if options.use_ptpl else 0.0,
-        edge=edge if options.use_ptl else 0.0,
-        shift_prior=options.edge_shift_precision,
+        plane=PLANE_FREEDOMS / plane_sigma_m**2 if parts.use_planes else 0.0,
+        edge=n_ends / edge_sigma_m**2 if parts.use_ends else 0.0,
+        shift_prior=parts.edge_shift_precision,
     )
 
 
 def _covariances(
     observations: Sequence[Observation],
     board: Board,
-    options: CalibrateOptions,
+    options: EstimateSettings,
     problem: Problem,
     solution: Solutions,
 ) -> tuple[Array, Array]:
@@ -146,20 +141,16 @@ def _covariances(
         What the scatter between captures shows, and what the LiDAR's errors common to them add.
     """
     x, edge_ids = solution.x[0], solution.edge_ids[0]
-    gradients, hessians = linearise(problem, x, edge_ids)
-    prior = np.zeros_like(hessians[0])
-    if problem.weights.shift_prior is not None:
-        prior[6, 6] = problem.weights.shift_prior
-    # Captures of one placement share its errors: they are left out together.
-    placement = group_placements(observations)
-    together = [sum_by_group(each, placement) for each in (gradients, hessians)]
-    scatter = jackknife_covariance(together[0], together[1], prior)
+    cost = problem.quadratics(x, edge_ids, group_placements(observations))
+    scatter = cost.jackknife_covariance()
     laser_m, offset_m = options.laser_bias_sigma_m, options.range_offset_sigma_m
     if laser_m == 0 and offset_m == 0:
         return scatter, np.zeros_like(scatter)
-    information = hessians.sum(axis=0) + prior
-    sensitivities = ring_sensitivities(observations, board, options, problem, x, edge_ids, information)
-    return scatter, systematic_covariance(sensitivities, laser_m, offset_m)
+    sensitivities = ring_sensitivities(
+        observations, board, options.parts.features, problem, x, edge_ids, cost.information
+    )
+    lasers, offset = systematic_covariances(sensitivities, laser_m, offset_m)
+    return scatter, lasers + offset
 
 
 def _diagnostics(

@@ -11,24 +11,22 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.expansion import SHIFT, end_rows
-from lce_rig.calibrate.features import CaptureFeatures
+from lce_rig.calibrate.expansion import SHIFT
 from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array, transform
-from lce_rig.core.results import LidarBoard, Observation
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Observation
+from lce_rig.residuals.along_rays import describe_background
+from lce_rig.residuals.features import CaptureFeatures
+from lce_rig.residuals.plane_and_ends import end_residuals, end_rows
+from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.solvers.covariance import symmetric_inverse
-from lce_rig.solvers.jackknife import jackknife_scatter, leave_one_out_moves
 
-BLENDS_M = 0.35
-"""Echoes from surfaces nearer to each other than this blend into one."""
 BACKGROUND_SIGMAS_M = (0.015, 0.01, 0.015)
 """What is believed of the shifts by the background, in the order of `describe_background`."""
 # What is believed of the extrinsic near which the shifts are sought.
 _SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD = 0.02, 0.01
 _N_SHIFTS = len(BACKGROUND_SIGMAS_M)
-BLENDS = 1
-"""Column of `describe_background` that tells whether the background's echo blends into the board's."""
 # Noise of a ring end, and beyond how many sigmas one counts less.
 _END_SIGMA_M, _HUBER = 0.003, 1.5
 _ROUNDS = 5
@@ -38,22 +36,6 @@ _TOGETHER = ((0, 1, 2), (0,), (1, 2))
 _MIN_CAPTURES = 5
 # They count if they would come about by chance in one session of so many.
 _ONE_IN = 1000
-
-
-def is_blended(lidar: LidarBoard) -> NDArray[np.bool_]:
-    """Tell of each ring end (M,) whether something stands close behind the board, along the beam."""
-    cosine = np.abs(lidar.edge_points @ lidar.plane[:3]) / np.linalg.norm(lidar.edge_points, axis=1)
-    return np.asarray(lidar.edge_behind_m < BLENDS_M * cosine)
-
-
-def describe_background(lidar: LidarBoard) -> Array:
-    """Tell what is behind each ring end (M, 3).
-
-    Columns are the background's share of the power where it is far behind, whether it blends, and its share
-    where it does.
-    """
-    blends = is_blended(lidar)
-    return np.stack([lidar.edge_echo * ~blends, blends, lidar.edge_echo * blends], axis=1)
 
 
 def estimate_shifts(
@@ -109,8 +91,8 @@ def _fit_shifts(
         x = np.linalg.solve(information, A.T @ (weights * inside_m))
     gradients = np.add.reduceat(A * (weights * (A @ x - inside_m))[:, None], first, axis=0)
     hessians = np.add.reduceat(A[:, :, None] * (weights[:, None] * A)[:, None, :], first, axis=0)
-    moves = leave_one_out_moves(gradients, hessians, hessians.sum(axis=0) + prior)
-    scatter = jackknife_scatter(moves)
+    cost = Quadratics(gradients, hessians, prior, prior @ x, np.arange(len(first)))
+    scatter = jackknife_scatter(cost.moves())
     return x[-_N_SHIFTS:], scatter[-_N_SHIFTS:, -_N_SHIFTS:]
 
 
@@ -134,7 +116,7 @@ def move_ends(
     """Take the shifts (3,) of `estimate_shifts` off ring ends."""
     moved = []
     for observation, f in zip(observations, features, strict=True):
-        edge = board.nearest_edge(transform(f.T_board_cam @ T_cam_lidar, f.edge_points))
+        _, edge = end_residuals(f, T_cam_lidar, board)
         outwards = f.edge_normals[edge] @ T_cam_lidar[:3, :3]
         shift = (describe_background(observation.lidar) @ shifts_m)[:, None] * outwards
         lidar = replace(observation.lidar, edge_points=observation.lidar.edge_points - shift)

@@ -4,33 +4,29 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from lce_rig.calibrate.algorithm_1 import calibrate_by_algorithm_1
-from lce_rig.calibrate.baselines.corners import calibrate_by_corners
-from lce_rig.calibrate.baselines.zhou2018 import calibrate_by_lines_and_planes
 from lce_rig.calibrate.consensus import Consensus, find_consensus
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.likelihood import calibrate_by_likelihood
-from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates, Method
+from lce_rig.calibrate.options import CaptureCandidates, EstimateSettings, Estimator, Method
 from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.results import Observation
 
 Progress = Callable[[int, int], None]
 
-METHODS: Mapping[
-    Method, Callable[[Sequence[Observation], Board, CalibrateOptions, Progress | None], CalibrationEstimate]
-] = {
+# Three planes determine six unknowns.
+_MIN_CAPTURES = 3
+METHODS: Mapping[Method, Estimator] = {
     "ml": calibrate_by_likelihood,
     "paper": calibrate_by_algorithm_1,
-    "zhou": calibrate_by_lines_and_planes,
-    "corners": calibrate_by_corners,
 }
 """Name -> what estimates T_cam_lidar from boards whose pairing is settled."""
 
 
-def calibrate(
+def fit_extrinsic(
     candidates: Sequence[CaptureCandidates],
     board: Board,
-    options: CalibrateOptions | None = None,
+    options: EstimateSettings | None = None,
     progress: Progress | None = None,
 ) -> CalibrationEstimate:
     """Estimate T_cam_lidar from what both sensors saw of the board.
@@ -45,8 +41,8 @@ def calibrate(
         NotEnoughDataError: too few captures, captures that agree with no extrinsic, or captures that leave a
             direction undetermined, which is named.
     """
-    options = options or CalibrateOptions()
-    consensus = agree(candidates, board, options)
+    options = options or EstimateSettings()
+    consensus = agree(candidates, board)
     estimate = calibrate_observations(consensus.observations, board, options, progress)
     return with_consensus(estimate, consensus)
 
@@ -54,10 +50,10 @@ def calibrate(
 def calibrate_observations(
     observations: Sequence[Observation],
     board: Board,
-    options: CalibrateOptions,
+    options: EstimateSettings,
     progress: Progress | None = None,
 ) -> CalibrationEstimate:
-    """Estimate T_cam_lidar by the method of the options from boards whose pairing is settled.
+    """Estimate T_cam_lidar by the settings' method from boards whose pairing is settled.
 
     Args:
         observations: one a capture.
@@ -68,7 +64,8 @@ def calibrate_observations(
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
-    estimate = METHODS[options.method](observations, board, options, progress)
+    estimator = options.estimator or METHODS[options.method]
+    estimate = estimator(observations, board, options, progress)
     return replace(estimate, method=options.method)
 
 
@@ -81,13 +78,13 @@ def with_consensus(estimate: CalibrationEstimate, consensus: Consensus) -> Calib
     )
 
 
-def agree(candidates: Sequence[CaptureCandidates], board: Board, options: CalibrateOptions) -> Consensus:
+def agree(candidates: Sequence[CaptureCandidates], board: Board) -> Consensus:
     """Find the consensus, or explain why there is none.
 
     Raises:
         NotEnoughDataError: too few captures, or captures that agree with no extrinsic.
     """
-    needed = max(3, options.min_captures)
+    needed = _MIN_CAPTURES
     if len(candidates) < needed:
         raise NotEnoughDataError(
             f"{len(candidates)} captures show the board in both sensors, {needed} are needed",

@@ -5,24 +5,24 @@ The extrinsics of both cameras with one LiDAR say the same thing by another way.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate.doubt import SURPRISING_CHI2, Doubt, Verdict
+from lce_rig.calibrate.doubt import SURPRISING_CHI2, doubt
 from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.expansion import Expansion
 from lce_rig.calibrate.halves import contrast_halves, doubt_halves
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.picture_terms import stack_pictures
 from lce_rig.calibrate.mean_pose import mean_pose
-from lce_rig.calibrate.placements import group_placements
 from lce_rig.calibrate.relative_pose import relative_covariance, relative_pose
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation
+from lce_rig.residuals.placements import group_placements
+from lce_rig.residuals.quadratics import Quadratics, without_prior
 from lce_rig.rig import CalibrationSettings, VerdictSettings
 from lce_rig.solvers.covariance import symmetric_inverse
-from lce_rig.solvers.jackknife import jackknife_covariance, sum_by_group
 
 # Fewer placements show no scatter.
 _MIN_PLACEMENTS = 4
@@ -32,6 +32,11 @@ _MIN_JACKKNIFE = 10
 _STUDENT = 5.0
 # Boards scatter for a reason where they do so by this many times what is usual.
 _MAX_SCATTER = 2.0
+
+_BY_IMAGES = {
+    "verdict.changed": "verdict.camera_changed",
+    "verdict.shares_differ": "verdict.camera_shares_differ",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +51,7 @@ class PicturePose:
         board_rms_m: how far apart the two cameras put the middle of a board, rms.
         scatter: of single boards about it, in standard deviations that poses in pictures usually have.
         expansion: of the cost about T_second_first, capture by capture.
+        centres: (F, 3) middle of the board in each, frame of the first camera, m.
     """
 
     T_second_first: Array
@@ -53,7 +59,8 @@ class PicturePose:
     captures: tuple[str, ...]
     board_rms_m: float
     scatter: float
-    expansion: Expansion
+    expansion: Quadratics
+    centres: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,15 +147,15 @@ def pose_from_pictures(shared: Sequence[tuple[Observation, Observation]]) -> Pic
     chi2 = float(np.einsum("ki,kij,kj->", apart, information, apart))
     hessians = weight[:, None, None] * information
     gradients = -(hessians @ apart[..., None])[..., 0]
-    none, board_rms_m = np.zeros((6, 6)), _board_rms_m(shared, mean)
-    expansion = Expansion(mean, gradients, hessians, none, placement, T_first[:, :3, 3])
+    expansion = without_prior(gradients, hessians, placement)
     scatter = float(np.sqrt(chi2 / (6 * (len(T) - 1))))
-    pulls, stiffness = (sum_by_group(each, placement) for each in (gradients, hessians))
-    if len(pulls) < _MIN_JACKKNIFE:
-        cov = max(scatter, 1.0) ** 2 * symmetric_inverse(stiffness.sum(axis=0))
+    if len(expansion.groups) < _MIN_JACKKNIFE:
+        cov = max(scatter, 1.0) ** 2 * expansion.covariance()
     else:
-        cov = jackknife_covariance(pulls, stiffness, none)
-    return PicturePose(mean, cov, tuple(one.capture for one in firsts), board_rms_m, scatter, expansion)
+        cov = expansion.jackknife_covariance()
+    captures = tuple(one.capture for one in firsts)
+    board_rms_m = _board_rms_m(shared, mean)
+    return PicturePose(mean, cov, captures, board_rms_m, scatter, expansion, T_first[:, :3, 3])
 
 
 def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
@@ -178,7 +185,7 @@ def _board_rms_m(shared: Sequence[tuple[Observation, Observation]], T_second_fir
 
 def doubt_cameras(
     pair: CameraPair, names: tuple[str, str], target: CalibrationSettings, limits: VerdictSettings
-) -> list[Doubt]:
+) -> list[Finding]:
     """Doubt the extrinsics of two cameras that contradict the cameras' own pictures.
 
     Args:
@@ -191,28 +198,21 @@ def doubt_cameras(
         return []
     # Pictures are exact enough to show any change that matters.
     strict = limits.model_copy(update={"max_change": limits.max_camera_difference})
-    changed = doubt_halves(contrast_halves(pair.pictures.expansion), pair.pictures.captures, target, strict)
-    first, second = names
+    halves = contrast_halves(pair.pictures.expansion, pair.pictures.centres)
+    changed = doubt_halves(halves, pair.pictures.captures, target, strict)
+    by_images = [replace(each, code=_BY_IMAGES[each.code], subject=" to ".join(names)) for each in changed]
     return [
-        *(
-            Doubt(doubt.verdict, f"{first} to {second}, by their pictures alone: {doubt.text}")
-            for doubt in changed
-        ),
+        *by_images,
         *_scattered(pair.pictures, names, limits),
         *_elsewhere(pair, pair.pictures, pair.apart, names, target, limits),
     ]
 
 
-def _scattered(pictures: PicturePose, names: tuple[str, str], limits: VerdictSettings) -> list[Doubt]:
+def _scattered(pictures: PicturePose, names: tuple[str, str], limits: VerdictSettings) -> list[Finding]:
     if pictures.scatter <= _MAX_SCATTER or pictures.board_rms_m <= limits.max_plane_misfit_m:
         return []
-    first, second = names
-    text = (
-        f"wherever {first} sits to {second}, their pictures put the same board "
-        f"{1000 * pictures.board_rms_m:.0f} mm apart (rms; {pictures.scatter:.1f} times what is usual): "
-        "did the board move between the pictures, or is an intrinsic wrong?"
-    )
-    return [Doubt("marginal", text)]
+    figures = {"rms_m": pictures.board_rms_m, "scatter": pictures.scatter}
+    return [doubt("verdict.cameras_scatter", figures, is_fail=False, subject=" to ".join(names))]
 
 
 def _elsewhere(
@@ -222,17 +222,16 @@ def _elsewhere(
     names: tuple[str, str],
     target: CalibrationSettings,
     limits: VerdictSettings,
-) -> list[Doubt]:
-    first, second = names
+) -> list[Finding]:
     rotation_deg, translation_m = tangent_sizes(apart)
     excess = target.in_targets(rotation_deg, translation_m) / limits.max_camera_difference
     if pair.surprise <= SURPRISING_CHI2 or excess <= 1:
         return []
-    verdict: Verdict = "fail" if excess > limits.fail_factor else "marginal"
-    text = (
-        f"{first} and {second} put the same board {1000 * pair.board_rms_m:.0f} mm apart "
-        f"({1000 * pictures.board_rms_m:.0f} mm by their pictures alone): extrinsics and pictures differ by "
-        f"{rotation_deg:.2f} deg, {1000 * translation_m:.0f} mm on where one camera sits to the other: "
-        "was one of them nudged, or is an intrinsic wrong?"
-    )
-    return [Doubt(verdict, text)]
+    figures = {
+        "rms_m": pair.board_rms_m,
+        "images_rms_m": pictures.board_rms_m,
+        "rotation_deg": rotation_deg,
+        "translation_m": translation_m,
+    }
+    is_fail = excess > limits.fail_factor
+    return [doubt("verdict.cameras_differ", figures, is_fail=is_fail, subject=" to ".join(names))]

@@ -16,8 +16,7 @@ from lce_rig.calibrate.calibrate import agree, calibrate_observations, with_cons
 from lce_rig.calibrate.consensus import Consensus
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.motion import PoseSamples, fit_motions
-from lce_rig.calibrate.options import CalibrateOptions, CaptureCandidates
-from lce_rig.calibrate.problem import Weights
+from lce_rig.calibrate.options import CaptureCandidates, EstimateSettings
 from lce_rig.calibrate.shared_scans import (
     Clocks,
     SharedScan,
@@ -31,6 +30,8 @@ from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference
 from lce_rig.core.results import ChannelResult, Observation
+from lce_rig.residuals.moments import Weights
+from lce_rig.residuals.plane_and_ends import along_normals
 
 # Fewer captures with known motion say nothing about clocks.
 _MIN_MOVING = 6
@@ -39,30 +40,13 @@ _MOVED = 1.0
 _N_SHARES = 7
 
 
-@dataclass(frozen=True, eq=False)
-class ChannelsEstimate:
-    """An extrinsic from all channels.
-
-    Attributes:
-        estimate: from all of them together.
-        channels: what each says alone, by name.
-        difference: (6,) tangent between the two channels' extrinsics; None with one channel.
-        difference_cov: (6, 6) of it.
-    """
-
-    estimate: CalibrationEstimate
-    channels: tuple[ChannelResult, ...]
-    difference: Array | None = None
-    difference_cov: Array | None = None
-
-
 def calibrate_channels(
     candidates: Mapping[str, Sequence[CaptureCandidates]],
     board: Board,
-    options: CalibrateOptions,
+    options: EstimateSettings,
     clocks: Clocks,
     progress: Callable[[int, int], None] | None = None,
-) -> ChannelsEstimate:
+) -> CalibrationEstimate:
     """Estimate T_cam_lidar from what the channels of one camera and a LiDAR saw of the board.
 
     Args:
@@ -76,7 +60,7 @@ def calibrate_channels(
     Raises:
         NotEnoughDataError: no channel has captures enough, or they leave a direction undetermined.
     """
-    agreed = _agree(candidates, board, options)
+    agreed = _agree(candidates, board)
     scans, conflicts = join_scans(agreed, candidates)
     noise_px = {name: pooled_noise_px([o.image for o in c.observations]) for name, c in agreed.items()}
     samples = sample_scans(scans, clocks, noise_px)
@@ -87,7 +71,7 @@ def calibrate_channels(
         estimate = with_consensus(estimate, consensus)
         n_captures = len(consensus.observations)
         result = _channel_result(name, n_captures, noise_px[name], estimate, estimate, None)
-        return ChannelsEstimate(estimate, (result,))
+        return replace(estimate, channels=(result,))
     still = {name: _alone(consensus, board, options) for name, consensus in agreed.items()}
     start = next(iter(still.values()))
     offsets = _offsets(samples, scans, board, options, clocks, start) if is_moving else None
@@ -103,7 +87,8 @@ def calibrate_channels(
         )
         for name in sorted(agreed)
     )
-    return ChannelsEstimate(estimate, results, *_difference(mover, results, board, options))
+    apart, cov = _difference(mover, results, board, options)
+    return replace(estimate, channels=results, channel_difference=apart, channel_difference_cov=cov)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,15 +120,13 @@ def _still_observation(scan: SharedScan, only: str | None) -> Observation:
     return scan.observation() if only is None else Observation(scan.capture, scan.images[only], scan.lidar)
 
 
-def _agree(
-    candidates: Mapping[str, Sequence[CaptureCandidates]], board: Board, options: CalibrateOptions
-) -> dict[str, Consensus]:
+def _agree(candidates: Mapping[str, Sequence[CaptureCandidates]], board: Board) -> dict[str, Consensus]:
     """Find each channel's consensus, the channel with the steadiest corners first."""
     agreed: dict[str, Consensus] = {}
     troubles: list[NotEnoughDataError] = []
     for channel, items in candidates.items():
         try:
-            agreed[channel] = agree(items, board, options)
+            agreed[channel] = agree(items, board)
         except NotEnoughDataError as error:
             troubles.append(error)
     if not agreed:
@@ -152,13 +135,15 @@ def _agree(
     return {name: agreed[name] for name in sorted(agreed, key=lambda name: noise[name])}
 
 
-def _alone(consensus: Consensus, board: Board, options: CalibrateOptions) -> CalibrationEstimate:
+def _alone(consensus: Consensus, board: Board, options: EstimateSettings) -> CalibrationEstimate:
     """Calibrate one channel by Algorithm 1 as if boards stood still, without draws."""
-    return calibrate_observations(consensus.observations, board, replace(options, method="paper", n_draws=0))
+    return calibrate_observations(
+        consensus.observations, board, replace(options, method="paper", estimator=None, n_draws=0)
+    )
 
 
 def _alone_moved(
-    mover: _Mover, channel: str, board: Board, options: CalibrateOptions, offsets: TimeOffsets | None
+    mover: _Mover, channel: str, board: Board, options: EstimateSettings, offsets: TimeOffsets | None
 ) -> CalibrationEstimate:
     only = channel if len(mover.samples.channels) > 1 else None
     return _widened(
@@ -170,7 +155,7 @@ def _offsets(
     samples: PoseSamples,
     scans: Sequence[SharedScan],
     board: Board,
-    options: CalibrateOptions,
+    options: EstimateSettings,
     clocks: Clocks,
     start: CalibrationEstimate,
 ) -> TimeOffsets | None:
@@ -179,7 +164,7 @@ def _offsets(
     weights = Weights(
         plane=start.diagnostics["plane_weight"] * unit,
         edge=start.diagnostics["edge_weight"] * unit,
-        shift_prior=options.edge_shift_precision,
+        shift_prior=options.parts.edge_shift_precision,
     )
     moving = np.flatnonzero(samples.tells_motion).tolist()
     offsets = estimate_time_offsets(
@@ -233,17 +218,15 @@ def _channel_result(
 
 def depth_scatter_m(estimate: CalibrationEstimate) -> float:
     """Compute the standard deviation over captures of the LiDAR's mean distance from the camera's plane."""
-    T = estimate.T_cam_lidar
-    depths = []
-    for observation in estimate.observations.values():
-        T_cam_board = observation.image.T_cam_board
-        middle = T[:3, :3] @ observation.lidar.points.mean(axis=0) + T[:3, 3]
-        depths.append(float(T_cam_board[:3, 2] @ (middle - T_cam_board[:3, 3])))
+    seen = estimate.observations.values()
+    T_cam_board = np.array([observation.image.T_cam_board for observation in seen])
+    middles = np.array([observation.lidar.points.mean(axis=0) for observation in seen])
+    depths = along_normals(T_cam_board[:, :3, 2], T_cam_board[:, :3, 3], middles, estimate.T_cam_lidar)
     return float(np.std(depths))
 
 
 def _difference(
-    mover: _Mover, results: Sequence[ChannelResult], board: Board, options: CalibrateOptions
+    mover: _Mover, results: Sequence[ChannelResult], board: Board, options: EstimateSettings
 ) -> tuple[Array | None, Array | None]:
     """Hold two channels' extrinsics against each other: the tangent (6,) between them and its covariance.
 

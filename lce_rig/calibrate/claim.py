@@ -1,14 +1,13 @@
 """Is the claimed uncertainty as large as captures drawn anew, left out singly or split in halves show?"""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.expansion import Expansion
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
+from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.rig import VerdictSettings
-from lce_rig.solvers.jackknife import jackknife_scatter
 
 _N_DRAWS = 300
 
@@ -32,12 +31,12 @@ class Spread:
 
         Returns:
             By how much the largest of the three exceeds the claim, in standard deviations of rotation or of
-            translation, and which it is, in words.
+            translation, and which it is.
         """
         ways = {
-            "captures drawn anew": self.bootstrap,
-            "captures left out one by one": self.left_out,
-            "random halves of the captures": self.halves,
+            "bootstrap": self.bootstrap,
+            "left_out": self.left_out,
+            "halves": self.halves,
         }
         ratios = {
             words: float(
@@ -54,7 +53,7 @@ class Spread:
         return ratios[words], words
 
 
-def resample(expansion: Expansion, seed: int = 0) -> Spread:
+def resample(expansion: Quadratics, seed: int = 0) -> Spread:
     """Spread the extrinsic by resampling placements.
 
     Args:
@@ -89,17 +88,19 @@ def _robust_cov(tangents: Array) -> Array:
     return np.asarray(kept.T @ kept / len(kept))
 
 
-def widen(
-    estimate: CalibrationEstimate, spread: Spread, limits: VerdictSettings
-) -> tuple[CalibrationEstimate, str]:
-    """Widen a claimed covariance that is smaller than the spread of resampled captures.
+def widening(cov: Array, spread: Spread, limits: VerdictSettings) -> tuple[float, Finding | None]:
+    """Compare a claimed covariance with the spread of resampled captures.
+
+    Args:
+        cov: (6, 6) as the method claims it.
+        spread: of the same extrinsic.
+        limits: of the verdict.
 
     Returns:
-        The estimate, its covariance multiplied where that is needed, and a remark that says why; else empty.
+        By how many times standard deviations are to be widened, 1 where the claim is large enough; and a
+        note that says why, else None.
     """
-    ratio, words = spread.ratio_to(estimate.cov)
+    ratio, way = spread.ratio_to(cov)
     if ratio <= limits.max_spread_ratio:
-        return estimate, ""
-    figures = {**estimate.diagnostics, "sigma_widened": ratio}
-    remark = f"standard deviations are {ratio:.1f} times what the method claims: {words} spread that far"
-    return replace(estimate, cov=ratio**2 * estimate.cov, diagnostics=figures), remark
+        return 1.0, None
+    return ratio, Finding("verdict.widened", "note", figures={"ratio": ratio, "spread": way})

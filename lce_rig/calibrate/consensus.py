@@ -220,19 +220,13 @@ def _observation(item: CaptureCandidates, pairs: _Pairs, index: int) -> Observat
 def _explain(item: CaptureCandidates, pairs: _Pairs, rows: NDArray[np.intp], R: Array, t: Array) -> Refusal:
     """Say by how much the best pair of a capture misses the consensus."""
     if len(rows) == 0:
-        return Refusal(
-            "pair", "no place in the scan looks like the board", "move the board clear of other things"
-        )
+        return Refusal("pair.no_candidate")
     angle, distance = (values[0, rows] for values in _misfit(pairs, R[None], t[None]))
     best = int(np.argmin((angle / NORMAL_TOLERANCE_RAD) ** 2 + (distance / CENTRE_TOLERANCE_M) ** 2))
-    n = len(item.lidar)
-    places = "the only place" if n == 1 else f"the best of {n} places"
-    cause = (
-        f"{places} in the scan lies {100 * distance[best]:.0f} cm and {np.degrees(angle[best]):.0f} deg from "
-        "where the picture and the other captures put the board"
-    )
-    if distance[best] > _MOVED_M:
-        return Refusal("pair", cause, "hold the board still and clear of other things while capturing")
-    return Refusal(
-        "pair", cause, "come closer or tilt the board more, so that both sensors see its tilt well"
-    )
+    figures = {
+        "n_candidates": len(item.lidar),
+        "distance_m": float(distance[best]),
+        "rotation_deg": float(np.degrees(angle[best])),
+    }
+    action = "hold_still" if distance[best] > _MOVED_M else ""
+    return Refusal("pair.elsewhere", figures=figures, action=action)

@@ -9,14 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.calibrate.doubt import Doubt, Verdict
-from lce_rig.calibrate.expansion import PLANE_FREEDOMS, Expansion, FeatureSigmas, feature_sigmas
-from lce_rig.calibrate.features import CaptureFeatures, extract_features
-from lce_rig.calibrate.observability import name_direction
-from lce_rig.calibrate.options import CalibrateOptions
+from lce_rig.calibrate.doubt import doubt
+from lce_rig.calibrate.observability import lever_arm, name_direction
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array, perturb, transform
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import Observation
+from lce_rig.residuals.features import extract_features
+from lce_rig.residuals.plane_and_ends import capture_costs, feature_sigmas
+from lce_rig.residuals.quadratics import Quadratics
 from lce_rig.rig import CalibrationSettings
 
 # A gain in the wrong direction that is this many of its standard errors sure is no chance.
@@ -43,7 +44,7 @@ def run_control(
     board: Board,
     T_cam_lidar: Array,
     cov: Array,
-    expansion: Expansion,
+    expansion: Quadratics,
     target: CalibrationSettings,
     n_sigmas: float,
 ) -> Control:
@@ -60,7 +61,8 @@ def run_control(
         target: the result is moved by no less than this, in rotation or in translation.
         n_sigmas: by how many standard deviations it is moved otherwise.
     """
-    lever_m = float(np.sqrt(np.mean(np.sum(expansion.centres**2, axis=1))))
+    features = [extract_features(seen, board) for seen in observations]
+    lever_m = lever_arm(features)
     scale = np.r_[np.ones(3), np.full(3, lever_m)]
     values, vectors = np.linalg.eigh(cov * np.outer(scale, scale))
     steps = n_sigmas * (np.sqrt(np.maximum(values, 0)) * vectors).T / scale
@@ -72,11 +74,10 @@ def run_control(
     moves = np.concatenate([steps, -steps])
     left_out = expansion.without_each()[expansion.placement]
     own = perturb(T_cam_lidar, left_out)
-    features = [extract_features(seen, board, CalibrateOptions()) for seen in observations]
     sigmas = feature_sigmas(features, board, T_cam_lidar)
     costs = np.array(
         [
-            _costs(f, board, perturb(T, np.vstack([np.zeros(6), moves])), sigmas)
+            capture_costs(f, board, perturb(T, np.vstack([np.zeros(6), moves])), sigmas)
             for f, T in zip(features, own, strict=True)
         ]
     )
@@ -85,26 +86,16 @@ def run_control(
     return Control(moves, increase.mean(axis=0), increase.std(axis=0, ddof=1) / np.sqrt(len(observations)))
 
 
-def _costs(f: CaptureFeatures, board: Board, T: Array, sigmas: FeatureSigmas) -> Array:
-    """Sum a capture's squared distances from plane and edges under T (B, 4, 4), weighed as by `expand`."""
-    plane = ((transform(T, f.plane_points) - f.centre) @ f.normal) ** 2
-    ends = transform(f.T_board_cam @ T, f.edge_points)
-    anchors, normals = board.edges()
-    edge = board.nearest_edge(ends)
-    beyond = np.sum((ends - anchors[edge]) * normals[edge], axis=-1)
-    # Returns reach beyond the plate by the beam's width, alike on all sides.
-    own = beyond - beyond.mean(axis=1, keepdims=True) if beyond.shape[1] else beyond
-    by_plane = PLANE_FREEDOMS * plane.mean(axis=1) / sigmas.plane_m**2
-    return np.asarray(by_plane + np.sum(own**2, axis=1) / sigmas.end_m**2)
-
-
-def doubt_control(control: Control) -> list[Doubt]:
+def doubt_control(control: Control) -> list[Finding]:
     """Doubt a result that captures left out do not tell from a bad one."""
     worst = int(np.argmin(control.worse / control.worse_sigma))
     if control.worse[worst] > 0:
         return []
     move = control.moves[worst]
-    verdict: Verdict = "fail" if control.worse[worst] < -_SURE * control.worse_sigma[worst] else "marginal"
-    figures = f"{np.degrees(np.linalg.norm(move[3:])):.2f} deg and {1000 * np.linalg.norm(move[:3]):.0f} mm"
-    text = f"moved by {figures} ({name_direction(move)}) the result fits captures left out as well or better"
-    return [Doubt(verdict, f"{text}: collect more captures; if it stays, measure the board anew")]
+    figures: dict[str, Figure] = {
+        "rotation_deg": float(np.degrees(np.linalg.norm(move[3:]))),
+        "translation_m": float(np.linalg.norm(move[:3])),
+        "direction": name_direction(move),
+    }
+    is_fail = bool(control.worse[worst] < -_SURE * control.worse_sigma[worst])
+    return [doubt("verdict.control", figures, is_fail=is_fail)]

@@ -1,24 +1,23 @@
-"""One reason against a result, and how bad it is."""
+"""Findings against a result, and the verdict that they amount to."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from typing import Literal
+
+from lce_rig.core.findings import Figure, Finding, Severity, worst
 
 Verdict = Literal["pass", "marginal", "fail"]
 SURPRISING_CHI2 = 16.81
 """99 % of the chi-squared distribution of six freedoms: differences beyond it are no chance."""
-_ORDER: tuple[Verdict, ...] = ("pass", "marginal", "fail")
+_VERDICTS: Mapping[Severity, Verdict] = {"note": "pass", "warning": "marginal", "error": "fail"}
 
 
-@dataclass(frozen=True)
-class Doubt:
-    """One reason, with its figure and what to do; a "pass" is a remark and does not count."""
+def doubt(
+    code: str, figures: Mapping[str, Figure], *, is_fail: bool, subject: str = "", action: str = ""
+) -> Finding:
+    """Make a finding that allows no pass: an error where the result fails by it, else a warning."""
+    return Finding(code, "error" if is_fail else "warning", subject, figures, action)
 
-    verdict: Verdict
-    text: str
 
-
-def weigh(doubts: Iterable[Doubt]) -> tuple[Verdict, tuple[str, ...]]:
-    """Take the worst of all doubts, and list them worst first, otherwise in the order given."""
-    ordered = sorted(doubts, key=lambda doubt: -_ORDER.index(doubt.verdict))
-    return ordered[0].verdict if ordered else "pass", tuple(doubt.text for doubt in ordered)
+def verdict_of(findings: Iterable[Finding]) -> Verdict:
+    """Give the verdict that findings amount to."""
+    return _VERDICTS[worst(findings)]

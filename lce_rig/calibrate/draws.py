@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.problem import Problem
 from lce_rig.core.geometry import Array, pose, project_to_so3
+from lce_rig.residuals.moments import Problem
 
 MIN_SUBSET = 3
 _CHUNK = 1000

@@ -3,30 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from lce_rig.calibrate.expansion import Expansion
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Certificate, Metrics, Observation, Refusal
-
-
-@dataclass(frozen=True)
-class CaptureResidual:
-    """How well one capture fits an extrinsic.
-
-    Attributes:
-        capture: its name.
-        plane_mean_m, plane_rms_m: distance of the LiDAR's board points from the camera's board plane.
-        edge_mean_m, edge_rms_m: distance in the board's plane of ring ends from the board's edges.
-        held_out_m: rms of both where the capture was not fitted; NaN without draws.
-        reprojection_px: rms corner residual of the board's pose.
-    """
-
-    capture: str
-    plane_mean_m: float
-    plane_rms_m: float
-    edge_mean_m: float
-    edge_rms_m: float
-    held_out_m: float
-    reprojection_px: float
+from lce_rig.core.results import CaptureResidual, Certificate, ChannelResult, Metrics, Observation, Refusal
+from lce_rig.residuals.quadratics import Quadratics
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +32,9 @@ class CalibrationEstimate:
         expansion: the method's own cost about its result, capture by capture, in the extrinsic (and those of
             cameras estimated with it) alone; None of methods that give none.
         estimated_with: cameras whose extrinsics were estimated together with this one.
+        channels: what each channel of the camera says alone; empty where they were not told apart.
+        channel_difference: (6,) tangent between the extrinsics of two channels; None with one channel.
+        channel_difference_cov: (6, 6) of it.
     """
 
     T_cam_lidar: Array
@@ -68,5 +50,8 @@ class CalibrationEstimate:
     weak_direction: str
     diagnostics: Mapping[str, float]
     method: str = "paper"
-    expansion: Expansion | None = None
+    expansion: Quadratics | None = None
     estimated_with: tuple[str, ...] = ()
+    channels: tuple[ChannelResult, ...] = ()
+    channel_difference: Array | None = None
+    channel_difference_cov: Array | None = None

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.calibrate.claim import resample, widen
+from lce_rig.calibrate.claim import resample, widening
 from lce_rig.calibrate.control import Control, run_control
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.expansion import SCALE, expand
@@ -14,6 +14,8 @@ from lce_rig.calibrate.intrinsics_check import IntrinsicsCheck, check_intrinsics
 from lce_rig.calibrate.intrinsics_estimate import View
 from lce_rig.calibrate.nuisances import Nuisances, estimate_nuisances
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import Array
 from lce_rig.rig import LidarSettings, Rig
 
 # Fewer placements leave nothing to be left out.
@@ -24,19 +26,21 @@ _MAX_VIEWS = 40
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """What the checks found.
+    """What checks on its own captures found about an estimate.
 
     Attributes:
-        estimate: the result, its covariance widened where captures spread it farther than it claims.
-        remark: why it was widened; empty where it was not.
+        cov: (6, 6) to report: the estimate's, widened where captures spread it farther than it claims.
+        widened_by: by how many times the standard deviations were widened; 1 where they were not.
+        remark: why; None where they were not.
         contrasts: shares of the captures that ought to agree.
         control: what happens to left-out captures when the result is moved.
         nuisances: what the captures share beside the extrinsic.
         intrinsics: the profile's, against those that the boards ask for; None where too few boards tell.
     """
 
-    estimate: CalibrationEstimate
-    remark: str
+    cov: Array
+    widened_by: float
+    remark: Finding | None
     contrasts: tuple[Contrast, ...]
     control: Control | None
     nuisances: Nuisances | None
@@ -66,22 +70,25 @@ def examine(
         range_offset_sigma_m=lidar.range_offset_sigma_m,
     )
     if len(expansion.groups) < _MIN_PLACEMENTS:
-        return Examination(estimate, "", (), None, None, intrinsics)
+        return Examination(estimate.cov, 1.0, None, (), None, None, intrinsics)
     settled = expansion.hold(SCALE).settled()
     # A cost made anew scatters as it does itself: a claim is held against the scatter of its own method.
-    widened, remark = widen(estimate, resample(estimate.expansion or settled), rig.verdict)
+    widened_by, remark = widening(estimate.cov, resample(estimate.expansion or settled), rig.verdict)
+    cov = widened_by**2 * estimate.cov
     control = run_control(
         observations,
         board,
         estimate.T_cam_lidar,
-        widened.cov,
+        cov,
         settled,
         rig.calibration,
         rig.verdict.control_sigmas,
     )
     rings = np.unique(np.concatenate([observation.lidar.ring for observation in observations]))
+    centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
     nuisances = estimate_nuisances(expansion, rings)
-    return Examination(widened, remark, contrast_halves(settled), control, nuisances, intrinsics)
+    contrasts = contrast_halves(settled, centres)
+    return Examination(cov, widened_by, remark, contrasts, control, nuisances, intrinsics)
 
 
 def _thinned(views: Sequence[View]) -> list[View]:

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.calibrate.doubt import Doubt, Verdict
-from lce_rig.calibrate.expansion import Expansion
+from lce_rig.calibrate.doubt import doubt
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, tangent_sizes
+from lce_rig.residuals.quadratics import Quadratics
 from lce_rig.rig import CalibrationSettings, VerdictSettings
 
 # Fewer placements are not worth halving.
@@ -22,11 +23,6 @@ _N_LOTS = 400
 _MEDIAN_CHI2 = 5.348
 # Differences beyond this many limits leave nothing to be used.
 _FAIL = 2.0
-_CAUSES = {
-    "near": "is the squares' size or the focal length wrong, or the board bent?",
-    "left": "do the intrinsics belong to this lens? Is the board flat?",
-    "upper": "do the intrinsics belong to this lens? Is the board flat?",
-}
 
 
 @dataclass(frozen=True)
@@ -48,11 +44,12 @@ class Contrast:
     n_first: int
 
 
-def contrast_halves(expansion: Expansion, seed: int = 0) -> tuple[Contrast, ...]:
+def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tuple[Contrast, ...]:
     """Compare shares that ought to agree.
 
     Args:
-        expansion: of captures in the order in which they were taken, settled.
+        expansion: of F captures in the order in which they were taken, settled.
+        centres: (F, 3) middle of the board in each, frame camera, m.
         seed: of the lots.
 
     Returns:
@@ -65,10 +62,10 @@ def contrast_halves(expansion: Expansion, seed: int = 0) -> tuple[Contrast, ...]
     order = np.argsort(np.random.default_rng(seed).random((_N_LOTS, n_placements)), axis=1)
     by_lot, _ = _chi2(expansion, (order < n_placements // 2) @ expansion.groups)
     unit = max(float(np.median(by_lot)) / _MEDIAN_CHI2, 1e-12)
-    x, y, z = expansion.centres.T
+    x, y, z = centres.T
     found = [_changed_on_the_way(expansion, unit)]
     for first, second, key in (
-        ("near", "far", np.linalg.norm(expansion.centres, axis=1)),
+        ("near", "far", np.linalg.norm(centres, axis=1)),
         ("left", "right", x / z),
         ("upper", "lower", y / z),
     ):
@@ -78,7 +75,7 @@ def contrast_halves(expansion: Expansion, seed: int = 0) -> tuple[Contrast, ...]
     return tuple(found)
 
 
-def _changed_on_the_way(expansion: Expansion, unit: float) -> Contrast:
+def _changed_on_the_way(expansion: Quadratics, unit: float) -> Contrast:
     """Find the capture from which on the others differ most; with as many chances as there are captures."""
     n = len(expansion.gradients)
     cuts = np.arange(_MIN_SHARE, n - _MIN_SHARE + 1)
@@ -94,7 +91,7 @@ def _tail(chi2: float) -> float:
     return float(chdtrc(6, chi2))
 
 
-def _chi2(expansion: Expansion, shares: Array) -> tuple[Array, Array]:
+def _chi2(expansion: Quadratics, shares: Array) -> tuple[Array, Array]:
     """Hold shares (B, F) against the rest: squared distance (B,) in units of noise, tangents (B, 6)."""
     H_first = np.tensordot(shares, expansion.hessians, axes=1)
     g_first = shares @ expansion.gradients
@@ -118,7 +115,7 @@ def doubt_halves(
     captures: Sequence[str],
     target: CalibrationSettings,
     limits: VerdictSettings,
-) -> list[Doubt]:
+) -> list[Finding]:
     """Doubt a result whose shares differ by more than the target, and more than lots make them.
 
     Args:
@@ -134,13 +131,12 @@ def doubt_halves(
         excess /= limits.max_change if is_change else limits.max_contrast
         if c.chance > limits.least_chance or excess <= 1:
             continue
-        verdict: Verdict = "fail" if excess > _FAIL else "marginal"
-        by = f"by {c.rotation_deg:.2f} deg and {1000 * c.translation_m:.0f} mm, more than by chance"
+        apart = {"rotation_deg": c.rotation_deg, "translation_m": c.translation_m, "chance": c.chance}
         if is_change:
-            text = (
-                f"captures before {captures[c.n_first]} and from it on differ {by}: was a sensor nudged then?"
-            )
-            doubts.append(Doubt(verdict, f"{text} Fasten it and collect anew"))
+            figures: dict[str, Figure] = {"capture": captures[c.n_first], **apart}
+            doubts.append(doubt("verdict.changed", figures, is_fail=excess > _FAIL))
         else:
-            doubts.append(Doubt(verdict, f"{c.first} and {c.second} boards differ {by}: {_CAUSES[c.first]}"))
+            figures = {"first": c.first, "second": c.second, **apart}
+            action = "near" if c.first == "near" else ""
+            doubts.append(doubt("verdict.shares_differ", figures, is_fail=excess > _FAIL, action=action))
     return doubts

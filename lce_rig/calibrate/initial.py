@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.features import CaptureFeatures
-from lce_rig.calibrate.problem import Problem, Weights
 from lce_rig.core.geometry import Array, pose
+from lce_rig.residuals.features import CaptureFeatures
+from lce_rig.residuals.moments import Problem, Weights
 from lce_rig.solvers.certificate import solve_globally
 from lce_rig.solvers.registration import eliminate_linear, linear_unknowns, rotation_from_directions
 

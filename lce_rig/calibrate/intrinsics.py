@@ -159,11 +159,8 @@ def _fitting(setup: Setup, state: State, channels: NDArray[np.str_]) -> NDArray[
 def _refusals(distances_px: Array, kept: NDArray[np.bool_], views: Sequence[View]) -> dict[str, Refusal]:
     """Say of each view that was left out how far its corners are from where the others' lens puts them."""
     usual = float(np.median(distances_px[kept]))
-    action = "was the board bent, cut off or moving? look at it with `lce-rig check --debug-images`"
     return {
-        view.name: Refusal(
-            "calibrate", f"corners lie {px:.2f} px off the others' lens (usual {usual:.2f})", action
-        )
+        view.name: Refusal("calibrate.other_lens", figures={"rms_px": float(px), "median_px": usual})
         for view, px, is_kept in zip(views, distances_px, kept, strict=True)
         if not is_kept
     }

@@ -7,11 +7,11 @@ profile's in units of its own uncertainty.
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from lce_rig.calibrate.doubt import Verdict, doubt
 from lce_rig.calibrate.intrinsics import distances_under, estimate_intrinsics
 from lce_rig.calibrate.intrinsics_difference import LensDifference, compare_lenses
 from lce_rig.calibrate.intrinsics_estimate import IntrinsicsEstimate, View
@@ -19,8 +19,7 @@ from lce_rig.calibrate.intrinsics_model import model_of
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError
-
-Verdict = Literal["pass", "marginal", "fail"]
+from lce_rig.core.findings import Figure, Finding
 
 # A difference is real where chance makes it this seldom.
 _CHANCE = 0.002
@@ -186,33 +185,19 @@ def describe(check: IntrinsicsCheck) -> str:
     )
 
 
-def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> str:
-    """Say how badly the given intrinsics fit, what is different, and what to do.
+def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
+    """Find that the given intrinsics do not fit, and what is different.
 
     Args:
         check: whose verdict is not "pass".
         target_deg: standard deviation of the extrinsic's rotation to reach.
     """
-    how = "do not fit" if check.verdict(target_deg) == "fail" else "fit only roughly"
-    misfit = f"corners are off by {check.rms_px:.2f} px where {check.possible_px:.2f} px is possible"
-    if check.rms_px < _VISIBLE * check.possible_px:
-        misfit = "corners fit, but only because the boards' poses are off"
-    parts = [misfit]
-    if not np.isfinite(check.displacement_px):
-        parts.append("they draw nothing where boards were seen")
-    elif check.is_bent:
-        moved = f"{check.displacement_px:.1f} +- {check.displacement_sigma_px:.1f} px"
-        parts.append(f"pixels lie {moved} from where the boards put them")
-    if check.is_turned:
-        turned = f"{check.turn_deg:.2f} +- {check.turn_sigma_deg:.2f} deg"
-        parts.append(f"that alone turns the extrinsic by {turned}")
-    cause = "was the lens or the resolution changed?"
-    if check.is_focal_off:
-        percent = 100 * (check.focal_ratio - 1)
-        larger = "larger" if percent > 0 else "smaller"
-        parts.append(f"the focal length looks {abs(percent):.1f} +- {100 * check.focal_sigma:.1f} % {larger}")
-        cause = "was the lens refocused?"
-    return (
-        f"the profile's intrinsics {how}: {'; '.join(parts)}: {cause} "
-        "Run `lce-rig intrinsics` and put its numbers into the profile"
-    )
+    figures: dict[str, Figure] = {
+        **asdict(check),
+        "is_visible": check.rms_px >= _VISIBLE * check.possible_px,
+        "is_bent": check.is_bent,
+        "is_turned": check.is_turned,
+        "is_focal_off": check.is_focal_off,
+    }
+    action = "refocused" if check.is_focal_off else ""
+    return doubt("verdict.intrinsics", figures, is_fail=check.verdict(target_deg) == "fail", action=action)

@@ -4,15 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lce_rig.calibrate.estimate import CaptureResidual
-from lce_rig.calibrate.features import extract_features
-from lce_rig.calibrate.options import CalibrateOptions
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array, rotation_angle, transform
-from lce_rig.core.results import Metrics, Observation
-
-# What is measured must not depend on what was switched on while fitting.
-_AS_MEASURED = CalibrateOptions(point_projection="ray", half_step=False)
+from lce_rig.core.geometry import Array, rotation_angle
+from lce_rig.core.results import CaptureResidual, Metrics, Observation
+from lce_rig.residuals.features import AS_MEASURED, extract_features
+from lce_rig.residuals.plane_and_ends import ends_on_board, plane_residuals
 
 
 def capture_residual(
@@ -29,11 +25,9 @@ def capture_residual(
         board: its size.
         held_out_m: passed through.
     """
-    features = extract_features(observation, board, _AS_MEASURED)
-    points_cam = transform(T_cam_lidar, observation.lidar.points)
-    plane = np.abs((points_cam - features.centre) @ features.normal)
-    ends_board = transform(features.T_board_cam @ T_cam_lidar, features.edge_points)
-    edge = board.outline_distance(ends_board)
+    features = extract_features(observation, board, AS_MEASURED)
+    plane = np.abs(plane_residuals(features, T_cam_lidar, observation.lidar.points))
+    edge = board.outline_distance(ends_on_board(features, T_cam_lidar))
     return CaptureResidual(
         capture=observation.capture,
         plane_mean_m=_mean(plane),

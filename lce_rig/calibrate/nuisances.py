@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.doubt import Doubt, Verdict
-from lce_rig.calibrate.expansion import FIRST_RING, SCALE, SHIFT, Expansion
+from lce_rig.calibrate.doubt import doubt
+from lce_rig.calibrate.expansion import FIRST_RING, SCALE, SHIFT
 from lce_rig.core.board import Board
+from lce_rig.core.findings import Finding
+from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.rig import LidarSettings, VerdictSettings
-from lce_rig.solvers.jackknife import jackknife_scatter
 
 # A scale that is off by this many times the limit leaves nothing to be used.
 _SCALE_FAIL = 2.5
@@ -40,7 +41,7 @@ class Nuisances:
     laser: int
 
 
-def estimate_nuisances(expansion: Expansion, rings: NDArray[np.int16]) -> Nuisances:
+def estimate_nuisances(expansion: Quadratics, rings: NDArray[np.int16]) -> Nuisances:
     """Estimate what all captures share, the scale without any prior.
 
     Args:
@@ -62,7 +63,7 @@ def estimate_nuisances(expansion: Expansion, rings: NDArray[np.int16]) -> Nuisan
     )
 
 
-def _sigma(expansion: Expansion, unknown: int) -> float:
+def _sigma(expansion: Quadratics, unknown: int) -> float:
     """Estimate a deviation from what single errors do, and from the estimates without each placement."""
     without = expansion.without_each()[:, [unknown]]
     scatter = jackknife_scatter(without - without.mean(axis=0))[0, 0]
@@ -71,37 +72,20 @@ def _sigma(expansion: Expansion, unknown: int) -> float:
 
 def doubt_nuisances(
     found: Nuisances, board: Board, lidar: LidarSettings, limits: VerdictSettings
-) -> list[Doubt]:
+) -> list[Finding]:
     """Doubt a result that needs what cannot be: another scale, edges beyond the beam, ranges far off."""
     doubts = []
     off = abs(found.scale) - _SURE * found.scale_sigma
     if off > 0 and abs(found.scale) > limits.max_scale_error:
-        verdict: Verdict = "fail" if off > _SCALE_FAIL * limits.max_scale_error else "marginal"
-        doubts.append(Doubt(verdict, explain_scale(found, board)))
+        square_m = board.square_m
+        figures = {"scale": found.scale, "scale_sigma": found.scale_sigma}
+        figures |= {"square_m": square_m / (1 + found.scale), "profile_square_m": square_m}
+        doubts.append(doubt("verdict.scale", figures, is_fail=off > _SCALE_FAIL * limits.max_scale_error))
     if abs(found.edge_shift_m) - _SURE * found.edge_shift_sigma_m > limits.max_edge_shift_m:
-        where = "beyond" if found.edge_shift_m > 0 else "within"
-        text = (
-            f"ring ends lie {1000 * abs(found.edge_shift_m):.0f} mm {where} the plate's edges, a beam is not "
-            f"wider than {1000 * limits.max_edge_shift_m:.0f} mm: measure the plate"
-        )
-        doubts.append(Doubt("marginal", text))
+        figures = {"shift_m": found.edge_shift_m, "limit_m": limits.max_edge_shift_m}
+        doubts.append(doubt("verdict.edge_shift", figures, is_fail=False))
     allowed_m = limits.max_prior_sigmas * max(lidar.laser_bias_sigma_m, _HARMLESS_M)
     if abs(found.laser_offset_m) > allowed_m:
-        longer = "long" if found.laser_offset_m > 0 else "short"
-        text = (
-            f"ranges of laser ring {found.laser} look {1000 * abs(found.laser_offset_m):.0f} mm too "
-            f"{longer}, the profile allows for {1000 * allowed_m:.0f} mm: correct them in the LiDAR's driver"
-        )
-        doubts.append(Doubt("marginal", text))
+        figures = {"ring": found.laser, "offset_m": found.laser_offset_m, "limit_m": allowed_m}
+        doubts.append(doubt("verdict.laser_offset", figures, is_fail=False))
     return doubts
-
-
-def explain_scale(found: Nuisances, board: Board) -> str:
-    """Say by how much distances differ, and what the squares would measure if they are the cause."""
-    longer = "longer" if found.scale > 0 else "shorter"
-    percent = f"{100 * abs(found.scale):.1f} +- {100 * found.scale_sigma:.1f} %"
-    square_mm = 1000 * board.square_m / (1 + found.scale)
-    return (
-        f"camera distances are {percent} {longer} than the LiDAR's: the squares measure {square_mm:.1f} mm "
-        f"instead of {1000 * board.square_m:.1f} mm, or the intrinsics belong to another lens"
-    )

@@ -3,41 +3,19 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lce_rig.calibrate.features import CaptureFeatures
-from lce_rig.calibrate.problem import Problem, Weights
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array
-from lce_rig.solvers.registration import tangent_basis, vec_rotation, with_one
+from lce_rig.residuals.features import CaptureFeatures
+from lce_rig.residuals.moments import Problem, Weights
+from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS
+from lce_rig.solvers.registration import vec_rotation, with_one
 
 # One capture's board plane, camera against LiDAR, is good to about this much.
 PLANE_SIGMA_M = 0.005
 # A motion that moves the board by more than this without a trace in the planes counts as undetermined.
 MAX_WEAK_SIGMA_M = 0.1
 _AXES = ("x axis (right)", "y axis (down)", "z axis (line of sight)")
-
-
-def linearise(
-    problem: Problem, x: Array, edge_ids: NDArray[np.int8], weights: Weights | None = None
-) -> tuple[Array, Array]:
-    """Expand each capture's cost in the tangent (translation m, rotation rad, edge shift m).
-
-    Args:
-        problem: F captures.
-        x: (m,) solution [vec R; t; d; 1].
-        edge_ids: (n,) its association.
-        weights: other weights than the problem's.
-
-    Returns:
-        Half the gradients (F, 6 + k) and half the Gauss-Newton Hessians (F, 6 + k, 6 + k), without prior.
-    """
-    w = weights or problem.weights
-    w = Weights(w.plane, w.edge, None if w.shift_prior is None else 0.0)
-    n = problem.n_captures
-    M = problem.moments(np.eye(n), np.repeat(edge_ids[None], n, axis=0), w)
-    J = tangent_basis(x[:9].reshape(3, 3).T, problem.n_shift)
-    return (M @ x) @ J, J.T @ M @ J
 
 
 def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_cam_lidar: Array) -> None:
@@ -56,9 +34,8 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
     x = with_one(
         np.concatenate([vec_rotation(T_cam_lidar[:3, :3]), T_cam_lidar[:3, 3], np.zeros(problem.n_shift)])
     )
-    # Three freedoms of a plane, each as good as that.
-    planes = Weights(3 / PLANE_SIGMA_M**2, 0.0, problem.weights.shift_prior)
-    _, hessians = linearise(problem, x, problem.associate(x[None])[0], planes)
+    planes = Weights(PLANE_FREEDOMS / PLANE_SIGMA_M**2, 0.0, problem.weights.shift_prior)
+    hessians = problem.quadratics(x, problem.associate(x[None])[0], weights=planes).hessians
     lever_m = lever_arm(features)
     scale = np.r_[np.ones(3), np.full(3, lever_m)]
     information = hessians.sum(axis=0)[:6, :6] / np.outer(scale, scale)

@@ -1,12 +1,16 @@
-"""What goes into a calibration: candidates per capture, and the switches of the algorithm."""
+"""What goes into a calibration: candidates per capture, the user's options, and what they are joined by."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.core.board import Board
+from lce_rig.core.results import ImageBoard, LidarBoard, Observation
+from lce_rig.residuals.features import AS_FITTED, FeatureSettings
+from lce_rig.rig import LidarSettings
 
-Method = Literal["ml", "paper", "zhou", "corners"]
+Method = Literal["ml", "paper"]
 
 
 EDGE_SHIFT_SIGMA_M = 0.015
@@ -30,52 +34,77 @@ class CaptureCandidates:
 
 @dataclass(frozen=True)
 class CalibrateOptions:
-    """Switches of the algorithm; the defaults are the recommended set.
+    """What a user decides about a calibration.
 
     Attributes:
-        method: how the extrinsic is found: "ml" (from Algorithm 1's solution on, the extrinsic, all board
-            poses and the sensors' constant errors that are most probable together), "paper" (Algorithm 1 of
-            LCE-Calib), "zhou" (lines and planes of Zhou, Li, Kaess, 2018) or "corners" (corner to corner);
-            what follows matters to the first two alone.
-        n_draws: I, subsets drawn for each subset size.
-        n_rounds: rounds of re-association in each draw.
+        method: how the extrinsic is found: "paper" (Algorithm 1 of LCE-Calib) or "ml" (from Algorithm 1's
+            solution on, the extrinsic, all board poses and the sensors' constant errors that are most
+            probable together).
+        n_draws: I, subsets drawn for each subset size; they judge the result and do not change it.
         seed: of the draws.
-        point_projection: how points come onto the fitted plane: along their rays ("ray"), along the plane's
-            normal as in the paper ("normal"), or not at all ("none").
-        use_uncertainty: leave out the tenth of the plane terms with the largest propagated variance.
-        use_ptpl, use_ptl: use point-to-plane, point-to-line terms in the refinement.
-        plane_weight, edge_weight: weights of the two terms; where either is None, both follow from the errors
-            that the captures themselves show.
-        half_step: move ring ends outwards by half an azimuth step, to where the edge is expected.
-        edge_shift: "free": ring ends may lie beyond the printed size by a common distance, as the finite beam
-            makes them; "off": they may not.
-        edge_shift_sigma_m: standard deviation of that distance a priori.
-        laser_bias_sigma_m: standard deviation a priori of the lasers' range offsets about their mean.
-        range_offset_sigma_m: standard deviation a priori of that mean, the offset common to all ranges.
-        reject_outliers: leave out captures that disagree with what the others predict.
-        min_captures: fewer captures are refused.
     """
 
     method: Method = "paper"
     n_draws: int = 100
-    n_rounds: int = 3
     seed: int = 0
-    point_projection: Literal["ray", "normal", "none"] = "ray"
+
+
+@dataclass(frozen=True)
+class Algorithm1Parts:
+    """Parts of Algorithm 1; benchmarks leave single ones out to see what each is good for.
+
+    Attributes:
+        features: how points and ring ends come onto the board's plane.
+        n_rounds: of association and solution.
+        use_uncertainty: leave out the tenth of the plane terms with the largest propagated variance.
+        use_planes, use_ends: use plane terms, ring-end terms in the refinement.
+        is_shift_free: ring ends may lie beyond the printed size by a common distance, as the beam's width
+            makes them.
+        reject_outliers: leave out captures that disagree with what the others predict.
+    """
+
+    features: FeatureSettings = AS_FITTED
+    n_rounds: int = 3
     use_uncertainty: bool = True
-    use_ptpl: bool = True
-    use_ptl: bool = True
-    plane_weight: float | None = None
-    edge_weight: float | None = None
-    half_step: bool = True
-    edge_shift: Literal["free", "off"] = "free"
-    edge_shift_sigma_m: float = EDGE_SHIFT_SIGMA_M
-    laser_bias_sigma_m: float = 0.0
-    range_offset_sigma_m: float = 0.0
+    use_planes: bool = True
+    use_ends: bool = True
+    is_shift_free: bool = True
     reject_outliers: bool = True
-    min_captures: int = 3
 
     @property
     def edge_shift_precision(self) -> float | None:
         """Inverse variance of the edge shift a priori, 1/m^2; None where it is held at zero."""
-        is_free = self.edge_shift == "free" and self.use_ptl
-        return 1 / self.edge_shift_sigma_m**2 if is_free else None
+        return 1 / EDGE_SHIFT_SIGMA_M**2 if self.is_shift_free and self.use_ends else None
+
+
+@dataclass(frozen=True)
+class EstimateSettings(CalibrateOptions):
+    """The user's options with what the profile says of the LiDAR, and what benchmarks exchange.
+
+    Attributes:
+        laser_bias_sigma_m: standard deviation a priori of the lasers' range offsets about their mean.
+        range_offset_sigma_m: standard deviation a priori of that mean, the offset common to all ranges.
+        parts: of Algorithm 1.
+        estimator: takes the place of the method.
+    """
+
+    laser_bias_sigma_m: float = 0.0
+    range_offset_sigma_m: float = 0.0
+    parts: Algorithm1Parts = Algorithm1Parts()
+    estimator: "Estimator | None" = None
+
+    @classmethod
+    def of(cls, options: CalibrateOptions, lidar: LidarSettings) -> "EstimateSettings":
+        """Add what the profile says of a LiDAR to a user's options."""
+        settings = options if isinstance(options, cls) else cls(**vars(options))
+        return replace(
+            settings,
+            laser_bias_sigma_m=lidar.laser_bias_sigma_m,
+            range_offset_sigma_m=lidar.range_offset_sigma_m,
+        )
+
+
+Estimator = Callable[
+    [Sequence[Observation], Board, EstimateSettings, Callable[[int, int], None] | None], CalibrationEstimate
+]
+"""Estimates T_cam_lidar from boards whose pairing is settled."""

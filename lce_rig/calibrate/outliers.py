@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lce_rig.calibrate.features import CaptureFeatures
-from lce_rig.calibrate.options import CalibrateOptions
-from lce_rig.calibrate.problem import Problem
+from lce_rig.calibrate.options import Algorithm1Parts
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
+from lce_rig.residuals.features import CaptureFeatures
+from lce_rig.residuals.moments import Problem
 
 _DEVIATIONS = 6.0
 _TIMES_MEDIAN = 3.0
@@ -19,7 +19,7 @@ _SIGMA_FLOOR_M = 0.001
 
 
 def reject_outliers(
-    features: Sequence[CaptureFeatures], problem: Problem, T_start: Array, options: CalibrateOptions
+    features: Sequence[CaptureFeatures], problem: Problem, T_start: Array, parts: Algorithm1Parts
 ) -> tuple[dict[str, Refusal], tuple[float, float]]:
     """Refuse captures whose plane or edges lie far from where the other captures predict them, worst first.
 
@@ -27,7 +27,7 @@ def reject_outliers(
         features: of the captures in `problem`.
         problem: their moments, weighted alike.
         T_start: (4, 4) planar initialisation.
-        options: `reject_outliers` switches the refusal off.
+        parts: of Algorithm 1; `reject_outliers` switches the refusal off.
 
     Returns:
         The refusals by capture; and the typical predicted plane and edge error of the captures kept, m.
@@ -38,12 +38,12 @@ def reject_outliers(
         selection = np.zeros((len(kept), problem.n_captures))
         selection[:, kept] = 1
         selection[np.arange(len(kept)), kept] = 0
-        solutions = problem.solve(selection, T_start, options.n_rounds)
+        solutions = problem.solve(selection, T_start, parts.n_rounds)
         plane, edge = (error[np.arange(len(kept)), kept] for error in problem.errors(solutions.x))
         excess = np.maximum(_excess(plane), _excess(edge))
         worst = int(np.argmax(excess))
         n_refused = problem.n_captures - len(kept)
-        is_done = not options.reject_outliers or excess[worst] <= 1 or len(kept) <= 4
+        is_done = not parts.reject_outliers or excess[worst] <= 1 or len(kept) <= 4
         if is_done or n_refused >= _MAX_SHARE * problem.n_captures:
             return refusals, (_typical(plane), _typical(edge))
         refusals[features[kept[worst]].capture] = _refusal(plane, edge, worst)
@@ -64,9 +64,11 @@ def _typical(errors: Array) -> float:
 
 def _refusal(plane: Array, edge: Array, k: int) -> Refusal:
     return Refusal(
-        "calibrate",
-        f"the LiDAR sees the board's plane {1e3 * plane[k]:.0f} mm and its edges {1e3 * edge[k]:.0f} mm "
-        f"(rms) from where the other captures predict them; they agree to {1e3 * np.median(plane):.0f} and "
-        f"{1e3 * np.median(edge):.0f} mm",
-        "hold the board still while capturing, with nothing in front of it or close behind its rim",
+        "calibrate.outlier",
+        figures={
+            "plane_m": float(plane[k]),
+            "edges_m": float(edge[k]),
+            "plane_median_m": float(np.median(plane)),
+            "edges_median_m": float(np.median(edge)),
+        },
     )

@@ -5,13 +5,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.calibrate.observability import describe_weakest
-from lce_rig.calibrate.placements import group_placements
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.results import Certificate, Observation, Refusal
+from lce_rig.residuals.features import CaptureFeatures
+from lce_rig.residuals.placements import group_placements
 
 # Of methods that prove nothing about their minimum.
 NO_CERTIFICATE = Certificate(is_optimal=False, gap=float("inf"))

@@ -12,7 +12,6 @@ from lce_rig.core.results import ImageBoard, LidarBoard, Observation, Refusal
 
 # Pictures without stamps may lie anywhere about the scan they were saved with.
 NO_STAMPS_SIGMA_S = 0.15
-REMOVE_OTHERS = "remove other things of the board's size, or cover them"
 
 
 @dataclass(frozen=True)
@@ -86,10 +85,8 @@ def join_scans(
             group = groups.setdefault(scan_of[channel, observation.capture], {})
             first = next(iter(group.values()), observation)
             if not np.array_equal(first.lidar.points, observation.lidar.points):
-                cause = (
-                    f"its {channel} put the board at another place of the scan than its {next(iter(group))}"
-                )
-                refused[observation.capture] = Refusal("pair", cause, REMOVE_OTHERS)
+                figures = {"first": next(iter(group)), "second": channel}
+                refused[observation.capture] = Refusal("pair.two_places", figures=figures)
             elif channel not in group:
                 group[channel] = observation
     scans = [

@@ -10,13 +10,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.features import CaptureFeatures, extract_features
-from lce_rig.calibrate.observability import linearise
-from lce_rig.calibrate.options import CalibrateOptions
-from lce_rig.calibrate.problem import Problem
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Observation
+from lce_rig.residuals.features import CaptureFeatures, FeatureSettings, extract_features
+from lce_rig.residuals.moments import Problem
 from lce_rig.solvers.covariance import symmetric_inverse
 
 # Of the order of the errors themselves, so that the difference quotient sees what they would do.
@@ -26,7 +24,7 @@ STEP_M = 0.005
 def ring_sensitivities(
     observations: Sequence[Observation],
     board: Board,
-    options: CalibrateOptions,
+    settings: FeatureSettings,
     problem: Problem,
     x: Array,
     edge_ids: NDArray[np.int8],
@@ -46,7 +44,7 @@ def ring_sensitivities(
     Args:
         observations: the F captures in `problem`.
         board: the board.
-        options: how features are extracted.
+        settings: how features are extracted.
         problem: their moments.
         x: (m,) solution [vec R; t; d; 1].
         edge_ids: (n,) its association, which is held.
@@ -63,11 +61,11 @@ def ring_sensitivities(
     shifted: list[CaptureFeatures] = []
     for observation, rings in zip(observations, seen, strict=True):
         for lidar in shift_rings(observation.lidar, rings, STEP_M):
-            shifted.append(extract_features(replace(observation, lidar=lidar), board, options))
+            shifted.append(extract_features(replace(observation, lidar=lidar), board, settings))
     keep = None if problem.keep is None else [problem.keep[int(k)] for k in capture]
     ids = [edge_ids[problem.edge_capture == k] for k in capture]
-    gradients, _ = linearise(problem, x, edge_ids)
-    moved, _ = linearise(Problem(shifted, board, problem.weights, keep), x, np.concatenate(ids))
+    gradients = problem.quadratics(x, edge_ids).gradients
+    moved = Problem(shifted, board, problem.weights, keep).quadratics(x, np.concatenate(ids)).gradients
     change = np.zeros((len(ring), len(information)))
     np.add.at(change, column, (moved - gradients[capture]) / STEP_M)
     return np.asarray(-symmetric_inverse(information) @ change.T)

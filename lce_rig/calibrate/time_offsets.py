@@ -15,13 +15,14 @@ from itertools import product
 
 import numpy as np
 
-from lce_rig.calibrate.features import CaptureFeatures, extract_features, place_features
 from lce_rig.calibrate.motion import BoardMotions, PoseSamples, board_time_s, deskew, fit_motions
-from lce_rig.calibrate.options import CalibrateOptions
-from lce_rig.calibrate.problem import Problem, Weights
+from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, difference
 from lce_rig.core.results import Observation
+from lce_rig.residuals.features import CaptureFeatures, extract_features, place_features
+from lce_rig.residuals.moments import Problem, Weights
+from lce_rig.residuals.plane_and_ends import along_normals, differentiate
 from lce_rig.solvers.covariance import symmetric_inverse
 
 _REACH_S, _GRID_S = 0.2, 0.04
@@ -86,7 +87,7 @@ def estimate_time_offsets(
     samples: PoseSamples,
     observations: Sequence[Observation],
     board: Board,
-    options: CalibrateOptions,
+    options: EstimateSettings,
     weights: Weights,
     T_start: Array,
     *,
@@ -109,7 +110,7 @@ def estimate_time_offsets(
     observations = deskew_points(observations, fit_motions(samples, offset_s), T_start)
     cost = _Cost(
         samples,
-        [extract_features(observation, board, options) for observation in observations],
+        [extract_features(observation, board, options.parts.features) for observation in observations],
         np.array([board_time_s(observation.lidar, sweep_s) for observation in observations]),
         board,
         weights,
@@ -230,17 +231,16 @@ def _search_grid(
     """Find the offsets (C,) that best put the boards' middles onto the camera's planes, on a coarse grid."""
     lidars = [observation.lidar for observation in observations]
     times_s = np.array([board_time_s(lidar, sweep_s) for lidar in lidars])
-    middles = np.array([lidar.points.mean(axis=0) for lidar in lidars]) @ T[:3, :3].T + T[:3, 3]
+    middles = np.array([lidar.points.mean(axis=0) for lidar in lidars])
     ticks = np.arange(-_REACH_S, _REACH_S + _GRID_S / 2, _GRID_S)
     best, best_cost = np.zeros(len(samples.channels)), np.inf
     for ticks_s in product(ticks, repeat=len(samples.channels)):
         offset_s = np.array(ticks_s)
         motions = fit_motions(samples, offset_s)
         T_cam_board = motions.at(times_s)
-        normals = T_cam_board[:, :3, 2]
-        depth = np.sum(normals * (middles - T_cam_board[:, :3, 3]), axis=1)
+        depth = along_normals(T_cam_board[:, :3, 2], T_cam_board[:, :3, 3], middles, T)
         # The extrinsic follows: what six small motions of it explain is no misfit.
-        J = np.concatenate([normals, np.cross(middles, normals)], axis=1)
+        J = differentiate(T_cam_board[:, :3, 2], middles @ T[:3, :3].T)
         misfit = np.abs(depth - J @ np.linalg.lstsq(J, depth, rcond=None)[0])
         cost = 2 * len(misfit) * np.log(np.median(misfit) + 1e-3)
         cost += np.sum(_rho(motions.misfit) + motions.log_volume)

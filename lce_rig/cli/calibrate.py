@@ -20,6 +20,7 @@ from lce_rig.cli.options import (
 from lce_rig.cli.uncertainty import uncertainty_lines
 from lce_rig.core.results import Calibration
 from lce_rig.detect.detection import Pair
+from lce_rig.words import sentence
 
 if TYPE_CHECKING:
     from lce_rig.pipeline.result_files import WrittenResults
@@ -43,11 +44,10 @@ if TYPE_CHECKING:
 @event_image_option
 @click.option(
     "--method",
-    type=click.Choice(["ml", "paper", "zhou", "corners"]),
+    type=click.Choice(["ml", "paper"]),
     default="paper",
     show_default=True,
-    help="How the extrinsic is found: maximum likelihood of everything together, Algorithm 1 of LCE-Calib "
-    "alone, or for comparison lines and planes (Zhou et al., 2018) or the plate's corners.",
+    help="Algorithm 1 of LCE-Calib, or from its solution on the maximum likelihood of everything together.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export a failed result too, marked as failed.")
@@ -62,42 +62,6 @@ if TYPE_CHECKING:
     type=click.IntRange(0, 10_000),
     help="Subsets drawn for each size (the paper's I).",
 )
-@click.option(
-    "--point-projection",
-    type=click.Choice(["ray", "normal", "none"]),
-    default="ray",
-    show_default=True,
-    help="How points come onto the board's plane: along the ray, along the normal (the paper), or not.",
-)
-@click.option(
-    "--uncertainty/--no-uncertainty",
-    "use_uncertainty",
-    default=True,
-    show_default=True,
-    help="Leave out the tenth of the terms with the largest propagated variance.",
-)
-@click.option("--ptpl/--no-ptpl", "use_ptpl", default=True, show_default=True, help="Point-to-plane terms.")
-@click.option("--ptl/--no-ptl", "use_ptl", default=True, show_default=True, help="Point-to-line terms.")
-@click.option(
-    "--half-step/--no-half-step",
-    default=True,
-    show_default=True,
-    help="Move ring ends outwards by half an azimuth step.",
-)
-@click.option(
-    "--edge-shift",
-    type=click.Choice(["free", "off"]),
-    default="free",
-    show_default=True,
-    help="Estimate how far returns reach beyond the plate's edges.",
-)
-@click.option(
-    "--weights",
-    type=click.Choice(["auto", "profile"]),
-    default="auto",
-    show_default=True,
-    help="Weights of the terms: from the data, or from the profile as the paper.",
-)
 def calibrate(
     session: Path,
     reference: Path | None,
@@ -106,8 +70,9 @@ def calibrate(
     event_image: Any,
     as_json: bool,
     force: bool,
-    weights: str,
-    **switches: Any,
+    method: Any,
+    seed: int,
+    n_draws: int,
 ) -> None:
     """Estimate where the LiDAR sits relative to each camera of SESSION (default: session/).
 
@@ -118,21 +83,14 @@ def calibrate(
     Exits with 7 where a result must not be used: that camera is then left out of the exports, unless --force
     is given. Exits with 6 where a camera has no result.
     """
-    from lce_rig import pipeline
-    from lce_rig.calibrate import CalibrateOptions
+    import lce_rig as lce
     from lce_rig.core.errors import UsageError
     from lce_rig.export.reference import read_reference
-    from lce_rig.session import Session
 
-    opened = Session.open(session)
+    opened = lce.Session.open(session)
     rig = opened.rig
     require_sensors("camera", cameras, rig.cameras)
-    if weights == "profile":
-        settings = rig.calibration
-        switches |= {"plane_weight": settings.plane_weight, "edge_weight": settings.edge_weight}
-    if not (switches["use_ptpl"] or switches["use_ptl"]):
-        raise UsageError("--no-ptpl and --no-ptl together leave nothing to fit")
-    options = CalibrateOptions(**switches)
+    options = lce.CalibrateOptions(method, n_draws, seed)
     wanted = [
         name
         for name, camera in rig.cameras.items()
@@ -146,36 +104,32 @@ def calibrate(
         )
     with _earlier_result_named(opened.path):
         with show.progress_bar("detecting") as progress:
-            detections = pipeline.detect(opened, event_image=event_image, progress=progress)
+            detections = lce.detect(opened, event_image=event_image, progress=progress)
         with show.progress_bar("calibrating") as progress:
-            results, troubles = pipeline.calibrate(
-                rig,
+            result = lce.calibrate(
+                opened,
                 detections,
-                options,
+                options=options,
                 cameras=cameras or None,
                 channels=channels,
                 reference=truth,
                 progress=progress,
             )
-        for trouble in troubles:
-            show.warn(str(trouble))
-        calibrations = [calibration for calibration, _ in results]
-        if truth is not None and any(c.egt_rotation_deg is None for c in calibrations):
+        for shortage in result.shortages:
+            show.warn(str(shortage))
+        if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
             show.warn(f"{reference} holds no T_cam_lidar of these sensors")
-        written = pipeline.write_results(opened, calibrations, force=force)
+        written = result.write(force=force)
     if as_json:
-        from lce_rig.export.result import to_json_dict
-
-        inputs = pipeline.inputs_sha256(opened, calibrations)
-        show.print_json(to_json_dict(rig.name, calibrations, inputs))
+        show.print_json(result.document())
     else:
-        for calibration, estimate in results:
-            show.print_lines(_lines(calibration, estimate.held_out_m, estimate.weak_direction))
-        for calibration in calibrations:
-            show.print_lines(camera_lines(calibration, calibrations))
+        for calibration in result.pairs:
+            show.print_lines(_lines(calibration))
+        for calibration in result.pairs:
+            show.print_lines(camera_lines(calibration, result.pairs))
         show.note("written: " + ", ".join(f.name for f in written.files) + f" in {written.files[0].parent}")
     _tell_earlier(written)
-    _exit(calibrations, wanted, {pair.camera for pair in detections.pairs}, are_told=not as_json)
+    _exit(result.pairs, wanted, {pair.camera for pair in detections.pairs}, are_told=not as_json)
 
 
 @contextmanager
@@ -237,7 +191,7 @@ def _left_out(held_out_m: float) -> str:
     return f"left out {1000 * held_out_m:.1f} mm, " if math.isfinite(held_out_m) else ""
 
 
-def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> list[str]:
+def _lines(calibration: Calibration) -> list[str]:
     c = calibration
     colour = show.COLOURS[c.verdict]
     metrics = c.metrics
@@ -245,11 +199,11 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
         f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/]",
         "  T_cam_lidar (p_cam = R p_lidar + t)",
         *("    " + "  ".join(f"{value: .6f}" for value in row) for row in c.T_cam_lidar[:3]),
-        *uncertainty_lines(c, weak_direction),
+        *uncertainty_lines(c),
         f"  captures     {len(c.captures_used)} used of {c.n_captures}, "
         f"board found by both sensors in {c.n_detected}",
         f"  residuals    planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm, "
-        f"{_left_out(held_out_m)}corners {metrics.reprojection_px:.2f} px",
+        f"{_left_out(c.held_out_m)}corners {metrics.reprojection_px:.2f} px",
         f"  certificate  {_certificate(c)}",
     ]
     lines += [*_channel_lines(c), *together_lines(c)]
@@ -258,7 +212,7 @@ def _lines(calibration: Calibration, held_out_m: float, weak_direction: str) -> 
             f"  reference    off by {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
         )
     for name, why in c.captures_refused.items():
-        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.cause}: {why.action}')}[/]")
+        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {sentence(why)}')}[/]")
     lines += [f"  [{colour}]{show.escape(reason)}[/]" for reason in c.reasons]
     return lines
 

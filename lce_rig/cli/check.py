@@ -12,6 +12,7 @@ from lce_rig.cli import show
 from lce_rig.cli.options import event_image_option, json_option, session_argument
 from lce_rig.core.results import Refusal
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
+from lce_rig.words import describe, recommend, refusal_as_json
 
 
 @click.command()
@@ -24,22 +25,20 @@ def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) ->
 
     Exits with 6 where no capture can be used.
     """
-    from lce_rig import pipeline
+    import lce_rig as lce
     from lce_rig.core.errors import NotEnoughDataError
-    from lce_rig.session import Session
+    from lce_rig.pipeline import refusals_of, write_debug_images
 
-    opened = Session.open(session)
+    opened = lce.Session.open(session)
     if not opened.captures:
         raise NotEnoughDataError(f"{session} holds no captures", "Collect some first: lce-rig collect --help")
     with show.progress_bar("detecting") as progress:
-        detections = pipeline.detect(opened, event_image=event_image, progress=progress)
+        detections = lce.detect(opened, event_image=event_image, progress=progress)
     if debug_images:
         with show.progress_bar("drawing") as progress:
-            folder = pipeline.write_debug_images(
-                opened, detections, event_image=event_image, progress=progress
-            )
+            folder = write_debug_images(opened, detections, event_image=event_image, progress=progress)
         show.note(f"pictures of every capture: {folder}")
-    refusals = {pair: pipeline.refusals(opened.rig, detections, pair) for pair in detections.pairs}
+    refusals = {pair: refusals_of(opened.rig, detections, pair) for pair in detections.pairs}
     if as_json:
         show.print_json(
             {"format_version": 1, "rig": opened.rig.name, "pairs": _document(detections, refusals)}
@@ -74,7 +73,7 @@ def _record(image: ImageDetection, lidar: LidarDetection, refusal: Refusal | Non
     best = lidar[0] if isinstance(lidar, list) else lidar
     return {
         "is_usable": refusal is None,
-        "refusal": None if refusal is None else vars(refusal),
+        "refusal": None if refusal is None else refusal_as_json(refusal),
         "image": _figures(image),
         "lidar": _figures(best),
         "n_surfaces": len(lidar) if isinstance(lidar, list) else 0,
@@ -146,11 +145,12 @@ def _cell(figures: Mapping[str, float | None] | None, key: str, scale: float, di
 def _summarise(n_captures: int, refused: Mapping[str, Refusal]) -> None:
     """Print each cause once, with the captures it holds for."""
     show.say(f"{n_captures - len(refused)} of {n_captures} captures can be used")
-    names: dict[Refusal, list[str]] = {}
+    names: dict[str, list[str]] = {}
     for name, refusal in sorted(refused.items()):
-        names.setdefault(refusal, []).append(name)
-    for refusal, captures in names.items():
-        show.say(f"  {', '.join(captures)}: {refusal.stage}: {refusal.cause}\n    -> {refusal.action}")
+        text = f"{refusal.stage}: {describe(refusal)}\n    -> {recommend(refusal)}"
+        names.setdefault(text, []).append(name)
+    for text, captures in names.items():
+        show.say(f"  {', '.join(captures)}: {text}")
     by_stage = Counter(refusal.stage for refusal in refused.values())
     if len(by_stage) > 1:
         show.say("  refused by stage: " + ", ".join(f"{stage} {n}" for stage, n in sorted(by_stage.items())))

@@ -8,6 +8,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, require_sensors
+from lce_rig.words import sentence
 
 
 def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
@@ -138,8 +139,8 @@ def collect(
 
     _refuse_options(tuple(live), "belongs to live collection", "leave --from out, or this option")
     from lce_rig.collect import CollectOptions
-    from lce_rig.collect import collect as fill
     from lce_rig.core.errors import NotEnoughDataError
+    from lce_rig.pipeline.collection import fill_session
     from lce_rig.rig import load_rig
     from lce_rig.session import Session
     from lce_rig.sources import open_recordings
@@ -155,14 +156,10 @@ def collect(
     )
     options = [SourceOptions(*names, pair, pair_tolerance, topics) for names in sensors]
     recordings = open_recordings(paths, rig, options)
-    with Session.resume(session, rig) as writer, show.progress_bar("collecting") as progress:
-        report = fill(
-            writer,
-            recordings,
-            CollectOptions(max_captures=max_captures, target=target),
-            lambda done, total, _message: progress(done, total),
-        )
-        n_captures = len(writer.captures)
+    wanted = CollectOptions(max_captures=max_captures, target=target)
+    with show.progress_bar("collecting") as progress:
+        report = fill_session(rig, recordings, session, wanted, progress)
+    n_captures = len(Session.open(session).captures)
     if topics and any(isinstance(recording, PairedRecording) for recording in recordings):
         show.warn("--topic means nothing for a folder of pictures and clouds")
     _tell(report, session, n_captures)
@@ -240,9 +237,10 @@ def _tell(report: Any, session: Path, n_captures: int) -> None:
     for label, capture in report.duplicates.items():
         show.note(f"{label}: duplicate of {capture}, left out")
     for label, refusal in report.refused.items():
-        show.warn(f"{label}: {refusal.cause}: {refusal.action}")
-    if report.counts:
-        show.note("not captured:\n" + "\n".join(f"  {n} x {why}" for why, n in report.counts.most_common()))
+        show.warn(f"{label}: {sentence(refusal)}")
+    counts = report.counts.counts()
+    if counts:
+        show.note("not captured:\n" + "\n".join(f"  {n} x {sentence(why)}" for why, n in counts))
     if report.n_missing:
         show.warn(f"{report.n_missing} captures short of the target")
     new = f"{len(report.captured)} new" + (f", {report.n_resumed} known already" if report.n_resumed else "")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from lce_rig.collect.preview import Preview
     from lce_rig.rig import Rig
     from lce_rig.session import Session
-    from lce_rig.sources.live.base import LiveSource
+    from lce_rig.sources.live.reading import LiveSource
 
 #: A run that nobody looks after ends after so long without a capture. The simulated person never rests;
 #: before a rig without a terminal somebody may have gone to fetch something.

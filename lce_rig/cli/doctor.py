@@ -1,9 +1,8 @@
 """`lce-rig doctor`: one screen on whether this computer and the rig's sensors are fit to collect."""
 
-import math
 import sys
 from collections import Counter
-from dataclasses import asdict, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,9 +13,10 @@ from lce_rig.cli.options import FiniteRange, json_option, rig_option
 
 if TYPE_CHECKING:
     from lce_rig.collect.health import Check
+    from lce_rig.core.findings import Severity
 
-_MARKS = {"green": "[green]ok[/]", "yellow": "[yellow]warn[/]", "red": "[bold red]FAIL[/]"}
-_EXIT_RED = 5
+_MARKS = {"note": "[green]ok[/]", "warning": "[yellow]warn[/]", "error": "[bold red]FAIL[/]"}
+_EXIT_ERROR = 5
 _INDENT = 5
 # What the program says before and after, and the next prompt.
 _N_OTHER_LINES = 3
@@ -51,30 +51,37 @@ def doctor(rig_name: str, as_json: bool, duration: float, folder: Path) -> int:
 
     Exits with 5 where a line says FAIL, else with 0.
     """
-    from lce_rig.collect.health import worst
     from lce_rig.collect.health.sensors import sensors
+    from lce_rig.core.findings import worst
     from lce_rig.pipeline.doctor import DoctorOptions, examine
     from lce_rig.rig import load_rig
 
     rig = load_rig(rig_name)
     show.note(f"watching {', '.join(sensors(rig))} ...")
     checks = examine(rig, DoctorOptions(duration, folder))
-    severity = worst(check.severity for check in checks)
+    severity = worst(found for check in checks for found in check.findings)
     if as_json:
         show.print_json(_document(rig.name, severity, checks))
     else:
         _print_screen(checks)
         show.say(_summary(checks))
-    return _EXIT_RED if severity == "red" else 0
+    return _EXIT_ERROR if severity == "error" else 0
 
 
 def _document(rig: str, severity: str, checks: "list[Check]") -> dict[str, Any]:
-    """Give every line; a figure that could not be measured is null."""
+    """Give every line with its findings; a figure that could not be measured is null."""
+    from lce_rig.words import as_json
+
     lines = [
-        asdict(check) | {"values": {k: v if math.isfinite(v) else None for k, v in check.values.items()}}
+        {
+            "subject": check.subject,
+            "name": check.name,
+            "severity": check.severity,
+            "findings": [as_json(found) for found in check.findings],
+        }
         for check in checks
     ]
-    return {"format_version": 1, "rig": rig, "severity": severity, "checks": lines}
+    return {"format_version": 2, "rig": rig, "severity": severity, "checks": lines}
 
 
 def _print_screen(checks: "list[Check]") -> None:
@@ -83,57 +90,82 @@ def _print_screen(checks: "list[Check]") -> None:
 
     console = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
     room = console.height - _N_OTHER_LINES
-    for group in dict.fromkeys(check.group for check in checks):
-        if not sys.stdout.isatty() or len(console.render_lines(_screen(checks))) <= room:
+    lines = [_Line.of(check) for check in checks]
+    for subject in dict.fromkeys(line.subject for line in lines):
+        if not sys.stdout.isatty() or len(console.render_lines(_screen(lines))) <= room:
             break
-        checks = _together(checks, group)
+        lines = _together(lines, subject)
     with console.capture() as capture:
-        console.print(_screen(checks))
+        console.print(_screen(lines))
     # Rich fills wrapped lines up with blanks.
     for line in capture.get().splitlines():
         show.say(line.rstrip())
 
 
-def _together(checks: "list[Check]", group: str) -> "list[Check]":
-    """Put a group's lines that are ok into one, before those that are not."""
-    fine = [check for check in checks if check.group == group and check.severity == "green"]
+@dataclass(frozen=True)
+class _Line:
+    """A check in words: what was found in one line, and a line for each thing to do."""
+
+    subject: str
+    name: str
+    severity: "Severity"
+    text: str
+    actions: tuple[str, ...]
+
+    @staticmethod
+    def of(check: "Check") -> "_Line":
+        from lce_rig.words import as_line, describe, recommend
+
+        actions = [action for found in check.findings for action in recommend(found).splitlines()]
+        return _Line(
+            check.subject,
+            check.name,
+            check.severity,
+            "; ".join(describe(found) for found in check.findings),
+            tuple(dict.fromkeys(as_line(action) for action in actions)),
+        )
+
+
+def _together(lines: list[_Line], subject: str) -> list[_Line]:
+    """Put a subject's lines that are ok into one, before those that are not."""
+    fine = [line for line in lines if line.subject == subject and line.severity == "note"]
     if len(fine) < 2:
-        return checks
-    names = ", ".join(check.name for check in fine)
-    at = next(index for index, check in enumerate(checks) if check.group == group)
-    rest = [check for check in checks if check not in fine]
-    return [*rest[:at], replace(fine[0], name="", figure=names), *rest[at:]]
+        return lines
+    names = ", ".join(line.name for line in fine)
+    at = next(index for index, line in enumerate(lines) if line.subject == subject)
+    rest = [line for line in lines if line not in fine]
+    return [*rest[:at], replace(fine[0], name="", text=names, actions=()), *rest[at:]]
 
 
-def _screen(checks: "list[Check]") -> Any:
+def _screen(lines: list[_Line]) -> Any:
     """Lay the lines out in columns, remedies below their line in the full width."""
     from rich.console import Group
     from rich.padding import Padding
     from rich.table import Table
 
-    widths = [4, *(max(len(getattr(check, column)) for check in checks) for column in ("group", "name"))]
+    widths = [4, *(max(len(getattr(line, column)) for line in lines) for column in ("subject", "name"))]
     rows: list[Any] = []
     last = ""
-    for check in checks:
+    for line in lines:
         row = Table.grid(padding=(0, 1))
         for width in widths:
             row.add_column(width=width)
         row.add_column(overflow="fold")
-        group = "" if check.group == last else f"[bold]{show.escape(check.group)}[/]"
-        row.add_row(_MARKS[check.severity], group, check.name, show.escape(check.figure))
+        subject = "" if line.subject == last else f"[bold]{show.escape(line.subject)}[/]"
+        row.add_row(_MARKS[line.severity], subject, line.name, show.escape(line.text))
         rows.append(row)
         rows += [
-            Padding(f"[cyan]-> {show.escape(line)}[/]", (0, 0, 0, _INDENT), expand=False)
-            for line in check.remedy.splitlines()
+            Padding(f"[cyan]-> {show.escape(action)}[/]", (0, 0, 0, _INDENT), expand=False)
+            for action in line.actions
         ]
-        last = check.group
+        last = line.subject
     return Group(*rows)
 
 
 def _summary(checks: "list[Check]") -> str:
     n = Counter(check.severity for check in checks)
-    if n["red"]:
-        return f"{n['red']} FAIL, {n['yellow']} warn, {n['green']} ok: see the lines after ->"
-    if n["yellow"]:
-        return f"{n['yellow']} warn, {n['green']} ok: fit to collect, with the limits above"
-    return f"all {n['green']} ok: fit to collect"
+    if n["error"]:
+        return f"{n['error']} FAIL, {n['warning']} warn, {n['note']} ok: see the lines after ->"
+    if n["warning"]:
+        return f"{n['warning']} warn, {n['note']} ok: fit to collect, with the limits above"
+    return f"all {n['note']} ok: fit to collect"

@@ -7,6 +7,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import cameras_option, require_sensors, session_argument, split_names
+from lce_rig.words import sentence
 
 if TYPE_CHECKING:
     from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
@@ -150,8 +151,8 @@ def _findings(measured: "MeasuredIntrinsics") -> list[str]:
         verdict = measured.check.verdict()
         lines.append(f"  {describe(measured.check)}")
         if verdict != "pass":
-            lines.append(f"  [{show.COLOURS[verdict]}]{show.escape(explain(measured.check))}[/]")
+            lines.append(f"  [{show.COLOURS[verdict]}]{show.escape(sentence(explain(measured.check)))}[/]")
     lines += [f"  [yellow]{show.escape(text)}[/]" for text in measured.weaknesses]
     for name, why in measured.refused.items():
-        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.cause}: {why.action}')}[/]")
+        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {sentence(why)}')}[/]")
     return lines

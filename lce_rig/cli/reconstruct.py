@@ -8,6 +8,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import EVENT_IMAGES, FiniteRange
+from lce_rig.words import describe
 
 if TYPE_CHECKING:
     from lce_rig.core.data import Events
@@ -170,7 +171,7 @@ def _write(
     with show.progress_bar("reconstructing") as progress:
         for done, picture in enumerate(pictures, start=1):
             if isinstance(picture, Refusal):
-                refused.append(picture.cause)
+                refused.append(describe(picture))
             else:
                 files.append(write_picture(output / f"{len(files):06d}.png", picture.pixels))
                 lines.append(f"{files[-1].name},{picture.stamp_ns}")

@@ -141,7 +141,7 @@ def _board_table(rig: "Rig") -> Any:
 
 def _limit_table(rig: "Rig") -> Any:
 
-    table = screen.plain_table("", "threshold or weight", "value", "default")
+    table = screen.plain_table("", "threshold", "value", "default")
     for block in ("quality", "calibration", "verdict"):
         settings = getattr(rig, block)
         for key, field in type(settings).model_fields.items():
@@ -157,7 +157,7 @@ def _limit_table(rig: "Rig") -> Any:
 def check_profile(file: str, as_json: bool) -> None:
     """Check a profile; every problem is named with its line. Exits with 3 where there is one."""
     from lce_rig.core.errors import ProfileError
-    from lce_rig.pipeline.event_detection import check_networks
+    from lce_rig.pipeline.detection import check_networks
     from lce_rig.rig import find_profile, load_rig
 
     try:

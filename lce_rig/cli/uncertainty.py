@@ -8,7 +8,7 @@ from lce_rig.core.results import Calibration
 _AXES = ("x right", "y down", "z forward")
 
 
-def uncertainty_lines(calibration: Calibration, weak_direction: str) -> list[str]:
+def uncertainty_lines(calibration: Calibration) -> list[str]:
     """State an extrinsic's standard deviations and its least certain motion, in lines of 80 columns."""
     c = calibration
     sigmas = np.sqrt(np.diag(c.cov))
@@ -16,7 +16,7 @@ def uncertainty_lines(calibration: Calibration, weak_direction: str) -> list[str
         f"  known to     {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
         f"               about {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
         f"               along {_by_axis(1000 * sigmas[:3], '.1f')} mm",
-        f"  weakest: {weak_direction}",
+        f"  weakest: {c.weak_direction}",
         *_at_distances(c),
     ]
 

@@ -28,43 +28,17 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
     Images and one contact sheet replace those in SESSION/calibration/overlays/, with --result FILE those in
     SESSION/overlays/. Exits with 7 where the verdict is fail or these captures contradict the extrinsic.
     """
-    from dataclasses import replace
-
-    from lce_rig import pipeline
+    import lce_rig as lce
     from lce_rig.cli.calibrate import exit_by_verdict
-    from lce_rig.core.errors import ResultRefusedError, SessionError
+    from lce_rig.core.errors import ResultRefusedError
     from lce_rig.detect.detection import Pair
-    from lce_rig.export.result import read_result
-    from lce_rig.pipeline.result_files import RESULT, result_content
-    from lce_rig.session import Session
-    from lce_rig.session.session import CALIBRATION
 
-    opened = Session.open(session)
-    own = None if result is not None else result_content(opened)
-    saved = read_result(result or session / CALIBRATION / RESULT)
-    if saved.rig != opened.rig.name or not saved.calibrations:
-        what = (
-            f"the result is of rig {saved.rig!r}"
-            if saved.calibrations
-            else "the result holds no pair of sensors"
-        )
-        raise SessionError(f"{what}; the session {session} is of rig {opened.rig.name!r}")
-    calibrations = list(saved.calibrations)
-    if result is not None:
-        # Names of captures say nothing across sessions: none of these was fitted.
-        calibrations = [replace(c, captures_used=(), captures_refused={}) for c in calibrations]
+    opened = lce.Session.open(session)
+    saved = None if result is None else lce.read_result(result)
     with show.progress_bar("detecting") as progress:
-        detections = pipeline.detect(opened, event_image=event_image, progress=progress)
+        verification = lce.verify(opened, saved, event_image=event_image, progress=progress)
     with show.progress_bar("drawing") as progress:
-        checks = pipeline.verify(
-            opened,
-            detections,
-            calibrations,
-            event_image=event_image,
-            result=own,
-            folder=output,
-            progress=progress,
-        )
+        checks = verification.write(output, progress=progress)
     if as_json:
         show.print_json(
             {"format_version": 1, "rig": opened.rig.name, "pairs": [c.document() for c in checks]}
@@ -73,11 +47,9 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
         for checked in checks:
             show.print_table(_table(checked))
             show.print_lines(_summary(checked))
-    held = {(checked.pair.camera, checked.pair.lidar) for checked in checks}
-    for c in calibrations:
-        if (c.camera, c.lidar) not in held:
-            show.warn(f"{session} holds no captures of {Pair.of(c)}: not checked")
-    exit_by_verdict(calibrations)
+    for c in verification.unchecked:
+        show.warn(f"{session} holds no captures of {Pair.of(c)}: not checked")
+    exit_by_verdict(verification.calibrations)
     contradicted = [checked for checked in checks if checked.doubts]
     if contradicted:
         raise ResultRefusedError(
@@ -94,7 +66,7 @@ def _table(checked: Any) -> Any:
     table.add_column("")
     for r in checked.residuals:
         lengths = (r.plane_mean_m, r.plane_rms_m, r.edge_mean_m, r.edge_rms_m)
-        state = "" if r.capture in checked.used else "[dim]not used[/]"
+        state = "" if r.capture in checked.calibration.captures_used else "[dim]not used[/]"
         cells = (*(f"{1000 * value:.1f}" for value in lengths), f"{r.reprojection_px:.2f}", state)
         table.add_row(r.capture, *cells)
     return table
@@ -108,7 +80,7 @@ def _summary(checked: Any) -> list[str]:
             f"mean over captures: planes {1000 * m.mpe_m:.1f} mm, edges {1000 * m.mee_m:.1f} mm, "
             f"together {1000 * m.mge_m:.1f} mm; corners {m.reprojection_px:.2f} px"
         )
-    lines.append(f"verdict of the calibration: {checked.verdict}")
+    lines.append(f"verdict of the calibration: {checked.calibration.verdict}")
     lines.append(f"these captures: {'; '.join(checked.doubts) or 'agree'}")
     if checked.contact_sheet is not None:
         lines.append(f"pictures: {show.escape(str(checked.contact_sheet))}")

@@ -1,6 +1,5 @@
 """Build a session from recordings, unattended: what is new becomes a capture, the rest is counted."""
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -9,13 +8,15 @@ from lce_rig.collect.moments import MomentSearch
 from lce_rig.collect.novelty import Placements, board_figures, known_placements
 from lce_rig.collect.stillness import StillnessOptions
 from lce_rig.collect.stored_events import StoredEvents
+from lce_rig.collect.tally import Tally
 from lce_rig.collect.watching import Moment
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.results import Refusal
 from lce_rig.session import Session
-from lce_rig.sources.base import ContinuousRecording, PairedRecording, PairFiles, Recording, Sample
+from lce_rig.sources.base import ContinuousRecording, PairedRecording, PairFiles, Recording
 from lce_rig.sources.joining import join_recordings, require_sensors
+from lce_rig.words import describe
 
 Progress = Callable[[int, int, str], None]
 """Told (samples done, samples in all, what happened)."""
@@ -51,7 +52,7 @@ class CollectReport:
         n_resumed: pairs and moments that an earlier run had captured already.
         duplicates: capture that holds the same data, by label.
         refused: why something became no capture, by label.
-        counts: how often each reason kept a moment of a continuous recording from becoming one.
+        counts: what kept moments of a continuous recording from becoming captures.
         notes: what was chosen, assumed or left out, in words.
         errors: recordings that could not be read to their end; what was captured before is kept.
         n_missing: captures short of the target.
@@ -62,7 +63,7 @@ class CollectReport:
     n_resumed: int = 0
     duplicates: dict[str, str] = field(default_factory=dict)
     refused: dict[str, Refusal] = field(default_factory=dict)
-    counts: Counter[str] = field(default_factory=Counter)
+    counts: Tally = field(default_factory=Tally)
     notes: list[str] = field(default_factory=list)
     errors: list[SourceError] = field(default_factory=list)
     n_missing: int = 0
@@ -132,9 +133,7 @@ class _Collector:
                 message = self._take_pair(files)
             except SourceError as error:
                 failures.append(error)
-                self.report.refused[files.label] = Refusal(
-                    "read", error.what, error.hint or "record it again"
-                )
+                self.report.refused[files.label] = Refusal.of_error("read", error, "record")
                 message = f"{files.label} refused: {error.what}"
             self._progress(done + 1, len(recording.pairs), message)
         if n_left_out:
@@ -194,8 +193,8 @@ class _Collector:
             captured=len(report.captured),
             resumed=report.n_resumed,
             duplicates=report.duplicates,
-            refused={label: refusal.cause for label, refusal in report.refused.items()},
-            counts=dict(sorted(report.counts.items())),
+            refused={label: describe(refusal) for label, refusal in report.refused.items()},
+            counts=report.counts.by_code(),
             errors=[error.what for error in report.errors],
         )
         if report.errors and self._n_captures == 0:
@@ -223,10 +222,11 @@ class _Collector:
             self.report.n_resumed += 1
             return
         if known.find_like(boards) is not None:
-            self.report.counts["the board stood as in a capture before"] += 1
+            self.report.counts.add(Refusal("calibrate.same_placement"))
             return
         self._note_sizes(images)
-        events = self._stored.join(frame.events)
+        self._stored.note(frame.events)
+        events = [cut.events for cut in frame.events]
         figures = {**moment.figures, **board_figures(boards)}
         self._store(key, label, images, frame.scans, figures, events)
         known.add(self._names_by_key.get(key, label), boards)

@@ -13,19 +13,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.collect.event_buffer import EventCut
 from lce_rig.collect.watching import ImageKey, Moment, Sighting
 from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
 from lce_rig.detect.event_figures import MEMORY_NS, event_figures, outline_px
-from lce_rig.detect.event_gate import explain_missing_board
-from lce_rig.detect.flicker import Flicker, measure_flicker
+from lce_rig.detect.event_gate import explain_missing_board, look_for_flicker, too_fast
 from lce_rig.rig import Rig
-from lce_rig.sources.rig_time import rig_time_ns
+from lce_rig.timing.event_buffer import EventCut
+from lce_rig.timing.rig_time import rig_time_ns
 
 _LEAST_SIGHTINGS = 3
-_MOVE = "move it sideways slowly, about 10 cm/s"
 
 
 @dataclass(frozen=True)
@@ -66,8 +64,7 @@ def judge_sighting(
     """
     cuts = {cut.sensor: cut for cut in sighting.frame.events}
     if sighting.images and not cuts:
-        action = "record events while the LiDAR runs; do their clocks agree?"
-        return Refusal("read", "no events at the time of the scan", action)
+        return Refusal("read.no_events_at_scan")
     watched = [key for key in sorted(sighting.images) if key[0] in cuts]
     if not watched:
         return _explain_unseen(sighting, cuts, rig)
@@ -75,16 +72,6 @@ def judge_sighting(
         return None
     judged = [_judge_camera(key, sighting, around, cuts[key[0]], rig, options) for key in watched]
     return next((found for found in judged if isinstance(found, Moment)), judged[0])
-
-
-def look_for_flicker(events: Events) -> Refusal | None:
-    """Name the lamps that make most of the events of about a second; None where none do."""
-    flicker: Flicker = measure_flicker(events)
-    if not flicker.is_storm:
-        return None
-    rhythm = f" at {flicker.frequency_hz:.0f} Hz" if flicker.frequency_hz else ""
-    cause = f"most events come from light that flickers{rhythm}"
-    return Refusal("image", cause, "record by daylight or under lamps that do not flicker")
 
 
 def _judge_camera(
@@ -102,16 +89,15 @@ def _judge_camera(
         return None
     recent, stamp_ns = _events_before(key, sighting, cut, rig)
     (speed_mps, unsteady_m), events_px = motion, _events_on_board(key, sighting, recent, stamp_ns, rig)
-    limits, said = rig.quality, f"{events_px:.1f} events a pixel of it in a second"
+    limits = rig.quality
+    made = {"events_px": events_px, "min_events_px": limits.min_events_px}
     if speed_mps > limits.max_board_speed_mps:
-        cause = f"the board moved at {speed_mps:.2f} m/s ({limits.max_board_speed_mps:g} allowed)"
-        return Refusal("image", cause, "move it slower, about 10 cm/s")
+        return too_fast(speed_mps, limits)
     is_slow = speed_mps < options.min_speed_mps
     if is_slow and events_px < max(options.plenty_events_px, limits.min_events_px):
-        return Refusal("image", f"the board stood still: {said}", _MOVE)
+        return Refusal("image.stood_still", figures=made)
     if events_px < limits.min_events_px:
-        action = f"{_MOVE}, rather than to and fro, and in better light"
-        return Refusal("image", f"the board made few events at {speed_mps:.2f} m/s: {said}", action)
+        return Refusal("image.made_few_events", figures={**made, "speed_mps": speed_mps})
     if is_slow:
         lamps = look_for_flicker(recent)
         if lamps is not None:
@@ -142,7 +128,7 @@ def _events_before(key: ImageKey, sighting: Sighting, cut: EventCut, rig: Rig) -
     # Frames and events of one camera may have clocks, or delays, of their own.
     time_ns = rig_time_ns(image, rig)
     stamp_ns = (sighting.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
-    return cut.between(stamp_ns - MEMORY_NS, stamp_ns), stamp_ns
+    return cut.events.between(stamp_ns - MEMORY_NS, stamp_ns), stamp_ns
 
 
 def _events_on_board(key: ImageKey, sighting: Sighting, recent: Events, stamp_ns: int, rig: Rig) -> float:
@@ -157,6 +143,6 @@ def _explain_unseen(sighting: Sighting, cuts: Mapping[str, EventCut], rig: Rig) 
     for (camera, channel), refusal in sorted(sighting.unseen.items()):
         if rig.cameras[camera].channels[channel].kind == "events" and camera in cuts:
             stamp_ns = sighting.frame.time_ns - cuts[camera].offset_ns
-            recent = cuts[camera].between(stamp_ns - MEMORY_NS, stamp_ns)
+            recent = cuts[camera].events.between(stamp_ns - MEMORY_NS, stamp_ns)
             return explain_missing_board(recent, stamp_ns, refusal, rig.quality)
     return None

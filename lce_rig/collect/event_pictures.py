@@ -3,25 +3,16 @@
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 
-from lce_rig.collect.pairing import PATIENCE_NS, middle_of_sweep_ns
 from lce_rig.collect.tally import Tally
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.results import Refusal
 from lce_rig.detect.event_board import reconstructor_for
 from lce_rig.rig import Rig
-from lce_rig.sources.base import Sample, Stream
-from lce_rig.sources.rig_time import event_channel, rig_offset_ns, rig_time_ns
+from lce_rig.timing.rig_time import event_channel, rig_offset_ns, rig_time_ns
+from lce_rig.timing.scan_pairing import PATIENCE_NS, middle_of_sweep_ns
 
-_NOT_BEGUN = Refusal(
-    "read",
-    "no events yet at the time of the scan",
-    "start the event camera first, or check that both sensors' clocks agree",
-)
-_GONE_BY = Refusal(
-    "read",
-    "the scan comes after the events that follow it",
-    "was the LiDAR's clock set back? Split the recording there",
-)
+_NOT_BEGUN = Refusal("read.events_not_begun")
+_GONE_BY = Refusal("read.events_gone_by")
 
 
 def with_event_pictures(

@@ -1,6 +1,5 @@
 """The moments of a recording that are worth a capture."""
 
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
@@ -8,14 +7,13 @@ from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.collect.motion import find_moving_moments
 from lce_rig.collect.novelty import Placements
-from lce_rig.collect.pairing import PairingCounts, pair_by_time
 from lce_rig.collect.stillness import StillnessOptions, find_still_moments
 from lce_rig.collect.tally import Tally
 from lce_rig.collect.watching import BoardWatcher, ImageKey, Moment
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, Sample, Stream
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
-from lce_rig.sources.base import Sample, Stream
+from lce_rig.timing.scan_pairing import PairingCounts, pair_by_time
 
 # How often an image without a board is searched thoroughly, which takes most of a second.
 _THOROUGH_S = 1.0
@@ -43,7 +41,6 @@ class MomentSearch:
     min_turn_deg: float
     _pairing: PairingCounts = field(default_factory=PairingCounts)
     _tally: Tally = field(default_factory=Tally)
-    _counts: Counter[str] = field(default_factory=Counter)
 
     @property
     def has_events(self) -> bool:
@@ -72,7 +69,7 @@ class MomentSearch:
             samples = with_event_pictures(samples, self.rig, cameras, self._tally)
         stillness = self.stillness or StillnessOptions(max_motion_m=self.rig.quality.max_motion_m)
         interval_s = self.motion.search_interval_s if self.has_events else stillness.search_interval_s
-        watcher = BoardWatcher(self.rig, interval_s, self._counts, self._tally, _THOROUGH_S)
+        watcher = BoardWatcher(self.rig, interval_s, self._tally, _THOROUGH_S)
         frames = pair_by_time(samples, self.rig, self._pairing)
         sightings = (watcher.sight(frame) for frame in frames)
         if self.has_events:
@@ -92,12 +89,14 @@ class MomentSearch:
         images = moment.sighting.frame.images
         return [image for image in images if (image.sensor, image.channel) not in self.reconstructed]
 
-    def counts(self) -> Counter[str]:
-        """Count by cause what became no moment so far."""
+    def counts(self) -> Tally:
+        """Count what became no moment so far."""
         # Why a picture could not be made of events is in the tally.
         n_alone = 0 if self.reconstructed else self._pairing.n_alone
-        alone = Counter({"no picture at the time of the scan": n_alone})
-        return alone + self._counts + self._tally.counts()
+        total = Tally()
+        total.add(Refusal("read.no_image_at_scan"), n_alone)
+        total.update(self._tally)
+        return total
 
     def notes(self) -> list[str]:
         """Say how scans and pictures came together."""

@@ -1,36 +1,32 @@
-"""The events kept with captures, and what has to be said about them."""
+"""What has to be said about the events that captures keep."""
 
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from lce_rig.collect.event_buffer import BEFORE_NS, EventCut
-from lce_rig.collect.event_moment import look_for_flicker
-from lce_rig.core.data import Events
+from lce_rig.detect.event_gate import look_for_flicker
+from lce_rig.timing.event_buffer import BEFORE_NS, EventCut
+from lce_rig.words import sentence
 
 
 @dataclass
 class StoredEvents:
-    """Joins stretches of events for captures, and keeps account of those that are short or flicker."""
+    """Keeps account of stored stretches of events that are short, or flicker."""
 
     _n_short: Counter[str] = field(default_factory=Counter)
     _shortest_ns: dict[str, int] = field(default_factory=dict)
     _lamps: Counter[tuple[str, str]] = field(default_factory=Counter)
 
-    def join(self, cuts: Sequence[EventCut]) -> list[Events]:
-        """Put together the events of one capture, of every camera."""
-        joined = []
+    def note(self, cuts: Sequence[EventCut]) -> None:
+        """Look at the events of one capture, of every camera."""
         for cut in cuts:
-            events = cut.join()
             if cut.missing_ns:
                 before_ns = max(0, BEFORE_NS - cut.missing_ns)
                 self._n_short[cut.sensor] += 1
                 self._shortest_ns[cut.sensor] = min(before_ns, self._shortest_ns.get(cut.sensor, before_ns))
-            lamps = look_for_flicker(events)
+            lamps = look_for_flicker(cut.events)
             if lamps is not None:
-                self._lamps[cut.sensor, f"{lamps.cause}: {lamps.action}"] += 1
-            joined.append(events)
-        return joined
+                self._lamps[cut.sensor, sentence(lamps)] += 1
 
     def notes(self) -> list[str]:
         """Say how many captures have less than 1.2 s of events before their scan, and which lamps flicker."""

@@ -1,15 +1,14 @@
 """The board followed from frame to frame, in every picture and scan."""
 
-from collections import Counter
 from dataclasses import dataclass, field, replace
 
-from lce_rig.collect.pairing import Frame
 from lce_rig.collect.tally import Tally
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.detect.finder import BoardFinder, ImageSearch
 from lce_rig.detect.image_board import NOT_SEEN_AT_ONCE
 from lce_rig.rig import Rig
+from lce_rig.timing.scan_pairing import Frame
 
 ImageKey = tuple[str, str]
 
@@ -59,8 +58,7 @@ class BoardWatcher:
     Attributes:
         rig: the profile.
         search_interval_s: how often a whole picture is searched while no board is in sight.
-        counts: frames in which it was not found, by sensor.
-        refusals: boards that were found and cannot be used, by cause.
+        refusals: frames in which it was not found, and boards that were found and cannot be used.
         thorough_interval_s: how often such a search is thorough, which takes most of a second; 0 for always.
         rescan_interval_s: how often a whole scan is searched while all candidates are followed; 0 for as
             often as while one is lost.
@@ -68,7 +66,6 @@ class BoardWatcher:
 
     rig: Rig
     search_interval_s: float
-    counts: Counter[str] = field(default_factory=Counter)
     refusals: Tally = field(default_factory=Tally)
     thorough_interval_s: float = 0.0
     rescan_interval_s: float = 0.0
@@ -109,9 +106,9 @@ class BoardWatcher:
                 lidars[scan.sensor] = candidates
         if not images:
             self._n_candidates.clear()  # A board that comes back is searched for at once.
-            self.counts["no board in any picture"] += 1
+            self.refusals.add(Refusal("image.none"))
         elif not lidars:
-            self.counts["no board in the scan"] += 1
+            self.refusals.add(Refusal("lidar.none"))
         return Sighting(frame, images, lidars, unseen, unscanned, unfit)
 
     def confirm(self, moment: Moment) -> Moment | Refusal:

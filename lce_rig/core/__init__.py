@@ -1,1 +1,1 @@
-"""Types and mathematics everything else is built on: numpy and scipy only, no files, no devices."""
+"""Types and mathematics for all other packages: numpy and scipy only, no files, no devices."""

@@ -12,8 +12,9 @@ from lce_rig.core.geometry import Array
 class Board:
     """A checkerboard on a plate.
 
-    Frame board: origin at the centre of the plate, x along its width, y up along its height (as the print is
-    looked at), z out of the print towards the viewer.
+    Frame board: origin at the centre of the plate, x along its width, y up along its height (as the pattern
+        is
+    looked at), z out of the pattern towards the viewer.
 
     Attributes:
         cols: inner corners along the width.
@@ -33,11 +34,11 @@ class Board:
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether the pattern turned by 180 deg gives the same picture (squares add up to an even number)."""
+        """Whether the pattern turned by 180 deg gives the same image (squares add up to an even number)."""
         return (self.cols + self.rows) % 2 == 0
 
     def corners(self) -> Array:
-        """List the inner corners, row by row from the top left as the print is looked at.
+        """List the inner corners, row by row from the top left as the pattern is looked at.
 
         Returns:
             (rows * cols, 3) in frame board, m.
@@ -48,7 +49,7 @@ class Board:
         return np.stack([grid_x.ravel(), grid_y.ravel(), np.zeros(grid_x.size)], axis=1)
 
     def outline(self) -> Array:
-        """List the plate's four corners, counter-clockwise from the lower left as the print is looked at.
+        """List the plate's four corners, counter-clockwise from the lower left as the pattern is looked at.
 
         Returns:
             (4, 3) in frame board, m.

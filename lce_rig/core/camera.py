@@ -16,7 +16,7 @@ class Intrinsics:
 
     Attributes:
         fx_px, fy_px, cx_px, cy_px: the camera matrix.
-        width_px, height_px: size of the picture the numbers belong to.
+        width_px, height_px: size of the image the numbers belong to.
         model: "radtan" (k1 k2 p1 p2 [k3 [k4 k5 k6]], as OpenCV's plumb bob and rational models) or
             "equidistant" (k1..k4, as OpenCV's fisheye and Kalibr's equi).
         distortion: the coefficients, in the order above.
@@ -40,7 +40,7 @@ class Intrinsics:
     def max_radius(self) -> float:
         """Largest r = tan(angle) (radtan) or angle in rad (equidistant) up to which distortion is monotonic.
 
-        Beyond it the polynomial folds back and draws points from outside the field of view into the picture.
+        Beyond it the polynomial folds back and draws points from outside the field of view into the image.
         """
         limit, n = (10.0, 20001) if self.model == "radtan" else (np.pi, 6284)
         r = np.linspace(0.0, limit, n)
@@ -98,14 +98,14 @@ class Intrinsics:
         )
 
     def project(self, points_camera: NDArray[Any]) -> tuple[Array, NDArray[np.bool_]]:
-        """Project points into the picture.
+        """Project points into the image.
 
         Args:
             points_camera: (..., 3) m, frame camera optical (x right, y down, z forward).
 
         Returns:
             Pixels (..., 2), NaN where invalid, and validity (...,): in front of the camera and within the
-            radius up to which the distortion is monotonic. A valid pixel may lie outside the picture.
+            radius up to which the distortion is monotonic. A valid pixel may lie outside the image.
         """
         points = np.asarray(points_camera, dtype=np.float64)
         z = points[..., 2]
@@ -194,7 +194,7 @@ class Intrinsics:
         return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
     def is_inside(self, pixels: Array, margin_px: float = 0.0) -> NDArray[np.bool_]:
-        """Tell which pixels lie in the picture, at least `margin_px` from its border; NaN never does."""
+        """Find which pixels lie in the image, at least `margin_px` from its border; NaN never does."""
         u, v = pixels[..., 0], pixels[..., 1]
         inside = (u >= margin_px) & (u <= self.width_px - 1 - margin_px)
         inside &= (v >= margin_px) & (v <= self.height_px - 1 - margin_px)

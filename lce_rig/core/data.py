@@ -1,7 +1,7 @@
-"""What sensors deliver, as frozen samples."""
+"""Sensor data as frozen samples."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """One picture.
+    """One image.
 
     Attributes:
         sensor: name of the camera in the rig profile.
@@ -17,7 +17,7 @@ class Image:
         stamp_ns: mid exposure, device time; None where the recording carries no time.
         host_ns: arrival at the host; None where unknown.
         pixels: (H, W) grey or (H, W, 3) BGR, uint8.
-        count: the camera's running number of the picture; gaps are lost ones; None where it does not count.
+        count: the camera's running number of the image; gaps are lost ones; None where it does not count.
     """
 
     sensor: str
@@ -29,11 +29,12 @@ class Image:
 
     @property
     def grey(self) -> NDArray[np.uint8]:
-        """The picture as (H, W) uint8 grey values (ITU-R BT.601 weights)."""
+        """The image as (H, W) uint8 grey values (ITU-R BT.601 weights)."""
         if self.pixels.ndim == 2:
             return self.pixels
-        weights = np.array([0.114, 0.587, 0.299], dtype=np.float32)
-        return np.asarray(np.rint(self.pixels @ weights), dtype=np.uint8)
+        import cv2  # Slow to import, and of no use to commands that look at no image.
+
+        return np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,11 +75,11 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class Events:
-    """A stretch of an event camera's stream.
+    """A range of an event camera's stream.
 
     Attributes:
         sensor: name of the camera in the rig profile.
-        t_ns: (N,) int64 device time, never decreasing; microsecond stamps times 1000, kept exactly.
+        t_ns: (N,) int64 device time, never decreasing; microsecond timestamps times 1000, kept exactly.
         x: (N,) uint16 column.
         y: (N,) uint16 row.
         polarity: (N,) bool, True where it became brighter.
@@ -115,3 +116,42 @@ class Events:
             self.height_px,
             self.host_ns,
         )
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """One edge that a trigger line made or a sensor saw.
+
+    Attributes:
+        sensor: name of the line: a camera that it triggers, or the sensor that saw it.
+        stamp_ns: device time of the board or sensor that reports it.
+        count: running number of its line; gaps are lost pulses.
+        host_ns: arrival at the host.
+    """
+
+    sensor: str
+    stamp_ns: int
+    count: int
+    host_ns: int
+
+
+@dataclass(frozen=True, order=True)
+class Stream:
+    """What one sensor sends.
+
+    Attributes:
+        sensor: the camera or LiDAR.
+        channel: of a camera; "" for a LiDAR.
+        kind: a channel of events may also bring pictures that others reconstructed.
+    """
+
+    sensor: str
+    channel: str
+    kind: Literal["pictures", "events", "scans"]
+
+    def __str__(self) -> str:
+        return f"{self.sensor}.{self.channel}" if self.channel else self.sensor
+
+
+Sample: TypeAlias = Image | Scan | Events
+LiveSample: TypeAlias = Image | Scan | Events | Pulse

@@ -1,4 +1,4 @@
-"""JSON documents from files: one place for what is read of them, whoever wrote them."""
+"""Checked reading of JSON documents from files."""
 
 import json
 import math
@@ -32,7 +32,7 @@ def parse_json(data: bytes, *, is_finite: bool = True) -> Any:
 
     Args:
         data: the document, in UTF-8.
-        is_finite: whether NaN and Infinity, which are no JSON, are refused.
+        is_finite: whether NaN and Infinity, which are not JSON, are refused.
 
     Raises:
         ValueError: what is wrong with it, in words that follow the file's name.
@@ -69,7 +69,7 @@ def _check(document: Any) -> None:
 
 
 def is_printable(text: str) -> bool:
-    """Tell whether a text can be encoded: an escape may give one half of a character of two (a surrogate)."""
+    """Return whether a text can be encoded: an escape may give half a surrogate pair."""
     try:
         text.encode()
     except UnicodeEncodeError:

@@ -1,4 +1,4 @@
-"""Errors the user can repair; each says what and where, and what to do about it."""
+"""Errors that the user can repair; each states what happened, where, and an action."""
 
 from collections.abc import Sequence
 
@@ -23,7 +23,7 @@ class LceRigError(Exception):
 
 
 class UsageError(LceRigError):
-    """A command line that cannot be meant."""
+    """An invalid command line."""
 
     exit_code = 2
 
@@ -53,7 +53,7 @@ class NotEnoughDataError(LceRigError):
 
 
 class ResultRefusedError(LceRigError):
-    """A result that was computed and must not be used."""
+    """A computed result that must not be used."""
 
     exit_code = 7
 

@@ -28,7 +28,7 @@ _ALIASES = {"x": ("x", "xs"), "y": ("y", "ys"), "polarity": ("polarity", "p", "p
 def encode_events(events: Events) -> bytes:
     """Write events as a compressed archive; the same events give the same bytes.
 
-    Stamps are stored as whole microseconds (t_us) where they are that, else as nanoseconds (t_ns).
+    Timestamps are stored as whole microseconds (t_us) where they are that, else as nanoseconds (t_ns).
 
     Returns:
         The bytes of an .npz file, to be put in place in one step by whoever owns the file.

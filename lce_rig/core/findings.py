@@ -1,7 +1,7 @@
 """What was found about a sensor, a capture or a result, as facts; `words` renders them."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 Severity = Literal["note", "warning", "error"]
@@ -27,6 +27,11 @@ class Finding:
     figures: Mapping[str, Figure] = field(default_factory=dict)
     action: str = ""
 
+    @property
+    def family(self) -> str:
+        """The part of the code before the point: what kind of thing was found."""
+        return self.code.partition(".")[0]
+
     def figure(self, name: str) -> float:
         """Give a figure as a number.
 
@@ -38,6 +43,11 @@ class Finding:
         if not isinstance(value, float | int):
             raise TypeError(f"{self.code}: {name} is {value!r}")
         return float(value)
+
+
+def about(subject: str, findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Give findings with the subject that whoever found them did not know."""
+    return tuple(replace(finding, subject=subject) for finding in findings)
 
 
 def worst(findings: Iterable[Finding]) -> Severity:

@@ -176,4 +176,4 @@ _READERS: dict[bytes, Callable[[bytes], _Declared]] = {
     },
     **{b"P" + str(kind).encode(): _pnm for kind in range(1, 7)},
 }
-"""By the first bytes of a file; what begins otherwise is not handed to OpenCV."""
+"""By the first bytes of a file; other files are not passed to OpenCV."""

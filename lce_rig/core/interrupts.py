@@ -1,4 +1,4 @@
-"""Ctrl-C: the program ends soon, whatever it is doing, in one line and with one exit code."""
+"""Ctrl-C: the program ends soon, in any state, with one line and one exit code."""
 
 import atexit
 import os
@@ -88,7 +88,7 @@ def watch_for_interrupts() -> None:
 
 
 def interrupt_no_more() -> None:
-    """Let the program end as it is about to; the watch goes on."""
+    """Let the program end as it is about to; the watch continues."""
     if _watch is not None:
         _watch.is_raising = False
 

@@ -1,4 +1,4 @@
-"""How much a file may ask for: one place for what a real sensor can reach.
+"""Limits on file contents, from what a real sensor can deliver.
 
 Sizes that a file declares are checked against these limits before memory is taken, and unpacking stops at
 them. A reader reports a limit as it reports damage, by a ValueError with words that follow the file's name.
@@ -24,13 +24,13 @@ MAX_DOCUMENT_BYTES = 1 << 24
 MAX_LINE_BYTES = 1 << 12
 """One line of text with figures."""
 MAX_EVENTS = 1 << 26
-"""Of one file or stretch that has to be in memory as a whole: half a minute at two million a second."""
+"""Of one file or stretch that has to be in memory as a whole: half a minute at two million per second."""
 MAX_NETWORK_BYTES = 1 << 29
 """Voxels and states of one step of a network: E2VID's at 1280 x 720 take 220 MB."""
 MAX_EVENT_PIXELS = 1 << 22
 """Of one event camera: four times the largest on sale."""
 MAX_TIME_NS = 1 << 62
-"""No timestamp is so far from zero: the year 2116 by clocks that count from 1970. Differences fit 64 bits."""
+"""No valid timestamp is so far from zero: year 2116 on clocks counted from 1970. Differences fit 64 bits."""
 MAX_PACKET_BYTES = 1 << 24
 """Of events in one message: drivers send some ms at a time."""
 MAX_TOPICS = 1 << 14
@@ -47,7 +47,7 @@ def open_regular(path: Path) -> BinaryIO:
 
     Raises:
         OSError: it is not there, or may not be read.
-        ValueError: it is no regular file, or hardly anything was ever written to it.
+        ValueError: it is not a regular file, or hardly anything was ever written to it.
     """
     # Without O_NONBLOCK opening a pipe waits for whoever writes to it.
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -73,7 +73,7 @@ def read_file(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
 
     Raises:
         OSError: it is not there, or cannot be read.
-        ValueError: it is no regular file, or larger.
+        ValueError: it is not a regular file, or larger.
     """
     with open_regular(path) as file:
         n_bytes = os.fstat(file.fileno()).st_size

@@ -37,7 +37,7 @@ def decode_pcd(data: bytes) -> NDArray[Any]:
 
     Returns:
         Structured (N,) with the fields as named in the header; a field of count c > 1 has shape
-        (c,). Fields of the same name (`_` in padded clouds) get a running number behind it.
+        (c,). Fields of the same name (`_` in padded point clouds) get a running number behind it.
 
     Raises:
         ValueError: what is wrong with the file, in words.
@@ -57,7 +57,7 @@ def decode_pcd(data: bytes) -> NDArray[Any]:
 
 
 def encode_pcd(cloud: NDArray[Any], comments: Iterable[str] = ()) -> bytes:
-    """Encode a cloud as binary PCD, `decode_pcd`'s inverse.
+    """Encode a point cloud as binary PCD, `decode_pcd`'s inverse.
 
     Args:
         cloud: structured (N,) of scalar fields.
@@ -175,7 +175,7 @@ def _decode_compressed(body: memoryview, header: _Header) -> NDArray[Any]:
     check_size(n_raw, "its compressed part", _MAX_COMPRESSED_BYTES)
     if len(body) - 8 < n_packed:
         raise ValueError(f"it is truncated: {len(body) - 8} of {n_packed} compressed bytes are there")
-    # LZF adds a byte to 32 where nothing can be compressed; more is no LZF, and takes long.
+    # LZF adds a byte to 32 where nothing can be compressed; more is not LZF, and takes long.
     if n_packed > n_raw + n_raw // 16 + 64:
         raise ValueError("its compressed part is damaged: it is larger than what it unpacks to")
     raw = _decompress_lzf(bytes(body[8 : 8 + n_packed]), n_raw)
@@ -183,7 +183,7 @@ def _decode_compressed(body: memoryview, header: _Header) -> NDArray[Any]:
     position = 0
     for name in header.dtype.names or ():
         field = header.dtype[name]
-        # Compressed clouds are stored field by field, not point by point.
+        # Compressed point clouds are stored field by field, not point by point.
         column = np.frombuffer(raw, field.base, cloud[name].size, position)
         cloud[name] = column.reshape(cloud[name].shape)
         position += column.nbytes

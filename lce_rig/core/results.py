@@ -1,33 +1,45 @@
-"""What the stages hand to each other, as frozen dataclasses."""
+"""The data passed between stages, as frozen dataclasses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.errors import LceRigError
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, sigma_sizes
+
+Stage = Literal["read", "image", "lidar", "pair", "calibrate"]
+STAGES: tuple[Stage, ...] = ("read", "image", "lidar", "pair", "calibrate")
 
 
 @dataclass(frozen=True)
-class Refusal:
-    """Why a capture is not used.
+class Refusal(Finding):
+    """The reason for refusing a capture; its code begins with the stage, as "lidar.too_few_rings".
 
-    Attributes:
-        stage: "read", "image", "lidar", "pair" (the two sensors disagree) or "calibrate" (outlier).
-        cause: what was seen, with its figure: "2 rings on the board".
-        action: what to do: "come 0.8 m closer".
+    Stages are "read", "image", "lidar", "pair" (the two sensors disagree) and "calibrate" (an outlier).
     """
 
-    stage: Literal["read", "image", "lidar", "pair", "calibrate"]
-    cause: str
-    action: str
+    def __post_init__(self) -> None:
+        if self.code.partition(".")[0] not in STAGES:
+            raise ValueError(f"{self.code} names no stage")
+
+    @property
+    def stage(self) -> Stage:
+        """The stage that refuses the capture."""
+        return cast(Stage, self.code.partition(".")[0])
+
+    @staticmethod
+    def of_error(stage: Stage, error: LceRigError, action: str = "") -> "Refusal":
+        """Refuse a capture for an error that was raised about it."""
+        return Refusal(f"{stage}.error", figures={"what": error.what, "hint": error.hint}, action=action)
 
 
 @dataclass(frozen=True, eq=False)
 class ImageBoard:
-    """The board as one picture shows it.
+    """The board detected in one image.
 
     Attributes:
         corners_px: (rows * cols, 2) in the order of `Board.corners()`.
@@ -63,7 +75,7 @@ class ImageBoard:
 
 @dataclass(frozen=True, eq=False)
 class LidarBoard:
-    """The board as one scan shows it, frame lidar.
+    """The board detected in one scan, frame lidar.
 
     Attributes:
         points: (N, 3) on the board as measured, m.
@@ -136,7 +148,7 @@ class PoseSolution:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Errors of an extrinsic; the definitions stand in docs/conventions.md.
+    """Errors of the extrinsics; docs/conventions.md defines them.
 
     Attributes:
         mpe_m: mean over captures of the mean distance of LiDAR board points from the camera's board plane.
@@ -157,7 +169,7 @@ class Metrics:
 
 @dataclass(frozen=True, eq=False)
 class ChannelResult:
-    """What one channel of a camera says alone, and how well it is timed.
+    """The result of one channel of a camera alone, with its time offset.
 
     Attributes:
         channel: its name.
@@ -185,7 +197,7 @@ class ChannelResult:
 
 @dataclass(frozen=True)
 class PointUncertainty:
-    """How far the LiDAR's points may be off, seen by the camera: standard deviations of the error's size.
+    """Errors of the LiDAR's points in the camera: standard deviations of the error's size.
 
     Attributes:
         distance_m: of the point from the camera.
@@ -202,7 +214,7 @@ class PointUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class OtherCamera:
-    """Where a camera sits to another one that saw the same boards in the same scans.
+    """The pose of a camera relative to another one that saw the same boards in the same scans.
 
     Attributes:
         camera: name of the other one.
@@ -226,9 +238,32 @@ class OtherCamera:
     board_rms_m: float
 
 
+@dataclass(frozen=True)
+class CaptureResidual:
+    """How well one capture fits an extrinsic.
+
+    Attributes:
+        capture: its name.
+        plane_mean_m, plane_rms_m: distance of the LiDAR's board points from the camera's board plane.
+        edge_mean_m, edge_rms_m: distance in the board's plane of ring ends from the board's edges.
+        held_out_m: rms of both where the capture was not fitted; NaN without draws.
+        reprojection_px: rms corner residual of the board's pose.
+    """
+
+    capture: str
+    plane_mean_m: float
+    plane_rms_m: float
+    edge_mean_m: float
+    edge_rms_m: float
+    held_out_m: float
+    reprojection_px: float
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """The extrinsic of one camera and one LiDAR, with everything needed to judge it.
+
+    result.json keeps all of it but the last four attributes, which are empty where it is read back.
 
     Attributes:
         channel: of the camera, or several joined by "+".
@@ -236,7 +271,9 @@ class Calibration:
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
         egt_rotation_deg, egt_translation_m: error against a reference given by the user; None without.
-        verdict: "pass", "marginal" or "fail", with reasons.
+        verdict: "pass", "marginal" or "fail".
+        reasons: for it, worst first, in words.
+        findings: the same as codes and figures; empty in results of earlier versions.
         captures_used: names of the captures behind the estimate.
         captures_refused: why each other capture is not.
         diagnostics: further figures by name.
@@ -244,6 +281,10 @@ class Calibration:
         uncertainty: what `cov` means for points at several distances; empty where no lens was at hand.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         other_cameras: those that saw the same boards held still.
+        weak_direction: the least certain motion, with its standard deviation.
+        held_out_m: rms residual of captures where they were not fitted; NaN where no method knows it.
+        residuals: of each capture used.
+        observations: capture -> the boards that were paired, as measured, for each capture used.
     """
 
     camera: str
@@ -259,6 +300,7 @@ class Calibration:
     captures_refused: Mapping[str, Refusal]
     verdict: Literal["pass", "marginal", "fail"]
     reasons: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
     egt_rotation_deg: float | None = None
     egt_translation_m: float | None = None
     diagnostics: Mapping[str, float] = field(default_factory=dict)
@@ -267,6 +309,10 @@ class Calibration:
     uncertainty: tuple[PointUncertainty, ...] = ()
     estimated_with: tuple[str, ...] = ()
     other_cameras: tuple[OtherCamera, ...] = ()
+    weak_direction: str = ""
+    held_out_m: float = float("nan")
+    residuals: tuple[CaptureResidual, ...] = ()
+    observations: Mapping[str, Observation] = field(default_factory=dict)
 
     @property
     def channels(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Which laser of a spinning LiDAR measured each point, from the points alone."""
+"""The laser of each point of a spinning LiDAR, inferred from the points alone."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ MAX_OFFSET_M = 0.015
 
 
 def rings_from_elevation(points_lidar: NDArray[Any]) -> NDArray[np.int16]:
-    """Number the lasers of a cloud without a ring field, 0 = lowest elevation.
+    """Number the lasers of a point cloud without a ring field, 0 = lowest elevation.
 
     A laser mounted h above the origin of the frame and inclined by alpha draws the line
     z = rho tan(alpha) + h over the distance rho from the vertical axis. The lines are found as peaks of
@@ -28,7 +28,8 @@ def rings_from_elevation(points_lidar: NDArray[Any]) -> NDArray[np.int16]:
         (N,) int16; -1 where the point is not finite or lies at the origin.
 
     Raises:
-        SourceError: the elevations form no rings, as with a solid-state LiDAR or a cloud that was moved.
+        SourceError: the elevations form no rings, as with a solid-state LiDAR or a point cloud that was
+            moved.
     """
     points = np.asarray(points_lidar, dtype=np.float64)
     rho = np.hypot(points[:, 0], points[:, 1])

@@ -39,8 +39,8 @@ def read_table(
         raise ValueError(
             f"it is truncated: {max(n_possible - n_skipped, 0)} of {n_rows} points are there at most"
         )
-    # Numbers are read as the columns' own types first: float64 would round 64-bit stamps. Some writers put
-    # "nan" or "3.0" into integer columns; then float64 and a cast must do.
+    # Numbers are read as the columns' own types first: float64 would round 64-bit timestamps. Some writers
+    # put "nan" or "3.0" into integer columns; then float64 and a cast must do.
     rows = _Rows(data, start, n_rows, n_skipped)
     try:
         with warnings.catch_warnings():
@@ -53,7 +53,7 @@ def read_table(
 
 
 class _BadRowsError(ValueError):
-    """The lines themselves are wrong, whatever figures they hold."""
+    """Malformed lines, whatever figures they hold."""
 
 
 class _Rows:

@@ -29,7 +29,7 @@ _DECOMPRESSORS = {
 
 
 class _Decompressor(Protocol):
-    """What bz2, lzma, zlib's like, zstd and lz4.frame have in common."""
+    """The common interface of bz2, lzma, zlib, zstd and lz4.frame."""
 
     @property
     def eof(self) -> bool: ...
@@ -52,7 +52,7 @@ def new_decompressor(kind: str) -> _FrameDecompressor:
 
     Raises:
         ValueError: another kind.
-        ImportError: this Python has no Zstandard, and nothing brought one.
+        ImportError: this Python has no Zstandard, and no package provides it.
     """
     if kind not in _DECOMPRESSORS:
         raise ValueError(f"compression {describe(kind)} is not known; known are {', '.join(_DECOMPRESSORS)}")
@@ -124,7 +124,7 @@ def unpack_file(kind: str, packed: BinaryIO, into: BinaryIO) -> None:
 
 
 def unpacked_limit(n_stored: int) -> int:
-    """Tell how many bytes of a recording so many stored ones may unpack to."""
+    """Compute how many bytes of a recording so many stored ones may unpack to."""
     return MAX_EVENT_RATIO * n_stored + _FREE_BYTES
 
 

@@ -1,4 +1,4 @@
-"""What a VLP-16 sends: the layout of its packets, their timing, and the names in their factory bytes.
+"""VLP-16 packets: their layout, their timing, and the names in their factory bytes.
 
 References:
     VLP-16 User Manual, Velodyne 63-9243 Rev. D, chapters 6 and 9, appendix E.

@@ -13,6 +13,7 @@ from lce_rig.core.data import Image
 from lce_rig.core.documents import parse_json
 from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, Refusal
 from lce_rig.detect.detection_fields import check_fields
+from lce_rig.words import is_renderable
 
 Arrays = dict[str, NDArray[Any]]
 LidarDetection = list[LidarBoard] | Refusal
@@ -66,7 +67,10 @@ def _rebuild(index: int, head: dict[str, Any], arrays: Mapping[str, NDArray[Any]
     prefix = f"{index}."
     own = {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)}
     check_fields(kind, {**head, **own})
-    return kind(**head, **own)
+    rebuilt = kind(**head, **own)
+    if isinstance(rebuilt, Refusal) and not is_renderable(rebuilt):
+        raise ValueError(f"no words for {rebuilt.code}")
+    return rebuilt
 
 
 @dataclass(frozen=True)

@@ -83,10 +83,6 @@ def _figures(value: Any, sizes: _Sizes) -> bool:
     return isinstance(value, dict) and all(_figure(each, sizes) for each in value.values())
 
 
-def _stage(value: Any, _: _Sizes) -> bool:
-    return value in ("read", "image", "lidar", "pair", "calibrate")
-
-
 def _plane(value: NDArray[Any], sizes: _Sizes) -> bool:
     return _array("f", 4)(value, sizes) and bool(abs(np.linalg.norm(value[:3]) - 1) < 1e-3)
 
@@ -104,7 +100,13 @@ def _pixels(value: Any, _: _Sizes) -> bool:
 
 
 _CHECKS: dict[type, dict[str, _Check]] = {
-    Refusal: {"stage": _stage, "cause": _text, "action": _text},
+    Refusal: {
+        "code": _text,
+        "severity": lambda value, _: value == "error",
+        "subject": _text,
+        "figures": lambda value, _: isinstance(value, dict),
+        "action": _text,
+    },
     Image: {
         "sensor": _text,
         "channel": _text,

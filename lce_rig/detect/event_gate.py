@@ -6,7 +6,6 @@ from lce_rig.core.data import Events
 from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.detect.event_figures import MEMORY_NS, busiest_events
 from lce_rig.detect.flicker import measure_flicker
-from lce_rig.detect.image_quality import MOVE_SLOWLY
 from lce_rig.detect.reconstruct.filters import hot_pixels
 from lce_rig.rig import QualitySettings
 
@@ -15,7 +14,6 @@ _MAX_HOT_SHARE = 0.5
 _MIN_EVENTS_PX = 0.01
 # Boards at 2 to 5 cm/s make 2 to 4 events a pixel in a second: with fewer one that is missing was too slow.
 _SLOW_EVENTS_PX = 4.0
-_SLOWER = "move it slower, about 10 cm/s"
 
 
 def gate_event_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:
@@ -31,23 +29,25 @@ def gate_event_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard |
     q = found.quality
     events_px = q.get("events_px")
     if events_px is not None and events_px < limits.min_events_px:
-        cause = f"the board hardly moved: {events_px:.1f} events a pixel of it in a second"
-        return Refusal("image", f"{cause} ({limits.min_events_px:g} needed)", MOVE_SLOWLY)
+        figures = {"events_px": events_px, "min_events_px": limits.min_events_px}
+        return Refusal("image.hardly_moved", figures=figures)
     speed_mps = q.get("speed_mps", 0.0)
     if speed_mps - 2 * q.get("speed_sigma_mps", 0.0) > limits.max_board_speed_mps:
-        cause = f"the board moved at {speed_mps:.2f} m/s while the LiDAR swept it"
-        return Refusal("image", f"{cause} ({limits.max_board_speed_mps:g} allowed)", _SLOWER)
+        return too_fast(speed_mps, limits)
     turn_deg_s = q.get("turn_deg_s", 0.0)
     if turn_deg_s - 2 * q.get("turn_sigma_deg_s", 0.0) > limits.max_turn_deg_s:
-        cause = f"the board turned at {turn_deg_s:.0f} deg/s while the LiDAR swept it"
-        return Refusal(
-            "image", f"{cause} ({limits.max_turn_deg_s:g} allowed)", "turn it less, move it sideways only"
-        )
+        figures = {"turn_deg_s": turn_deg_s, "max_turn_deg_s": limits.max_turn_deg_s}
+        return Refusal("image.turning", figures=figures)
     smear_m = q.get("smear_m", 0.0)
     if smear_m > limits.max_smear_m:
-        cause = f"the board moved {1000 * smear_m:.0f} mm while the LiDAR swept it"
-        return Refusal("image", f"{cause} ({1000 * limits.max_smear_m:.0f} allowed)", _SLOWER)
+        return Refusal("image.smeared", figures={"smear_m": smear_m, "max_smear_m": limits.max_smear_m})
     return found
+
+
+def too_fast(speed_mps: float, limits: QualitySettings) -> Refusal:
+    """Refuse a board that moves faster than the profile allows."""
+    figures = {"speed_mps": speed_mps, "max_speed_mps": limits.max_board_speed_mps}
+    return Refusal("image.too_fast", figures=figures)
 
 
 def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: QualitySettings) -> Refusal:
@@ -59,29 +59,38 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
         seen: why there is no picture, or no board in it.
         limits: `quality` of the rig profile.
     """
-    if not len(events):
-        return Refusal("image", "the capture holds no events", "uncover the lens, switch the event stream on")
-    if seen.stage == "read":
+    if len(events) and seen.stage == "read":
         return seen
+    return events_problem(events, stamp_ns, limits) or seen
+
+
+def events_problem(events: Events, stamp_ns: int, limits: QualitySettings) -> Refusal | None:
+    """Say what about the events before a stamp keeps a board from being found; None where nothing does."""
+    if not len(events):
+        return Refusal("image.no_events")
     recent = events.between(stamp_ns - MEMORY_NS, stamp_ns)
     n_pixels = events.width_px * events.height_px
     if len(recent) < _MIN_EVENTS_PX * n_pixels:
-        cause = f"no events to speak of: {len(recent)} in the second before the picture"
-        return Refusal("image", cause, f"{MOVE_SLOWLY}; if it moved, uncover the lens")
-    flicker = measure_flicker(recent)
-    if flicker.is_storm:
-        rhythm = f" at {flicker.frequency_hz:.0f} Hz" if flicker.frequency_hz else ""
-        cause = f"most events come from light that flickers{rhythm}"
-        return Refusal("image", cause, "record by daylight or under lamps that do not flicker")
+        return Refusal("image.few_events", figures={"n_events": len(recent)})
+    lamps = look_for_flicker(recent)
+    if lamps is not None:
+        return lamps
     n_hot, hot_share = _hot(recent)
     if hot_share > _MAX_HOT_SHARE:
-        cause = f"{n_hot} hot pixels make {100 * hot_share:.0f} % of the events; the board makes too few"
-        return Refusal("image", cause, f"{MOVE_SLOWLY}; let the camera cool down, or mask them in its driver")
-    events_px = busiest_events(events, stamp_ns)
-    if events_px < max(_SLOW_EVENTS_PX, limits.min_events_px):
-        cause = f"the board hardly moved: {events_px:.1f} events a pixel in a second where most are"
-        return Refusal("image", cause, MOVE_SLOWLY)
-    return seen
+        return Refusal("image.hot_pixels", figures={"n_hot": n_hot, "share": hot_share})
+    events_px, needed_px = busiest_events(events, stamp_ns), max(_SLOW_EVENTS_PX, limits.min_events_px)
+    if events_px < needed_px:
+        figures = {"events_px": events_px, "min_events_px": needed_px}
+        return Refusal("image.still_scene", figures=figures)
+    return None
+
+
+def look_for_flicker(events: Events) -> Refusal | None:
+    """Name the lamps that make most of the events of about a second; None where none do."""
+    flicker = measure_flicker(events)
+    if not flicker.is_storm:
+        return None
+    return Refusal("image.flicker", figures={"frequency_hz": flicker.frequency_hz})
 
 
 def _hot(events: Events) -> tuple[int, float]:

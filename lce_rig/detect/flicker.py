@@ -55,9 +55,12 @@ def measure_flicker(events: Events, bin_ns: int = 1_000_000) -> Flicker:
     t_ns = events.t_ns[: np.searchsorted(events.t_ns, events.t_ns[0] + bin_ns * _MAX_FLICKER_BINS)]
     n_bins = int((t_ns[-1] - t_ns[0]) // bin_ns) + 1
     ends = np.searchsorted(t_ns, t_ns[0] + bin_ns * np.arange(1, n_bins + 1))
-    n_brighter = np.concatenate([[0], np.cumsum(events.polarity[: ends[-1]], dtype=np.int64)])[ends]
     counts = np.diff(ends, prepend=0)
-    signed = 2.0 * np.diff(n_brighter, prepend=0) - counts
+    is_filled = counts > 0
+    n_brighter = np.zeros(n_bins, dtype=np.int64)
+    begins = (ends - counts)[is_filled]
+    n_brighter[is_filled] = np.add.reduceat(events.polarity[: ends[-1]], begins, dtype=np.int64)
+    signed = 2.0 * n_brighter - counts
     coherence = _coherence(signed, counts)
     power = np.abs(np.fft.rfft(signed - signed.mean())) ** 2
     duration_s = len(signed) * bin_ns * 1e-9

@@ -16,26 +16,18 @@ def gate_image_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard |
         limits: `quality` of the rig profile.
     """
     q = found.quality
-    distance_m = q["distance_m"]
-    if q["square_px"] < limits.min_square_px:
-        closer_m = distance_m * (1 - q["square_px"] / limits.min_square_px)
-        return Refusal(
-            "image",
-            f"squares of {q['square_px']:.1f} px ({limits.min_square_px:g} needed)",
-            f"come {closer_m:.1f} m closer",
-        )
+    distance_m, square_px = q["distance_m"], q["square_px"]
+    if square_px < limits.min_square_px:
+        closer_m = distance_m * (1 - square_px / limits.min_square_px)
+        figures = {"square_px": square_px, "min_square_px": limits.min_square_px, "closer_m": closer_m}
+        return Refusal("image.small_squares", figures=figures)
     if q["border_px"] < limits.min_border_px:
-        return Refusal(
-            "image",
-            f"a corner lies {q['border_px']:.1f} px from the border ({limits.min_border_px:g} needed)",
-            "move the board towards the middle of the picture",
-        )
+        figures = {"border_px": q["border_px"], "min_border_px": limits.min_border_px}
+        return Refusal("image.near_border", figures=figures)
     if q["tilt_deg"] > limits.max_tilt_deg:
-        return Refusal(
-            "image",
-            f"tilted by {q['tilt_deg']:.0f} deg ({limits.max_tilt_deg:g} allowed)",
-            f"turn the board {q['tilt_deg'] - limits.max_tilt_deg + 5:.0f} deg towards the camera",
-        )
+        turn_deg = q["tilt_deg"] - limits.max_tilt_deg + 5
+        figures = {"tilt_deg": q["tilt_deg"], "max_tilt_deg": limits.max_tilt_deg, "turn_deg": turn_deg}
+        return Refusal("image.tilted", figures=figures)
     return _gate_distance("image", distance_m, limits) or found
 
 
@@ -59,26 +51,20 @@ def _lidar_problem(found: LidarBoard, board: Board, limits: QualitySettings) -> 
     if q["n_points"] < limits.min_points:
         closer_m = max(0.1, q["distance_m"] * (1 - (q["n_points"] / limits.min_points) ** 0.5))
         return Refusal(
-            "lidar",
-            f"{q['n_points']:.0f} points on the board ({limits.min_points} needed)",
-            f"come {closer_m:.1f} m closer",
+            "lidar.too_few_points",
+            figures={"n_points": int(q["n_points"]), "min_points": limits.min_points, "closer_m": closer_m},
         )
     for side, wanted_m in (("width", board.width_m), ("height", board.height_m)):
         measured_m, sigma_m = q[f"{side}_m"], q[f"{side}_sigma_m"]
         excess = abs(measured_m - wanted_m) - 3 * sigma_m - limits.max_size_error * wanted_m
         if excess > 0:
             return Refusal(
-                "lidar",
-                f"the plate's {side} measures {measured_m:.3f} m, the profile says {wanted_m:.3f} m",
-                f"measure the plate and correct board.{side}_m, or remove what touches it",
+                "lidar.other_size",
+                figures={"side": side, "measured_m": measured_m, "sigma_m": sigma_m, "profile_m": wanted_m},
             )
     if q["edge_rms_m"] > limits.max_edge_rms_m:
-        return Refusal(
-            "lidar",
-            f"ring ends lie {1000 * q['edge_rms_m']:.0f} mm off a rectangle "
-            f"({1000 * limits.max_edge_rms_m:.0f} allowed)",
-            "keep hands and other things away from the board's border",
-        )
+        figures = {"rms_m": q["edge_rms_m"], "max_rms_m": limits.max_edge_rms_m}
+        return Refusal("lidar.ragged_edges", figures=figures)
     return _gate_distance("lidar", q["distance_m"], limits)
 
 
@@ -86,11 +72,11 @@ def _gate_distance(
     stage: Literal["image", "lidar"], distance_m: float, limits: QualitySettings
 ) -> Refusal | None:
     """Refuse a board that is too near or too far."""
-    if distance_m < limits.min_distance_m:
-        away_m = limits.min_distance_m - distance_m
-        cause = f"the board is {distance_m:.2f} m away ({limits.min_distance_m:g} at least)"
-        return Refusal(stage, cause, f"go {away_m + 0.05:.1f} m back")
-    if distance_m > limits.max_distance_m:
-        cause = f"the board is {distance_m:.2f} m away ({limits.max_distance_m:g} at most)"
-        return Refusal(stage, cause, f"come {distance_m - limits.max_distance_m + 0.05:.1f} m closer")
+    low_m, high_m = limits.min_distance_m, limits.max_distance_m
+    if distance_m < low_m:
+        figures = {"distance_m": distance_m, "min_distance_m": low_m, "move_m": low_m - distance_m + 0.05}
+        return Refusal(f"{stage}.too_near", figures=figures)
+    if distance_m > high_m:
+        figures = {"distance_m": distance_m, "max_distance_m": high_m, "move_m": distance_m - high_m + 0.05}
+        return Refusal(f"{stage}.too_far", figures=figures)
     return None

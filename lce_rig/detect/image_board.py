@@ -24,7 +24,7 @@ from lce_rig.detect.image_saddle import Crossings, fit_crossings
 from lce_rig.solvers.pnp import PlanarPose, solve_planar_pose
 
 Region = tuple[int, int, int, int]
-NOT_SEEN_AT_ONCE = Refusal("image", "no board at first sight", "search the picture thoroughly")
+NOT_SEEN_AT_ONCE = Refusal("image.not_at_first_sight")
 """Of a search that was not thorough."""
 
 # The alternative pose is as good as the first where the difference of the costs could be noise (3 sigma).
@@ -105,7 +105,7 @@ def find_image_board(
         grey, crossings, board, intrinsics, _starts(None if followed is None else last)
     )
     if solved is None or solved.reprojection_px > max_reprojection_px:
-        return _misfit(solved, quality, intrinsics, max_reprojection_px)
+        return _misfit(solved, intrinsics, max_reprojection_px)
     quality |= {"n_corners": float(crossings.is_fitted.sum()), "corner_rms_px": solved.reprojection_px}
     return board_from_pose(crossings.grid_px.reshape(-1, 2), solved, quality)
 
@@ -291,14 +291,9 @@ def _pose_quality(T_cam_board: Array) -> dict[str, float]:
     return {"tilt_deg": float(np.degrees(np.arccos(min(cosine, 1.0)))), "distance_m": distance_m}
 
 
-def _misfit(
-    solved: PlanarPose | None, quality: dict[str, float], intrinsics: Intrinsics, max_reprojection_px: float
-) -> Refusal:
-    lens = f"{intrinsics.model} at {intrinsics.width_px}x{intrinsics.height_px} px"
-    action = f"check the camera's intrinsics ({lens}): model, distortion and resolution; is the print flat?"
+def _misfit(solved: PlanarPose | None, intrinsics: Intrinsics, max_reprojection_px: float) -> Refusal:
+    lens = {"model": intrinsics.model, "width_px": intrinsics.width_px, "height_px": intrinsics.height_px}
     if solved is None:
-        return Refusal("image", "the corners fit no pose of the board in front of the camera", action)
-    cause = (
-        f"corners fit the board to {solved.reprojection_px:.2f} px rms (at most {max_reprojection_px:.2f})"
-    )
-    return Refusal("image", cause, action)
+        return Refusal("image.no_pose", figures=lens)
+    errors = {"rms_px": solved.reprojection_px, "max_rms_px": max_reprojection_px}
+    return Refusal("image.misfit", figures={**lens, **errors})

@@ -22,6 +22,15 @@ _SQUARE_PX = 12.0
 _MOST_SCALE = 1.5
 # A grid of another size with this share of the wanted corners is another board, not a part of the board.
 _OTHER_BOARD = 0.6
+# Saddle points that are looked at, and about how far edges reach around them, in the image that is searched.
+_MOST_SADDLES = 220
+_SADDLE_SIGMA_PX = 1.2
+# Cosine of the angle between a corner's edge and the way to its neighbour, at least.
+_ALONG = 0.94
+# Neighbours are alike: in the strength of their saddles, and in how far apart they are along a row.
+_MOST_STRONGER = 2.5
+_MOST_LONGER = 1.7
+_WAYS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 _SB_THOROUGH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
@@ -40,6 +49,16 @@ def find_grid(
     Returns:
         The crossings, `grid_px` in the order of `Board.corners()`; None where no attempt finds that many.
     """
+    width = grey.shape[1]
+    lattice_scale = _SEARCH_PX / width if width > _WIDE_PX else 1.0
+    if square_px is not None:
+        lattice_scale = min(_SQUARE_PX / square_px, 1.0)
+    lattice = crossing_lattice(grey, (board.cols, board.rows), lattice_scale)
+    if lattice is not None:
+        ordered = order_corners(grey, lattice, board)
+        crossings = fit_crossings(grey, ordered.reshape(board.rows, board.cols, 2))
+        if crossings.is_fitted.all():
+            return crossings
     seen = seen_grid(grey, None if square_px is None else min(_SQUARE_PX / square_px, _MOST_SCALE))
     if seen is not None and seen.shape[:2] == (board.cols, board.rows):
         seen = seen.swapaxes(0, 1)
@@ -185,3 +204,126 @@ def _to_full_scale(corners: NDArray[Any] | None, scale: float) -> Array | None:
         return None
     # Pixel centres are integers: the centre of the first pixel lies half a pixel inside the picture.
     return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
+
+
+def crossing_lattice(grey: Grey, size: tuple[int, int], scale: float) -> Array | None:
+    """Find a grid of just so many crossings by linking saddle points of the grey values.
+
+    Each saddle point's two edges point at its neighbours, whose colours are the other way round. Points that
+    find each other so are linked, and the links are followed over the grid. It gives up, and the finders
+    take over, where a corner is missing, or one is linked that does not belong there.
+
+    Args:
+        grey: (H, W).
+        size: (cols, rows); either may be the rows.
+        scale: of the image that is searched.
+
+    Returns:
+        (rows * cols, 2) px, row by row, to about half a pixel; None where no such grid is found.
+    """
+    points, edges, strengths = _saddle_points(_resize(grey, scale))
+    if len(points) < size[0] * size[1]:
+        return None
+    places = _follow_links(_link(points, edges, strengths), size[0] * size[1])
+    if places is None:
+        return None
+    cells = np.array(list(places.values()))
+    cells -= cells.min(axis=0)
+    n_columns, n_rows = (int(n) for n in cells.max(axis=0) + 1)
+    if {(n_columns, n_rows), (n_rows, n_columns)}.isdisjoint({size}) or len(cells) != size[0] * size[1]:
+        return None
+    grid = np.empty((n_rows, n_columns, 2))
+    grid[cells[:, 1], cells[:, 0]] = points[list(places)]
+    grid = grid if (n_columns, n_rows) == size else grid.swapaxes(0, 1)
+    return _to_full_scale(grid, scale)
+
+
+def _saddle_points(grey: Grey) -> tuple[Array, Array, Array]:
+    """Find the strongest saddle points, (N, 2) px, directions (N, 2, 2) of the two edges, and strengths (N,).
+
+    The quarter counter-clockwise of the first edge, as (u, v) are, is bright.
+    """
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _SADDLE_SIGMA_PX)
+    duu, dvv = cv2.Sobel(smooth, cv2.CV_32F, 2, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 2)
+    duv = cv2.Sobel(smooth, cv2.CV_32F, 1, 1)
+    response = duv * duv - duu * dvv
+    is_peak = (response >= cv2.dilate(response, np.ones((3, 3), np.uint8))) & (response > 1.0)
+    is_peak[:2], is_peak[-2:], is_peak[:, :2], is_peak[:, -2:] = False, False, False, False
+    v, u = np.nonzero(is_peak)
+    order = np.argsort(-response[v, u], kind="stable")[:_MOST_SADDLES]
+    v, u = v[order], u[order]
+    H = np.empty((len(u), 2, 2))
+    H[:, 0, 0], H[:, 1, 1], H[:, 0, 1] = duu[v, u], dvv[v, u], duv[v, u]
+    H[:, 1, 0] = H[:, 0, 1]
+    values, vectors = np.linalg.eigh(H)
+    # From the pixel to where the slope vanishes; Sobel's second derivatives are four times as large.
+    slope = np.stack([smooth[v, u + 1] - smooth[v, u - 1], smooth[v + 1, u] - smooth[v - 1, u]], axis=1) / 2
+    shift = np.clip(-4.0 * np.linalg.solve(H, slope[..., None])[..., 0], -1.0, 1.0)
+    # Along the edges the second derivative vanishes: between the eigenvectors, in the ratio of their values.
+    half = np.arctan(np.sqrt(np.maximum(values[:, 1], 1e-9) / np.maximum(-values[:, 0], 1e-9)))
+    middle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+    angles = np.stack([middle - half, middle + half], axis=1)
+    points = np.stack([u, v], axis=1) + shift
+    return points, np.stack([np.cos(angles), np.sin(angles)], axis=-1), response[v, u]
+
+
+def _link(points: Array, edges: Array, strengths: Array) -> dict[int, dict[int, tuple[int, int]]]:
+    """Link points that are each other's nearest along their edges, by point and side: (neighbour, its side).
+
+    Sides 0 to 3 are the first edge, the second, and both backwards.
+    """
+    apart = points[None] - points[:, None]
+    distance = np.linalg.norm(apart, axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    along = np.einsum("ijc,iac->aij", apart, edges) / np.maximum(distance, 1e-9)
+    ratio = strengths[None] / strengths[:, None]
+    is_alike = (ratio < _MOST_STRONGER) & (ratio > 1 / _MOST_STRONGER)
+    nearest = np.empty((4, len(points)), dtype=np.int64)
+    lengths = np.empty((4, len(points)))
+    for edge in (0, 1):
+        # Colours change from corner to corner, so that the first edge of one is the second of the next.
+        is_back = (np.abs(along[1 - edge].T) > _ALONG) & is_alike
+        for side, cosine in ((edge, along[edge]), (edge + 2, -along[edge])):
+            allowed = np.where(is_back & (cosine > _ALONG), distance, np.inf)
+            nearest[side], lengths[side] = allowed.argmin(axis=1), allowed.min(axis=1)
+    is_near = np.isfinite(lengths) & (lengths <= _MOST_LONGER * lengths[[2, 3, 0, 1]])
+    links: dict[int, dict[int, tuple[int, int]]] = {}
+    for side, i in zip(*np.nonzero(is_near), strict=True):
+        j = int(nearest[side, i])
+        back = 1 - side % 2
+        back += 2 if along[back, j, i] < 0 else 0
+        if is_near[back, j] and nearest[back, j] == i:
+            links.setdefault(int(i), {})[int(side)] = (j, int(back))
+    return links
+
+
+def _follow_links(
+    links: dict[int, dict[int, tuple[int, int]]], n_wanted: int
+) -> dict[int, tuple[int, int]] | None:
+    """Give the points of one connected grid of at least so many (column, row); None where links disagree.
+
+    Corners of a grid have two neighbours at least: what has fewer hangs on to it by chance.
+    """
+    while loose := [i for i, sides in links.items() if len(sides) < 2]:
+        for i in loose:
+            for j, back in links.pop(i).values():
+                links.get(j, {}).pop(back, None)
+    left = set(links)
+    while len(left) >= n_wanted:
+        first = left.pop()
+        places, turns, due = {first: (0, 0)}, {first: 0}, [first]
+        while due:
+            i = due.pop()
+            for side, (j, back) in links[i].items():
+                way = (side + turns[i]) % 4
+                place = (places[i][0] + _WAYS[way][0], places[i][1] + _WAYS[way][1])
+                turn = (way - back - 2) % 4
+                if j not in places:
+                    places[j], turns[j] = place, turn
+                    due.append(j)
+                elif (places[j], turns[j]) != (place, turn):
+                    return None
+        left -= places.keys()
+        if len(places) >= n_wanted:
+            return places if len(set(places.values())) == len(places) else None
+    return None

@@ -1,4 +1,4 @@
-"""What a picture shows of the board in numbers, and in words where it shows too little."""
+"""What a picture shows of the board in numbers, and why where it shows too little."""
 
 from collections.abc import Mapping
 
@@ -11,8 +11,6 @@ from lce_rig.core.results import Refusal
 from lce_rig.detect.image_corners import seen_grid, square_values
 from lce_rig.detect.image_saddle import Crossings
 
-#: What events need to show a board.
-MOVE_SLOWLY = "move the board sideways slowly, about 10 cm/s, from a second before the capture on"
 # 10 to 90 % of an edge blurred by a Gaussian span 2.56 sigma.
 _EDGE_WIDTH_PER_SIGMA = 2.56
 
@@ -90,35 +88,23 @@ def _alternation(values: Array, signs: Array) -> float:
 
 def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool = False) -> Refusal:
     """Say why the board was not found, from the grey values and from what checkerboard is there instead."""
-    wanted = f"{board.cols}x{board.rows}"
     low, dark, bright = (float(value) for value in np.percentile(grey, (1, 50, 99)))
     if bright < 50:
-        return Refusal(
-            "image", f"too dark: 99 % of the picture below grey {bright:.0f}", "expose longer or add light"
-        )
-    if np.mean(grey >= 250) > 0.5:
-        cause = f"overexposed: {100 * np.mean(grey >= 250):.0f} % of the picture is white"
-        return Refusal("image", cause, "expose shorter or turn the board away from the light")
+        return Refusal("image.too_dark", figures={"grey_99": bright})
+    white_share = float(np.mean(grey >= 250))
+    if white_share > 0.5:
+        return Refusal("image.overexposed", figures={"white_share": white_share})
     seen = seen_grid(grey)
     if seen is not None:
         return explain_other_grid(grey, board, seen, is_from_events)
+    wanted = {"n_cols": board.cols, "n_rows": board.rows}
+    action = _action(is_from_events)
     if bright - low < 50:
-        cause = f"contrast too low: grey values {low:.0f} to {bright:.0f}, no {wanted} inner corners seen"
-        too_few = "move the board while events are recorded: only moving edges make them"
-        return Refusal("image", cause, too_few if is_from_events else "light the board, expose longer")
+        return Refusal("image.flat", figures={**wanted, "grey_1": low, "grey_99": bright}, action=action)
     width_px = strongest_edge_px(grey, bright - low)
     if width_px > 6:
-        cause = f"too blurred: the sharpest edges are {width_px:.0f} px wide, no {wanted} inner corners seen"
-        action = MOVE_SLOWLY if is_from_events else "hold the board still, expose shorter, focus the lens"
-        return Refusal("image", cause, action)
-    action = (
-        "show the whole print, uncovered; inner corners are where four squares meet, one less than squares"
-    )
-    return Refusal(
-        "image",
-        f"no board: {wanted} inner corners wanted, none seen (median grey {dark:.0f})",
-        f"{action}; {MOVE_SLOWLY}" if is_from_events else action,
-    )
+        return Refusal("image.blurred", figures={**wanted, "edge_px": width_px}, action=action)
+    return Refusal("image.no_board", figures={**wanted, "grey_50": dark}, action=action)
 
 
 def explain_other_grid(
@@ -130,48 +116,41 @@ def explain_other_grid(
         seen_px: (rows, cols, 2).
     """
     wanted, seen = _sizes(board, seen_px)
-    text = f"{wanted[0]}x{wanted[1]} inner corners wanted, {seen[0]}x{seen[1]} seen"
+    figures = {"n_cols": wanted[0], "n_rows": wanted[1], "n_cols_seen": seen[0], "n_rows_seen": seen[1]}
+    action = _action(is_from_events)
     if seen == wanted:
-        return Refusal(
-            "image",
-            f"the {wanted[0]}x{wanted[1]} inner corners are there but too unclear to measure",
-            f"{MOVE_SLOWLY}; come closer"
-            if is_from_events
-            else "hold the board still, closer and better lit",
-        )
+        return Refusal("image.unclear", figures=figures, action=action)
     is_part = seen[0] <= wanted[0] and seen[1] <= wanted[1]
     side = _side_beyond(grey, seen_px)
     if is_part and side:
-        return Refusal(
-            "image",
-            f"board cut off by the {side} border: {text}",
-            f"move the board away from the {side} border",
-        )
+        return Refusal("image.cut_off", figures={**figures, "side": side})
     if is_part:
-        action = (
-            "uncover the whole print; if it has these corners, correct board.inner_corners in the profile"
-        )
-        return Refusal("image", text, f"{MOVE_SLOWLY}; {action}" if is_from_events else action)
-    return Refusal(
-        "image", text, "correct board.inner_corners in the profile: one less than squares along each side"
-    )
+        return Refusal("image.part", figures=figures, action=action)
+    return Refusal("image.other_board", figures=figures)
 
 
 def quality_problem(
     quality: Mapping[str, float], min_contrast: float, min_sharpness: float, is_from_events: bool = False
 ) -> Refusal | None:
     """Judge the figures of a grid that was found; None where they will do."""
+    action = _action(is_from_events)
     if quality["contrast"] < min_contrast:
-        cause = f"contrast too low: black and white differ by {quality['contrast']:.0f} grey values"
-        cause += f" ({min_contrast:.0f} needed)"
-        return Refusal("image", cause, MOVE_SLOWLY if is_from_events else "expose longer or add light")
+        figures = {"contrast": quality["contrast"], "min_contrast": min_contrast}
+        return Refusal("image.low_contrast", figures=figures, action=action)
     if quality["sharpness"] < min_sharpness:
-        cause = f"too blurred: edges {quality['edge_width_px']:.1f} px wide on squares of"
-        cause += f" {quality['square_px']:.1f} px"
-        cause += f" ({min_sharpness:g} edge widths a square needed)" if is_from_events else ""
-        still = "hold the board still, expose shorter, come closer, focus the lens"
-        return Refusal("image", cause, f"{MOVE_SLOWLY}; come closer" if is_from_events else still)
+        figures = {
+            "edge_px": quality["edge_width_px"],
+            "square_px": quality["square_px"],
+            "sharpness": quality["sharpness"],
+            "min_sharpness": min_sharpness,
+        }
+        return Refusal("image.not_sharp", figures=figures, action=action)
     return None
+
+
+def _action(is_from_events: bool) -> str:
+    """Name the kind of advice: events need motion where a camera wants stillness."""
+    return "events" if is_from_events else ""
 
 
 def _sizes(board: Board, seen_px: Array) -> tuple[tuple[int, int], tuple[int, int]]:

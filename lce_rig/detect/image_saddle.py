@@ -12,10 +12,15 @@ from lce_rig.core.geometry import Array
 # next corners stay outside.
 _REACH = 0.42
 _MAX_SAMPLES_PER_SIDE = 25
+# Of the patches that bring corners to where the final ones need few steps; those take most of the time.
+_COARSE_SAMPLES = 9
+_COARSE_STEPS = 6
+# Of samples farther apart the image is blurred before.
+_FAR_APART_PX = 1.3
 _STEPS = 12
 _MIN_SIGMA_PX = 0.25
-# Fits that gain no more than this share of their cost in a step are done: corners rest to 1e-3 px.
-_SETTLED = 1e-6
+# Fits that gain no more than this share of their cost in a step are done: corners rest within their noise.
+_SETTLED = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +59,17 @@ def fit_crossings(
         grid_px: (rows, cols, 2) corners to within a third of a square.
         most_samples: per side of a patch; of fewer a fit is faster and noisier.
     """
+    coarse, parameters = _fit_patches(grey, grid_px, min(_COARSE_SAMPLES, most_samples), None, _COARSE_STEPS)
+    if not coarse.is_fitted.all():
+        # A patch that slips from its corner pulls no other one along.
+        return _fit_patches(grey, grid_px, most_samples, None)[0]
+    return _fit_patches(grey, coarse.grid_px, most_samples, parameters)[0]
+
+
+def _fit_patches(
+    grey: NDArray[np.uint8], grid_px: Array, most_samples: int, start: Array | None, n_steps: int = _STEPS
+) -> tuple[Crossings, Array]:
+    """Fit patches of at most so many samples a side; the parameters (K, 8) serve finer patches as start."""
     e1, e2 = _sides(grid_px)
     area = np.abs(e1[..., 0] * e2[..., 1] - e1[..., 1] * e2[..., 0])
     # Width of a square across its edges: what one unit of a and of b is in px.
@@ -63,28 +79,36 @@ def fit_crossings(
     axis = np.linspace(-_REACH, _REACH, n)
     b, a = (grid.ravel() for grid in np.meshgrid(axis, axis, indexing="ij"))
     pixels = grid_px[..., None, :] + a[:, None] * e1[..., None, :] + b[:, None] * e2[..., None, :]
-    values = sample(grey, pixels).reshape(-1, n * n)
+    # Samples far apart would see a sharp edge jump between them, and corners would rest anywhere there.
+    step_px = 2 * _REACH * longest_px / (n - 1)
+    blur_px = 0.4 * step_px if step_px > _FAR_APART_PX else 0.0
+    values = _sample_smooth(grey, pixels, blur_px).reshape(-1, n * n)
 
     flat_height = height_px.reshape(-1, 2)
-    parameters, residuals = _fit(values, a, b, flat_height)
+    parameters, residuals = _fit(
+        values, a, b, flat_height, start, n_steps, float(np.hypot(_MIN_SIGMA_PX, blur_px))
+    )
     shift = parameters[:, :2].reshape(grid_px.shape)
-    sigma_px = np.exp(parameters[:, 6:8]) * flat_height
+    blurred_px = np.exp(parameters[:, 6:8]) * flat_height
+    sigma_px = np.sqrt(np.maximum(blurred_px**2 - blur_px**2, _MIN_SIGMA_PX**2))
+    parameters[:, 6:8] = np.log(sigma_px / flat_height)
     noise = np.sqrt(np.mean(residuals**2, axis=1))
     contrast = 2.0 * parameters[:, 5]
     is_fitted = (np.abs(parameters[:, :2]).max(axis=1) < 0.35) & (np.abs(contrast) > 2.0 * noise)
     is_fitted &= np.abs(parameters[:, 2:4]).max(axis=1) < 0.7
     is_fitted = is_fitted.reshape(grid_px.shape[:2])
     moved = grid_px + shift[..., :1] * e1 + shift[..., 1:] * e2
-    return Crossings(
+    crossings = Crossings(
         grid_px=np.where(is_fitted[..., None], moved, grid_px),
         is_fitted=is_fitted,
         contrast=contrast.reshape(is_fitted.shape),
         edge_sigma_px=sigma_px.reshape(grid_px.shape),
         noise=float(np.median(noise)),
     )
+    return crossings, parameters
 
 
-def sample(grey: NDArray[np.uint8], pixels: Array) -> Array:
+def sample(grey: NDArray[np.uint8] | NDArray[np.float32], pixels: Array) -> Array:
     """Interpolate grey values bilinearly at (..., 2) px; beyond the border its value is kept."""
     # cv2.remap takes at most 32766 rows and columns.
     maps = np.asarray(pixels, dtype=np.float32).reshape(-1, pixels.shape[-2], 2)
@@ -92,45 +116,93 @@ def sample(grey: NDArray[np.uint8], pixels: Array) -> Array:
     return np.asarray(values, dtype=np.float64).reshape(pixels.shape[:-1])
 
 
+def _sample_smooth(grey: NDArray[np.uint8], pixels: Array, blur_px: float) -> Array:
+    """Sample the image under Gaussian blur; only the part about the pixels is blurred."""
+    if not blur_px:
+        return sample(grey, pixels)
+    reach = np.ceil(4 * blur_px) + 1
+    axes = tuple(range(pixels.ndim - 1))
+    low = np.maximum(np.floor(pixels.min(axis=axes) - reach), 0).astype(int)
+    high = np.maximum(np.ceil(pixels.max(axis=axes) + reach).astype(int), low + 1)
+    part = grey[low[1] : high[1], low[0] : high[0]]
+    if not part.size:
+        return sample(grey, pixels)
+    smooth = np.asarray(
+        cv2.GaussianBlur(part.astype(np.float32), (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE),
+        dtype=np.float32,
+    )
+    return sample(smooth, pixels - low)
+
+
 def _sides(grid_px: Array) -> tuple[Array, Array]:
     """Measure the local side vectors along rows and columns, (rows, cols, 2) each."""
     return np.gradient(grid_px, axis=1), np.gradient(grid_px, axis=0)
 
 
-def _fit(values: Array, a: Array, b: Array, height_px: Array) -> tuple[Array, Array]:
-    """Fit all patches (K, n): parameters (K, 8) a0 b0 alpha beta m c log(s1) log(s2), residuals (K, n)."""
-    count = len(values)
-    mean = values.mean(axis=1)
-    swing = ((values - mean[:, None]) * np.sign(a * b)).mean(axis=1)
-    p = np.zeros((count, 8))
-    p[:, 4], p[:, 5] = mean, swing
-    p[:, 6:8] = np.log(np.clip(0.8 / height_px, 1e-3, 0.3))
-    lowest = np.log(_MIN_SIGMA_PX / height_px)
-    damping = np.full(count, 1e-2)
+def _fit(
+    values: Array,
+    a: Array,
+    b: Array,
+    height_px: Array,
+    start: Array | None,
+    n_steps: int,
+    least_sigma_px: float,
+) -> tuple[Array, Array]:
+    """Fit all patches (K, n): parameters (K, 8) a0 b0 alpha beta m c log(s1) log(s2), residuals (K, n).
+
+    `start` holds parameters of patches that were fitted before, and have been centred on their corners since.
+    """
+    p, lowest = _start(values, a, b, height_px), np.log(least_sigma_px / height_px)
+    if start is not None:
+        p[:, 2:] = start[:, 2:]
+        p[:, 6:8] = np.clip(p[:, 6:8], lowest, 0.0)
+    damping = np.full(len(p), 1e-2 if start is None else 1e-4)
     residuals, J = _model(p, values, a, b)
     cost = np.sum(residuals**2, axis=1)
-    for _ in range(_STEPS):
-        H = J @ np.swapaxes(J, 1, 2)
+    k = np.arange(len(p))  # Those that are not done.
+    for _ in range(n_steps):
+        J_k = J if len(k) == len(p) else J[k]
+        # Blurs at their bounds that would go beyond stay there: the others then settle in few steps.
+        gradient = (J_k @ residuals[k, :, None])[..., 0]
+        is_held = np.zeros((len(k), 8), dtype=bool)
+        is_held[:, 6:8] = ((p[k, 6:8] <= lowest[k]) & (gradient[:, 6:8] > 0)) | (
+            (p[k, 6:8] >= 0.0) & (gradient[:, 6:8] < 0)
+        )
+        H = J_k @ np.swapaxes(J_k, 1, 2)
+        H[is_held[:, :, None] | is_held[:, None, :]] = 0.0
+        gradient[is_held] = 0.0
         diagonal = np.einsum("kii->ki", H)
         damped = (
             H
             + np.eye(8)
-            * (damping[:, None] * diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-12)[:, None, :]
+            * (damping[k, None] * diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-12)[:, None, :]
         )
-        step = -np.linalg.solve(damped, J @ residuals[..., None])[..., 0]
-        candidate = p + step
+        damped += np.eye(8) * is_held[:, None, :]
+        step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
+        candidate = p[k] + step
         candidate[:, :4] = np.clip(candidate[:, :4], -1.0, 1.0)
-        candidate[:, 6:8] = np.clip(candidate[:, 6:8], lowest, 0.0)
-        new_residuals, new_J = _model(candidate, values, a, b)
+        candidate[:, 6:8] = np.clip(candidate[:, 6:8], lowest[k], 0.0)
+        new_residuals, new_J = _model(candidate, values[k], a, b)
         new_cost = np.sum(new_residuals**2, axis=1)
-        is_better = new_cost < cost
-        is_settled = np.all(np.abs(cost - new_cost) <= _SETTLED * cost)
-        p[is_better], cost[is_better] = candidate[is_better], new_cost[is_better]
-        residuals[is_better], J[is_better] = new_residuals[is_better], new_J[is_better]
-        damping = np.where(is_better, damping * 0.2, damping * 5.0)
-        if is_settled:
+        is_better = new_cost < cost[k]
+        is_settled = np.abs(cost[k] - new_cost) <= _SETTLED * cost[k]
+        better = k[is_better]
+        p[better], cost[better] = candidate[is_better], new_cost[is_better]
+        residuals[better], J[better] = new_residuals[is_better], new_J[is_better]
+        damping[k] = np.where(is_better, damping[k] * 0.2, damping[k] * 5.0)
+        k = k[~is_settled]
+        if not len(k):
             break
     return p, residuals
+
+
+def _start(values: Array, a: Array, b: Array, height_px: Array) -> Array:
+    """Guess the parameters (K, 8) of corners in the middles of their patches."""
+    mean = values.mean(axis=1)
+    p = np.zeros((len(values), 8))
+    p[:, 4], p[:, 5] = mean, ((values - mean[:, None]) * np.sign(a * b)).mean(axis=1)
+    p[:, 6:8] = np.log(np.clip(0.8 / height_px, 1e-3, 0.3))
+    return p
 
 
 def _model(p: Array, values: Array, a: Array, b: Array) -> tuple[Array, Array]:

@@ -127,7 +127,7 @@ def measure_plate(
         max_beyond: largest share of returns in the plane beyond the outline, as it is guessed.
 
     Returns:
-        The board, why it is refused, None where there is no plate to speak of.
+        The board, why it is refused, None where there is no plate.
     """
     refined = refine(ordered, plane, origin, start, limits.template_m, max_beyond)
     if refined is None:
@@ -147,7 +147,7 @@ def measure_plate(
 
 
 def _is_clear(found: LidarBoard) -> bool:
-    """Tell whether a candidate has many rings and its plane almost to itself."""
+    """Return whether a candidate has many rings and its plane almost to itself."""
     return found.quality["n_rings"] >= CLEAR_RINGS and found.quality["beyond_share"] < CLEAR_SHARE
 
 

@@ -203,13 +203,13 @@ def _within_reach(centres: Array, others: Array, reach_m: float, block: int = 32
 
 
 def _faces_lidar(plates: Plates) -> NDArray[np.bool_]:
-    """Tell which planes (K,) the beams meet at less than the largest incidence; d = distance of the plane."""
+    """Find which planes (K,) the beams meet at less than the largest incidence; d = distance of the plane."""
     distance = np.linalg.norm(plates.centre, axis=1)
     return np.asarray(plates.plane[:, 3] > np.cos(MAX_INCIDENCE_RAD) * distance)
 
 
 def _is_plausible(plates: Plates, board: Board) -> NDArray[np.bool_]:
-    """Tell which plates (K,) can be the board, part of which may be hidden or outside the rings."""
+    """Find which plates (K,) can be the board, part of which may be hidden or outside the rings."""
     long_m, short_m = max(board.width_m, board.height_m), min(board.width_m, board.height_m)
     ratio = plates.size_m / [long_m, short_m]
     return np.asarray((ratio[:, 0] > 0.5) & (ratio[:, 0] < 1.5) & (ratio[:, 1] > 0.25) & (ratio[:, 1] < 1.5))

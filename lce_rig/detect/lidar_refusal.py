@@ -1,4 +1,4 @@
-"""Say why no board was found in a scan: the nearest miss, with its figure and what to do."""
+"""Why no board was found in a scan: the nearest miss, with its figures."""
 
 from dataclasses import replace
 
@@ -22,11 +22,7 @@ LAYER_M = 0.06  # half the depth in which returns may belong to one warped or mo
 
 def no_returns(n_points: int, min_range_m: float) -> Refusal:
     """Refuse a scan without usable returns."""
-    return Refusal(
-        "lidar",
-        f"{n_points} points, none of them finite and farther than {min_range_m:g} m",
-        "check the LiDAR's cable, topic and driver settings",
-    )
+    return Refusal("lidar.no_returns", figures={"n_points": n_points, "min_range_m": min_range_m})
 
 
 def too_few_rings(found: LidarBoard, min_rings: int) -> Refusal:
@@ -34,9 +30,13 @@ def too_few_rings(found: LidarBoard, min_rings: int) -> Refusal:
     n_rings, distance_m = found.quality["n_rings"], found.quality["distance_m"]
     closer_m = max(0.1, distance_m * (1.0 - n_rings / min_rings))
     return Refusal(
-        "lidar",
-        f"{n_rings:.0f} rings on the board at {distance_m:.1f} m ({min_rings} needed)",
-        f"come {closer_m:.1f} m closer",
+        "lidar.too_few_rings",
+        figures={
+            "n_rings": int(n_rings),
+            "min_rings": min_rings,
+            "distance_m": distance_m,
+            "closer_m": closer_m,
+        },
     )
 
 
@@ -49,10 +49,12 @@ def too_thick(heights_m: Array, limit_m: float) -> Refusal:
     """
     low_m, high_m = np.percentile(heights_m, [2.5, 97.5])
     return Refusal(
-        "lidar",
-        f"surface {100 * (high_m - low_m):.0f} cm thick, rms {1000 * np.sqrt(np.mean(heights_m**2)):.0f} mm "
-        f"({1000 * limit_m:.0f} allowed): the board moved during the sweep or is not flat",
-        "hold the board still, or put it on a stand",
+        "lidar.too_thick",
+        figures={
+            "thickness_m": float(high_m - low_m),
+            "rms_m": float(np.sqrt(np.mean(heights_m**2))),
+            "max_rms_m": limit_m,
+        },
     )
 
 
@@ -72,19 +74,18 @@ def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_li
     is_one_sheet = len(heights_m) > 0.8 * max(1, int((distance < -0.03).sum()))
     if is_one_sheet and np.sqrt(np.mean(heights_m**2)) > rms_limit_m:
         return too_thick(heights_m, rms_limit_m)
-    where = f"at {np.linalg.norm(view.origin):.1f} m"
+    distance_m = float(np.linalg.norm(view.origin))
     if beyond > TOUCHING_SHARE:
-        return Refusal(
-            "lidar",
-            f"the board {where} touches another surface: {100 * beyond:.0f} % more returns lie in its plane",
-            "keep walls, tables and hands 0.2 m away from the board's edges and plane",
-        )
+        return Refusal("lidar.touching", figures={"distance_m": distance_m, "beyond_share": beyond})
     hidden = float(np.mean(~view.is_on[distance <= -0.03])) if np.any(distance <= -0.03) else 0.0
     return Refusal(
-        "lidar",
-        f"the outline of the plate {where} is off by {1000 * placement.error_m:.0f} mm "
-        f"({1000 * limit_m:.0f} allowed), {100 * hidden:.0f} % of the board hidden",
-        "show the whole board, with nothing before it and nothing at its edges",
+        "lidar.outline",
+        figures={
+            "distance_m": distance_m,
+            "error_m": float(placement.error_m),
+            "max_error_m": limit_m,
+            "hidden_share": hidden,
+        },
     )
 
 
@@ -112,20 +113,20 @@ def no_plate(
         if len(heights_m) > 0.8 * (distance < -0.03).sum() and np.std(heights_m) > 2.0 * scan.sigma_m + 0.008:
             return too_thick(heights_m, 2.0 * scan.sigma_m + 0.008)
     board_m = np.array([max(board.width_m, board.height_m), min(board.width_m, board.height_m)])
-    wanted = f"{board.width_m:.2f} x {board.height_m:.2f} m"
+    wanted = {"board_width_m": board.width_m, "board_height_m": board.height_m}
     misfit = np.abs(np.log(np.maximum(plates.size_m, 1e-2) / board_m)).sum(axis=1)
     misfit[plates.n_rings < 3] += 1.0
     if len(misfit) and misfit.min() < MAX_SIZE_MISFIT:
         best = int(np.argmin(misfit))
         return Refusal(
-            "lidar",
-            f"the plate nearest to the board's size is {plates.size_m[best, 0]:.2f} x "
-            f"{plates.size_m[best, 1]:.2f} m, at {np.linalg.norm(plates.centre[best]):.1f} m; "
-            f"the board is {wanted}",
-            "check width_m and height_m of the board in the rig profile, or show the whole board",
+            "lidar.other_plate",
+            figures={
+                "width_m": float(plates.size_m[best, 0]),
+                "height_m": float(plates.size_m[best, 1]),
+                "distance_m": float(np.linalg.norm(plates.centre[best])),
+                **wanted,
+            },
         )
     return Refusal(
-        "lidar",
-        f"no plate of the board's size ({wanted}) between {min_range_m:g} and {max_range_m:g} m",
-        "hold the board 1.5 to 3 m from the LiDAR, in sight, with nothing at its edges",
+        "lidar.no_plate", figures={**wanted, "min_range_m": min_range_m, "max_range_m": max_range_m}
     )

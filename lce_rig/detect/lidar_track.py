@@ -65,13 +65,11 @@ def track_lidar_board(
         beam=beam,
     )
     if isinstance(found, Refusal):
-        return Refusal("lidar", f"lost near its last place: {found.cause}", found.action)
+        return Refusal("lidar.lost", figures={**found.figures, "cause": found.code})
     for candidate in found:
         if candidate.plane[:3] @ previous.plane[:3] > MAX_TURN:
             return candidate
-    return Refusal(
-        "lidar", "the only plate near the board's last place is turned by over 45 deg", "move more slowly"
-    )
+    return Refusal("lidar.turned_away", figures={"max_turn_deg": float(np.degrees(np.arccos(MAX_TURN)))})
 
 
 def _near(scan: Scan, board: Board, previous: LidarBoard, margin_m: float) -> Indices:

@@ -35,10 +35,10 @@ def load_exporter(name: str) -> Exporter:
     return exporter
 
 
-def write_exports(
+def export(
     calibrations: Sequence[Calibration],
     rig: Rig,
-    folder: Path,
+    folder: Path | str,
     *,
     formats: Iterable[str] | None = None,
     is_forced: bool = False,
@@ -52,8 +52,8 @@ def write_exports(
         calibrations: what to write, one for each camera channel and LiDAR.
         rig: the profile the calibrations belong to.
         folder: as a rule the session's `calibration/`.
-        formats: keys of EXPORTS; all where left out.
-        is_forced: write also what failed; every file then says so.
+        formats: keys of EXPORTS; all by default.
+        is_forced: write failed calibrations too; every file then says so.
 
     Returns:
         The files written, in the order of the formats.
@@ -63,6 +63,7 @@ def write_exports(
         ResultRefusedError: a verdict is "fail"; nothing is written.
         LceRigError: a file does not say what was calibrated; it and all others are removed again.
     """
+    folder = Path(folder)
     for calibration in calibrations:
         require_known(calibration, rig)
     exporters = [load_exporter(name) for name in (EXPORTS if formats is None else formats)]
@@ -99,7 +100,7 @@ def remove_exports(folder: Path) -> None:
 
 
 def is_export(path: Path) -> bool:
-    """Tell whether a file is an export that lce-rig wrote, by its first lines.
+    """Return whether a file is an export that lce-rig wrote, by its first lines.
 
     Raises:
         SessionError: it cannot be read.

@@ -1,4 +1,4 @@
-"""The tree of frames that URDF and static transforms describe, and the check that it is one."""
+"""The tree of frames for URDF and static transforms, and the check that it is a tree."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

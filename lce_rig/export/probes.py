@@ -1,4 +1,4 @@
-"""Probe points: what was written must put the same LiDAR points on the same pixels."""
+"""Probe points: a written file must project the same LiDAR points to the same pixels."""
 
 from pathlib import Path
 
@@ -14,12 +14,12 @@ TOLERANCE = 1e-6
 
 
 def probe_points(calibration: Calibration, rig: Rig) -> Array:
-    """List points (N, 3) m, frame LiDAR, that the camera sees all over its picture 1 to 10 m away."""
+    """List points (N, 3) m, frame LiDAR, that the camera sees all over its image 1 to 10 m away."""
     intrinsics = rig.cameras[calibration.camera].to_intrinsics()
     u = np.linspace(0.05, 0.95, 5) * (intrinsics.width_px - 1)
     v = np.linspace(0.05, 0.95, 5) * (intrinsics.height_px - 1)
     rays = intrinsics.unproject(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
-    # A lens model may end short of the picture's corners.
+    # A lens model may end short of the image's corners.
     rays = rays[np.isfinite(rays).all(axis=1)]
     points_camera = (rays[:, None, :] * np.array([1.0, 3.0, 10.0])[:, None]).reshape(-1, 3)
     return transform(invert(calibration.T_cam_lidar), points_camera)

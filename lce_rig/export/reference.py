@@ -1,4 +1,4 @@
-"""A reference extrinsic from outside, to report errors against."""
+"""Reference extrinsics from a file, for reporting errors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,12 +25,13 @@ class Reference:
         return self.by_pair.get((camera, lidar), self.default)
 
 
-def read_reference(path: Path) -> Reference:
+def read_reference(path: Path | str) -> Reference:
     """Read truth.json, result.json or any JSON with a 4x4 `T_cam_lidar`, at the top or in a list `pairs`.
 
     Raises:
-        SessionError: there is none, or it is no rigid transform.
+        SessionError: there is none, or it is not a rigid transform.
     """
+    path = Path(path)
     try:
         document = read_json(path)
     except OSError as error:

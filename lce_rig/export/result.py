@@ -16,6 +16,7 @@ from lce_rig.core.limits import describe
 from lce_rig.core.results import Calibration, ChannelResult, OtherCamera, PointUncertainty
 from lce_rig.export.result_schema import ChannelRecord, OtherCameraRecord, PairRecord, ResultRecord
 from lce_rig.export.writing import MADE_BY, write_atomically
+from lce_rig.words import as_json, refusal_as_json
 
 FORMAT_VERSION = 1
 
@@ -27,13 +28,13 @@ class SavedResult:
     Attributes:
         rig: its name.
         made_by: the program and its version.
-        calibrations: one for each camera and LiDAR.
+        pairs: one for each camera and LiDAR.
         inputs_sha256: SHA-256 of the session's files that the result was made from, by their path in it.
     """
 
     rig: str
     made_by: str
-    calibrations: tuple[Calibration, ...]
+    pairs: tuple[Calibration, ...]
     inputs_sha256: Mapping[str, str]
 
 
@@ -65,8 +66,7 @@ def to_json_dict(
 def _pair(calibration: Calibration) -> dict[str, Any]:
     metrics, certificate = calibration.metrics, calibration.certificate
     refused = {
-        name: {"stage": refusal.stage, "cause": refusal.cause, "action": refusal.action}
-        for name, refusal in sorted(calibration.captures_refused.items())
+        name: refusal_as_json(refusal) for name, refusal in sorted(calibration.captures_refused.items())
     }
     return {
         "camera": calibration.camera,
@@ -89,6 +89,7 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
         "egt_translation_m": _figure(calibration.egt_translation_m),
         "verdict": calibration.verdict,
         "reasons": list(calibration.reasons),
+        "findings": [as_json(finding) for finding in calibration.findings],
         "diagnostics": {name: _figure(value) for name, value in sorted(calibration.diagnostics.items())},
         "channels": [_channel(result, calibration) for result in calibration.channel_results],
         "method": calibration.method,
@@ -145,7 +146,12 @@ def result_text(
     rig_name: str, calibrations: Sequence[Calibration], inputs_sha256: Mapping[str, str] | None = None
 ) -> str:
     """Write the content of result.json: deterministic, floats to the last digit, a matrix row a line."""
-    return _layout(to_json_dict(rig_name, calibrations, inputs_sha256), "") + "\n"
+    return layout(to_json_dict(rig_name, calibrations, inputs_sha256))
+
+
+def layout(document: Mapping[str, Any]) -> str:
+    """Lay the content of result.json out as its text."""
+    return _layout(document, "") + "\n"
 
 
 def _layout(value: Any, indent: str) -> str:
@@ -177,12 +183,13 @@ def write_result(
     write_atomically(path, result_text(rig_name, calibrations, inputs_sha256))
 
 
-def read_result(path: Path) -> SavedResult:
+def read_result(path: Path | str) -> SavedResult:
     """Read result.json back, exactly as it was written; keys that later versions may add are ignored.
 
     Raises:
         SessionError: no such file, or not a result that can be trusted; with the key at fault.
     """
+    path = Path(path)
     try:
         data = read_json(path)
     except FileNotFoundError as error:
@@ -213,7 +220,7 @@ def read_result(path: Path) -> SavedResult:
 
 
 def _calibration(pair: PairRecord) -> Calibration:
-    from lce_rig.core.results import Certificate, Metrics, Refusal
+    from lce_rig.core.results import Certificate, Metrics
 
     def figure(value: float | None) -> float:
         return np.nan if value is None else value
@@ -231,12 +238,10 @@ def _calibration(pair: PairRecord) -> Calibration:
         n_captures=pair.n_captures,
         n_detected=pair.n_detected,
         captures_used=tuple(pair.captures_used),
-        captures_refused={
-            name: Refusal(refusal.stage, refusal.cause, refusal.action)
-            for name, refusal in pair.captures_refused.items()
-        },
+        captures_refused={name: record.refusal for name, record in pair.captures_refused.items()},
         verdict=pair.verdict,
         reasons=tuple(pair.reasons),
+        findings=tuple(record.finding for record in pair.findings),
         egt_rotation_deg=pair.egt_rotation_deg,
         egt_translation_m=pair.egt_translation_m,
         diagnostics={name: figure(value) for name, value in pair.diagnostics.items()},

@@ -1,11 +1,14 @@
 """The schema of result.json, strict where it is read."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import FARTHEST_M
+from lce_rig.core.results import Refusal
+from lce_rig.words import is_renderable
 
 
 def _check_pose(rows: list[list[float]]) -> list[list[float]]:
@@ -43,12 +46,57 @@ class _Record(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
 
 
+def _check_figures(figures: dict[str, Any]) -> dict[str, Figure]:
+    return {name: _figure(value) for name, value in figures.items()}
+
+
+def _figure(value: Any) -> Figure:
+    if isinstance(value, dict):
+        raise ValueError("a figure is no mapping")
+    return tuple(_figure(each) for each in value) if isinstance(value, list) else value
+
+
+_Figures = Annotated[dict[str, Any], AfterValidator(_check_figures)]
+
+
 class RefusalRecord(_Record):
-    """Why a capture is not used."""
+    """The reason for refusing a capture; files of earlier versions hold stage, cause and action only."""
 
     stage: Literal["read", "image", "lidar", "pair", "calibrate"]
     cause: str
     action: str
+    code: str = ""
+    figures: _Figures = Field(default_factory=dict)
+    action_code: str = ""
+
+    @property
+    def refusal(self) -> Refusal:
+        """The refusal; as plain text where this version has no words for its code."""
+        if self.code.startswith(f"{self.stage}."):
+            known = Refusal(self.code, figures=self.figures, action=self.action_code)
+            if is_renderable(known):
+                return known
+        return Refusal(f"{self.stage}.text", figures={"text": self.cause, "advice": self.action})
+
+
+class FindingRecord(_Record):
+    """One reason of a verdict, or a note."""
+
+    code: str
+    severity: Literal["note", "warning", "error"]
+    subject: str
+    figures: _Figures
+    action_code: str
+    text: str
+    action: str
+
+    @property
+    def finding(self) -> Finding:
+        """The finding; as plain text where this version has no words for its code."""
+        known = Finding(self.code, self.severity, self.subject, self.figures, self.action_code)
+        if is_renderable(known):
+            return known
+        return Finding("verdict.text", self.severity, figures={"text": self.text})
 
 
 class CertificateRecord(_Record):
@@ -59,7 +107,7 @@ class CertificateRecord(_Record):
 
 
 class ChannelRecord(_Record):
-    """What one channel says alone; time offsets are null where nothing moved."""
+    """The result of one channel alone; time offsets are null if nothing moved."""
 
     channel: str
     n_captures: _Count
@@ -73,7 +121,7 @@ class ChannelRecord(_Record):
 
 
 class UncertaintyRecord(_Record):
-    """What the covariance means for a point at a distance, in the picture's centre and worst corner."""
+    """The covariance as the error of a point at a distance, in the image's centre and worst corner."""
 
     distance_m: Annotated[float, Field(gt=0)]
     centre_px: _NotNegative
@@ -83,7 +131,7 @@ class UncertaintyRecord(_Record):
 
 
 class OtherCameraRecord(_Record):
-    """Where a camera sits to another one; cov is null where they were not estimated together."""
+    """The pose of a camera relative to another one; cov is null if they were not estimated together."""
 
     camera: str
     n_captures: _Count
@@ -118,6 +166,7 @@ class PairRecord(_Record):
     egt_translation_m: _NotNegative | None
     verdict: Literal["pass", "marginal", "fail"]
     reasons: list[str]
+    findings: list[FindingRecord] = Field(default_factory=list)
     diagnostics: dict[str, float | None] = Field(default_factory=dict)
     channels: list[ChannelRecord] = Field(default_factory=list)
     method: str = "paper"

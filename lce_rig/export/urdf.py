@@ -21,7 +21,7 @@ def export_urdf(calibrations: Sequence[Calibration], rig: Rig, folder: Path) -> 
     """Write RIG.urdf, and RIG-ROOT.urdf for sensors not connected with the base, and read them back.
 
     Raises:
-        LceRigError: a file is no tree or does not say what was calibrated.
+        LceRigError: a file is not a tree or does not say what was calibrated.
     """
     chosen = choose_channels(calibrations, rig)
     paths = []
@@ -98,7 +98,7 @@ def _check(path: Path, tree: FrameTree, chosen: Sequence[Calibration], rig: Rig)
     joined = {frozenset((joint.parent, joint.child)) for joint in tree.joints}
     for calibration in chosen:
         camera, lidar = rig.cameras[calibration.camera], rig.lidars[calibration.lidar]
-        # A pair that closes a loop is left out of the tree; nothing in the file says it.
+        # The tree omits a pair that closes a loop; the file does not mention it.
         if frozenset((camera.frame, lidar.frame)) in joined:
             T_cam_lidar = invert(poses[camera.optical_frame]) @ poses[lidar.frame]
             check_pose(

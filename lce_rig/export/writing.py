@@ -1,4 +1,4 @@
-"""Text on disk: numbers that read back exactly, files that exist whole or not at all."""
+"""Text on disk: numbers that read back exactly, files that are complete or absent."""
 
 import json
 from collections.abc import Callable, Iterable, Sequence

@@ -1,35 +1,129 @@
-"""Estimate and judge the extrinsic of every camera with every LiDAR of a session."""
+"""Estimate and judge the extrinsic of every camera with every LiDAR of a session.
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+detections -> estimate of each camera with each LiDAR -> cameras of one LiDAR, together -> checks, verdict
+"""
 
-from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from lce_rig.calibrate import (
+    CalibrateOptions,
+    CalibrationEstimate,
+    CaptureCandidates,
+    Clocks,
+    EstimateSettings,
+    calibrate_channels,
+)
+from lce_rig.calibrate.camera_pairs import CameraPair, doubt_cameras, relate
+from lce_rig.calibrate.consensus import find_consensus
+from lce_rig.calibrate.examination import Examination, examine
+from lce_rig.calibrate.intrinsics_estimate import View
+from lce_rig.calibrate.likelihood.calibrate_together import TogetherEstimate, calibrate_together
 from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.calibrate.reach import point_uncertainties
+from lce_rig.calibrate.relative_pose import relative_pose
 from lce_rig.calibrate.shared_scans import take_apart
 from lce_rig.calibrate.verdict import judge
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
-from lce_rig.core.geometry import Array, tangent_sizes
-from lce_rig.core.results import Calibration, Refusal
+from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
+from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
-from lce_rig.pipeline.cameras import InCompany, bring_cameras_together
-from lce_rig.pipeline.progress import Progress, silent
-from lce_rig.pipeline.solving import solve
+from lce_rig.pipeline.detection import Progress, detect, silent
+from lce_rig.pipeline.result_files import Result
 from lce_rig.rig import Rig
+from lce_rig.session import Session
+from lce_rig.words import sentence
+
+
+@dataclass(frozen=True, eq=False)
+class _Sensors:
+    """One camera with one LiDAR, and what both saw.
+
+    Attributes:
+        pairs: channels of the camera with the LiDAR.
+        settings: the user's options, with what the profile says of the LiDAR.
+        candidates: by channel, of captures in which both sensors saw something.
+        refused: why the other captures are unusable.
+    """
+
+    pairs: tuple[Pair, ...]
+    settings: EstimateSettings
+    candidates: Mapping[str, Sequence[CaptureCandidates]]
+    refused: Mapping[str, Refusal]
+
+    @property
+    def camera(self) -> str:
+        return self.pairs[0].camera
+
+    @property
+    def lidar(self) -> str:
+        return self.pairs[0].lidar
+
+
+@dataclass(frozen=True, eq=False)
+class _Link:
+    """Two cameras that saw the same boards, by their place among all that have an estimate."""
+
+    first: int
+    second: int
+    pair: CameraPair
+    doubts: tuple[Finding, ...]
 
 
 def calibrate(
+    session: Session,
+    detections: Detections | None = None,
+    *,
+    options: CalibrateOptions | None = None,
+    cameras: Sequence[str] | None = None,
+    channels: Sequence[str] | None = None,
+    reference: Reference | None = None,
+    progress: Progress = silent,
+) -> Result:
+    """Estimate and judge the extrinsic of every camera with every LiDAR of a session; nothing is written.
+
+    Args:
+        session: open for reading is enough.
+        detections: of the session; None detects the board first, as `detect` does by default.
+        options: of the estimate; None takes the usual ones.
+        cameras: to calibrate, as if the session held no others; None takes all.
+        channels: of the cameras, to use; None takes all that the session holds.
+        reference: extrinsics to report errors against; they never enter the estimate or the verdict.
+        progress: called with (done, total) for each camera and LiDAR in turn.
+
+    Raises:
+        NotEnoughDataError: every pair has too few captures or leaves a direction open; the causes are named.
+        UsageError: no capture holds one of the channels.
+    """
+    pairs, shortages = calibrate_detections(
+        session.rig,
+        detect(session) if detections is None else detections,
+        options,
+        cameras=cameras,
+        channels=channels,
+        reference=reference,
+        progress=progress,
+    )
+    return Result(session, tuple(pairs), tuple(shortages))
+
+
+def calibrate_detections(
     rig: Rig,
     detections: Detections,
-    options: CalibrateOptions,
+    options: CalibrateOptions | None = None,
     *,
     cameras: Sequence[str] | None = None,
     channels: Sequence[str] | None = None,
     reference: Reference | None = None,
     progress: Progress = silent,
-) -> tuple[list[tuple[Calibration, CalibrationEstimate]], list[NotEnoughDataError]]:
-    """Estimate and judge the extrinsic of every camera with every LiDAR.
+) -> tuple[list[Calibration], list[NotEnoughDataError]]:
+    """Estimate and judge the extrinsic of every camera with every LiDAR from what they saw of the board.
 
     Channels of one camera share pixels and lens: together they give one extrinsic. Cameras that saw the same
     boards are held against each other, and with method "ml" estimated together.
@@ -37,11 +131,7 @@ def calibrate(
     Args:
         rig: thresholds, targets and nominal extrinsics.
         detections: of one session.
-        options: switches of the algorithm.
-        cameras: to calibrate, as if the session held no others; None takes all.
-        channels: of the cameras, to use; None takes all that the session holds.
-        reference: extrinsics to report errors against; they never enter the estimate or the verdict.
-        progress: called with (done, total) for each camera and LiDAR in turn.
+        options, cameras, channels, reference, progress: as of `calibrate`.
 
     Returns:
         The sensors that could be calibrated; and for each other pair why not.
@@ -50,16 +140,31 @@ def calibrate(
         NotEnoughDataError: every pair has too few captures or leaves a direction open; the causes are named.
         UsageError: no capture holds one of the channels.
     """
-    solved, troubles = [], []
+    board = rig.board.to_board()
+    sensors, alone, shortages = [], [], []
     for pairs in _pairs_by_sensors(detections, cameras, channels):
         try:
-            solved.append(solve(rig, detections, pairs, options, progress))
+            own = _sensors(rig, detections, pairs, options or CalibrateOptions())
+            clocks = clocks_of(rig, own.camera, own.lidar)
+            alone.append(calibrate_channels(own.candidates, board, own.settings, clocks, progress))
+            sensors.append(own)
         except NotEnoughDataError as error:
-            troubles.append(error)
-    if not solved:
-        raise _nothing_solved(troubles, cameras)
-    members = bring_cameras_together(rig, detections, solved)
-    return [(_judged(rig, detections, each, reference), each.solved.estimate) for each in members], troubles
+            shortages.append(error)
+    if not sensors:
+        raise _nothing_solved(shortages, cameras)
+    links = list(_links(rig, sensors, alone))
+    joint = _estimate_together(rig, sensors, alone, links)
+    final = [_from_all_cameras(rig, detections, k, sensors[k], alone[k], joint) for k in range(len(sensors))]
+    checked = [_examine(rig, detections, *each) for each in zip(sensors, final, strict=True)]
+    calibrations = []
+    for k, own in enumerate(sensors):
+        mine = [link for link in links if k in (link.first, link.second)]
+        doubts = [doubt for link in mine for doubt in link.doubts]
+        others = tuple(_other_camera(sensors, final, checked, k, link, joint) for link in mine)
+        calibration = _judged(rig, detections, own, final[k], checked[k], doubts, others)
+        truth = reference.of(own.camera, own.lidar) if reference else None
+        calibrations.append(calibration if truth is None else _compared(calibration, truth))
+    return calibrations, shortages
 
 
 def _nothing_solved(
@@ -95,45 +200,213 @@ def _pairs_by_sensors(
     return list(groups.values())
 
 
-def compare_with_reference(calibration: Calibration, reference: Array) -> Calibration:
-    """Report the error against a T_cam_lidar (4, 4) that somebody else vouches for."""
-    rotation_deg, translation_m = error_to_reference(calibration.T_cam_lidar, reference)
-    return replace(calibration, egt_rotation_deg=rotation_deg, egt_translation_m=translation_m)
+def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: CalibrateOptions) -> _Sensors:
+    """Gather the candidates of each channel that has captures enough, and why other captures are unusable.
+
+    Raises:
+        NotEnoughDataError: no channel has.
+    """
+    candidates: dict[str, list[CaptureCandidates]] = {}
+    refused: dict[str, Refusal] = {}
+    needed = rig.quality.min_captures
+    trouble: NotEnoughDataError | None = None
+    for pair in pairs:
+        own, own_refused = _candidates(detections, pair)
+        refused |= {name: why for name, why in own_refused.items() if name not in refused}
+        if len(own) >= needed:
+            candidates[pair.channel] = own
+        elif trouble is None:
+            trouble = NotEnoughDataError(
+                f"{pair}: the board was found by both sensors in {len(own)} of "
+                f"{len(own) + len(own_refused)} captures, at least {needed} are needed",
+                _commonest(own_refused) or "collect more captures",
+            )
+    if not candidates and trouble is not None:
+        raise trouble
+    found = {item.capture for items in candidates.values() for item in items}
+    refused = {name: why for name, why in refused.items() if name not in found}
+    settings = EstimateSettings.of(options, rig.lidars[pairs[0].lidar])
+    return _Sensors(tuple(pairs), settings, candidates, refused)
 
 
-def _judged(rig: Rig, detections: Detections, member: InCompany, reference: Reference | None) -> Calibration:
-    solved, estimate = member.solved, member.solved.estimate
-    camera, lidar, result = solved.camera, solved.lidar, solved.result
-    n_captures = len({name for pair in solved.pairs for name in detections.captures(pair)})
-    verdict, reasons = judge(result, solved.examination, rig, camera, lidar, n_captures, member.doubts)
+def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandidates], dict[str, Refusal]]:
+    candidates, refused = [], {}
+    for name in detections.captures(pair):
+        image, lidar = detections.of(pair, name)
+        if isinstance(image, Refusal):
+            refused[name] = image
+        elif isinstance(lidar, Refusal):
+            refused[name] = lidar
+        else:
+            candidates.append(CaptureCandidates(name, image, lidar))
+    return candidates, refused
+
+
+def _commonest(refused: dict[str, Refusal]) -> str:
+    """List the commonest causes of refusal, one a line."""
+    counts = Counter(f"{why.stage}: {sentence(why)}" for why in refused.values())
+    return "\n".join(f"{n} x {text}" for text, n in counts.most_common(3))
+
+
+def _links(rig: Rig, sensors: Sequence[_Sensors], alone: Sequence[CalibrationEstimate]) -> Iterator[_Link]:
+    """Compare cameras of one LiDAR that saw the same boards held still."""
+    for i, j in combinations(range(len(sensors)), 2):
+        if sensors[i].lidar == sensors[j].lidar and _is_still(alone[i]) and _is_still(alone[j]):
+            # Captures that contradict each other widen what a method claims: that must not excuse them.
+            pair = relate(alone[i], alone[j])
+            if pair is not None:
+                names = sensors[i].camera, sensors[j].camera
+                yield _Link(i, j, pair, tuple(doubt_cameras(pair, names, rig.calibration, rig.verdict)))
+
+
+def _is_still(estimate: CalibrationEstimate) -> bool:
+    """Tell whether boards stood still, so that images count as they are, whenever they were taken."""
+    return all(channel.time_offset_s is None for channel in estimate.channels)
+
+
+def _estimate_together(
+    rig: Rig, sensors: Sequence[_Sensors], alone: Sequence[CalibrationEstimate], links: Sequence[_Link]
+) -> dict[int, TogetherEstimate]:
+    """Estimate cameras that agree together, with method "ml", by their place.
+
+    One that contradicts another is not among them, or it would spoil the other's extrinsic.
+    """
+    joint: dict[int, TogetherEstimate] = {}
+    for group in _groups(len(sensors), links):
+        settings = sensors[group[0]].settings
+        if settings.method == "ml":
+            own = {sensors[k].camera: alone[k] for k in group}
+            joint |= dict.fromkeys(group, calibrate_together(own, rig.board.to_board(), settings))
+    return joint
+
+
+def _groups(n: int, links: Sequence[_Link]) -> list[list[int]]:
+    """List groups of two or more that sound links connect, without those in which a link is doubted."""
+    group = list(range(n))
+    for link in links:
+        if not link.doubts:
+            mine, other = group[link.first], group[link.second]
+            group = [mine if number == other else number for number in group]
+    doubted = {group[link.first] for link in links if link.doubts and group[link.first] == group[link.second]}
+    found = [[k for k in range(n) if group[k] == number] for number in sorted(set(group) - doubted)]
+    return [members for members in found if len(members) > 1]
+
+
+def _from_all_cameras(
+    rig: Rig,
+    detections: Detections,
+    k: int,
+    sensors: _Sensors,
+    alone: CalibrationEstimate,
+    joint: Mapping[int, TogetherEstimate],
+) -> CalibrationEstimate:
+    """Give the estimate together with other cameras where there is one, else the camera's own."""
+    if k not in joint:
+        return alone
+    estimate = joint[k].estimates[sensors.camera]
+    sigma_deg, sigma_m = sigma_sizes(_examine(rig, detections, sensors, alone).cov)
+    figures = {"alone_sigma_rotation_deg": sigma_deg, "alone_sigma_translation_m": sigma_m}
+    return replace(
+        estimate,
+        diagnostics={**estimate.diagnostics, **figures},
+        channels=alone.channels,
+        channel_difference=alone.channel_difference,
+        channel_difference_cov=alone.channel_difference_cov,
+    )
+
+
+def _other_camera(
+    sensors: Sequence[_Sensors],
+    estimates: Sequence[CalibrationEstimate],
+    checked: Sequence[Examination],
+    k: int,
+    link: _Link,
+    joint: Mapping[int, TogetherEstimate],
+) -> OtherCamera:
+    """Say where the other camera of a link sits to camera k."""
+    pair, is_second = link.pair, k == link.second
+    other = link.first if is_second else link.second
+    T, J = relative_pose(estimates[k].T_cam_lidar, estimates[other].T_cam_lidar)
+    cov = None
+    if k in joint and joint[k] is joint.get(other):
+        # Widened as both extrinsics were.
+        J = J * np.repeat([checked[k].widened_by, checked[other].widened_by], 6)
+        cov = np.asarray(J @ joint[k].covariance_of(sensors[k].camera, sensors[other].camera) @ J.T)
+    seen = None if pair.pictures is None else pair.pictures.T_second_first
+    apart_deg, apart_m = (None, None) if pair.apart is None else tangent_sizes(pair.apart)
+    return OtherCamera(
+        camera=sensors[other].camera,
+        n_captures=len(pair.captures),
+        T_cam_other=T,
+        cov=cov,
+        T_cam_other_pictures=seen if seen is None or is_second else invert(seen),
+        apart_rotation_deg=apart_deg,
+        apart_translation_m=apart_m,
+        board_rms_m=pair.board_rms_m,
+    )
+
+
+def _examine(
+    rig: Rig, detections: Detections, sensors: _Sensors, estimate: CalibrationEstimate
+) -> Examination:
+    """Check an estimate on its own captures and images."""
+    used = sorted(take_apart(estimate.used))
+    channels = {channel.channel for channel in estimate.channels}
+    views = []
+    for name in used:
+        for pair in sensors.pairs:
+            image = detections.images[pair.camera, pair.channel].get(name)
+            if pair.channel in channels and isinstance(image, ImageBoard):
+                views.append(View(name, pair.channel, image))
+    lens = rig.cameras[sensors.camera].to_intrinsics()
+    return examine(estimate, rig, rig.lidars[sensors.lidar], lens, views)
+
+
+def _judged(
+    rig: Rig,
+    detections: Detections,
+    sensors: _Sensors,
+    estimate: CalibrationEstimate,
+    examination: Examination,
+    between_cameras: Sequence[Finding],
+    others: tuple[OtherCamera, ...],
+) -> Calibration:
+    camera, lidar = sensors.camera, sensors.lidar
+    n_captures = len({name for pair in sensors.pairs for name in detections.captures(pair)})
+    verdict, findings = judge(estimate, examination, rig, camera, lidar, n_captures, between_cameras)
     diagnostics = dict(estimate.diagnostics)
-    if result.difference is not None:
-        rotation_deg, translation_m = tangent_sizes(result.difference)
+    if examination.widened_by != 1:
+        diagnostics["sigma_widened"] = examination.widened_by
+    if estimate.channel_difference is not None:
+        rotation_deg, translation_m = tangent_sizes(estimate.channel_difference)
         diagnostics |= {"channels_rotation_deg": rotation_deg, "channels_translation_m": translation_m}
     lens = rig.cameras[camera].to_intrinsics()
-    calibration = Calibration(
+    return Calibration(
         camera=camera,
-        channel="+".join(channel.channel for channel in result.channels),
+        channel="+".join(channel.channel for channel in estimate.channels),
         lidar=lidar,
         T_cam_lidar=estimate.T_cam_lidar,
-        cov=estimate.cov,
+        cov=examination.cov,
         certificate=estimate.certificate,
         metrics=estimate.metrics,
         n_captures=n_captures,
-        n_detected=n_captures - len(solved.refused),
+        n_detected=n_captures - len(sensors.refused),
         captures_used=tuple(sorted(take_apart(estimate.used))),
-        captures_refused=_still_refused(estimate, solved.refused),
+        captures_refused=_still_refused(estimate, sensors.refused),
         verdict=verdict,
-        reasons=reasons,
+        reasons=tuple(sentence(finding) for finding in findings),
+        findings=findings,
         diagnostics=diagnostics,
-        channel_results=result.channels,
+        channel_results=estimate.channels,
         method=estimate.method,
-        uncertainty=point_uncertainties(estimate.T_cam_lidar, estimate.cov, lens),
+        uncertainty=point_uncertainties(estimate.T_cam_lidar, examination.cov, lens),
         estimated_with=estimate.estimated_with,
-        other_cameras=member.others,
+        other_cameras=others,
+        weak_direction=estimate.weak_direction,
+        held_out_m=estimate.held_out_m,
+        residuals=estimate.residuals,
+        observations=estimate.observations,
     )
-    truth = reference.of(camera, lidar) if reference else None
-    return calibration if truth is None else compare_with_reference(calibration, truth)
 
 
 def _still_refused(estimate: CalibrationEstimate, refused: Mapping[str, Refusal]) -> dict[str, Refusal]:
@@ -143,3 +416,27 @@ def _still_refused(estimate: CalibrationEstimate, refused: Mapping[str, Refusal]
     for name, why in estimate.refused.items():
         every |= dict.fromkeys(take_apart([name]), why)
     return {name: every[name] for name in sorted(every) if name not in used}
+
+
+def _compared(calibration: Calibration, reference: Array) -> Calibration:
+    """Report the error against a T_cam_lidar (4, 4) that somebody else vouches for."""
+    rotation_deg, translation_m = error_to_reference(calibration.T_cam_lidar, reference)
+    return replace(calibration, egt_rotation_deg=rotation_deg, egt_translation_m=translation_m)
+
+
+def refusals_of(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refusal]:
+    """Say why captures of a pair cannot be used: a sensor saw no board, or both sensors disagree."""
+    candidates, refused = _candidates(detections, pair)
+    consensus = find_consensus(candidates, rig.board.to_board()) if len(candidates) >= 3 else None
+    return dict(sorted({**refused, **(consensus.refused if consensus else {})}.items()))
+
+
+def clocks_of(rig: Rig, camera: str, lidar: str) -> Clocks:
+    """Read what the profile says of the time of a camera and a LiDAR."""
+    stamps = {name: channel.timestamps for name, channel in rig.cameras[camera].channels.items()}
+    return Clocks(
+        sweep_s=1 / rig.lidars[lidar].rate_hz,
+        lidar_offset_s=rig.lidars[lidar].timestamps.expected_offset_s,
+        channel_offset_s={name: settings.expected_offset_s for name, settings in stamps.items()},
+        tolerance_s={name: settings.tolerance_s for name, settings in stamps.items()},
+    )

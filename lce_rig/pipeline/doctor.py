@@ -6,24 +6,26 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from lce_rig.collect.event_buffer import join_events
 from lce_rig.collect.health import Check
 from lce_rig.collect.health.clocks import check_clock, check_edges, check_offsets, check_sync
 from lce_rig.collect.health.computer import COMPUTER_CHECKS
 from lce_rig.collect.health.devices import check_device, check_stream
-from lce_rig.collect.health.examination import Examination, Sight
+from lce_rig.collect.health.examination import Examination
 from lce_rig.collect.health.observing import Observation, observe
 from lce_rig.collect.health.pictures import check_board, check_events, check_picture
 from lce_rig.collect.health.pulses import check_frames_of_pulses, check_pulses_sent
-from lce_rig.collect.health.sensors import SYNC, driver_of, sensors, source_of
+from lce_rig.collect.health.sensors import driver_of, sensors, source_of
 from lce_rig.collect.health.velodyne import check_pulse, check_settings, read_web
 from lce_rig.core.data import Image
 from lce_rig.core.errors import LceRigError, SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.core.results import Refusal
 from lce_rig.detect.event_board import find_event_board, reconstructor_for
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
+from lce_rig.rig.sync import BOARD
 from lce_rig.sources.live.velodyne_web import WebReport
+from lce_rig.timing.event_buffer import join_events
 
 SensorCheck = Callable[[Examination, str], Check | None]
 
@@ -64,7 +66,7 @@ class DoctorOptions:
 def examine(rig: Rig, options: DoctorOptions | None = None) -> list[Check]:
     """Look at the computer and every sensor of a rig; takes the duration and up to some 3 s more.
 
-    What is absent or fails is a red line; everything else is looked at all the same.
+    What is absent or fails is an error; everything else is looked at all the same.
 
     Args:
         rig: the profile.
@@ -92,7 +94,7 @@ def examine(rig: Rig, options: DoctorOptions | None = None) -> list[Check]:
     for names, table in (
         (list(rig.lidars), LIDAR_CHECKS),
         (list(rig.cameras), CAMERA_CHECKS),
-        ([SYNC] if rig.sync is not None else [], SYNC_CHECKS),
+        ([BOARD] if rig.sync is not None else [], SYNC_CHECKS),
     ):
         for name in names:
             checks += _applying(table, exam, name)
@@ -104,9 +106,9 @@ def _applying(table: tuple[Callable[..., Check | None], ...], *arguments: object
     return [line for line in (check(*arguments) for check in table) if line is not None]
 
 
-def look_for_boards(rig: Rig, seen: Mapping[str, Observation]) -> dict[tuple[str, str], Sight]:
+def look_for_boards(rig: Rig, seen: Mapping[str, Observation]) -> dict[tuple[str, str], Finding]:
     """Look for the board in each sensor's last sample; in events only where a camera has no pictures."""
-    sights = {}
+    sights: dict[tuple[str, str], Finding] = {}
     for sensor, observation in seen.items():
         if observation.scan is not None:
             sights[sensor, ""] = _sight_in_scan(rig, observation)
@@ -117,32 +119,28 @@ def look_for_boards(rig: Rig, seen: Mapping[str, Observation]) -> dict[tuple[str
     return sights
 
 
-def _sight_in_scan(rig: Rig, seen: Observation) -> Sight:
+def _sight_in_scan(rig: Rig, seen: Observation) -> Finding:
     assert seen.scan is not None
     found = BoardFinder(rig).scan(seen.scan)
     if isinstance(found, Refusal):
-        return Sight("", found, {})
+        return found
     best = found[0].quality
-    more = f"; {len(found)} things of its size" if len(found) > 1 else ""
-    figure = (
-        f"{best['distance_m']:.2f} m away, {best['n_rings']:.0f} rings, {best['n_points']:.0f} points{more}"
-    )
-    return Sight(figure, None, dict(best))
+    figures = {name: best[name] for name in ("distance_m", "n_rings", "n_points")}
+    return Finding("board.in_scan", "note", figures={**figures, "n_candidates": len(found)})
 
 
-def _sight_in_picture(rig: Rig, image: Image) -> Sight:
+def _sight_in_picture(rig: Rig, image: Image) -> Finding:
     try:
         found = BoardFinder(rig).image(image)
     except LceRigError as error:
-        found = Refusal("image", error.what, error.hint)
+        found = Refusal.of_error("image", error)
     if isinstance(found, Refusal):
-        return Sight("", found, {})
-    q = found.quality
-    figure = f"{q['distance_m']:.2f} m away, {q['n_corners']:.0f} corners to {q['corner_rms_px']:.2f} px"
-    return Sight(f"{figure}, sharpness {q['sharpness']:.1f}", None, dict(q))
+        return found
+    names = ("distance_m", "n_corners", "corner_rms_px", "sharpness")
+    return Finding("board.in_image", "note", figures={name: found.quality[name] for name in names})
 
 
-def _sight_in_events(rig: Rig, seen: Observation) -> Sight:
+def _sight_in_events(rig: Rig, seen: Observation) -> Finding:
     camera = rig.cameras[seen.sensor]
     channel = camera.first_channel("events") or "events"
     events = join_events(list(seen.events))
@@ -159,8 +157,7 @@ def _sight_in_events(rig: Rig, seen: Observation) -> Sight:
             rig.quality,
         ).board
     except LceRigError as error:
-        found = Refusal("image", error.what, error.hint)
+        found = Refusal.of_error("image", error)
     if isinstance(found, Refusal):
-        return Sight("", found, {})
-    figure = f"{found.quality['distance_m']:.2f} m away, seen through its events"
-    return Sight(figure, None, dict(found.quality))
+        return found
+    return Finding("board.in_events", "note", figures={"distance_m": found.quality["distance_m"]})

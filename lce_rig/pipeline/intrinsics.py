@@ -21,10 +21,10 @@ from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.detect.detection import ImageDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image_board import crop_to_intrinsics
-from lce_rig.pipeline.detection import detect
-from lce_rig.pipeline.progress import Progress, silent
+from lce_rig.pipeline.detection import Progress, detect, silent
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
+from lce_rig.words import describe
 
 AUTO = "auto"
 Key = tuple[str, str]
@@ -168,9 +168,9 @@ class _Samples:
                 image = capture.image(self._camera, channel)
                 return finder.corners(image, lens, max_reprojection_px=max_reprojection_px)
             except SessionError as error:
-                return Refusal("read", error.what, error.hint or "collect this placement again")
+                return Refusal.of_error("read", error)
             except ProfileError as error:
-                return Refusal("image", error.what, error.hint)
+                return Refusal.of_error("image", error)
 
         found: dict[Key, ImageDetection] = {}
         with ThreadPoolExecutor(2) as pool:
@@ -238,7 +238,7 @@ def _require_boards(camera: str, found: Mapping[Key, ImageDetection]) -> None:
     n, total = _n_captures(found), len({name for name, _ in found})
     if n >= MIN_CAPTURES:
         return
-    causes = Counter(str(why.cause) for why in found.values() if isinstance(why, Refusal))
+    causes = Counter(describe(why) for why in found.values() if isinstance(why, Refusal))
     hint = "\n".join(f"{count} x {cause}" for cause, count in causes.most_common(3))
     raise NotEnoughDataError(
         f"camera {camera}: the board is in {n} of {total} captures, intrinsics need {MIN_CAPTURES} at least "

@@ -29,6 +29,7 @@ from lce_rig.rig import (
 from lce_rig.session import Session
 from lce_rig.session.replacing import copy_over
 from lce_rig.session.session import INTRINSICS
+from lce_rig.words import refusal_as_json
 
 DOCUMENT = "intrinsics.json"
 FORMAT_VERSION = 1
@@ -235,7 +236,7 @@ def _figure(value: float | None) -> float | None:
 
 
 def _refusals(refused: Mapping[str, Refusal]) -> dict[str, Any]:
-    return {name: asdict(why) for name, why in refused.items()}
+    return {name: refusal_as_json(why) for name, why in refused.items()}
 
 
 def _comparison(measured: MeasuredIntrinsics) -> dict[str, Any] | None:

@@ -8,14 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from lce_rig.calibrate import CalibrateOptions
 from lce_rig.calibrate.repeatability import Repeatability, compare_calibrations
 from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.results import Calibration
 from lce_rig.export.result import read_result
 from lce_rig.pipeline.calibration import calibrate
-from lce_rig.pipeline.detection import detect
-from lce_rig.pipeline.progress import Progress, silent
+from lce_rig.pipeline.detection import Progress, silent
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.session import Session
 from lce_rig.session.identity import differing_keys
@@ -44,13 +42,13 @@ class Repeat:
     failed: tuple[str, ...]
 
 
-def repeat(paths: Sequence[Path], *, progress: Progress = silent) -> Repeat:
+def repeat(folders: Sequence[Path | str], *, progress: Progress = silent) -> Repeat:
     """Compare the results of independent sessions of one rig.
 
     A session without a result is calibrated with the usual options; nothing is written.
 
     Args:
-        paths: of the sessions.
+        folders: of the sessions.
         progress: called with (done, total) sessions.
 
     Raises:
@@ -59,6 +57,7 @@ def repeat(paths: Sequence[Path], *, progress: Progress = silent) -> Repeat:
             camera and LiDAR in two of them.
         NotEnoughDataError: a session holds too few captures to be calibrated; it is named.
     """
+    paths = [Path(folder) for folder in folders]
     if len(paths) < 2:
         raise UsageError("one session alone has nothing to agree with", "Name two sessions or more.")
     _require_different(paths)
@@ -163,10 +162,10 @@ def _calibrate(name: str, session: Session) -> tuple[list[Calibration], list[str
         NotEnoughDataError: none of them could; the session is named.
     """
     try:
-        results, troubles = calibrate(session.rig, detect(session), CalibrateOptions())
+        result = calibrate(session)
     except NotEnoughDataError as error:
         raise NotEnoughDataError(f"{name}: {error.what}", error.hint) from None
-    return [calibration for calibration, _ in results], [f"{name}: {trouble}" for trouble in troubles]
+    return list(result.pairs), [f"{name}: {shortage}" for shortage in result.shortages]
 
 
 def _calibrated_sensors(name: str, calibrations: Sequence[Calibration]) -> str:
@@ -182,13 +181,13 @@ def _read_calibrations(session: Session) -> list[Calibration]:
             f"{path} is of rig {saved.rig!r}, its session of rig {session.rig.name!r}",
             "Run `lce-rig calibrate` again.",
         )
-    for calibration in saved.calibrations:
+    for calibration in saved.pairs:
         if np.linalg.eigvalsh(calibration.cov).min() <= 0:
             raise SessionError(
                 f"{path}: the covariance of {calibration.camera} and {calibration.lidar} has no inverse",
                 "Run `lce-rig calibrate` again.",
             )
-    return list(saved.calibrations)
+    return list(saved.pairs)
 
 
 def _comparisons(results: dict[str, list[Calibration]]) -> tuple[tuple[Repeatability, ...], list[str]]:

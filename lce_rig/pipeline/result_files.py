@@ -5,8 +5,9 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from lce_rig.core.errors import LceRigError, SessionError
+from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError
 from lce_rig.core.limits import read_file
 from lce_rig.core.results import Calibration
 from lce_rig.session import Session
@@ -15,6 +16,67 @@ from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE
 from lce_rig.session.writing import MANIFEST
 
 RESULT, OVERLAYS, PREVIOUS = "result.json", "overlays", "previous"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """The extrinsics of a session's sensors.
+
+    Attributes:
+        session: whose captures they come from.
+        pairs: one for each camera and LiDAR that could be calibrated.
+        shortages: for each other camera and LiDAR with captures, why it has none.
+    """
+
+    session: Session
+    pairs: tuple[Calibration, ...]
+    shortages: tuple[NotEnoughDataError, ...] = ()
+
+    def of(self, camera: str, lidar: str | None = None) -> Calibration:
+        """Give the extrinsic of a camera with a LiDAR, by default the first that has one.
+
+        Raises:
+            NotEnoughDataError: they have none.
+        """
+        for pair in self.pairs:
+            if pair.camera == camera and lidar in (None, pair.lidar):
+                return pair
+        raise NotEnoughDataError(f"no extrinsic of camera {camera}", "Collect more captures.")
+
+    def document(self) -> dict[str, Any]:
+        """Build the content of result.json from plain types.
+
+        Raises:
+            SessionError: a capture that was used is no longer there.
+            ResultRefusedError: a pose or covariance is not finite.
+        """
+        from lce_rig.export.result import to_json_dict
+
+        return to_json_dict(self.session.rig.name, self.pairs, inputs_sha256(self.session, self.pairs))
+
+    def text(self) -> str:
+        """Write the content of result.json; raises as `document`."""
+        from lce_rig.export.result import layout
+
+        return layout(self.document())
+
+    def write(self, folder: Path | str | None = None, *, force: bool = False) -> "WrittenResults":
+        """Write result.json and, unless a verdict forbids it, every export.
+
+        Args:
+            folder: None, or the session's calibration/: the files there are replaced in one step, and the
+                earlier ones kept in calibration/previous/. In any other folder files are replaced one by one.
+            force: export failed results too; each file then says so.
+
+        Raises:
+            SessionError: a capture that was used is gone, or the disk is full.
+            ResultRefusedError: a pose or covariance is not finite.
+        """
+        own = self.session.path / CALIBRATION
+        if folder is None or Path(folder).resolve() == own.resolve():
+            return write_results(self.session, self.pairs, force=force)
+        names = _write_files(Path(folder), self.session, self.pairs, force=force)
+        return WrittenResults(tuple(Path(folder) / name for name in names), None, False, (), False)
 
 
 @dataclass(frozen=True)
@@ -48,13 +110,7 @@ def write_results(session: Session, calibrations: Sequence[Calibration], *, forc
         SessionError: a capture that was used is gone, or the disk is full; the earlier files are untouched.
         ResultRefusedError: a pose or covariance is not finite; the same.
     """
-    from lce_rig.export import write_exports
-    from lce_rig.export.result import write_result
-
     folder = session.path / CALIBRATION
-    usable = [c for c in calibrations if force or c.verdict != "fail"]
-    names: list[str] = [RESULT]
-    inputs = inputs_sha256(session, calibrations)
     is_same = False
 
     def finish(earlier: Path, draft: Path) -> None:
@@ -62,9 +118,7 @@ def write_results(session: Session, calibrations: Sequence[Calibration], *, forc
         is_same = _keep_earlier_results(earlier, draft)
 
     with session.replacing(CALIBRATION, finish=finish) as draft:
-        write_result(draft / RESULT, session.rig.name, calibrations, inputs)
-        if usable:
-            names += [path.name for path in write_exports(usable, session.rig, draft, is_forced=force)]
+        names = _write_files(draft, session, calibrations, force=force)
     previous = folder / PREVIOUS
     return WrittenResults(
         tuple(folder / name for name in names),
@@ -73,6 +127,21 @@ def write_results(session: Session, calibrations: Sequence[Calibration], *, forc
         tuple(sorted(_usable(previous) - {f"{c.camera} and {c.lidar}" for c in calibrations})),
         is_same,
     )
+
+
+def _write_files(
+    folder: Path, session: Session, calibrations: Sequence[Calibration], *, force: bool
+) -> list[str]:
+    """Write result.json and the exports of what may be used; give the files' names."""
+    from lce_rig.export import export, remove_exports
+    from lce_rig.export.result import write_result
+
+    usable = [c for c in calibrations if force or c.verdict != "fail"]
+    write_result(folder / RESULT, session.rig.name, calibrations, inputs_sha256(session, calibrations))
+    if not usable:
+        remove_exports(folder)
+        return [RESULT]
+    return [RESULT, *(path.name for path in export(usable, session.rig, folder, is_forced=force))]
 
 
 def inputs_sha256(session: Session, calibrations: Sequence[Calibration]) -> dict[str, str]:
@@ -103,9 +172,7 @@ def _usable(folder: Path) -> set[str]:
 
     with suppress(LceRigError):
         return {
-            f"{c.camera} and {c.lidar}"
-            for c in read_result(folder / RESULT).calibrations
-            if c.verdict != "fail"
+            f"{c.camera} and {c.lidar}" for c in read_result(folder / RESULT).pairs if c.verdict != "fail"
         }
     return set()
 

@@ -1,6 +1,7 @@
-"""Pictures and residuals: an extrinsic held against captures, and what each sensor saw."""
+"""Extrinsics compared with captures: residuals, overlays, and what each sensor saw."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -8,86 +9,150 @@ from lce_rig.core.errors import SessionError
 from lce_rig.core.results import Calibration, Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.detect.event_board import EventImage
-from lce_rig.pipeline.detection import event_picture
-from lce_rig.pipeline.event_detection import event_channels
-from lce_rig.pipeline.progress import Progress, silent
-from lce_rig.pipeline.result_files import OVERLAYS, keep_foreign, result_content
-from lce_rig.pipeline.solving import clocks_of
+from lce_rig.export.result import SavedResult, read_result
+from lce_rig.pipeline.calibration import clocks_of
+from lce_rig.pipeline.detection import Progress, detect, event_channels, event_picture, silent
+from lce_rig.pipeline.result_files import OVERLAYS, RESULT, Result, keep_foreign, result_content
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.session.session import CALIBRATION, DEBUG
 from lce_rig.verify.event_picture import CameraView
-from lce_rig.verify.session_check import SessionCheck, check_session
+from lce_rig.verify.session_check import SessionCheck, check_session, draw_check
 from lce_rig.verify.writing import is_overlay
+
+
+@dataclass(frozen=True, eq=False)
+class Verification:
+    """Extrinsics compared with the captures of a session.
+
+    Attributes:
+        session: whose captures were looked at.
+        checks: one for each channel of a camera and LiDAR that the session holds captures of.
+        calibrations: the extrinsics, also of sensors that it holds no captures of.
+        detections: of the session.
+        event_image: how pictures are made of raw events, as the detections were made.
+        own_result: content of the session's result.json where the calibrations are those in it, else None.
+    """
+
+    session: Session
+    checks: tuple[SessionCheck, ...]
+    calibrations: tuple[Calibration, ...]
+    detections: Detections
+    event_image: EventImage | None
+    own_result: bytes | None
+
+    @property
+    def unchecked(self) -> tuple[Calibration, ...]:
+        """Extrinsics of sensors that the session holds no captures of."""
+        checked = {(check.pair.camera, check.pair.lidar) for check in self.checks}
+        return tuple(c for c in self.calibrations if (c.camera, c.lidar) not in checked)
+
+    def write(
+        self, folder: Path | str | None = None, *, progress: Progress = silent
+    ) -> tuple[SessionCheck, ...]:
+        """Draw the LiDAR into every picture of the session.
+
+        Args:
+            folder: for the images; by default the session's calibration/overlays/ where the result is its
+                own, else its overlays/, which are replaced as a whole. Several pairs get a folder each.
+            progress: called with (done, total) for each pair in turn.
+
+        Returns:
+            The checks, with their pictures.
+
+        Raises:
+            SessionError: a picture cannot be written; or the session's result was replaced meanwhile, and the
+                overlays there are untouched.
+        """
+        session = self.session
+        if folder is not None:
+            return self._draw(Path(folder), progress)
+
+        def finish(earlier: Path, draft: Path) -> None:
+            if self.own_result is not None and result_content(session) != self.own_result:
+                raise SessionError(
+                    f"{session.path / CALIBRATION} was calibrated again while overlays were drawn",
+                    "Run `lce-rig verify` again.",
+                )
+            _keep_users_files(session.rig, earlier, draft)
+
+        parts = (OVERLAYS,) if self.own_result is None else (CALIBRATION, OVERLAYS)
+        with session.replacing(*parts, finish=finish) as draft:
+            drawn = self._draw(draft, progress)
+        place = session.path.joinpath(*parts)
+        return tuple(each.moved(draft, place) for each in drawn)
+
+    def _draw(self, base: Path, progress: Progress) -> tuple[SessionCheck, ...]:
+        return tuple(
+            draw_check(
+                self.session,
+                self.detections,
+                check,
+                base if len(self.checks) == 1 else base / check.pair.folder_name,
+                view_of=partial(_view, self.session, check.pair.camera, check.pair.channel, self.event_image),
+                progress=progress,
+            )
+            for check in self.checks
+        )
 
 
 def verify(
     session: Session,
-    detections: Detections,
-    calibrations: Sequence[Calibration],
+    result: Result | SavedResult | None = None,
+    detections: Detections | None = None,
     *,
     event_image: EventImage | None = None,
-    result: bytes | None = None,
-    folder: Path | None = None,
     progress: Progress = silent,
-) -> list[SessionCheck]:
-    """Hold extrinsics against every capture of a session, and draw the LiDAR into its pictures.
+) -> Verification:
+    """Compare extrinsics with every capture of a session.
 
     Args:
-        session: may be another one than the calibrations come from.
-        detections: of this session.
-        calibrations: as a rule from its result.json.
-        event_image: as the detections were made.
-        result: content of the session's own result.json, where the calibrations come from it.
-        folder: for the images; by default the session's calibration/overlays/ where the result is its own,
-            else its overlays/, which are replaced as a whole. Several pairs get a folder each.
-        progress: called with (done, total) for each pair in turn.
-
-    Returns:
-        A check of each channel; of sensors of which the session has no captures there is none.
+        session: may be another one than the extrinsics come from.
+        result: of `calibrate` or `read_result`; None takes the session's own result.json.
+        detections: of this session; None detects the board first.
+        event_image: how pictures are made of raw events, as the detections were made.
+        progress: called with (done, total) while the board is detected.
 
     Raises:
-        SessionError: the session has no captures of any calibration's sensors; or its result was replaced
-            meanwhile, and the overlays there are untouched.
+        SessionError: there is no result, or it is of another rig; or the session has no captures of its
+            sensors.
     """
-    jobs = [(c, pair) for c in calibrations for pair in _pairs_held(detections, c)]
-    if not jobs:
+    calibrations, own_result = _extrinsics(session, result)
+    detections = detections or detect(session, event_image=event_image, progress=progress)
+    checks = tuple(
+        check_session(session.rig, detections, c, channel, clocks_of(session.rig, c.camera, c.lidar))
+        for c in calibrations
+        for channel in sorted(c.channels)
+        if Pair(c.camera, channel, c.lidar) in detections.pairs
+    )
+    if not checks:
         wanted = ", ".join(str(Pair.of(c)) for c in calibrations)
         raise SessionError(
             f"{session.path} holds no captures of {wanted}", "The result belongs to another session."
         )
+    return Verification(session, checks, tuple(calibrations), detections, event_image, own_result)
 
-    def check(base: Path) -> list[SessionCheck]:
-        return [
-            check_session(
-                session,
-                detections,
-                c,
-                pair.channel,
-                base if len(jobs) == 1 else base / pair.folder_name,
-                clocks=clocks_of(session.rig, pair.camera, pair.lidar),
-                view_of=partial(_view, session, pair.camera, pair.channel, event_image),
-                progress=progress,
-            )
-            for c, pair in jobs
-        ]
 
-    if folder is not None:
-        return check(folder)
-
-    def finish(earlier: Path, draft: Path) -> None:
-        if result is not None and result_content(session) != result:
-            raise SessionError(
-                f"{session.path / CALIBRATION} was calibrated again while overlays were drawn",
-                "Run `lce-rig verify` again.",
-            )
-        _keep_users_files(session.rig, earlier, draft)
-
-    parts = (OVERLAYS,) if result is None else (CALIBRATION, OVERLAYS)
-    with session.replacing(*parts, finish=finish) as draft:
-        checks = check(draft)
-    place = session.path.joinpath(*parts)
-    return [each.moved(draft, place) for each in checks]
+def _extrinsics(
+    session: Session, result: Result | SavedResult | None
+) -> tuple[Sequence[Calibration], bytes | None]:
+    """Give the extrinsics to check; and the content of the session's result.json where it holds them."""
+    content = result_content(session)
+    if isinstance(result, Result):
+        rig, calibrations = result.session.rig.name, result.pairs
+        is_own = result.session.path.resolve() == session.path.resolve()
+        content = content if is_own and result.text().encode() == content else None
+    else:
+        saved = result or read_result(session.path / CALIBRATION / RESULT)
+        rig, calibrations, is_own = saved.rig, saved.pairs, result is None
+        content = content if is_own else None
+    if rig != session.rig.name or not calibrations:
+        what = f"the result is of rig {rig!r}" if calibrations else "the result holds no pair of sensors"
+        raise SessionError(f"{what}; the session {session.path} is of rig {session.rig.name!r}")
+    if not is_own:
+        # Names of captures say nothing across sessions: none of these was fitted.
+        calibrations = tuple(replace(c, captures_used=(), captures_refused={}) for c in calibrations)
+    return calibrations, content
 
 
 def _keep_users_files(rig: Rig, earlier: Path, draft: Path) -> None:
@@ -102,12 +167,6 @@ def _keep_users_files(rig: Rig, earlier: Path, draft: Path) -> None:
     for name in folders:
         if not (earlier / name).is_symlink():
             keep_foreign(earlier / name, draft / name, is_overlay)
-
-
-def _pairs_held(detections: Detections, calibration: Calibration) -> list[Pair]:
-    """Name those pairs behind a calibration that the session holds captures of."""
-    pairs = [Pair(calibration.camera, channel, calibration.lidar) for channel in sorted(calibration.channels)]
-    return [pair for pair in pairs if pair in detections.pairs]
 
 
 def write_debug_images(

@@ -1,4 +1,4 @@
-"""The profile of a rig: which sensors it carries, which board they look at, and what counts as good."""
+"""The profile of a rig: its sensors, its board, and the limits and targets of a calibration."""
 
 from lce_rig.rig.board import BoardSettings
 from lce_rig.rig.editing import derive_text, set_value

@@ -16,7 +16,7 @@ class BoardSettings(Settings):
 
     Attributes:
         inner_corners: (cols, rows) where four squares meet, one fewer each way than there are squares.
-        square_m: side of one square, measured over many squares on the print itself.
+        square_m: side of one square, measured over many squares on the pattern itself.
         width_m: outer width of the plate, along the columns.
         height_m: outer height of the plate, along the rows.
         pattern_offset_m: (x right, y up) of the pattern's centre from the plate's centre.
@@ -43,7 +43,7 @@ class BoardSettings(Settings):
         cols, rows = self.inner_corners
         width, height = (cols + 1) * self.square_m, (rows + 1) * self.square_m
         offset_x, offset_y = (2 * abs(offset) for offset in self.pattern_offset_m)
-        # Where the print fills the plate both are measured to a millimetre.
+        # Where the pattern fills the plate both are measured to a millimetre.
         if width + offset_x <= self.width_m + 1e-3 and height + offset_y <= self.height_m + 1e-3:
             return self
         what = (

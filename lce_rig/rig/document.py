@@ -1,4 +1,4 @@
-"""YAML text as plain data that remembers on which line each key stands."""
+"""YAML text as plain data with the line number of each key."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

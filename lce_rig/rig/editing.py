@@ -1,4 +1,4 @@
-"""Edits of a profile's text that leave comments and layout as they are."""
+"""Edits of a profile's text that keep comments and layout."""
 
 import json
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ def derive_text(text: str, name: str, settings: Sequence[tuple[str, str]], sourc
 
     Raises:
         ProfileError: the new profile would not be valid.
-        UsageError: a value that is no YAML, or a path into something that has no keys.
+        UsageError: a value that is not YAML, or a path into something that has no keys.
     """
     head = f"# {name}: made from {origin} by `lce-rig rigs new`; the comments below are {origin}'s.\n"
     # A name such as 346 is a text only in quotes.
@@ -45,7 +45,7 @@ def set_value(text: str, path: str, value: str) -> str:
         value: the value as YAML on one line: "0.1", "[1, 2]".
 
     Raises:
-        UsageError: a value that is no YAML on one line, or a path into something that has no keys.
+        UsageError: a value that is not YAML on one line, or a path into something that has no keys.
     """
     wanted = _parsed(path, value)
     root = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -65,7 +65,7 @@ def set_value(text: str, path: str, value: str) -> str:
 
 
 def _is_plain(name: str) -> bool:
-    """Tell whether a text is read as that text without quotes."""
+    """Return whether a text is read as that text without quotes."""
     try:
         return bool(yaml.safe_load(name) == name)
     except (yaml.YAMLError, RecursionError, *BAD_SCALARS):

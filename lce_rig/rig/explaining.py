@@ -118,7 +118,7 @@ def _is_model(annotation: Any) -> bool:
 
 
 def _is_block(annotation: Any) -> bool:
-    """Tell a block of settings, optional or not, from many by name or in a list."""
+    """Return a block of settings, optional or not, from many by name or in a list."""
     return _is_model(annotation) or any(_is_model(argument) for argument in _members(annotation))
 
 

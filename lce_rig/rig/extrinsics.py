@@ -1,4 +1,4 @@
-"""Nominal poses of a profile: what the drawing of the rig says, as a sanity check."""
+"""Nominal poses of a profile: the CAD model's values, as a check of the result."""
 
 import numpy as np
 from pydantic import model_validator

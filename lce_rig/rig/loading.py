@@ -68,7 +68,7 @@ def read_profile(path: Path) -> str:
     """Read the text of a profile's file.
 
     Raises:
-        ProfileError: it cannot be read, or is no text of a profile's size.
+        ProfileError: it cannot be read, or is not a text of a profile's size.
     """
     try:
         return read_file(path, MAX_DOCUMENT_BYTES).decode()
@@ -88,7 +88,7 @@ def parse_rig(text: str, source: str = "profile") -> Rig:
         source: what to call the text in errors, as a rule its file.
 
     Raises:
-        ProfileError: the text is no profile.
+        ProfileError: the text is not a profile.
     """
     return rig_from_document(read_document(text, source))
 

@@ -17,13 +17,13 @@ _MOST_SENSORS = 64
 
 
 class Rig(Settings):
-    """A rig: which sensors it carries and which board they look at.
+    """A rig: its sensors and its board.
 
     Attributes:
         format_version: version of this schema.
         name: name of the rig; a session belongs to one rig by name.
         description: one line for `lce-rig rigs`.
-        base_frame: a LiDAR's or camera's frame, root of the URDF; the first LiDAR's where left out.
+        base_frame: a LiDAR's or camera's frame, root of the URDF; the first LiDAR's by default.
         lidars: settings by the LiDAR's name.
         cameras: settings by the camera's name.
         nominal_extrinsics: what the CAD model says, a sanity check only.

@@ -1,4 +1,4 @@
-"""The block of a channel that says how pictures are made from its events."""
+"""The block of a channel for image reconstruction from its events."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,7 +10,7 @@ from lce_rig.rig.settings import Settings, problem
 
 
 class ReconstructionSettings(Settings):
-    """How pictures are made from a channel's events.
+    """Settings of image reconstruction from a channel's events.
 
     Attributes:
         method: a recurrent network, or the event map: sums of polarities, for comparison.

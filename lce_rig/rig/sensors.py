@@ -28,13 +28,13 @@ _COUNTS = {"radtan": ((0, 4, 5, 8), "4, 5 or 8 (or none)"), "equidistant": ((4,)
 
 
 class TimestampSettings(Settings):
-    """What a sensor's time stamps mean.
+    """The meaning of a sensor's timestamps.
 
     Attributes:
         clock: whose clock is read: the sensor's own, the computer's, or UTC by GPS or PTP.
-        reference: the moment a stamp marks: start or middle of the exposure, first or last firing.
+        reference: the moment a timestamp marks: start or middle of the exposure, first or last firing.
         sync: how clocks are tied: by a shared pulse, by PTP, or not at all.
-        expected_offset_s: what to add to these stamps to get the rig's time.
+        expected_offset_s: what to add to these timestamps to get the rig's time.
         tolerance_s: how far pairs of captures may lie apart after that.
     """
 
@@ -46,11 +46,11 @@ class TimestampSettings(Settings):
 
 
 class FrameTimingSettings(Settings):
-    """What the kernel's stamp of a picture means, where the camera's driver does not say, or says wrong.
+    """The meaning of the kernel's timestamp of an image, if the camera's driver does not report it correctly.
 
     Attributes:
-        clock: the clock that stamps pictures; "auto" tries which one fits.
-        mark: the moment that is stamped; "auto" believes the driver's flags.
+        clock: the clock that timestamps images; "auto" tries which one fits.
+        mark: the moment that is timestamped; "auto" believes the driver's flags.
         exposure_us: how long a row is exposed; None asks the camera.
         line_time_us: time between rows of a rolling shutter; 0 for a global one.
         trigger_delay_us: from the trigger's edge to the start of the first row's exposure.
@@ -64,17 +64,17 @@ class FrameTimingSettings(Settings):
 
 
 class DriverSettings(Settings):
-    """How a live sensor is reached.
+    """The connection to a live sensor.
 
     Attributes:
         type: which of the program's drivers; None takes the one that goes with the model.
         port: UDP port of a networked sensor.
         address: IP address of a networked sensor.
         device: device file or serial number of an attached sensor.
-        command: program and arguments whose standard output is the camera's pictures.
+        command: program and arguments whose standard output is the camera's images.
         pixel_format: four characters of the wanted pixel format ("UYVY"); None takes the camera's first.
-        frame_rate_hz: wanted pictures a second; None leaves the camera's own.
-        frame_timing: what a picture's stamp means.
+        frame_rate_hz: wanted images per second; None leaves the camera's own.
+        frame_timing: what an image's timestamp means.
         controls: settings handed to the driver as they are.
     """
 
@@ -95,7 +95,7 @@ class LidarSettings(Settings):
     Attributes:
         model: maker's name of the model.
         frame: frame of its points, x forward, y left, z up.
-        topic: topic of its clouds in bags.
+        topic: topic of its point clouds in bags.
         min_range_m: nearer returns are ignored.
         max_range_m: farther returns are ignored.
         beam_aperture_m: width of the light beam where it leaves the sensor; 0 for an ideal one.
@@ -157,9 +157,9 @@ class ChannelSettings(Settings):
     """One stream of a camera.
 
     Attributes:
-        kind: "frames", or "events" and the pictures reconstructed from them.
-        topic: topic of its pictures or events in bags.
-        reconstruction: how pictures are made from events; None for the shipped network.
+        kind: "frames", or "events" and the images reconstructed from them.
+        topic: topic of its images or events in bags.
+        reconstruction: how images are made from events; None for the shipped network.
     """
 
     kind: Literal["frames", "events"] = "frames"
@@ -194,7 +194,7 @@ class CameraSettings(Settings):
         model: maker's name of the model.
         frame: the camera's body frame, x forward, y left, z up.
         optical_frame: frame of its optics, x right, y down, z forward.
-        resolution_px: (width, height) of the pictures.
+        resolution_px: (width, height) of the images.
     """
 
     model: Text = ""

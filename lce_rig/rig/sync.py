@@ -1,4 +1,4 @@
-"""The sync board's block of a profile: how it is reached, and which camera each of its lines triggers."""
+"""The sync board's block of a profile: its connection, and the camera that each line triggers."""
 
 from typing import Annotated, Literal
 
@@ -8,16 +8,19 @@ from lce_rig.rig.settings import Name, Settings, problem
 
 _BAUD = {"lce1": 115_200, "nmea": 9_600, "simplesensorsync": 921_600, "tline": 921_600}
 
+BOARD, PPS_LINE = "sync", "pps"
+"""Names of the sync board among the sensors, and of its pulses per second among the lines of cameras."""
+
 
 class TriggerSettings(Settings):
     """The pulses that trigger one camera.
 
     Attributes:
         channel: number of the board's line.
-        rate_hz: pulses a second; boards that decide by themselves are not told.
+        rate_hz: pulses per second; not sent to boards that set their own rate.
         phase_us: first pulse of a second after that second's beginning.
         pulse_us: length of a pulse.
-        max_delay_s: latest stamp of a frame after its pulse; as short as the camera allows.
+        max_delay_s: latest timestamp of a frame after its pulse; as short as the camera allows.
     """
 
     channel: Annotated[int, Field(ge=0, le=15)]
@@ -39,7 +42,7 @@ class TriggerSettings(Settings):
 
 
 class SyncSettings(Settings):
-    """A board that makes the pulse per second and triggers cameras.
+    """A board that generates the pulse per second and triggers cameras.
 
     Attributes:
         type: how it talks: lce-rig's own protocol, plain NMEA, SimpleSensorSync's JSON, or lines `T,n,us`.

@@ -1,8 +1,8 @@
-"""Thresholds and weights of a profile; every one has a default and may be left out."""
+"""Thresholds of a profile; each is optional and has a default."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lce_rig.rig.settings import NotNegative, Positive, Settings
 
@@ -10,11 +10,11 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class QualitySettings(Settings):
-    """From which figures on a capture is used, and a result passes.
+    """Limits for using a capture and for passing a result.
 
     Attributes:
-        min_square_px: least side of a square in the picture; below it corners are blurred together.
-        min_border_px: least distance of a corner from the picture's border.
+        min_square_px: least side of a square in the image; below it corners are blurred together.
+        min_border_px: least distance of a corner from the image's border.
         max_tilt_deg: largest angle between the board's normal and the line of sight.
         max_reprojection_px: largest rms corner residual.
         min_rings: least number of LiDAR rings on the board.
@@ -26,11 +26,11 @@ class QualitySettings(Settings):
         max_distance_m: farthest board.
         max_motion_m: how far the board may move while it counts as still.
         min_events_px: fewest events on the board in a second, per pixel of it.
-        min_event_contrast: least difference of black and white in a picture made from events, grey values.
-        min_event_sharpness: fewest widths of an edge in a square of such a picture.
+        min_event_contrast: least difference of black and white in an image made from events, grey values.
+        min_event_sharpness: fewest widths of an edge in a square of such an image.
         max_board_speed_mps: fastest board that events may show.
         max_turn_deg_s: fastest turn of such a board.
-        max_smear_m: how far such a board may move while the LiDAR sweeps it.
+        max_smear_m: how far such a board may move while the LiDAR scans it.
         min_captures: fewer captures make no calibration.
         min_detected_fraction: a smaller share of captures with the board found is marginal.
         max_mpe_m: largest mean distance of LiDAR points from the camera's board plane.
@@ -61,20 +61,25 @@ class QualitySettings(Settings):
     max_mee_m: Positive = 0.04
 
 
+_WEIGHTS = ("plane_weight", "edge_weight")
+
+
 class CalibrationSettings(Settings):
-    """Weights of the cost, and how sure the result has to be.
+    """Target standard deviations.
 
     Attributes:
-        plane_weight: weight of a point's distance from the board's plane.
-        edge_weight: weight of a ring end's distance from the board's edge.
         target_sigma_deg: standard deviation of the rotation to reach; above it a result is marginal.
         target_sigma_m: standard deviation of the translation to reach; above it a result is marginal.
     """
 
-    plane_weight: Positive = 1.0
-    edge_weight: Positive = 3.0
     target_sigma_deg: Positive = 0.2
     target_sigma_m: Positive = 0.01
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_weights(cls, data: Any) -> Any:
+        """Drop weights, which profiles of earlier sessions hold: they follow from the captures."""
+        return {k: v for k, v in data.items() if k not in _WEIGHTS} if isinstance(data, dict) else data
 
     def in_targets(self, rotation_deg: float, translation_m: float) -> float:
         """Measure an error or a difference in units of the targets; the larger of the two counts."""
@@ -82,24 +87,24 @@ class CalibrationSettings(Settings):
 
 
 class VerdictSettings(Settings):
-    """When a result passes; what is beyond a limit is marginal, and fails where a second limit says so.
+    """Limits of the verdict: beyond a limit a result is marginal, beyond a second limit it fails.
 
     Attributes:
         fail_factor: a deviation, or a difference between two answers, this many times the target fails.
         max_scale_error: how far camera and LiDAR distances may differ, as a fraction; 2.5 times that fails.
         max_edge_shift_m: how far ring ends may lie beyond the plate's edge; beams are not wider.
         max_plane_misfit_m: rms between the planes of both sensors that boards held still stay below.
-        max_held_out_ratio: how many times worse captures may fit that were left out.
+        max_held_out_ratio: how many times worse held-out captures may fit.
         max_prior_sigmas: how many of the profile's `laser_bias_sigma_m` a laser's range offset may reach.
         max_change: largest difference of earlier and later captures, in targets; twice it fails.
         max_contrast: the same between near and far, left and right, upper and lower boards, whose differences
             all but cancel in the whole.
-        max_camera_difference: how far two cameras' extrinsics and their own pictures may differ on where one
+        max_camera_difference: how far two cameras' extrinsics and their own images may differ on where one
             sits to the other, and how far that may change on the way, in targets; `fail_factor` times that,
             or twice for a change, fails.
         least_chance: a difference of shares of the captures counts where chance makes it this rarely.
         control_sigmas: how many standard deviations the result is moved for the control, and no less than
-            the target; captures that were left out must then fit worse.
+            the target; held-out captures must then fit worse.
         max_spread_ratio: where resampled captures spread the result by more than this many claimed standard
             deviations, the claim is widened.
     """

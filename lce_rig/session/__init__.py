@@ -1,4 +1,4 @@
-"""Sessions on disk: captures that exist whole or not at all, a journal, a frozen profile and a cache."""
+"""Sessions on disk: captures that are complete or absent, a journal, a copied profile and a cache."""
 
 from lce_rig.session.capture import Capture
 from lce_rig.session.discarding import discard_if_empty

@@ -1,4 +1,4 @@
-"""Arrays and figures kept between runs; a damaged entry is one that is not there."""
+"""Arrays and figures cached between runs; a damaged entry counts as missing."""
 
 import hashlib
 import io
@@ -25,7 +25,7 @@ _SEAL_BYTES = len(_SEAL) + 64
 
 @dataclass(frozen=True, eq=False)
 class Cached:
-    """What was stored under one key: arrays by name, and values of JSON types."""
+    """The entry of one key: arrays by name, and values of JSON types."""
 
     arrays: dict[str, NDArray[Any]]
     values: dict[str, Any]

@@ -1,4 +1,4 @@
-"""One capture of a session: a folder of plain files and the manifest that vouches for them."""
+"""One capture of a session: a folder of plain files and a manifest with their checksums."""
 
 import hashlib
 import os
@@ -30,7 +30,7 @@ _MAX_OFFSET_NS = 3600 * 10**9
 
 @dataclass(frozen=True)
 class Capture:
-    """One board placement as the sensors saw it.
+    """One board placement as the sensors recorded it.
 
     Attributes:
         path: the capture's folder; its name is the capture's.
@@ -55,7 +55,7 @@ class Capture:
 
     @property
     def file_hashes(self) -> frozenset[str]:
-        """SHA-256 of every picture, scan and stretch of events in it."""
+        """SHA-256 of every image, scan and stretch of events in it."""
         return frozenset(entry.sha256 for entry in self._manifest.files)
 
     @property
@@ -74,7 +74,7 @@ class Capture:
 
     @property
     def image_keys(self) -> list[tuple[str, str]]:
-        """(camera, channel) of every picture, sorted."""
+        """(camera, channel) of every image, sorted."""
         return sorted((entry.camera, entry.channel) for entry in self._manifest.images)
 
     @property
@@ -88,11 +88,11 @@ class Capture:
         return sorted(entry.camera for entry in self._manifest.events)
 
     def has_image(self, camera: str, channel: str) -> bool:
-        """Tell whether this capture has a picture of that camera and channel."""
+        """Return whether this capture has an image of that camera and channel."""
         return (camera, channel) in self.image_keys
 
     def image(self, camera: str, channel: str) -> Image:
-        """Read a picture exactly as it was captured.
+        """Read an image exactly as it was captured.
 
         Raises:
             SessionError: there is none, or it is damaged.
@@ -133,7 +133,7 @@ class Capture:
             raise self._damaged(f"{entry.file}: {error}") from None
 
     def events(self, camera: str) -> Events:
-        """Read the events about this capture exactly as they were recorded, stamps to the microsecond.
+        """Read the events about this capture exactly as they were recorded, timestamps to the microsecond.
 
         Raises:
             SessionError: there are none, or they are damaged.
@@ -215,7 +215,7 @@ class Capture:
 
 
 def _lengths(cloud: NDArray[Any], name: str) -> NDArray[np.float32]:
-    """Take a field of finite figures out of a scan's cloud; raise a ValueError where it holds others."""
+    """Take a field of finite values from a scan's point cloud; raise a ValueError where one is not."""
     values = _field(cloud, name, "f")
     if not np.isfinite(values).all() or np.abs(values).max(initial=0) > np.finfo(np.float32).max:
         raise ValueError(f"its field {name} is not finite everywhere")
@@ -223,7 +223,7 @@ def _lengths(cloud: NDArray[Any], name: str) -> NDArray[np.float32]:
 
 
 def _whole(cloud: NDArray[Any], name: str, lowest: int, highest: int) -> NDArray[np.int64]:
-    """Take a field of whole numbers out of a scan's cloud; raise a ValueError where it holds others."""
+    """Take a field of whole numbers from a scan's point cloud; raise a ValueError where one is not."""
     values = _field(cloud, name, "iu")
     if len(values) and (int(values.min()) < lowest or int(values.max()) > highest):
         raise ValueError(f"its field {name} runs from {values.min()} to {values.max()} (limit {highest})")

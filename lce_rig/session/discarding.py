@@ -1,4 +1,4 @@
-"""A session that never began leaves no folder behind."""
+"""Removal of the folder of a session that has no capture."""
 
 from contextlib import suppress
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Files that survive a power cut, and the lock that keeps a second writer out."""
+"""Files that survive a power failure, and the lock against a second writer."""
 
 import errno
 import fcntl

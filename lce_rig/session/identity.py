@@ -1,4 +1,4 @@
-"""What makes a folder a session, and whose session it is."""
+"""Recognition of session folders and of their rig."""
 
 import json
 import re

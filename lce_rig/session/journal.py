@@ -1,4 +1,4 @@
-"""What happened to a session, line by line."""
+"""A session's journal, one event per line."""
 
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ def read_entries(path: Path) -> list[dict[str, Any]]:
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no regular file.
+        ValueError: it is not a regular file.
     """
     entries: list[dict[str, Any]] = []
     if not path.exists():

@@ -1,4 +1,4 @@
-"""What a capture's manifest says; strict where it is read, for a session may come from somebody else."""
+"""The schema of a capture's manifest; reading is strict, as a session may come from elsewhere."""
 
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
@@ -25,7 +25,7 @@ class _FileEntry(_Record):
 
 
 class ImageEntry(_FileEntry):
-    """A picture's file."""
+    """An image's file."""
 
     kind: Literal["image"]
     camera: Name
@@ -42,7 +42,7 @@ class ScanEntry(_FileEntry):
 
 
 class EventsEntry(_FileEntry):
-    """The file of a stretch of events."""
+    """The file of a range of events."""
 
     kind: Literal["events"]
     camera: Name
@@ -55,7 +55,7 @@ Entry = ImageEntry | ScanEntry | EventsEntry
 
 
 class Manifest(_Record):
-    """The whole file; `meta` is what the collector wrote, of any shape."""
+    """The whole file; `meta` holds any JSON of the collector."""
 
     format_version: Annotated[int, Field(ge=1)]
     content_sha256: str
@@ -64,7 +64,7 @@ class Manifest(_Record):
 
     @property
     def images(self) -> list[ImageEntry]:
-        """Entries of pictures."""
+        """Entries of images."""
         return [entry for entry in self.files if isinstance(entry, ImageEntry)]
 
     @property

@@ -1,4 +1,4 @@
-"""Which samples a session takes: one of each sensor, of sensors that its rig has."""
+"""The samples that a session accepts: one per sensor of its rig."""
 
 from collections.abc import Sequence
 

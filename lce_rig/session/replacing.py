@@ -1,8 +1,8 @@
-"""Folders of results, replaced whole: whoever looks finds all earlier files or all new ones, at any moment.
+"""Folders of results, replaced as a whole: a reader finds all earlier files or all new ones, at any time.
 
-A draft beside the session's other folders (`.new-calibration-XXXX`) is filled, then it and the folder change
-places in one step of the kernel (renameat2). A process that is killed leaves one whole folder, and a draft
-that the next one removes; a draft is locked (flock) while its maker lives.
+The writer fills a draft beside the session's other folders (`.new-calibration-XXXX`), then exchanges both in
+one system call (renameat2). A killed process leaves one complete folder, and a draft that the next process
+removes. A draft is locked (flock) while its writer lives.
 """
 
 import ctypes

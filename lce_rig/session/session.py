@@ -1,4 +1,4 @@
-"""A session folder: the frozen rig profile, captures, a journal and a cache of detections.
+"""A session folder: the copied rig profile, captures, a journal and a cache of detections.
 
 Layout, every file plain: rig.yaml, session.json, journal.jsonl, detections/ and
 captures/000012/{meta.json, cam.frames.png, lidar.pcd, cam.events.npz}. A capture is written to
@@ -90,7 +90,8 @@ class Session:
         """Open an existing session; for writing it also clears what a killed writer left behind.
 
         Raises:
-            SessionError: it is no session, damaged, made by a newer version, or another process writes to it.
+            SessionError: it is not a session, damaged, made by a newer version, or another process writes to
+                it.
         """
         path = Path(path)
         check_marker(path)
@@ -217,7 +218,7 @@ class Session:
             The capture's name.
 
         Raises:
-            SessionError: the session is open for reading only, a sensor is not in the rig, events are out of
+            SessionError: the session is open read-only, a sensor is not in the rig, events are out of
                 order or off their sensor, or the disk is full; what was captured before is not affected.
         """
         images, scans, events = list(images), list(scans), list(events)

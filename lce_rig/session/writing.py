@@ -1,8 +1,9 @@
-"""A capture on its way to the disk: samples as plain files, and the manifest that vouches for them."""
+"""Writing a capture: samples as plain files, and a manifest with their checksums."""
 
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ PLAIN_VERSION, EVENTS_VERSION = 1, 2
 
 
 def content_hash(images: Iterable[Image], scans: Iterable[Scan], events: Iterable[Events] = ()) -> str:
-    """Fingerprint what the sensors saw, stamps left aside, whatever files it came from.
+    """Fingerprint what the sensors saw, timestamps left aside, whatever files it came from.
 
     Of events, the times between them count.
 
@@ -56,28 +57,20 @@ def write_capture(
 
     Raises:
         OSError: a full disk, no permission.
-        ValueError: a picture that is not 8-bit grey or BGR, events out of order or off their sensor, or
+        ValueError: an image that is not 8-bit grey or BGR, events out of order or off their sensor, or
             `meta` that is not JSON.
     """
     images, scans, events = list(images), list(scans), list(events)
-    files: list[dict[str, Any]] = []
-    for image in images:
-        entry = {"kind": "image", "camera": image.sensor, "channel": image.channel}
-        stored = _store(folder, f"{image.sensor}.{image.channel}.png", _encode_png(image))
-        files.append({**entry, **stored, "stamp_ns": image.stamp_ns, "host_ns": image.host_ns})
-    for scan in scans:
-        stored = _store(folder, f"{scan.sensor}.pcd", _encode_scan(scan))
-        stamps = {"stamp_ns": scan.stamp_ns, "host_ns": scan.host_ns}
-        files.append({"kind": "scan", "lidar": scan.sensor, **stored, **stamps})
-    for channel, stretch in events:
-        check_events(stretch)
-        entry = {"kind": "events", "camera": stretch.sensor, "channel": channel}
-        stored = _store(folder, f"{stretch.sensor}.events.npz", encode_events(stretch))
-        files.append({**entry, **stored, **stamps_of(stretch), "host_ns": stretch.host_ns})
+    # Encoding, hashing and flushing release the interpreter: a capture takes as long as its slowest file.
+    with ThreadPoolExecutor(thread_name_prefix="write capture") as pool:
+        content = pool.submit(content_hash, images, scans, [stretch for _, stretch in events])
+        stored_events = [pool.submit(_store_events, folder, *each) for each in events]  # the longest first
+        entries = [pool.submit(_store_image, folder, image) for image in images]
+        entries += [pool.submit(_store_scan, folder, scan) for scan in scans] + stored_events
     manifest = {
         "format_version": EVENTS_VERSION if events else PLAIN_VERSION,
-        "content_sha256": content_hash(images, scans, [stretch for _, stretch in events]),
-        "files": files,
+        "content_sha256": content.result(),
+        "files": [entry.result() for entry in entries],
         "meta": dict(meta),
     }
     text = json.dumps(manifest, indent=1, sort_keys=True, allow_nan=False) + "\n"
@@ -86,7 +79,7 @@ def write_capture(
 
 
 def stamps_of(events: Events) -> dict[str, int | None]:
-    """Read the first and last stamp of events, null where there are none, as a manifest has them."""
+    """Read the first and last timestamp of events, null where there are none, as a manifest has them."""
     if not len(events):
         return {"first_ns": None, "last_ns": None}
     return {"first_ns": int(events.t_ns[0]), "last_ns": int(events.t_ns[-1])}
@@ -103,6 +96,25 @@ def check_events(events: Events) -> None:
     if np.any(events.x >= events.width_px) or np.any(events.y >= events.height_px):
         size = f"{events.width_px}x{events.height_px}"
         raise ValueError(f"events of {events.sensor} lie off its {size} pixels")
+
+
+def _store_image(folder: Path, image: Image) -> dict[str, Any]:
+    entry = {"kind": "image", "camera": image.sensor, "channel": image.channel}
+    stored = _store(folder, f"{image.sensor}.{image.channel}.png", _encode_png(image))
+    return {**entry, **stored, "stamp_ns": image.stamp_ns, "host_ns": image.host_ns}
+
+
+def _store_scan(folder: Path, scan: Scan) -> dict[str, Any]:
+    stored = _store(folder, f"{scan.sensor}.pcd", _encode_scan(scan))
+    stamps = {"stamp_ns": scan.stamp_ns, "host_ns": scan.host_ns}
+    return {"kind": "scan", "lidar": scan.sensor, **stored, **stamps}
+
+
+def _store_events(folder: Path, channel: str, stretch: Events) -> dict[str, Any]:
+    check_events(stretch)
+    entry = {"kind": "events", "camera": stretch.sensor, "channel": channel}
+    stored = _store(folder, f"{stretch.sensor}.events.npz", encode_events(stretch))
+    return {**entry, **stored, **stamps_of(stretch), "host_ns": stretch.host_ns}
 
 
 def _store(folder: Path, name: str, data: bytes) -> dict[str, Any]:
@@ -135,7 +147,7 @@ def _encode_scan(scan: Scan) -> bytes:
     }
     comments = ["frame of the lidar: x forward, y left, z up; m; ring 0 is the lowest"]
     if scan.offset_ns is not None:
-        # 32 bits hold 4.3 s and are all that many viewers know; a longer sweep needs 64.
+        # 32 bits hold 4.3 s and are all that many viewers know; a longer scan needs 64.
         fits = len(scan.offset_ns) == 0 or (scan.offset_ns.min() >= 0 and scan.offset_ns.max() < 2**32)
         columns["time"] = ("u4" if fits else "i8", scan.offset_ns)
         comments.append("time: ns after the first firing")

@@ -1,4 +1,4 @@
-"""What a camera sees of the standing room: the costly half of a picture, computed once a session."""
+"""The static room in a camera's image: the costly half of rendering, computed once per session."""
 
 from dataclasses import dataclass
 
@@ -18,17 +18,17 @@ _CHUNK = 1 << 18
 
 @dataclass(frozen=True, eq=False)
 class Backdrop:
-    """A camera at its place in the room, and what it sees of it.
+    """A camera at its pose in the room, with its image of the room.
 
     Attributes:
-        intrinsics: the lens.
+        intrinsics: of the camera.
         T_world_cam: (4, 4).
         corner_rays: (H + 1, W + 1, 3) unit rays through the pixels' corners, world.
         radiance: (H, W, 3) linear (blue, green, red).
         range_m: (H, W) along the ray through each pixel's centre.
         mirrors: shiny surfaces, indexed by row-major pixel.
         lamps: (P, 3) m, world.
-        shadow_points: (h, w, 3) m, what every fourth pixel sees, world.
+        shadow_points: (h, w, 3) m, seen by every fourth pixel, world.
         shadow_share: (h, w, P) each lamp's share of the light there.
     """
 
@@ -78,7 +78,7 @@ def build_backdrop(room: Room, T_world_cam: Array, intrinsics: Intrinsics) -> Ba
 def pixel_corner_rays(intrinsics: Intrinsics) -> Array:
     """Find the rays (H + 1, W + 1, 3) through the corners of all pixels, frame camera optical.
 
-    Newton's method on a grid of knots and cubic splines between them: within 2e-3 px of
+    Newton's method on a grid of knots, with cubic splines between them: within 2e-3 px of
     `Intrinsics.unproject` at a twentieth of its time.
     """
     from scipy.interpolate import RectBivariateSpline
@@ -92,9 +92,9 @@ def pixel_corner_rays(intrinsics: Intrinsics) -> Array:
 
 
 def _rays_beyond_the_lens(intrinsics: Intrinsics, pixels: Array) -> Array:
-    """Unproject; where the lens model has folded back, go on outwards in proportion to the distance.
+    """Unproject; where the lens model has folded back, continue outwards in proportion to the distance.
 
-    Real pictures are not black there: only the polynomial ends, not the lens.
+    Real images are not black there: only the polynomial ends, not the lens.
     """
     centre = np.array([intrinsics.cx_px, intrinsics.cy_px])
     focal = np.array([intrinsics.fx_px, intrinsics.fy_px])
@@ -112,9 +112,9 @@ def _rays_beyond_the_lens(intrinsics: Intrinsics, pixels: Array) -> Array:
 
 
 def lens_reach(intrinsics: Intrinsics) -> float:
-    """Find the |(pixel - c) / f| up to which pictures follow the lens model.
+    """Find the |(pixel - c) / f| up to which images follow the lens model.
 
-    Just before it folds, the polynomial's slope falls to zero: pictures leave it a little earlier.
+    Just before it folds, the polynomial's slope falls to zero: images leave it a little earlier.
     """
     widest = 0.999 * intrinsics.max_radius
     if intrinsics.model == "equidistant":

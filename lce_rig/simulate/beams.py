@@ -1,4 +1,4 @@
-"""Beams of finite width: which surfaces one touches, and what single range it reports of several."""
+"""Beams of finite width: the surfaces that a beam hits, and the single range that it reports."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from lce_rig.simulate.scene import Hits, Scene
 
 @dataclass(frozen=True, eq=False)
 class Returns:
-    """What beams bring back.
+    """The returns of beams.
 
     Attributes:
         range_m: (N,), inf where nothing.
         energy: (N,) received, 1 for a white surface across the whole beam.
-        reflectivity: (N,) of what was met, 0..1.
+        reflectivity: (N,) of the surface hit, 0..1.
         surface: (N,) int32 index of the scene's surface, -1 where nothing.
     """
 
@@ -28,10 +28,10 @@ class Returns:
 
 
 def receive(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) -> Returns:
-    """Find what each beam brings back: its axis alone decides where its whole footprint meets one surface.
+    """Find the return of each beam: its axis alone decides where its whole footprint hits one surface.
 
     Args:
-        scene: what the beams meet.
+        scene: the surfaces.
         origins: (N, 3) m, world.
         directions: (N, 3) unit, world.
         noise: sizes of the beam.
@@ -74,7 +74,7 @@ _CELLS = _footprint(16, 8)
 
 def _sub_rays(origins: Array, directions: Array, cells: Array, noise: LidarNoise) -> tuple[Array, Array]:
     """Spread beams (N, 3) into origins and unit directions (N, K, 3) through the footprint's cells."""
-    # A LiDAR mounted anyhow still turns about its own axis; world z serves as that axis to first order only,
+    # A tilted LiDAR still turns about its own axis; world z serves as that axis to first order only,
     # which is exact for an upright LiDAR and turns the footprint's ellipse a little for a tilted one.
     across = np.cross([0.0, 0.0, 1.0], directions)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)

@@ -1,4 +1,4 @@
-"""A camera of any lens model: board and carrier before the backdrop, anti-aliased, blurred and noisy."""
+"""A camera of any lens model: board and carrier in front of the room, anti-aliased, blurred and noisy."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,11 +27,11 @@ def render_image(
     channel: str = "frames",
     stamp_ns: int = 0,
 ) -> Image:
-    """Render one picture.
+    """Render one image.
 
     Args:
         scene: the room of the backdrop, with the board and its carrier.
-        backdrop: the camera and what it sees of the standing room.
+        backdrop: the camera and its image of the static room.
         noise: the camera's errors.
         rng: source of the sensor's noise.
         sensor: name in the rig profile.
@@ -47,7 +47,7 @@ def render_radiance(scene: Scene, backdrop: Backdrop, n_subpixels: int = SUBPIXE
 
     Args:
         scene: the room of the backdrop, with the board and its carrier.
-        backdrop: the camera and what it sees of the standing room.
+        backdrop: the camera and its image of the static room.
         n_subpixels: samples a pixel along each axis wherever an edge runs through it.
     """
     radiance = backdrop.radiance * _shadow(scene, backdrop)[..., None]
@@ -71,7 +71,7 @@ def _shadow(scene: Scene, backdrop: Backdrop) -> Array:
     through = 1.0 - 0.85 * lost / (share.sum(axis=1) + 0.35)
     soft = cv2.GaussianBlur(through.reshape(shape), (0, 0), 1.2)
     height, width = backdrop.range_m.shape
-    # Pixel k * step of the full picture is pixel k of the coarse one.
+    # Pixel k * step of the full image is pixel k of the coarse one.
     to_coarse = np.array([[1 / SHADOW_STEP_PX, 0, 0], [0, 1 / SHADOW_STEP_PX, 0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(
@@ -101,7 +101,7 @@ def _region(scene: Scene, backdrop: Backdrop, *, is_mirrored: bool = False) -> t
 
 
 def _paint_mirror_images(radiance: Array, scene: Scene, backdrop: Backdrop) -> None:
-    """Let the shiny floor show the board and its carrier in the picture (H, W, 3), in place."""
+    """Let the shiny floor show the board and its carrier in the image (H, W, 3), in place."""
     rows, cols = _region(scene, backdrop, is_mirrored=True)
     mirrors = backdrop.mirrors
     v, u = np.divmod(mirrors.index, backdrop.range_m.shape[1])
@@ -117,7 +117,7 @@ def _paint_mirror_images(radiance: Array, scene: Scene, backdrop: Backdrop) -> N
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """The part of a picture that board and carrier can touch, h by w pixels.
+    """The part of an image that board and carrier can cover, h by w pixels.
 
     Attributes:
         corner_rays: (h + 1, w + 1, 3) unit, world.
@@ -143,7 +143,7 @@ def _paint_moving(radiance: Array, scene: Scene, backdrop: Backdrop, n_subpixels
     is_edge = _dilate(beside_changes(label[1:] != label[:-1], label[:, 1:] != label[:, :-1]))
     is_carrier = (label >= 0) & (label < scene.board_index)
     lights = (_spread(light, is_carrier), _spread(light, label >= scene.board_index))
-    # Far from the carrier only the board can be met, which spares half the rays.
+    # Far from the carrier, rays can only hit the board; this saves half of them.
     near_carrier = _dilate(_dilate(is_carrier))
     for with_carrier in (False, True):
         v, u = np.nonzero(is_edge & (near_carrier == with_carrier))
@@ -167,7 +167,7 @@ def _look_through_centres(
     colour, light = np.zeros((len(rays), 3)), np.zeros((len(rays), 3))
     colour[seen] = scene.colour(kept, points)
     light[seen] = irradiance(backdrop.lamps, points, kept.normals, scene.occluders)
-    # Dark squares count as a surface of their own, so that edges of the print are found as edges.
+    # Dark squares count as a surface of their own, so that edges of the pattern are found as edges.
     label[seen] += (kept.surface == scene.board_index) & scene.is_dark(points)
     return label.reshape(shape[:2]), colour.reshape(shape), light.reshape(shape)
 
@@ -220,7 +220,7 @@ def _spread(light: Array, mask: NDArray[np.bool_]) -> Array:
 def sensor_gain(height_px: int, width_px: int, noise: CameraNoise) -> Array:
     """Compute by what radiance is multiplied on its way to each pixel (H, W): exposure and vignetting.
 
-    It is the same for all pictures of a camera, and not to be changed.
+    It is the same for all images of a camera and read-only.
     """
     v, u = np.mgrid[0:height_px, 0:width_px]
     radius2 = ((u - (width_px - 1) / 2) ** 2 + (v - (height_px - 1) / 2) ** 2) / (
@@ -232,7 +232,7 @@ def sensor_gain(height_px: int, width_px: int, noise: CameraNoise) -> Array:
 
 
 def expose(radiance: Array, noise: CameraNoise, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Turn linear radiance (H, W, 3) into a picture: vignetting, point spread, shot and read noise, gamma."""
+    """Turn linear radiance (H, W, 3) into an image: vignetting, point spread, shot and read noise, gamma."""
     linear = focus(radiance, noise)
     if np.isfinite(noise.full_well_e):
         normals = rng.standard_normal(linear.shape, dtype=np.float32)
@@ -259,6 +259,6 @@ def shot_noise_e(linear: NDArray[np.float32], noise: CameraNoise) -> NDArray[np.
 
 
 def develop(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Turn what a sensor measured (H, W, 3) into a picture."""
+    """Turn what a sensor measured (H, W, 3) into an image."""
     tone = 255.0 * np.clip(linear, 0.0, 1.0) ** _GAMMA
     return np.asarray(np.rint(tone), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""A simulated session: captures of the board among its decoys, held still or moved by hand."""
+"""A simulated session: captures of the board among decoys, still or hand-held."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -29,9 +29,9 @@ class SimulatedCapture:
         index: of the capture in its session.
         images: one a camera that has a channel of frames, in the profile's order.
         scans: one a LiDAR, in the profile's order.
-        T_lidar_board: true (4, 4) by LiDAR, at its scan's stamp.
-        T_cam_board: true (4, 4) by camera, at the middle of its picture's exposure; of a camera without
-            frames, at the stamp of the scan it was placed for.
+        T_lidar_board: true (4, 4) by LiDAR, at its scan's timestamp.
+        T_cam_board: true (4, 4) by camera, at the middle of its image's exposure; of a camera without
+            frames, at the timestamp of the scan it was placed for.
         target: the camera and the LiDAR that the board was placed for; others may not see it.
         events: one a camera that has a channel of events, if the board moves.
         trajectory: where the board is in the world at any time of the rig's clock, the LiDAR's.
@@ -51,7 +51,7 @@ class SimulatedCapture:
     def T_sensor_board(self, sensor: str, t_ns: int | NDArray[np.int64]) -> Array:
         """Compute the board's true pose (..., 4, 4) before a camera or LiDAR at times of the rig's clock.
 
-        Stamps of pictures and events read `frame_offset_s` or `event_offset_s` more than that clock.
+        Timestamps of images and events read `frame_offset_s` or `event_offset_s` more than that clock.
         """
         return np.asarray(invert(self.T_world_sensor[sensor]) @ self.trajectory.at(t_ns))
 
@@ -89,7 +89,7 @@ def capture_at(
 
     Args:
         stage: the session, see `set_stage`.
-        index: of the capture; its noise and its stamp follow from it.
+        index: of the capture; its noise and its timestamp follow from it.
         T_world_board: (4, 4).
         rng: source of what its carrier looks like; follows from the index by default.
     """
@@ -105,14 +105,14 @@ def capture_at(
 
 
 def _moving_capture(stage: Stage, index: int) -> SimulatedCapture:
-    """Take one capture of a board that passes its placement when the LiDAR looks its way."""
+    """Take one capture of a board that passes its placement when the LiDAR scans it."""
     options = stage.options
     stamp_ns = _FIRST_STAMP_NS + index * _CAPTURE_EVERY_NS
     middle_ns = stamp_ns + _half_turn_ns(stage, index)
     T_world_board = stage.place(index, stage.rng(index, PLACEMENT))
     trajectory = sway_board(T_world_board, middle_ns, options.hand, stage.rng(index, HAND))
     board = MovingBoard(stage, trajectory, (index, CARRIER))
-    # A camera that runs freely: its picture nearest to the scan's middle, by its own stamps.
+    # A camera that runs freely: its image nearest to the scan's middle, by its own timestamps.
     phase_s = options.frame_every_s * stage.rng(index, PHASE).uniform(-0.5, 0.5)
     exposed_ns = middle_ns + round(1e9 * (phase_s - options.frame_offset_s))
     images = [board.take_image(camera, exposed_ns, (index,)) for camera in stage.framed]
@@ -123,7 +123,7 @@ def _moving_capture(stage: Stage, index: int) -> SimulatedCapture:
 
 
 def _film_capture(board: MovingBoard, camera: str, stamp_ns: int, index: int) -> Events:
-    """Record the events whose stamps lie about a scan's."""
+    """Record the events whose timestamps lie about a scan's."""
     options = board.stage.options
     before_s, after_s = options.events_span_s
     start_ns, end_ns = (stamp_ns + round(1e9 * (s - options.event_offset_s)) for s in (-before_s, after_s))
@@ -134,7 +134,7 @@ def _film_capture(board: MovingBoard, camera: str, stamp_ns: int, index: int) ->
 
 
 def _half_turn_ns(stage: Stage, index: int) -> int:
-    """How long after its scan's stamp the LiDAR of this capture looks straight ahead."""
+    """How long after its scan's timestamp the LiDAR of this capture looks straight ahead."""
     view = stage.views[index % len(stage.views)]
     return stage.models[view.lidar].period_ns // 2
 

@@ -1,4 +1,4 @@
-"""The board's carrier as event cameras see it: rendered now and then, shifted and blended in between."""
+"""The board's carrier for event cameras: rendered at intervals, shifted and blended in between."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from lce_rig.simulate.light import irradiance, reached
 from lce_rig.simulate.scene import Hits, Raycaster, Scene
 
 GREY = np.array([0.114, 0.587, 0.299])
-#: Where the carrier's middle is thought to be, m behind the board: decides how its picture shifts.
+#: Assumed place of the carrier's middle, m behind the board: decides how its image shifts.
 _BEHIND_M = 0.15
 _MARGIN_PX = 4
 # Rays go through pixels' centres only: this blur stands for the pixel's area and keeps borders smooth.
@@ -22,13 +22,13 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True, eq=False)
 class CarrierLayer:
-    """A picture of the carrier at one moment, cut out.
+    """A cut-out image of the carrier at one time.
 
     Attributes:
         layers: (h, w, 4) float32: the carrier's radiance times its cover, and its cover; then both again of
             those parts alone that stand before the board.
         first_px: (2,) column and row of its first pixel.
-        anchor_px: (2,) picture of the carrier's middle.
+        anchor_px: (2,) image of the carrier's middle.
         distance_m: of that middle from the camera.
     """
 
@@ -45,7 +45,7 @@ class CarrierLayer:
         return np.stack([np.floor(low) - 1, np.ceil(low + scale * size) + 2])
 
     def shifted(self, window: Window, anchor_px: Array, distance_m: float) -> NDArray[np.float32]:
-        """Draw the layer (h, w, 4) into a window of the picture with its middle elsewhere."""
+        """Draw the layer (h, w, 4) into a window of the image with its middle elsewhere."""
         import cv2
 
         scale = self.distance_m / distance_m
@@ -57,7 +57,7 @@ class CarrierLayer:
 
 
 def carrier_middle(backdrop: Backdrop, T_world_board: Array) -> tuple[Array, float] | None:
-    """Find the carrier's middle in the picture (2,) and its distance; None where no lens shows it."""
+    """Find the carrier's middle in the image (2,) and its distance; None where no lens shows it."""
     middle = T_world_board[:3, 3] - _BEHIND_M * T_world_board[:3, 2]
     pixel, is_valid = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam), middle[None]))
     if not is_valid[0]:
@@ -107,7 +107,7 @@ def _window(moving: Raycaster, backdrop: Backdrop) -> Window | None:
 
 
 def clip_window(bounds_px: Array, backdrop: Backdrop) -> Window | None:
-    """Cut bounds (2, 2) as (low, high) column and row to the picture; None where nothing is left."""
+    """Cut bounds (2, 2) as (low, high) column and row to the image; None where nothing is left."""
     height, width = backdrop.range_m.shape
     (u0, v0), (u1, v1) = np.clip(np.rint(bounds_px), 0, [width, height]).astype(int)
     return (slice(int(v0), int(v1)), slice(int(u0), int(u1))) if u1 > u0 and v1 > v0 else None

@@ -48,7 +48,7 @@ def _clearance(bodies: Array, board: Board, T_world_board: Array, gap_m: float) 
         T_world_board: (4, 4).
         gap_m: distance left.
     """
-    along = float(T_world_board[:3, 2] @ _backwards(T_world_board))  # negative: backwards leaves the print
+    along = float(T_world_board[:3, 2] @ _backwards(T_world_board))  # negative: backwards leaves the pattern
     outline = transform(T_world_board, board.outline())
     low, high = outline[:, 2].min() - 0.1, outline[:, 2].max() + 0.1
     near = bodies[(bodies[:, 2] > low) & (bodies[:, 2] < high)]

@@ -1,4 +1,4 @@
-"""An event camera's pixels: each tells when its own slow view of ln(intensity) has changed enough.
+"""An event camera's pixels: each fires when its low-pass filtered ln(intensity) crosses a threshold.
 
 References:
     P. Lichtsteiner, C. Posch and T. Delbruck, A 128x128 120 dB 15 us latency asynchronous temporal contrast
@@ -26,12 +26,12 @@ _HOT_ON_SHARE = 0.95
 
 @dataclass(frozen=True, eq=False)
 class EventPixels:
-    """What makes one pixel differ from the next, fixed for a sensor.
+    """The differences between pixels, fixed for a sensor.
 
     Attributes:
         width_px, height_px: of the sensor.
         threshold_on, threshold_off: (P,) by row-major pixel.
-        hot_hz: (P,) events a second that have no cause at all.
+        hot_hz: (P,) spontaneous events per second.
     """
 
     width_px: int
@@ -63,16 +63,16 @@ class _Raw:
 
 
 class EventCamera:
-    """An event camera at work: give it the scene's intensities in order of time, it gives events.
+    """An event camera: takes the scene's intensities in order of time and returns events.
 
     Args:
         pixels: the sensor.
-        noise: how it errs.
+        noise: its errors.
         radiance: (H, W) linear intensity at the start, to which the pixels have settled.
         start_ns: when that is, on the rig's clock.
         rng: source of noise.
         sensor: name in the rig profile.
-        offset_ns: how much more its stamps read than the rig's clock.
+        offset_ns: how much more its timestamps read than the rig's clock.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class EventCamera:
         self._reference = self._input.copy()
         n = len(self._input)
         if noise.leak_hz > 0:
-            # Pixels leak since long ago: each is somewhere on its way to its next event.
+            # Pixels have leaked for a long time: each is somewhere on its way to its next event.
             self._reference -= pixels.threshold_on * rng.random(n)
         self._released_s = np.zeros(n)  # a pixel is blind until then
         self._last_s = np.full(n, -np.inf)  # when it last made an event
@@ -150,7 +150,7 @@ class EventCamera:
         now_s: float,
         output: Array,
     ) -> None:
-        """Make the events of pixels (M,) whose excess + slope t (M,) passes their threshold by now_s."""
+        """Generate the events of pixels (M,) whose excess + slope t (M,) passes their threshold by now_s."""
         if not len(pixel):
             return
         threshold = np.where(is_on, self._on[pixel], self._off[pixel])
@@ -171,14 +171,14 @@ class EventCamera:
         self._reference[pixel] = output[pixel] - slope * np.maximum(now_s - released_s, 0.0)
 
     def _redraw_thresholds(self, pixel: NDArray[np.intp]) -> None:
-        """Let the noise of pixels (M,) decide how much change it takes to make their next event."""
+        """Draw the change that triggers the next event of pixels (M,)."""
         if self._noise.event_sigma > 0:
             change = self._noise.event_sigma * self._rng.standard_normal((2, len(pixel)))
             self._on[pixel] = np.maximum(self._pixels.threshold_on[pixel] + change[0], _LEAST_THRESHOLD)
             self._off[pixel] = np.maximum(self._pixels.threshold_off[pixel] + change[1], _LEAST_THRESHOLD)
 
     def take(self) -> Events:
-        """Hand over the events since the last call, in order of time, with those of noise among them."""
+        """Return the events since the last call, in order of time, noise included."""
         raw = [*self._raw, self._noise_events(self._taken_s, self._now_s)]
         self._raw, self._taken_s = [], self._now_s
         t_s, pixel, polarity = (
@@ -212,7 +212,7 @@ class EventCamera:
         return _Raw(t_s, pixel, self._rng.random(n) < on_share)
 
     def _outlasts_refractory(self, t_s: Array, pixel: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Tell which events (N,), in order of time, their pixel was not blind for after its last."""
+        """Find which events (N,), in order of time, fall outside their pixel's refractory period."""
         order = np.argsort(pixel, kind="stable")
         by_pixel, by_time = pixel[order], t_s[order]
         is_first = np.ones(len(order), dtype=np.bool_)

@@ -91,7 +91,7 @@ def simulate_scan(
         model: the LiDAR's geometry and timing.
         noise: its errors.
         rng: source of the azimuth phase and of all noise.
-        board_at: T_world_board (N, 4, 4) at times (N,) ns of the stamp's clock; None for the scene's.
+        board_at: T_world_board (N, 4, 4) at times (N,) ns of the timestamp's clock; None for the scene's.
         laser_bias_m: (L,) constant range offset of each laser in firing order; zeros by default.
         sensor: name in the rig profile.
         stamp_ns: device time of the first firing.
@@ -114,7 +114,7 @@ def simulate_scan(
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """What the beams of one revolution met, before any error of measurement.
+    """The surfaces hit by the beams of one revolution, without measurement errors.
 
     Attributes:
         laser: (N,) of each firing, in firing order.
@@ -155,14 +155,14 @@ def sweep_scene(
 def sweep_again(
     empty: Sweep, scene: Scene, T_world_lidar: Array, model: LidarModel, noise: LidarNoise
 ) -> Sweep:
-    """Send the beams of a sweep of the standing room once more, with the board and its carrier in it.
+    """Send the beams of a scan of the standing room once more, with the board and its carrier in it.
 
-    Only those that may meet them are traced: all others bring back what they did.
+    Only those that may hit them are traced; all others keep their returns.
 
     Args:
-        empty: what the beams met without the board and its carrier.
+        empty: the returns without the board and its carrier.
         scene: the same room with them.
-        T_world_lidar, model, noise: as for the sweep.
+        T_world_lidar, model, noise: as for the scan.
     """
     near = np.flatnonzero(_may_meet(scene, T_world_lidar, empty.azimuth_rad))
     origins, directions = _beams(model, T_world_lidar, empty.laser[near], empty.azimuth_rad[near])
@@ -176,7 +176,7 @@ def sweep_again(
 
 
 def _may_meet(scene: Scene, T_world_lidar: Array, azimuth_rad: Array) -> NDArray[np.bool_]:
-    """Tell which beams at azimuths (N,) may meet the board or its carrier."""
+    """Find which beams at azimuths (N,) may meet the board or its carrier."""
     bodies = [surface.mesh.vertices for surface in scene.moving.surfaces]
     bodies.append(transform(scene.T_world_board, scene.board.outline()))
     points = transform(invert(T_world_lidar), np.concatenate(bodies))
@@ -201,7 +201,7 @@ def measure_sweep(
     min_range_m: float = 0.4,
     max_range_m: float = 100.0,
 ) -> Scan:
-    """Measure what the beams met; for the arguments see `simulate_scan`."""
+    """Measure the surfaces hit by the beams; for the arguments see `simulate_scan`."""
     laser, returns = sweep.laser, sweep.returns
     bias_m = np.zeros(len(model.elevations_rad)) if laser_bias_m is None else laser_bias_m
     range_m, intensity = _measure(returns, bias_m[laser], noise, rng)
@@ -240,7 +240,7 @@ def _instants(
 def _receive_moving(
     instants: Iterable[tuple[slice, Scene]], origins: Array, directions: Array, noise: LidarNoise
 ) -> tuple[Returns, NDArray[np.bool_]]:
-    """Receive each stretch of beams (N, 3) from its own scene; also tell which met the board's border."""
+    """Trace each stretch of beams (N, 3) in its own scene; also return which hit the board's border."""
     parts, rims = [], []
     for beams, scene in instants:
         parts.append(receive(scene, origins[beams], directions[beams], noise))

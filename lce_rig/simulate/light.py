@@ -1,4 +1,4 @@
-"""How bright surfaces are: ceiling lamps, soft light from all walls, shadows and mirror images."""
+"""The brightness of surfaces: ceiling lamps, diffuse light from all walls, shadows and reflections."""
 
 from dataclasses import dataclass
 
@@ -41,7 +41,7 @@ def ambient_light(normals: Array) -> Array:
 
 
 def irradiance(lamps: Array, points: Array, normals: Array, occluders: Raycaster | None = None) -> Array:
-    """Sum soft and lamp light (N, 3) at points (N, 3), lamps hidden by `occluders` left out."""
+    """Sum soft and lamp light (N, 3) at points (N, 3), without lamps hidden by `occluders`."""
     share = lamp_light(lamps, points, normals)
     if occluders is not None:
         lifted = points + 2e-3 * normals
@@ -54,7 +54,7 @@ def irradiance(lamps: Array, points: Array, normals: Array, occluders: Raycaster
 
 @dataclass(frozen=True, eq=False)
 class Mirrors:
-    """Which rays meet a shiny surface, and the mirror image of the standing room they see there.
+    """The rays that hit a shiny surface, and their reflection of the static room.
 
     Attributes:
         index: (M,) of the rays.

@@ -1,4 +1,4 @@
-"""A board before the simulated sensors, now held and now on its way, whenever somebody looks."""
+"""A board in front of the simulated sensors, still or moving, at any time."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import CARRIER, OF_SESSION, set_stage
 
 _NOISE_STREAM = 102
-# Where no beam goes.
+# A place that no beam reaches.
 _NOWHERE = pose(np.eye(3), np.array([0.0, 0.0, -1e6]))
 _SUBPIXELS_ON_THE_WAY = 2
 
 
 @dataclass(frozen=True, eq=False)
 class _Light:
-    """What falls onto a sensor, and its noise.
+    """The light on a sensor, and its noise.
 
     Attributes:
         linear: (H, W, 3), white is 1.
@@ -37,9 +37,9 @@ class _Light:
 
 
 class LiveScene:
-    """Takes pictures and scans of a board that somebody moves.
+    """Renders images and scans of a moving board.
 
-    What is still is rendered once; each picture and scan has its own noise. The beams of a board that is held
+    What is still is rendered once; each image and scan has its own noise. The beams of a board that is held
     keep their phase from scan to scan.
 
     Attributes:
@@ -65,22 +65,22 @@ class LiveScene:
     def hold(self, T_world_board: Array) -> None:
         """Hold the board still at (4, 4)."""
         self._show(T_world_board, is_held=True)
-        # The rotor is not synchronised with anything: elsewhere the beams fall otherwise.
+        # The rotor is not synchronised with anything: the beam phase differs at each place.
         self._rooms.clear()
 
     def pass_by(self, start: Array, end: Array, share: float) -> None:
-        """Put the board on its way between two poses (4, 4)."""
+        """Move the board between two poses (4, 4)."""
         self._show(between(start, end, share), is_held=False)
 
     def can_be_held(self, camera: str, T_world_board: Array) -> bool:
-        """Tell whether nothing is in the way at a pose (4, 4), and enough rings of the LiDAR meet it."""
+        """Return whether a pose (4, 4) is free of obstacles, and enough rings of the LiDAR hit the board."""
         view = next(view for view in self.stage.views if view.camera == camera)
         stage = self.stage
         is_free = can_be_held(view, stage.board, stage.room, T_world_board)
         return is_free and count_rings(view, stage.board, T_world_board) >= stage.rig.quality.min_rings
 
     def take(self, stamp_ns: int) -> Iterator[Image | Scan]:
-        """Take a scan of each LiDAR that begins at a time, and a picture of each camera at its middle."""
+        """Take a scan of each LiDAR that begins at a time, and an image of each camera at its middle."""
         stage = self.stage
         period_ns = max(model.period_ns for model in stage.models.values())
         for camera in stage.framed:
@@ -157,7 +157,7 @@ class LiveScene:
 
 
 def between(start: Array, end: Array, share: float) -> Array:
-    """Find the pose (4, 4) a share of the way from one (4, 4) to another, turning evenly."""
+    """Interpolate between two poses (4, 4) at a fraction of the way, turning evenly."""
     turn = log_so3(start[:3, :3].T @ end[:3, :3])
     place = (1 - share) * start[:3, 3] + share * end[:3, 3]
     return pose(start[:3, :3] @ exp_so3(share * turn), place)

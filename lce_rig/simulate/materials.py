@@ -1,4 +1,4 @@
-"""What surfaces look like to a camera and to a LiDAR; the prints on them are functions of position."""
+"""Materials for a camera and a LiDAR; their patterns are functions of position."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ def value_noise(u: Array, v: Array) -> Array:
 
 
 def albedo(material: Material, points: Array, normals: Array) -> Array:
-    """Evaluate the print at points of a surface.
+    """Evaluate the printed texture at points of a surface.
 
     Args:
         material: the surface's material.
@@ -132,7 +132,7 @@ _PRINTS: dict[Pattern, Callable[[Array, Array], Array]] = {
 def checker(
     xy_board: Array, cols: int, rows: int, square_m: float, offset_m: tuple[float, float]
 ) -> NDArray[np.bool_]:
-    """Tell which points of the print are dark; the outer square at the top left is.
+    """Find which points of the pattern are dark; the outer square at the top left is.
 
     Args:
         xy_board: (..., 2) m, frame board.

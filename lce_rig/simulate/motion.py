@@ -1,4 +1,4 @@
-"""How a hand moves the board: smooth, seeded, and through every placement."""
+"""The motion of a hand-held board: smooth, seeded, through every placement."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ _SWAY_HZ = (0.4, 1.2)
 _TREMOR_HZ = (5.0, 9.0)
 #: Distance from the plate's middle at which a trembling hand holds it, m: turns its way into an angle.
 _ARM_M = 0.4
-#: The speed is that of the second before the anchor, which is what a picture of events is made of.
+#: The speed is that of the second before the anchor, whose events form the image.
 _SPEED_WINDOW_S = np.linspace(-1.0, 0.2, 61)
 _FASTEST_TURN_RAD_S = np.radians(60.0)
 _PROBE_NS = 500_000
@@ -23,7 +23,7 @@ _PROBE_NS = 500_000
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Where the board is at any time: held at placements, carried between them, swaying all the while.
+    """The board's pose at any time: still at placements, moving between them, swaying throughout.
 
     Attributes:
         arrival_ns: (K,) when the board reaches each placement, increasing.
@@ -32,7 +32,7 @@ class Trajectory:
         frequency_hz: (M,) of the sways.
         amplitude: (M, 6) of each sway's tangent (translation m, world; rotation rad).
         phase_rad: (M, 6), at the first arrival.
-        centre: (6,) tangent that is taken off, so that the board can pass a placement exactly.
+        centre: (6,) tangent that is subtracted, so that the board can pass a placement exactly.
     """
 
     arrival_ns: NDArray[np.int64]
@@ -63,7 +63,7 @@ class Trajectory:
         return np.asarray(np.sum(self.amplitude * np.sin(angle), axis=-2))
 
     def _carried(self, t_ns: NDArray[np.int64]) -> Array:
-        """Interpolate the placements: s = 10 u^3 - 15 u^4 + 6 u^5, the way of least jerk from rest to rest.
+        """Interpolate the placements: s = 10 u^3 - 15 u^4 + 6 u^5, minimum jerk from rest to rest.
 
         References:
             T. Flash and N. Hogan, The coordination of arm movements, J. Neuroscience 5(7), 1985.
@@ -103,13 +103,13 @@ def carry_board(
 ) -> Trajectory:
     """Let a hand carry the board from placement to placement (each (4, 4)), resting at each for a while.
 
-    It sways by a quarter of the greatest speed while it rests: no hand is still.
+    While it rests, it sways at a quarter of the greatest speed.
     """
     arrivals, departures = [start_ns], [start_ns + round(1e9 * hand.rest_s)]
     for start, end in pairwise(placements):
         way_m = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
         turn_rad = float(np.linalg.norm(log_so3(start[:3, :3].T @ end[:3, :3])))
-        # The way of least jerk is 15/8 as fast in its middle as on average.
+        # Minimum-jerk motion is 15/8 as fast in its middle as on average.
         duration_s = 15 / 8 * max(way_m / hand.carry_mps, turn_rad / _FASTEST_TURN_RAD_S)
         arrivals.append(departures[-1] + round(1e9 * max(duration_s, 0.2)))
         departures.append(arrivals[-1] + round(1e9 * hand.rest_s))

@@ -1,4 +1,4 @@
-"""What can be chosen about a simulated rig; defaults come from data sheets and real recordings."""
+"""Options of a simulated rig; defaults come from data sheets and real recordings."""
 
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -12,14 +12,14 @@ Motion = Literal["still", "moving"]
 
 @dataclass(frozen=True)
 class LidarNoise:
-    """How a spinning LiDAR errs.
+    """Errors of a spinning LiDAR.
 
     Attributes:
         range_sigma_m: white noise of each range.
         range_offset_m: constant offset of all ranges.
         laser_sigma_m: spread of the lasers' constant offsets (real ones repeat to +-10 mm).
-        dark_bias_m: how much longer a return of reflectivity 0 reads than one of reflectivity 1.
-        weak_bias_m: how much longer the weakest returns read (intensity 0; none from intensity 30 on).
+        dark_bias_m: excess range of a return of reflectivity 0 over one of reflectivity 1.
+        weak_bias_m: excess range of the weakest returns (intensity 0; none from intensity 30 on).
         rim_spread_rad: half-width of the azimuth error of points within a footprint of the board's border.
         edge_growth_m: how much wider the beam's rim is than divergence and exit explain; with it the returns
             reach 9-10 mm beyond a board's border, as they do on real recordings.
@@ -61,14 +61,14 @@ class LidarNoise:
 
 @dataclass(frozen=True)
 class CameraNoise:
-    """How a camera errs.
+    """Errors of a camera.
 
     Attributes:
         blur_px: sigma of the lens's point spread.
         full_well_e: electrons at full scale; sets the shot noise.
         read_noise_e: electrons of noise in the dark.
         exposure: brightness; 1 shows the white of a well-lit board a little below full scale.
-        vignetting: loss of light at the picture's corners, 0..1.
+        vignetting: loss of light at the image's corners, 0..1.
     """
 
     blur_px: float = 0.6
@@ -85,7 +85,7 @@ class CameraNoise:
 
 @dataclass(frozen=True)
 class EventNoise:
-    """How an event camera errs; the defaults are a DAVIS346's indoors.
+    """Errors of an event camera; the defaults are those of a DAVIS346 indoors.
 
     Attributes:
         threshold_on, threshold_off: mean change of ln(intensity) that makes an event.
@@ -114,7 +114,7 @@ class EventNoise:
 
     @classmethod
     def none(cls) -> "EventNoise":
-        """Pixels that are all alike, fast and quiet."""
+        """Identical, fast pixels without noise."""
         return cls(
             threshold_sigma=0.0,
             event_sigma=0.0,
@@ -128,11 +128,11 @@ class EventNoise:
 
 @dataclass(frozen=True)
 class HandMotion:
-    """How a hand moves the board.
+    """The motion of a hand-held board.
 
     Attributes:
-        speed_mps: range of the board's mean speed, drawn anew for each capture; from the slowest that events
-            tell of to the fastest that hands move a board which is to be seen.
+        speed_mps: range of the board's mean speed, redrawn for each capture; from the slowest that gives
+            events to the fastest at which a held board is still detected.
         turn_deg_s: how fast it turns at most at the greatest speed.
         tremor_m: amplitude of the hand's trembling, 5 to 9 Hz.
         carry_mps: greatest speed on the way from one placement of a recording to the next.
@@ -152,30 +152,30 @@ class HandMotion:
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """What a simulated session shows and how its sensors err.
+    """The content of a simulated session and the errors of its sensors.
 
     Attributes:
         carrier: what carries the board.
         noise_level: 1..10, the paper's simulated sets: the range noise of `PAPER_RANGE_SIGMA_M` and noise on
-            points near the board's rim instead of `lidar.range_sigma_m`; None for `lidar` as it is.
+            points near the board's rim instead of `lidar.range_sigma_m`; None for `lidar` unchanged.
         lidar, camera: the sensors' errors.
         distance_m: range of the board's distance from the camera; where the LiDAR would see less than four
             fifths of the plate, no board is placed (a diamond of 1 m nearer than about 1.4 m).
         tilt_deg: largest tilt of the board out of the direction to the camera.
         roll_deg: mean and half-width of the board's turn in its plane, 0 = upright, 45 = a diamond.
         has_decoy_plate: whether a blank plate of the board's size stands in the room.
-        truth_rotation_deg, truth_translation_m: how far the true extrinsic lies from the profile's nominal
-            one at most; never more than 0.8 of the tolerances that the profile gives.
+        truth_rotation_deg, truth_translation_m: how far the true extrinsics lie from the profile's nominal
+            ones at most; never more than 0.8 of the tolerances that the profile gives.
         lidar_height_m: height of the LiDAR above the floor.
         print_reflectivity: of the dark squares at 905 nm (the ink of the paper's boards is bright there).
         motion: whether the board is held still or moved by hand; only a moving one makes events.
         hand: how it moves.
-        events: errors of cameras with a channel of events; their lens is `camera`'s.
-        events_span_s: how long before and after a scan's stamp a capture's events begin and end.
-        exposure_s: of a moving board's pictures.
-        frame_every_s: between the pictures of a camera that runs freely while the board moves.
+        events: errors of cameras with a channel of events; their optics are `camera`'s.
+        events_span_s: how long before and after a scan's timestamp a capture's events begin and end.
+        exposure_s: of a moving board's images.
+        frame_every_s: between the images of a camera that runs freely while the board moves.
         flicker_depth, flicker_hz: how much the lamps' light swings, to event cameras, and how often a second.
-        frame_offset_s, event_offset_s: how much more the stamps of pictures and of events read than the
+        frame_offset_s, event_offset_s: how far the timestamps of images and of events are ahead of the
             LiDAR's clock, which is the rig's.
     """
 
@@ -222,6 +222,6 @@ class SimulationOptions:
     def for_rig(cls, name: str, motion: Motion = "still") -> "SimulationOptions":
         """Choose what the recordings of the rig of this name show, of a board held still or moving."""
         if name.startswith("sss"):
-            # The paper's simulated rig: a board hung in the air, and an extrinsic that is known exactly.
+            # The paper's simulated rig: a board hung in the air, and exactly known extrinsics.
             return cls(carrier="none", motion=motion, truth_rotation_deg=0.0, truth_translation_m=0.0)
         return cls(carrier="person" if name.startswith("rles") else "stand", motion=motion)

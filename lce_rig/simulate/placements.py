@@ -1,4 +1,4 @@
-"""Where the board is shown: spread over the picture, near and far, tilted, and seen by the LiDAR."""
+"""Placements of the board: all over the image, near and far, tilted, and visible to the LiDAR."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ _SPREAD = (1 / 1.2207440846057596) ** np.arange(1, 4)
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera and a LiDAR that both must see the board."""
+    """A camera and a LiDAR; the board must be visible to both."""
 
     camera: str
     intrinsics: Intrinsics
@@ -52,12 +52,12 @@ def place_board(
         board: the board.
         room: the board and its carrier must stand free in it.
         options: ranges of distance, tilt and roll.
-        index: of the capture; consecutive ones fill the picture evenly.
+        index: of the capture; consecutive ones fill the image evenly.
         rng: source of the tilt and of what is tried next.
         start: (3,) where the session's even filling begins, 0..1.
 
     Raises:
-        LceRigError: there is no place that the camera and the LiDAR both see.
+        LceRigError: no placement is visible to both the camera and the LiDAR.
     """
     fallback, most_rings = None, 0
     for attempt in range(_ATTEMPTS):
@@ -89,8 +89,8 @@ def place_board(
 def _candidate(
     view: View, options: SimulationOptions, where: Array, rng: np.random.Generator
 ) -> Array | None:
-    """Put the board's centre at a place in the picture and turn it about facing the camera."""
-    # Evenly over the disc of all tilts: strong ones tell most about the extrinsic.
+    """Put the board's centre at a place in the image and turn it about facing the camera."""
+    # Evenly over the disc of all tilts: strong tilts constrain the extrinsics most.
     tilt_rad = np.radians(options.tilt_deg) * np.sqrt(rng.uniform())
     direction_rad = rng.uniform(0.0, 2 * np.pi)
     roll_rad = np.radians(options.roll_deg[0] + options.roll_deg[1] * rng.uniform(-1.0, 1.0))
@@ -124,7 +124,7 @@ def _is_in_picture(view: View, board: Board, T_world_board: Array) -> bool:
 
 
 def can_be_held(view: View, board: Board, room: Room, T_world_board: Array) -> bool:
-    """Tell whether somebody can hold the board there, and the camera and the LiDAR see all of it."""
+    """Return whether a person can hold the board there, and the camera and the LiDAR see all of it."""
     return _is_in_picture(view, board, T_world_board) and _stands_free(view, board, room, T_world_board)
 
 
@@ -145,7 +145,7 @@ def _stands_free(view: View, board: Board, room: Room, T_world_board: Array) -> 
 
 
 def seen_share(view: View, board: Board, T_world_board: Array) -> float:
-    """Measure which share of the plate's height lies within the LiDAR's vertical field, 0..1."""
+    """Measure the fraction of the plate's height within the LiDAR's vertical field, 0..1."""
     outline = transform(invert(view.T_world_lidar) @ T_world_board, board.outline())
     elevation = np.arctan2(outline[:, 2], np.hypot(outline[:, 0], outline[:, 1]))
     lasers = view.model.elevations_rad
@@ -156,7 +156,7 @@ def seen_share(view: View, board: Board, T_world_board: Array) -> float:
 
 
 def count_rings(view: View, board: Board, T_world_board: Array) -> int:
-    """Count the LiDAR's rings that bring back at least a few returns from the board."""
+    """Count the LiDAR's rings with at least a few returns from the board."""
     scene = Scene(Raycaster(()), (), board, T_world_board)
     outline = transform(invert(view.T_world_lidar) @ T_world_board, board.outline())
     azimuth = np.arctan2(outline[:, 1], outline[:, 0])

@@ -1,4 +1,4 @@
-"""A simulated recording: pictures, scans and events of a board carried from place to place."""
+"""A simulated recording: images, scans and events of a board moved between placements."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ _PACKET_NS = 20_000_000
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRecording:
-    """A recording with its truth: iterate over it for its samples, in order of their stamps.
+    """A recording with its truth; iterating yields its samples in order of their timestamps.
 
     Attributes:
         stage: the rig's true geometry and the room.
@@ -47,7 +47,7 @@ class SimulatedRecording:
     def T_sensor_board(self, sensor: str, t_ns: int | NDArray[np.int64]) -> Array:
         """Compute the board's true pose (..., 4, 4) before a camera or LiDAR at times of the rig's clock.
 
-        Stamps of pictures and events read `frame_offset_s` or `event_offset_s` more than that clock.
+        Timestamps of images and events read `frame_offset_s` or `event_offset_s` more than that clock.
         """
         return np.asarray(invert(self.stage.T_world_sensor[sensor]) @ self.trajectory.at(t_ns))
 
@@ -72,7 +72,7 @@ class SimulatedRecording:
 
 
 def stamp_of(sample: Image | Scan | Events) -> int:
-    """Read a sample's stamp; a packet of events has that of its first one."""
+    """Read a sample's timestamp; a packet of events has that of its first one."""
     return int(sample.t_ns[0]) if isinstance(sample, Events) else int(sample.stamp_ns or 0)
 
 
@@ -87,7 +87,7 @@ def simulate_recording(
         rig: the profile.
         duration_s: of the recording.
         seed: of truth, room, placements and noise.
-        options: `SimulationOptions.for_rig` of the rig by default; the board moves whatever they say.
+        options: `SimulationOptions.for_rig` of the rig by default; the board always moves.
 
     Raises:
         ProfileError: a LiDAR's model is unknown, or no camera has a channel that can be simulated.

@@ -1,4 +1,4 @@
-"""The room the rig stands in, full of what a detector must not take for the board."""
+"""The room around the rig, with objects that a detector must not mistake for the board."""
 
 from dataclasses import dataclass
 
@@ -37,7 +37,7 @@ _LAMP_SPOTS = ((-2.6, 0.2), (0.6, 1.3), (0.6, -1.2), (3.6, 1.3), (3.6, -1.2), (6
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """What stands still.
+    """The static objects.
 
     Attributes:
         T_world_room: (4, 4); world has the LiDAR's heading, z up, origin on the floor below the LiDAR.
@@ -52,7 +52,7 @@ class Room:
     T_world_decoy: Array | None = None
 
     def is_free(self, points_world: Array, margin_m: float = 0.1) -> NDArray[np.bool_]:
-        """Tell which points (N, 3) lie in the room, at least `margin_m` from everything in it."""
+        """Find which points (N, 3) lie in the room, at least `margin_m` from everything in it."""
         points = transform(invert(self.T_world_room), points_world)
         free = np.all((points > _LOW + margin_m) & (points < _HIGH - margin_m), axis=1)
         for low, high in _OBSTACLES:

@@ -1,4 +1,4 @@
-"""The scene a ray meets: meshes that stand still, meshes that move with the board, and the board itself."""
+"""The scene for ray casting: static meshes, meshes that move with the board, and the board."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What rays meet first.
+    """The first hits of rays.
 
     Attributes:
         range_m: (N,) distance along the unit ray; inf where nothing is met.
@@ -45,7 +45,7 @@ class Hits:
 
 
 class Raycaster:
-    """Finds the first of a fixed set of surfaces along rays (Embree, float32)."""
+    """Finds the first hit of rays on a fixed set of surfaces (Embree, float32)."""
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
         self.surfaces = tuple(surfaces)
@@ -83,7 +83,7 @@ class Raycaster:
         Args:
             origins: (N, 3) or (3,) m, world.
             directions: (N, 3) unit, world.
-            with_normals: False leaves the normals zero, which spares half the time.
+            with_normals: False leaves the normals zero and halves the time.
         """
         if not self.surfaces:
             return _nothing(len(directions))
@@ -102,7 +102,7 @@ class Raycaster:
         return Hits(range_m, surface, normals)
 
     def is_blocked(self, origins: Array, targets: Array) -> NDArray[np.bool_]:
-        """Tell which straight lines from origins (N, 3) to targets (N, 3) or (3,) meet a surface."""
+        """Find which straight lines from origins (N, 3) to targets (N, 3) or (3,) meet a surface."""
         if not self.surfaces:
             return np.zeros(len(origins), dtype=np.bool_)
         rays = self._rays(origins, targets - origins)
@@ -121,7 +121,7 @@ def _unit_towards(normals: Array, directions: Array) -> Array:
 
 
 class Scene:
-    """Everything one capture shows.
+    """The scene of one capture.
 
     Args:
         static: what stands still over a session.
@@ -157,7 +157,7 @@ class Scene:
 
     @cached_property
     def occluders(self) -> Raycaster:
-        """The moving surfaces and the board, as things that cast shadows."""
+        """The moving surfaces and the board, as occluders of light."""
         plate = rectangle(self.board.width_m, self.board.height_m).moved(self.T_world_board)
         return Raycaster([*self.moving.surfaces, Surface("board", plate, PLATE, self.T_world_board)])
 
@@ -205,14 +205,14 @@ class Scene:
         return Hits(range_m, surface, normals)
 
     def is_dark(self, points_world: Array) -> NDArray[np.bool_]:
-        """Tell which points (N, 3), taken straight onto the board, lie on a dark square."""
+        """Find which points (N, 3), taken straight onto the board, lie on a dark square."""
         board = self.board
         from_centre = points_world - self.T_world_board[:3, 3]
         xy = np.stack([from_centre @ self.T_world_board[:3, k] for k in (0, 1)], axis=1)
         return checker(xy, board.cols, board.rows, board.square_m, board.pattern_offset_m)
 
     def is_front(self, normals: Array) -> NDArray[np.bool_]:
-        """Tell which normals (N, 3) of hits on the board belong to its printed side."""
+        """Find which normals (N, 3) of hits on the board belong to its printed side."""
         return np.asarray(normals @ self.T_world_board[:3, 2] > 0)
 
     def reflectivity(self, hits: Hits, points_world: Array) -> Array:
@@ -246,7 +246,7 @@ class Scene:
 
 
 def surface_colour(surface: Surface, points_world: Array, normals: Array) -> Array:
-    """Evaluate a surface's print (N, 3) at points and normals (N, 3) in world coordinates."""
+    """Evaluate a surface's printed texture (N, 3) at points and normals (N, 3) in world coordinates."""
     T_surface_world = invert(surface.T_world_surface)
     return albedo(
         surface.material, transform(T_surface_world, points_world), normals @ T_surface_world[:3, :3].T

@@ -1,4 +1,4 @@
-"""Triangle meshes of simple bodies, with the normals that make round ones look round."""
+"""Triangle meshes of simple bodies, with smooth normals for round ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What stays the same over a simulated session: the room, the sensors' true places and their own errors."""
+"""The constants of a simulated session: the room, the sensors' true poses and their own errors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ _FORWARD = pose(
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """What stays the same over a session.
+    """The constants of a session.
 
     Attributes:
         rig: the profile.
@@ -61,7 +61,7 @@ class Stage:
 
     @property
     def framed(self) -> list[str]:
-        """The cameras that take pictures, in the profile's order."""
+        """The cameras that take images, in the profile's order."""
         return [name for name in self.backdrops if self.rig.cameras[name].first_channel("frames")]
 
     def rng(self, *stream: int) -> np.random.Generator:
@@ -84,9 +84,9 @@ def truth_extrinsics(
 ) -> dict[tuple[str, str], Array]:
     """Draw the true T_cam_lidar (4, 4) of every camera and LiDAR.
 
-    The nominal extrinsics of the profile, each moved by a seeded few degrees and centimetres, so that nobody
-    can pass by handing back the nominal. Pairs without an entry follow from the others; a camera without any
-    looks along the first LiDAR's x axis.
+    The nominal extrinsics of the profile, each moved by a seeded few degrees and centimetres, so that no
+    solver can pass by returning the nominal. Pairs without an entry follow from the others; a camera without
+    any looks along the first LiDAR's x axis.
 
     Args:
         rig: the profile.

@@ -1,6 +1,6 @@
-"""Grey sub-frames of the moving board: fast enough for hundreds a second, smooth enough for event pixels.
+"""Grey images of the moving board: hundreds per second, smooth enough for event pixels.
 
-`render_image` draws single pictures with shadows and mirror images. Here the room is one fixed picture, the
+`render_image` draws single images with shadows and mirror images. Here the room is one fixed image, the
 board is drawn analytically, and its carrier is a cut-out that shifts. Edges are smoothed by their distance
 in units of the pixel's own spread, not by sampling: intensities change without steps as the board moves.
 """
@@ -41,7 +41,7 @@ _PIXEL_AREA_PX2 = 1 / 12
 
 @dataclass(frozen=True, eq=False)
 class _Key:
-    """What is computed only now and then: the carrier's picture, and the light on the board.
+    """The parts computed at intervals: the carrier's image, and the light on the board.
 
     Attributes:
         carrier: None where there is none to be seen.
@@ -54,7 +54,7 @@ class _Key:
 
 @dataclass(eq=False)
 class MovingView:
-    """What one camera sees of the board on its way.
+    """One camera's view of the moving board.
 
     Attributes:
         backdrop: the camera and the standing room.
@@ -152,8 +152,8 @@ class MovingView:
         """Compute the share (h, w) of each pixel that is inked.
 
         Along each axis the squares are a wave of +-1, smoothed where it changes sign; where both waves have
-        the same sign the print is dark. For a smoothing that is round in the picture this product is what
-        smoothing the whole print would give, as long as the board is not seen at a grazing angle.
+        the same sign the pattern is dark. For a smoothing that is round in the image this product is what
+        smoothing the whole pattern would give, as long as the board is not seen at a grazing angle.
         """
         board, offset_m = self.board, self.board.pattern_offset_m
         axes = ((x - offset_m[0], board.cols, spread_x), (offset_m[1] - y, board.rows, spread_y))
@@ -168,7 +168,7 @@ class MovingView:
         return np.asarray(inside * (1 + wave) / 2, dtype=np.float32)
 
     def _carrier(self, t_ns: int, T_world_board: Array) -> tuple[Window, Float] | None:
-        """Draw the carrier (h, w, 4) as blended from the pictures before and after this time."""
+        """Draw the carrier (h, w, 4) as blended from the images before and after this time."""
         middle = carrier_middle(self.backdrop, T_world_board)
         k, weight = divmod(t_ns, _KEY_NS)
         first, second = self._key(k).carrier, self._key(k + 1).carrier
@@ -198,7 +198,7 @@ class MovingView:
 
 
 def film(view: MovingView, camera: EventCamera, start_ns: int, end_ns: int) -> None:
-    """Show an event camera what moves from start_ns on, which it has seen already, up to end_ns.
+    """Feed an event camera the motion after start_ns, which it has seen already, up to end_ns.
 
     The steps are short enough that an edge crosses no more than a part of a pixel in each.
     """
@@ -209,7 +209,7 @@ def film(view: MovingView, camera: EventCamera, start_ns: int, end_ns: int) -> N
 
 
 def speed_px_s(trajectory: Trajectory, board: Board, backdrop: Backdrop, t_ns: int) -> float:
-    """Measure how fast the board's outline moves through the picture at most."""
+    """Measure how fast the board's outline moves through the image at most."""
     step_ns = 1_000_000
     outlines = transform(trajectory.at(np.array([t_ns, t_ns + step_ns])), board.outline())
     pixels, is_valid = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam), outlines))
@@ -235,7 +235,7 @@ def _size(board: Board) -> Sequence[float]:
 
 
 def _slope(values: Float) -> Float:
-    """Measure |gradient| (h, w) of a picture, per px."""
+    """Measure |gradient| (h, w) of an image, per px."""
     down, across = np.empty_like(values), np.empty_like(values)
     if min(values.shape) < 3:
         return np.zeros_like(values)
@@ -255,5 +255,5 @@ def _smooth_step(distance: Float, sigma: Float) -> Float:
 
 
 def _inside(half: float, place: Float, sigma: Float) -> Float:
-    """Tell how much of each pixel lies within +-half of a place: 0..1."""
+    """Compute how much of each pixel lies within +-half of a place: 0..1."""
     return _smooth_step(np.float32(half) - np.abs(place), sigma)

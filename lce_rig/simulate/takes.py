@@ -1,4 +1,4 @@
-"""One sample of one sensor: of a board that is held still, or of one on its way."""
+"""One sample of one sensor, of a still or moving board."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import EVENTS, IMAGE, SCAN, Stage
 from lce_rig.simulate.subframes import MovingView, speed_px_s
 
-# While the shutter is open the board is drawn at moments that lie this far apart in the picture at most.
+# While the shutter is open the board is drawn at moments that lie this far apart in the image at most.
 _SMEAR_STEP_PX = 0.35
 _MOST_MOMENTS = 15
 
@@ -25,7 +25,7 @@ Stream = tuple[int, ...]
 
 
 def take_image(stage: Stage, camera: str, scene: Scene, exposed_ns: int, stream: Stream) -> Image:
-    """Take a picture of a scene that stands still, exposed about a time of the rig's clock."""
+    """Take an image of a scene that stands still, exposed about a time of the rig's clock."""
     return _develop(stage, camera, render_radiance(scene, stage.backdrops[camera]), exposed_ns, stream)
 
 
@@ -56,7 +56,7 @@ def take_scan(
 
 @dataclass(frozen=True, eq=False)
 class MovingBoard:
-    """A board on its way before the sensors of a stage, and whoever carries it.
+    """A moving board and its carrier in front of the sensors of a stage.
 
     Attributes:
         stage: the session.
@@ -78,7 +78,7 @@ class MovingBoard:
         )
 
     def take_image(self, camera: str, exposed_ns: int, stream: Stream) -> Image:
-        """Expose a picture about a time of the rig's clock: the mean of what is seen while it lasts."""
+        """Expose an image about a time of the rig's clock: the mean of what is seen while it lasts."""
         backdrop, options = self.stage.backdrops[camera], self.stage.options
         smear_px = options.exposure_s * speed_px_s(self.trajectory, self.stage.board, backdrop, exposed_ns)
         n_moments = int(np.clip(np.ceil(smear_px / _SMEAR_STEP_PX), 1, _MOST_MOMENTS))

@@ -1,4 +1,4 @@
-"""The truth of a simulation as values of JSON, for files that stand beside what was simulated."""
+"""The truth of a simulation as JSON values, for files beside the simulated data."""
 
 from typing import Any
 
@@ -18,11 +18,11 @@ _ON_BOARD_M = 0.05
 
 
 def rig_truth(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, Any]:
-    """Tell the extrinsics and clocks of a simulated rig.
+    """Return the extrinsics and clocks of a simulated rig.
 
     Returns:
         `pairs` of camera and lidar with T_cam_lidar (p_cam = T p_lidar), the first pair's alone, and how much
-        more the stamps of pictures and events read than the rig's clock, which is the LiDAR's.
+        more the timestamps of images and events read than the rig's clock, which is the LiDAR's.
     """
     pairs = [
         {"camera": camera, "lidar": lidar, "T_cam_lidar": T.tolist()}
@@ -39,12 +39,12 @@ def rig_truth(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, Any]
 
 
 def capture_truth(rig: Rig, capture: SimulatedCapture, options: SimulationOptions) -> dict[str, Any]:
-    """Tell where the board was when each sensor saw it.
+    """Return where the board was when each sensor saw it.
 
     Returns:
         `boards`: by sensor `t_ns`, on the rig's clock, and `T_sensor_board` then; `speed_mps` of the board's
         middle when the LiDAR that it was placed for met it. A LiDAR's time is the mean firing time of its
-        returns from the board, a camera's the middle of its picture's exposure, or that of the LiDAR where it
+        returns from the board, a camera's the middle of its image's exposure, or that of the LiDAR where it
         takes none.
     """
     times_ns = {scan.sensor: board_time_ns(rig, capture, scan) for scan in capture.scans}
@@ -62,7 +62,7 @@ def capture_truth(rig: Rig, capture: SimulatedCapture, options: SimulationOption
 
 
 def recording_truth(recording: SimulatedRecording) -> dict[str, Any]:
-    """Tell where the board is before the first LiDAR, 100 times a second.
+    """Return where the board is before the first LiDAR, 100 times per second.
 
     Returns:
         `boards`: by LiDAR `t_ns` (K), on the rig's clock, and `T_sensor_board` (K, 4, 4).
@@ -74,9 +74,9 @@ def recording_truth(recording: SimulatedRecording) -> dict[str, Any]:
 
 
 def board_time_ns(rig: Rig, capture: SimulatedCapture, scan: Scan) -> int:
-    """Find the mean firing time of a scan's returns from the board; half a sweep after its stamp without any.
+    """Find the mean firing time of a scan's board returns; half a scan after its timestamp without any.
 
-    Each return is held against the board where it was at that return's own time.
+    Each return is compared with the board where it was at that return's own time.
     """
     first_ns = scan.stamp_ns or 0
     middle_ns = first_ns + round(0.5e9 / rig.lidars[scan.sensor].rate_hz)

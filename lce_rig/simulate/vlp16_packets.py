@@ -1,4 +1,4 @@
-"""Scans as the packets a VLP-16 would have sent: data packets, and position packets with PPS and NMEA."""
+"""Scans as VLP-16 packets: data packets, and position packets with PPS and NMEA."""
 
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -18,7 +18,7 @@ _DATA_PER_POSITION = 14
 # A GPS sends its sentence for a pulse a while after that pulse.
 _SENTENCE_DELAY_NS = 300_000_000
 _NS_PER_S = 1_000_000_000
-# Each simulated scan begins anywhere within a step; a rotor goes on evenly. The step is spread over 12 deg.
+# Each simulated scan begins anywhere within a step; a rotor turns evenly. The step is spread over 12 deg.
 _EASED_BLOCKS = 30
 
 
@@ -39,7 +39,7 @@ class SensorPacket:
 
 @dataclass(frozen=True)
 class Vlp16Clock:
-    """How the sensor's clock is kept.
+    """The sensor's clock.
 
     Attributes:
         pps: one of PPS_STATES.
@@ -56,9 +56,9 @@ class Vlp16Clock:
 
 
 class Vlp16Packets:
-    """Cuts scans into packets; what does not fill one waits for the next scan.
+    """Cuts scans into packets; an incomplete packet waits for the next scan.
 
-    Scans simulated with STREAMED_VLP16 and stamped one period apart come out as they went in, within the
+    Scans simulated with STREAMED_VLP16 and timestamped one period apart come out as they went in, within the
     steps of range and azimuth, but for the first 12 deg behind the cut: there the azimuth is eased from
     the phase of the scan before, by 0.2 deg at most.
 
@@ -90,7 +90,7 @@ class Vlp16Packets:
             last: the last returns of the same revolution, in dual mode; None for the same.
 
         Raises:
-            ValueError: a point lies on no firing, or the scan has no stamp, times or points.
+            ValueError: a point lies on no firing, or the scan has no timestamp, times or points.
         """
         if scan.stamp_ns is None or scan.offset_ns is None or len(scan.points) == 0:
             raise ValueError("a scan without points or their times cannot be sent")

@@ -7,7 +7,9 @@ from lce_rig.core.geometry import Array
 _RELATIVE_FLOOR = 1e-12
 
 
-def systematic_covariance(sensitivities: Array, sigma_each: float, sigma_common: float) -> Array:
+def systematic_covariances(
+    sensitivities: Array, sigma_each: float, sigma_common: float
+) -> tuple[Array, Array]:
     """Propagate errors that every group shares, and that no scatter between groups can show.
 
     Source r is off by e + e_r, with e the mean error of all L sources and e_r its own deviation from it, and
@@ -16,16 +18,17 @@ def systematic_covariance(sensitivities: Array, sigma_each: float, sigma_common:
         cov = sigma_each^2 sum_r (s_r - s) (s_r - s)^T + sigma_common^2 L^2 s s^T,   s = sum_r s_r / L
 
     Args:
-        sensitivities: (p, L) s_r in columns.
+        sensitivities: (..., p, L) s_r in columns.
         sigma_each: standard deviation of e_r, before their mean is taken off.
         sigma_common: standard deviation of e.
 
     Returns:
-        (p, p).
+        Its two terms (..., p, p).
     """
-    common = sensitivities.sum(axis=1)
-    each = sensitivities - sensitivities.mean(axis=1, keepdims=True)
-    return np.asarray(sigma_each**2 * each @ each.T + sigma_common**2 * np.outer(common, common))
+    common = sensitivities.sum(axis=-1, keepdims=True)
+    each = sensitivities - sensitivities.mean(axis=-1, keepdims=True)
+    of_each = sigma_each**2 * each @ np.swapaxes(each, -1, -2)
+    return of_each, sigma_common**2 * common @ np.swapaxes(common, -1, -2)
 
 
 def symmetric_inverse(H: Array) -> Array:

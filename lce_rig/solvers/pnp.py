@@ -1,4 +1,4 @@
-"""Pose of a planar board from its corners in one picture: both local minima, with covariance."""
+"""Pose of a planar board from its corners in one image: both local minima, with covariance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -48,14 +48,14 @@ def solve_planar_pose(
     """Find T_cam_board and the second local minimum of the reprojection error.
 
     A homography gives the first start. Mirroring the board's tilt in the line of sight gives the second:
-    under weak perspective both draw the same picture, which is why the cost of a plane has two minima. Either
+    under weak perspective both draw the same image, which is why the cost of a plane has two minima. Either
     start is refined by Levenberg-Marquardt in distorted pixels, so that any camera model is treated alike.
 
     Args:
         corners_px: (N, 2) measured, N >= 4.
         corners_board: (N, 3) with z = 0, frame board, m.
         intrinsics: the camera.
-        starts: T_cam_board (4, 4) near one minimum, or near both, where a picture shortly before gave them:
+        starts: T_cam_board (4, 4) near one minimum, or near both, where an image shortly before gave them:
             the homography is then not needed, and fewer steps are.
 
     Returns:
@@ -146,7 +146,7 @@ def mirror_tilt(T_cam_board: Array, centre_board: Array) -> Array:
     """Mirror the board's tilt in its line of sight, keeping its centre.
 
     With S = diag(1, 1, -1) along the line of sight, R' = S R S turns the depth of every board point about the
-    centre's depth, up to the same picture under weak perspective.
+    centre's depth, up to the same image under weak perspective.
 
     Args:
         T_cam_board: (4, 4).
@@ -163,7 +163,7 @@ def _pose_from_homography(corners_board: Array, rays: Array) -> Array | None:
     """Decompose the homography board plane -> rays, H ~ [r1 r2 t]; None where the corners have no rays.
 
     Rays beyond 90 deg from the axis have no x/z; turning all rays so that their mean is the axis keeps the
-    homography finite for wide fisheye pictures too.
+    homography finite for wide fisheye images too.
     """
     if not np.all(np.isfinite(rays)):
         return None

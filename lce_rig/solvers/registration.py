@@ -20,30 +20,6 @@ from lce_rig.core.geometry import Array, exp_so3, project_to_so3, skew
 N_ROTATION = 9
 
 
-def residual_rows(normals: Array, anchors: Array, points: Array, nuisances: Array | None = None) -> Array:
-    """Write the residuals n . (g - R p - t) + c . s as rows a of a . x.
-
-    Args:
-        normals: (..., 3) unit n, target frame.
-        anchors: (..., 3) g on the plane or line, m, target frame.
-        points: (..., 3) p, m, source frame.
-        nuisances: (..., k) coefficients c; none by default.
-
-    Returns:
-        (..., 13 + k).
-    """
-    normals, anchors, points = np.broadcast_arrays(normals, anchors, points)
-    batch = points.shape[:-1]
-    lever = -(points[..., :, None] * normals[..., None, :]).reshape(*batch, N_ROTATION)
-    offset = np.sum(normals * anchors, axis=-1, keepdims=True)
-    extra = (
-        np.zeros((*batch, 0))
-        if nuisances is None
-        else np.broadcast_to(nuisances, (*batch, nuisances.shape[-1]))
-    )
-    return np.concatenate([lever, -normals, extra, offset], axis=-1)
-
-
 def moment_matrix(rows: Array, weights: Array) -> Array:
     """Sum w a a^T, equation (2).
 

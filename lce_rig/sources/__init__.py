@@ -1,4 +1,4 @@
-"""Recordings and sensors behind one door: `open_recording` finds the reader for a path."""
+"""Recordings of all kinds: `open_recording` finds the reader for a path."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -30,7 +30,7 @@ RECORDINGS = {
 
 
 def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = None) -> Recording:
-    """Open what lies at a path: a folder of pictures and clouds, a bag, or a file of an event camera.
+    """Open what lies at a path: a folder of images and point clouds, a bag, or a file of an event camera.
 
     Raises:
         SourceError: nothing is there, or nothing that can be read.

@@ -1,4 +1,4 @@
-"""Files of bags whose messages lie in chunks: read by their index, or from the front where it is torn.
+"""Bag files with chunks of messages: read by their index, or from the front if it is damaged.
 
 A chunk that cannot be read costs its own messages only. What the index says of places, times and counts is
 not believed further than it takes to find the chunks: each is read once, and what all unpack to is limited by
@@ -41,13 +41,13 @@ class Chunk:
     connections: frozenset[int] | None = None
 
     def holds(self, numbers: frozenset[int]) -> bool:
-        """Tell whether it may hold messages of some connections."""
+        """Return whether it may hold messages of some connections."""
         return self.connections is None or not numbers.isdisjoint(self.connections)
 
 
 @dataclass
 class Block:
-    """What was read at one place of the file.
+    """The data read at one position of the file.
 
     Attributes:
         end: place behind it; None where nothing follows that could be read.
@@ -123,7 +123,7 @@ class ChunkedBag(ABC):
 
         Raises:
             OSError: the file cannot be read.
-            ValueError: it is no file, or none of this kind.
+            ValueError: it is not a file, or none of this kind.
         """
         self.path = path
         self.contents = Contents()

@@ -48,7 +48,8 @@ class BagFile:
                 self.topics[topic] = msgtype, n_before + part.contents.counts[number]
         if not self.topics and self._damages.n_places:
             raise SourceError(
-                f"{self.path} cannot be read: {self.damage}", "Record again, or try to reindex it."
+                f"{self.path} cannot be read: {self.damage}",
+                "Record again, or try to reindex it.",
             )
 
     @property
@@ -154,7 +155,7 @@ class BagFile:
 
 
 def is_bag_file(path: Path) -> bool:
-    """Tell whether a file's name is that of a bag, or of one that was compressed as a whole."""
+    """Return whether a file's name is that of a bag, or of one that was compressed as a whole."""
     suffixes = [suffix.lower() for suffix in path.suffixes[-2:]]
     return suffixes[-1:] != [] and (suffixes[-1] in SUFFIXES or _is_packed(suffixes))
 

@@ -56,7 +56,7 @@ class McapBag(ChunkedBag):
             position += _HEAD.size + n_bytes
         if n_messages == 0:
             return True
-        # Some writers leave out of the index what can be found without it.
+        # Some writers omit from the index what can be found without it.
         return bool(n_messages > 0 and self._chunks and self.contents.connections)
 
     def _add_chunk(self, fields: "_Fields") -> None:

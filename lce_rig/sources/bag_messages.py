@@ -1,9 +1,9 @@
-"""Pictures and scans as ROS messages, with the fields and conventions that other programs expect.
+"""Images and scans as ROS messages, with the fields and conventions that other programs expect.
 
 References:
     https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/Image.html
     https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/PointCloud2.html
-    https://github.com/ros-drivers/velodyne (the layout of its clouds)
+    https://github.com/ros-drivers/velodyne (the layout of its point clouds)
 """
 
 from functools import cache
@@ -18,7 +18,7 @@ IMAGE_TYPE = "sensor_msgs/msg/Image"
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 _NS_PER_S = 10**9
 _UINT16, _FLOAT32 = 4, 7
-# velodyne_pointcloud's: times are seconds after the header's stamp, which float32 holds to 4 ns.
+# velodyne_pointcloud's: times are seconds after the header's timestamp, which float32 holds to 4 ns.
 _POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2")])
 _TIMED_POINT = np.dtype([*_POINT.descr, ("time", "<f4")])
 
@@ -32,10 +32,10 @@ def typestore(is_ros1: bool) -> Any:
 
 
 def encode_image(image: Image, frame_id: str, is_ros1: bool, number: int) -> memoryview:
-    """Encode a picture as sensor_msgs/Image, mono8 or bgr8.
+    """Encode an image as sensor_msgs/Image, mono8 or bgr8.
 
     Args:
-        image: the picture; one without a stamp gets 0, which readers take for none.
+        image: the image; one without a timestamp gets 0, which readers take for none.
         frame_id: of the header.
         is_ros1: whether for ROS 1.
         number: of the message in its topic; ROS 1 headers carry it.
@@ -58,8 +58,8 @@ def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool, number: int)
     """Encode a scan as sensor_msgs/PointCloud2 with x, y, z, intensity, ring and, where known, time.
 
     Args:
-        scan: the scan; one without a stamp gets 0, which readers take for none.
-        settings: the LiDAR's frame, and which firing its stamps mark.
+        scan: the scan; one without a timestamp gets 0, which readers take for none.
+        settings: the LiDAR's frame, and which firing its timestamps mark.
         is_ros1: whether for ROS 1.
         number: of the message in its topic; ROS 1 headers carry it.
     """
@@ -90,7 +90,7 @@ def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool, number: int)
 
 
 def _cloud_stamp_ns(scan: Scan, settings: LidarSettings) -> int:
-    """Say what the LiDAR's driver would have stamped: the first firing, or the last one."""
+    """Say what the LiDAR's driver would have timestamped: the first firing, or the last one."""
     if scan.stamp_ns is None or settings.timestamps.reference == "first_firing":
         return scan.stamp_ns or 0
     if scan.offset_ns is None or not len(scan.offset_ns):

@@ -1,4 +1,4 @@
-"""A bag that grows as samples come: what a rig's sensors deliver, on the topics of its profile."""
+"""A bag written as samples arrive, on the topics of the rig's profile."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -7,13 +7,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.sources.bag_messages import CLOUD_TYPE, IMAGE_TYPE, encode_image, encode_scan, typestore
-from lce_rig.sources.base import Sample
 from lce_rig.sources.events.bag_writer import MESSAGE_TYPE, add_event_topic, event_messages, open_bag_writer
-from lce_rig.sources.rig_time import event_channel
+from lce_rig.timing.rig_time import event_channel
 
 
 class BagRecorder:
@@ -52,12 +51,12 @@ class BagRecorder:
             self._writer.open()
 
     def write(self, sample: Sample) -> None:
-        """Add a picture, a scan or a packet of events.
+        """Add an image, a scan or a packet of events.
 
         Raises:
             SourceError: the disk is full, now or before; the rig lacks the sensor; or two sensors of the
                 profile share a topic and differ in kind.
-            ValueError: it carries no time at all.
+            ValueError: it has no timestamp at all.
         """
         if isinstance(sample, Events):
             self._write_events(sample)

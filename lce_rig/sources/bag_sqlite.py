@@ -32,7 +32,7 @@ class SqliteBag:
 
         Raises:
             OSError: the file cannot be read.
-            ValueError: it is no file, or no bag.
+            ValueError: it is not a file, or no bag.
         """
         self.path = path
         self.contents = Contents()

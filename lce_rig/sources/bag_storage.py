@@ -1,4 +1,4 @@
-"""What the files of bags have in common, ROS 1, mcap and sqlite3: topics, and messages as they lie there."""
+"""The common interface of ROS 1, mcap and sqlite3 bag files: topics and raw messages."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -10,7 +10,7 @@ from lce_rig.core import limits, unpacking
 
 
 class RawMessage(NamedTuple):
-    """A message as it lies in the bag.
+    """A raw message of the bag.
 
     Attributes:
         msgtype: "sensor_msgs/PointCloud2", without ROS 2's "/msg".
@@ -35,7 +35,7 @@ class Connection(NamedTuple):
 
 @dataclass
 class Damages:
-    """What cannot be read of a bag: how many places, and what is wrong with the first."""
+    """The unreadable parts of a bag: their number, and the fault of the first."""
 
     n_places: int = 0
     first: str = ""
@@ -51,7 +51,7 @@ class Damages:
 
 @dataclass
 class Contents:
-    """What was found in a bag on opening it.
+    """The contents found on opening a bag.
 
     Attributes:
         connections: by number.

@@ -1,39 +1,20 @@
-"""What every recording offers."""
+"""The interface of every recording."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Image, Sample, Scan, Stream
 
-Sample: TypeAlias = Image | Scan | Events
 PairMethod: TypeAlias = Literal["auto", "stem", "order", "time"]
 Span: TypeAlias = tuple[int, int]
 """First and last stamp, ns, the sensor's own clock."""
 
 
-@dataclass(frozen=True, order=True)
-class Stream:
-    """What one sensor sends.
-
-    Attributes:
-        sensor: the camera or LiDAR.
-        channel: of a camera; "" for a LiDAR.
-        kind: a channel of events may also bring pictures that others reconstructed.
-    """
-
-    sensor: str
-    channel: str
-    kind: Literal["pictures", "events", "scans"]
-
-    def __str__(self) -> str:
-        return f"{self.sensor}.{self.channel}" if self.channel else self.sensor
-
-
 @dataclass(frozen=True)
 class SourceOptions:
-    """How a recording is read, where the profile does not say or says otherwise.
+    """Options for reading a recording; they override the profile.
 
     Attributes:
         camera, channel, lidar: whose pictures and clouds a folder holds; None takes the rig's first channel
@@ -55,7 +36,7 @@ class SourceOptions:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """What the sensors saw of one board placement.
+    """The samples of one board placement.
 
     Attributes:
         label: the files it came from, for messages: "00003.png + 00003.pcd".
@@ -101,14 +82,14 @@ class Recording(Protocol):
 
 @runtime_checkable
 class PairedRecording(Recording, Protocol):
-    """A recording in which somebody has put pictures and clouds of each board placement side by side."""
+    """A recording with matched images and point clouds of each board placement."""
 
     pairs: Sequence[PairFiles]
 
 
 @runtime_checkable
 class ContinuousRecording(Recording, Protocol):
-    """A recording that runs on while the board is moved about.
+    """A continuous recording of a moving board.
 
     Attributes:
         key: fingerprint of the recording.

@@ -1,4 +1,4 @@
-"""From a cloud with whatever fields to a `Scan`: names, units and conventions are settled here, once."""
+"""Conversion of a point cloud with any fields to a `Scan`: names, units and conventions."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +17,7 @@ TIME_FIELDS = ("time", "t", "timestamp", "offset", "offset_time", "time_offset",
 MIN_RANGE_M = 1e-3
 # Half of a room's or a street's returns come from well within a LiDAR's reach, unless metres are millimetres.
 _FARTHEST_MEDIAN = 3.0
-# A sweep lasts 0.02 to 1.5 s whatever the spinning LiDAR; the same figure in another unit is far outside.
+# A scan lasts 0.02 to 1.5 s whatever the spinning LiDAR; the same figure in another unit is far outside.
 SWEEP_S = (0.02, 1.5)
 _LATEST = 1e19
 _MOST_RINGS = 1024
@@ -26,12 +26,12 @@ NS_PER_UNIT = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
 @dataclass(frozen=True, eq=False)
 class CloudReading:
-    """A scan, and what had to be done to get it.
+    """A scan, and the conversions applied to it.
 
     Attributes:
         n_not_finite: points dropped because a coordinate is NaN or infinite.
         n_zero_range: points dropped because they lie at the origin (no return), or above or below it.
-        notes: what the cloud lacks or how it was understood, in words; the same for like clouds.
+        notes: what the point cloud lacks or how it was understood, in words; the same for like point clouds.
     """
 
     scan: Scan
@@ -40,7 +40,7 @@ class CloudReading:
     notes: tuple[str, ...]
 
 
-# What is no number, or beyond a type's range, is looked for where it matters.
+# What is not a number, or beyond a type's range, is looked for where it matters.
 @np.errstate(over="ignore", invalid="ignore")
 def to_scan(
     cloud: NDArray[Any],
@@ -50,19 +50,19 @@ def to_scan(
     stamp_ns: int | None = None,
     host_ns: int | None = None,
 ) -> CloudReading:
-    """Build a scan from a cloud with any fields.
+    """Build a scan from a point cloud with any fields.
 
     Args:
         cloud: structured (N,) with at least x, y, z in m, frame lidar.
         lidar: the LiDAR's name in the profile.
         settings: its settings; `timestamps.reference` says which firing `stamp_ns` marks.
         where: file or topic, for messages.
-        stamp_ns: the cloud's stamp as recorded; None where there is none.
+        stamp_ns: the point cloud's timestamp as recorded; None where there is none.
         host_ns: arrival at the host.
 
     Raises:
-        SourceError: no coordinates, no valid point, coordinates that are no metres, or no rings and none that
-            could be told from elevations.
+        SourceError: no coordinates, no valid point, coordinates that are not metres, or no rings and none
+            that could be inferred from elevation angles.
     """
     fields = {
         name.lower(): name for name in reversed(cloud.dtype.names or ()) if _is_scalar(cloud.dtype[name])
@@ -89,7 +89,7 @@ def to_scan(
 
 
 def _is_scalar(field: np.dtype[Any]) -> bool:
-    """Tell a figure of each point from several, and from text."""
+    """Return a figure of each point from several, and from text."""
     return field.shape == () and field.kind in "biuf"
 
 
@@ -144,7 +144,7 @@ def _ring(
 
 
 def _counts_upwards(rank: NDArray[np.intp]) -> bool:
-    """Tell whether ring numbers rise with elevation, by Spearman's correlation.
+    """Return whether ring numbers rise with elevation, by Spearman's correlation.
 
     Some drivers count lasers from the top (Ouster) or by firing order. Neighbouring rings with few near
     points may swap their mean elevations, which is no reason to renumber.
@@ -161,7 +161,7 @@ def _times(
     stamp_ns: int | None,
     notes: list[str],
 ) -> tuple[NDArray[np.int64] | None, int | None]:
-    """Find each point's time after the first firing, and the stamp of the first firing."""
+    """Find each point's time after the first firing, and the timestamp of the first firing."""
     is_last = settings.timestamps.reference == "last_firing"
     name = _find(fields, TIME_FIELDS)
     ticks = None if name is None else _ticks(cloud[name])
@@ -181,11 +181,11 @@ def _times(
         return offset_ns, None
     first_ns, last_ns = round(float(first) * scale), round(float(ticks.max()) * scale)
     if abs(first_ns) > 10**12:
-        # Times since an epoch: only the stamp's own clock counts, for the cameras' sake.
+        # Times since an epoch: only the timestamp's own clock counts, for the cameras' sake.
         return offset_ns, stamp_ns - (last_ns - first_ns if is_last else 0)
     if is_last and first_ns >= 0:
         return offset_ns, stamp_ns - last_ns + first_ns
-    # velodyne_pointcloud gives times relative to the stamp: negative where that marks the last packet.
+    # velodyne_pointcloud gives times relative to the timestamp: negative where that marks the last packet.
     return offset_ns, stamp_ns + first_ns
 
 
@@ -196,7 +196,7 @@ def _ticks(values: NDArray[Any]) -> NDArray[Any] | None:
         return ticks if np.ptp(ticks) > 0 else None
     with np.errstate(invalid="ignore"):  # of NaN that signals
         ticks = values.astype(np.float64)
-    # Beyond a century of nanoseconds it is no time in any unit.
+    # Beyond a century of nanoseconds it is not a time in any unit.
     if not np.isfinite(ticks).all() or np.abs(ticks).max() > _LATEST or np.ptp(ticks) == 0:
         return None
     # A float32 of Unix time moves in steps of two minutes.
@@ -205,12 +205,12 @@ def _ticks(values: NDArray[Any]) -> NDArray[Any] | None:
 
 
 def _unit(ticks: NDArray[Any]) -> str | None:
-    """Tell the unit from how long the sweep lasts; None where it lasts longer than any, in any unit."""
+    """Return the unit from how long the scan lasts; None where it lasts longer than any, in any unit."""
     span = float(ticks.max()) - float(ticks.min())
     for unit, scale in NS_PER_UNIT.items():
         if SWEEP_S[0] <= span * scale * 1e-9 <= SWEEP_S[1]:
             return unit
-    # A sector of a sweep may be shorter than any sweep: then it is the usual unit of the type.
+    # A sector of a scan may be shorter than any scan: then it is the usual unit of the type.
     usual = _usual_unit(ticks)
     return usual if span * NS_PER_UNIT[usual] * 1e-9 < SWEEP_S[0] else None
 

@@ -1,4 +1,4 @@
-"""Point clouds from files."""
+"""Point point clouds from files."""
 
 from collections.abc import Callable
 from pathlib import Path

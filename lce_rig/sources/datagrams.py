@@ -1,4 +1,4 @@
-"""UDP datagrams inside the frames that network recorders keep, out of them and into them.
+"""UDP datagrams in the frames of network recordings: unpacking and packing.
 
 References:
     https://www.tcpdump.org/linktypes.html; RFC 791 (IPv4), RFC 768 (UDP); IEEE 802.1Q (VLAN tags)
@@ -95,21 +95,21 @@ def read_datagram(link: int, host_ns: int, frame: bytes, flaws: Counter[str]) ->
         link: link type, of LINKS.
         host_ns: arrival at the host.
         frame: as recorded, maybe cut short.
-        flaws: counts datagrams that are not whole, by what is wrong with them.
+        flaws: counts datagrams that are not whole, by the code of what is wrong with them.
     """
     ip = LINKS[link](frame)
     if ip is None or len(frame) < ip + 20 or frame[ip] >> 4 != 4 or frame[ip + 9] != _UDP:
         return None
     udp = ip + 4 * (frame[ip] & 0x0F)
     if int.from_bytes(frame[ip + 6 : ip + 8], "big") & 0x3FFF:
-        flaws["sent in fragments"] += 1
+        flaws["datagram.fragmented"] += 1
         return None
     if len(frame) < udp + 8:
-        flaws["cut short by the recorder"] += 1
+        flaws["datagram.cut_short"] += 1
         return None
     source_port, port, length = struct.unpack_from(">HHH", frame, udp)
     if length < 8 or udp + length > len(frame):
-        flaws["cut short by the recorder"] += 1
+        flaws["datagram.cut_short"] += 1
         return None
     source = socket.inet_ntoa(frame[ip + 12 : ip + 16])
     return Datagram(host_ns, source, source_port, port, frame[udp + 8 : udp + length])

@@ -1,11 +1,11 @@
-"""A file of an event camera's own recorder: its events and, in AEDAT4, the frames it took beside them."""
+"""A file of an event camera's own recorder: its events and, in AEDAT4, its frames."""
 
 from collections.abc import Iterator
 from pathlib import Path
 
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, Sample, Stream
 from lce_rig.rig import Rig
-from lce_rig.sources.base import Sample, SourceOptions, Span, Stream
+from lce_rig.sources.base import SourceOptions, Span
 from lce_rig.sources.events import open_events
 from lce_rig.sources.events.aedat4_file import Aedat4File
 from lce_rig.sources.events.aedat4_frames import Aedat4Frames
@@ -21,7 +21,7 @@ class EventCameraFile:
 
     Attributes:
         path: the file.
-        notes: what was assumed on opening, and after reading what was left out and why.
+        notes: what was assumed on opening, and after reading what was skipped and why.
         key: fingerprint of the file.
         n_samples: number of frames.
         streams: the camera's events and, where the file and the profile have them, its frames.

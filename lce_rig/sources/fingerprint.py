@@ -1,4 +1,4 @@
-"""Files known again without reading them whole."""
+"""File fingerprints that do not need the whole content."""
 
 import hashlib
 from collections.abc import Iterable

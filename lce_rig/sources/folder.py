@@ -1,4 +1,4 @@
-"""A folder of pictures and clouds: for every board placement a cloud, and a picture of each camera."""
+"""A folder of images and point clouds: per board placement one point cloud, and one image per camera."""
 
 import hashlib
 from collections import Counter
@@ -20,7 +20,7 @@ from lce_rig.sources.sensors import choose_camera, choose_lidar
 
 @dataclass(frozen=True)
 class PictureOnDisk:
-    """A picture that has not been read yet; the stamp is that in its name.
+    """An image that has not been read yet; the timestamp comes from its name.
 
     Attributes:
         label: its name, for messages; with its folder's where several cameras may have the same names.
@@ -43,7 +43,7 @@ class PictureOnDisk:
 
 @dataclass(frozen=True)
 class PairOnDisk:
-    """Pictures and a cloud that have not been read yet; the cloud's stamp is that in its name."""
+    """Images and a point cloud that have not been read yet; the timestamp comes from the file name."""
 
     pictures: tuple[PictureOnDisk, ...]
     cloud_path: Path
@@ -90,19 +90,19 @@ class PairOnDisk:
 
 
 class FolderRecording:
-    """Pictures and clouds in folders side by side, or in one; pictures of several cameras in a folder each.
+    """Images and point clouds in folders side by side, or in one; images of several cameras in a folder each.
 
     Attributes:
         path: the folder.
         notes: how pairs were found and what was left over.
-        pairs: every cloud with its pictures, by name of the cloud; read them one by one.
+        pairs: every point cloud with its images, by name of the point cloud; read them one by one.
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
         """Find the files and pair them; nothing is decoded yet.
 
         Raises:
-            SourceError: no pictures, no clouds, no way to pair them, or no telling whose pictures they are.
+            SourceError: no images, no point clouds, no way to pair them, or no telling whose images they are.
         """
         self.path = path
         self.notes: list[str] = []
@@ -111,7 +111,7 @@ class FolderRecording:
         pictures = self._pictures()
         clouds = list_clouds(path, self.notes)
         cloud_ns = parse_times([cloud.stem for cloud in clouds])
-        # The second picture of one camera that goes with a cloud makes a pair of its own.
+        # The second image of one camera that goes with a point cloud makes a pair of its own.
         together: dict[tuple[int, int], list[PictureOnDisk]] = {}
         lone = []
         for own, pairing in zip(pictures, self._pair(pictures, clouds), strict=True):
@@ -136,7 +136,7 @@ class FolderRecording:
         ]
 
     def _pictures(self) -> list[list[PictureOnDisk]]:
-        """List the pictures of each camera.
+        """List the images of each camera.
 
         Raises:
             SourceError: there are none, or none of the camera that was asked for.
@@ -166,7 +166,7 @@ class FolderRecording:
         ]
 
     def _pair(self, pictures: Sequence[Sequence[PictureOnDisk]], clouds: Sequence[Path]) -> list[Pairing]:
-        """Match each camera's pictures with the clouds, all cameras' in one way."""
+        """Match each camera's images with the point clouds, all cameras' in one way."""
         pairings = [self._pair_camera(own, clouds, self._options.pair) for own in pictures]
         methods = {pairing.method for pairing in pairings}
         if len(methods) > 1:

@@ -1,4 +1,4 @@
-"""Where a folder keeps its pictures and clouds, and which camera a folder of pictures belongs to."""
+"""The layout of a folder: its images and point clouds, and the camera of each image folder."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -23,7 +23,7 @@ CLOUD_FOLDERS = (
 
 
 def list_pictures(folder: Path, notes: list[str]) -> list[Path]:
-    """List the pictures of one camera, in natural order; what was chosen between is noted.
+    """List the images of one camera, in natural order; what was chosen between is noted.
 
     Raises:
         SourceError: there are none, or several folders have some and no name tells which is meant.
@@ -32,7 +32,7 @@ def list_pictures(folder: Path, notes: list[str]) -> list[Path]:
 
 
 def list_clouds(folder: Path, notes: list[str]) -> list[Path]:
-    """List the clouds, in natural order; what was chosen between is noted.
+    """List the point clouds, in natural order; what was chosen between is noted.
 
     Raises:
         SourceError: as `list_pictures`.
@@ -41,10 +41,10 @@ def list_clouds(folder: Path, notes: list[str]) -> list[Path]:
 
 
 def list_pictures_by_camera(folder: Path, cameras: Collection[str]) -> dict[str, list[Path]]:
-    """List the pictures in folders named after cameras: img/left/ and img/right/, or left/ and right/.
+    """List the images in folders named after cameras: img/left/ and img/right/, or left/ and right/.
 
     Returns:
-        Pictures by camera, in the order of `cameras`; empty where no folder is named after one.
+        Images by camera, in the order of `cameras`; empty where no folder is named after one.
     """
     above = [path for name, path in _folders(folder).items() if name in IMAGE_FOLDERS and name not in cameras]
     for place in (*above, folder):

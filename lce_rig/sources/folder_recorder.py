@@ -1,16 +1,15 @@
-"""Everything that a rig's sensors deliver, as files in one folder that other programs read."""
+"""Recording of all sensor data, as files in one folder that other programs read."""
 
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 
-from lce_rig.core.data import Events
+from lce_rig.core.data import Events, Sample
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.sources.bag_recorder import BagRecorder, not_writable
-from lce_rig.sources.base import Sample
 from lce_rig.sources.events.aedat4_writer import Aedat4Writer
-from lce_rig.sources.rig_time import event_channel
+from lce_rig.timing.rig_time import event_channel
 
 BAG_NAMES = {1: "recording.bag", 2: "recording"}
 """By the version of ROS; a ROS 2 bag is a folder."""

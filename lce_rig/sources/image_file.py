@@ -1,4 +1,4 @@
-"""Pictures from files, as they were taken: no rotation by EXIF, no colour management."""
+"""Images from files, unchanged: no rotation by EXIF, no colour management."""
 
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,13 @@ _MAX_SAMPLED = 1 << 24
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """Read a picture.
+    """Read an image.
 
     Returns:
         (H, W) grey or (H, W, 3) BGR.
 
     Raises:
-        SourceError: the file is missing, empty, truncated or no picture.
+        SourceError: the file is missing, empty, truncated or no image.
     """
     try:
         return decode_image(read_file(path))
@@ -33,7 +33,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8]:
-    """Decode a PNG, JPEG or other picture file held in memory.
+    """Decode a PNG, JPEG or other image file held in memory.
 
     Raises:
         ValueError: what is wrong with it.
@@ -47,7 +47,7 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
 def to_8_bit(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     """Bring pixels to 8 bits; deeper ones are stretched by their darkest and brightest percent.
 
-    Twelve-bit sensors leave the upper bits of 16 empty: a plain shift would give black pictures.
+    Twelve-bit sensors leave the upper bits of 16 empty: a plain shift would give black images.
 
     Raises:
         ValueError: pixels of a kind no camera delivers.
@@ -61,7 +61,7 @@ def to_8_bit(pixels: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _stretched(pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    # Every k-th pixel has the same shares, and no copies of a large picture are made.
+    # Every k-th pixel has the same shares, and no copies of a large image are made.
     sample = pixels.ravel()[:: 1 + pixels.size // _MAX_SAMPLED].astype(np.float64)
     sample = sample[np.isfinite(sample)]
     if not len(sample):

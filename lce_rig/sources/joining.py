@@ -1,22 +1,23 @@
-"""Recordings of one moment by several recorders, read as one."""
+"""Simultaneous recordings of several recorders, read as one."""
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+from lce_rig.core.data import Sample, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
-from lce_rig.sources.base import ContinuousRecording, Recording, Sample, Span, Stream
+from lce_rig.sources.base import ContinuousRecording, Recording, Span
 from lce_rig.sources.merging import merge_by_time
 from lce_rig.sources.overlap import check_overlap
-from lce_rig.sources.rig_time import stream_of
+from lce_rig.timing.rig_time import stream_of
 
 
 def join_recordings(recordings: Iterable[Recording], rig: Rig) -> list[Recording]:
     """Join continuous recordings of the same moment, in the order given.
 
     A recording is of the same moment as those before it where it repeats no LiDAR, and adds a sensor or runs
-    while their LiDAR does; what else it repeats is left out.
+    while their LiDAR does; what else it repeats is skipped.
     """
     groups: list[list[Recording]] = []
     for recording in recordings:
@@ -48,13 +49,13 @@ def require_sensors(recording: ContinuousRecording) -> None:
 
 
 class JoinedRecording:
-    """Several recordings of one moment; see `ContinuousRecording`.
+    """Several simultaneous recordings; see `ContinuousRecording`.
 
     Attributes:
         path: of the first.
-        notes: those of all, and what was left out.
+        notes: those of all, and what was skipped.
         key: fingerprint of all, in whatever order they were given.
-        n_samples: pictures and scans of all.
+        n_samples: images and scans of all.
         streams: each from the first recording that holds it.
     """
 
@@ -77,7 +78,7 @@ class JoinedRecording:
         """Yield the samples of all parts, merged by the rig's time.
 
         Raises:
-            SourceError: pictures or events of one part lie wholly before or after the scans of another; or,
+            SourceError: images or events of one part lie wholly before or after the scans of another; or,
                 after everything that can be read, a part is torn.
         """
         self._check_overlap()
@@ -112,7 +113,7 @@ def _belongs(recording: Recording, group: Sequence[Recording], rig: Rig) -> bool
 
 
 def _is_copy(recording: ContinuousRecording, parts: Sequence[ContinuousRecording], rig: Rig) -> bool:
-    """Tell whether all of a recording runs while a LiDAR does, whose cameras are there already."""
+    """Return whether all of a recording runs while a LiDAR does, whose cameras are there already."""
     scans = {s: span for part in parts for s, span in part.streams.items() if s.kind == "scans"}
     if not any(scans.values()) or not all(recording.streams.values()):
         return False

@@ -1,11 +1,12 @@
-"""Whether the streams of one moment were recorded at the same time, by their own clocks."""
+"""The check that streams overlap in time, by their own clocks."""
 
 from collections.abc import Mapping
 
+from lce_rig.core.data import Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
-from lce_rig.sources.base import Span, Stream
-from lce_rig.sources.rig_time import rig_offset_ns
+from lce_rig.sources.base import Span
+from lce_rig.timing.rig_time import rig_offset_ns
 
 _MAX_OFFSET_S = 3600.0
 # Spans are told from a recording's ends, without reading what lies between.
@@ -17,12 +18,12 @@ _USUAL_LAG_S = 2.0
 def check_overlap(
     scans: Mapping[Stream, Span | None], others: Mapping[Stream, Span | None], rig: Rig
 ) -> list[str]:
-    """Make sure that pictures and events run while the LiDAR does.
+    """Make sure that images and events run while the LiDAR does.
 
     Args:
         scans: streams of LiDARs.
         others: streams of cameras.
-        rig: its `expected_offset_s` are added to the stamps.
+        rig: its `expected_offset_s` are added to the timestamps.
 
     Returns:
         Notes on streams that cover only a part of the scans.

@@ -1,4 +1,4 @@
-"""Which picture belongs to which cloud, from file names alone."""
+"""Image-scan matching from file names alone."""
 
 import re
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ class Pairing:
 
     Attributes:
         method: how the pairs were found.
-        pairs: (image, cloud) positions, by name of the image.
+        pairs: (image, point cloud) positions, by name of the image.
         lone_images, lone_clouds: positions that have no partner.
         explanation: what was chosen and why, one sentence.
     """
@@ -41,9 +41,10 @@ def natural_order(name: str) -> list[tuple[int, int, str]]:
 
 
 def parse_times(stems: Sequence[str]) -> NDArray[np.int64] | None:
-    """Read file names as times in ns; None where any is no time.
+    """Read file names as times in ns; None where any is not a time.
 
-    Seconds have a decimal point; 19 digits are ns since 1970, 16 are us and 13 are ms. Counters are no times.
+    Seconds have a decimal point; 19 digits are ns since 1970, 16 are us and 13 are ms. Counters are not
+    times.
     """
     times = []
     for stem in stems:
@@ -61,10 +62,11 @@ def parse_times(stems: Sequence[str]) -> NDArray[np.int64] | None:
 def pair_names(
     images: Sequence[str], clouds: Sequence[str], method: PairMethod = "auto", tolerance_s: float = 0.05
 ) -> Pairing:
-    """Match pictures and clouds by their names (without suffix).
+    """Match images and point clouds by their names (without suffix).
 
     `auto` takes equal names where nine in ten match; else the nearest time, where names are times and nine in
-    ten find a partner within the tolerance; else sorted order, where there are as many pictures as clouds.
+    ten find a partner within the tolerance; else sorted order, where there are as many images as point
+    clouds.
 
     Args:
         images, clouds: names in natural order.
@@ -144,7 +146,7 @@ def _by_time(image_ns: NDArray[np.int64], cloud_ns: NDArray[np.int64], tolerance
 
 def _nearest(times_ns: NDArray[np.int64], others_ns: NDArray[np.int64]) -> NDArray[np.intp]:
     """Find the place of the nearest of `others_ns` to each time; of equally near ones the first."""
-    # Equal stamps are found at their first place, whatever the order they came in.
+    # Equal timestamps are found at their first place, whatever the order they came in.
     sorted_ns, place = np.unique(others_ns, return_index=True)
     above = np.clip(np.searchsorted(sorted_ns, times_ns), 0, len(sorted_ns) - 1)
     below = np.maximum(above - 1, 0)

@@ -1,4 +1,4 @@
-"""A recording of the network as a stream of scans of a VLP-16, through the decoding that is used live."""
+"""A network recording as a stream of VLP-16 scans, with the live decoder."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lce_rig.core import velodyne
-from lce_rig.core.data import Scan
+from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.rig import LidarSettings, Rig
-from lce_rig.sources.base import SourceOptions, Span, Stream
+from lce_rig.sources.base import SourceOptions, Span
 from lce_rig.sources.datagrams import Datagram
 from lce_rig.sources.fingerprint import fingerprint
 from lce_rig.sources.pcap_file import PcapFile
@@ -17,20 +18,21 @@ from lce_rig.sources.sensors import choose_lidar
 from lce_rig.sources.velodyne_packet import BadPacketError, OtherModelError, read_data_packet
 from lce_rig.sources.velodyne_points import DUAL_NOTE, OFFSETS_NOTE
 from lce_rig.sources.velodyne_stream import Vlp16Stream
+from lce_rig.words import describe
 
-# So many data packets, a second or less of one sensor, show which sensors were recorded.
+# So many data packets, per second or less of one sensor, show which sensors were recorded.
 _SURVEY_PACKETS = 800
 _MAX_SHOWN = 6
 
 
 @dataclass
 class _Survey:
-    """What the beginning of a recording holds.
+    """The contents of a recording's start.
 
     Attributes:
         senders: data packets of VLP-16s by IP address.
         others: data packets of other models by name.
-        refused: packets of the right length that are no data packets, by what is wrong with them.
+        refused: packets of the right length that are not data packets, by the code of what is wrong.
         ports: all UDP packets by the port they were sent to.
         n_bytes: how much of the file this is.
     """
@@ -47,7 +49,7 @@ class PcapRecording:
 
     Attributes:
         path: the file.
-        notes: which sensor was taken, and after reading what was left out and why.
+        notes: which sensor was taken, and after reading what was skipped and why.
         key: fingerprint of the file.
         n_samples: number of scans to come, estimated from the file's size.
         streams: the LiDAR's scans; their span, by arrival, is found only where they are part of a recording.
@@ -57,8 +59,8 @@ class PcapRecording:
         """Find the sensor's packets.
 
         Raises:
-            SourceError: it is no recording of the network, holds no packets of a VLP-16, or those of several
-                of which none has the profile's address; velodyne-decoder is not installed.
+            SourceError: it is not a recording of the network, holds no packets of a VLP-16, or those of
+                several of which none has the profile's address; velodyne-decoder is not installed.
         """
         self.path = path
         self.notes: list[str] = []
@@ -109,7 +111,7 @@ class PcapRecording:
                 except OtherModelError as error:
                     survey.others[error.model] += 1
                 except BadPacketError as error:
-                    survey.refused[str(error)] += 1
+                    survey.refused[error.code] += 1
             n_found = survey.senders.total() + survey.others.total()
             if n_found >= _SURVEY_PACKETS or (n_found and survey.ports.total() >= 50 * _SURVEY_PACKETS):
                 break
@@ -150,18 +152,17 @@ class PcapRecording:
     def _what_is_there(self, survey: _Survey) -> str:
         wrong = survey.refused + self._file.flaws
         if wrong:
-            cut = " (record with tcpdump -s 0)" if "cut short by the recorder" in wrong else ""
-            return ", ".join(f"{n} {what}" for what, n in wrong.most_common(_MAX_SHOWN)) + cut
+            cut = " (record with tcpdump -s 0)" if "datagram.cut_short" in wrong else ""
+            return ", ".join(describe(_flaw(code, n)) for code, n in wrong.most_common(_MAX_SHOWN)) + cut
         ports = ", ".join(f"{n} to {port}" for port, n in survey.ports.most_common(_MAX_SHOWN))
         there = f"UDP packets by port: {ports}" if ports else "no UDP packets at all"
         return f"{there}; {self._file.damage}" if self._file.damage else there
 
     def _summarise(self, stream: Vlp16Stream) -> None:
         lines = [OFFSETS_NOTE, *([DUAL_NOTE] if stream.mode == velodyne.DUAL else [])]
-        state = stream.clock.state()
-        lines.append(f"stamps are {state.text}")
+        lines.append(describe(stream.clock.state()))
         lines += _account(stream)
-        lines += [f"{n} datagrams {what}" for what, n in sorted(self._file.flaws.items())]
+        lines += [describe(_flaw(code, n)) for code, n in sorted(self._file.flaws.items())]
         lines += [self._file.damage] if self._file.damage else []
         notes = [f"{self.path.name}: {line}" for line in lines]
         self.notes += [note for note in notes if note not in self.notes]
@@ -177,7 +178,7 @@ def _push(stream: Vlp16Stream, datagram: Datagram) -> Scan | None:
 
 
 def _account(stream: Vlp16Stream) -> list[str]:
-    """Say what was lost or left out, in words."""
+    """Say what was lost or skipped, in words."""
     counts, order = stream.counts, stream.counts.order
     figures = {
         "data packets lost on the way": order.n_lost,
@@ -190,4 +191,8 @@ def _account(stream: Vlp16Stream) -> list[str]:
         "scans whose stamps do not rise, left out": counts.n_not_rising,
     }
     lines = [f"{n} {what}" for what, n in figures.items() if n]
-    return lines + [f"{n} {what}, left out" for what, n in sorted(counts.bad.items())]
+    return lines + [describe(flaw) for flaw in counts.flaws()]
+
+
+def _flaw(code: str, n: int) -> Finding:
+    return Finding(code, "warning", figures={"n": n, "of": "data"})

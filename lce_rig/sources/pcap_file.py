@@ -1,4 +1,4 @@
-"""Files of network recorders: pcap (tcpdump, VeloView) and pcapng (Wireshark), whole or torn.
+"""Files of network recorders: pcap (tcpdump, VeloView) and pcapng (Wireshark), complete or truncated.
 
 References:
     https://www.ietf.org/archive/id/draft-ietf-opsawg-pcap-05.html
@@ -26,7 +26,7 @@ _RESOLUTION_OPTION, _OFFSET_OPTION = 9, 14
 
 
 class _TornError(Exception):
-    """The file ends, or turns to nonsense, within a record."""
+    """The file ends, or becomes invalid, within a record."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class PcapFile:
 
     Attributes:
         path: the file.
-        flaws: datagrams that could not be read, by what is wrong with them; grows while it is read.
+        flaws: datagrams that could not be read, by the code of what is wrong; grows while it is read.
         damage: where the file ends before its end, in words; "" before that is known, or where it is whole.
         n_bytes_read: how far the last reading has come.
     """
@@ -52,7 +52,7 @@ class PcapFile:
         """Look at the beginning.
 
         Raises:
-            SourceError: it is no recording of a network, or of a kind of network that is not read.
+            SourceError: it is not a recording of a network, or of a kind of network that is not read.
         """
         self.path = path
         self.flaws: Counter[str] = Counter()
@@ -134,7 +134,7 @@ def _whole(data: bytes, n_bytes: int) -> bytes:
 
 
 def _read_head(path: Path, head: bytes) -> tuple[str, int, int | None]:
-    """Tell byte order, ns per tick and link type; None for pcapng, where each card has its own."""
+    """Return byte order, ns per tick and link type; None for pcapng, where each card has its own."""
     magic = head[:4]
     for order in "<>":
         for value, ns_per_tick in ((_US_MAGIC, 1000), (_NS_MAGIC, 1)):

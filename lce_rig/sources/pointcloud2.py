@@ -63,7 +63,7 @@ def decode_pointcloud2(message: Any) -> NDArray[Any]:
     width, height, step = int(message.width), int(message.height), int(message.point_step)
     if width * height > limits.MAX_POINTS:
         raise ValueError(f"it declares {width * height} points, at most {limits.MAX_POINTS} are read")
-    # Some drivers leave row_step at zero in clouds of one row.
+    # Some drivers leave row_step at zero in point clouds of one row.
     row_step = int(message.row_step) or width * step
     if row_step < width * step:
         raise ValueError(f"row_step {row_step} is less than {width} points of {step} bytes")

@@ -1,4 +1,4 @@
-"""A folder in which several recorders kept one moment: a bag, packets of LiDARs, files of event cameras."""
+"""A folder of simultaneous recordings: a bag, packets of LiDARs, files of event cameras."""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -30,7 +30,7 @@ def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path,
     kinds = {suffix: [e for e in entries if e.is_file() and e.suffix.lower() in suffix] for suffix in _KINDS}
     folders = [entry for entry in entries if entry.is_dir()]
     if not all(_is_bag(folder) for folder in folders):
-        return [(path, options)]  # Of pictures and clouds, whatever lies beside them.
+        return [(path, options)]  # Of images and point clouds, whatever lies beside them.
     # A bag in several pieces lies in one folder, and is read as one.
     bags = ([path] if kinds[_BAGS] else []) + folders
     is_one_of_many = len(bags) + len(kinds[_PACKETS]) + len(kinds[_EVENTS]) > 1

@@ -1,4 +1,4 @@
-"""sensor_msgs/Image and CompressedImage as grey or BGR pictures.
+"""sensor_msgs/Image and CompressedImage as grey or BGR images.
 
 References:
     https://docs.ros.org/en/noetic/api/sensor_msgs/html/image__encodings_8h_source.html
@@ -71,7 +71,7 @@ def decode_ros_compressed_image(message: Any) -> NDArray[np.uint8]:
         (H, W) grey or (H, W, 3) BGR.
 
     Raises:
-        ValueError: it is damaged, or no picture.
+        ValueError: it is damaged, or no image.
     """
     form = str(message.format).lower()
     if "compresseddepth" in form:

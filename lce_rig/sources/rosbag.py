@@ -1,4 +1,4 @@
-"""A bag as a stream of pictures, scans and events, by the stamps in their headers."""
+"""A bag as a stream of images, scans and events, by the timestamps in their headers."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -9,12 +9,12 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.sources.bag_file import BagFile, list_topics
 from lce_rig.sources.bag_storage import RawMessage
-from lce_rig.sources.base import Sample, SourceOptions, Span, Stream
+from lce_rig.sources.base import SourceOptions, Span
 from lce_rig.sources.cloud import to_scan
 from lce_rig.sources.events.bag import BagEvents
 from lce_rig.sources.events.camera import CameraEvents
@@ -26,7 +26,7 @@ from lce_rig.sources.pointcloud2 import check_field_count, decode_pointcloud2
 from lce_rig.sources.ros_image import decode_ros_compressed_image, decode_ros_image
 from lce_rig.sources.topics import CLOUD_TYPES, Target, choose_topics
 
-# A stamp this much earlier than the one before is a clock that was set, not a message that came late.
+# A timestamp this much earlier than the one before is a clock that was set, not a message that came late.
 CLOCK_JUMP_NS = 1_000_000_000
 # Drivers start within this many messages of each other; who comes later has no span told beforehand.
 _N_PROBED = 500
@@ -34,7 +34,7 @@ _N_PROBED = 500
 
 @dataclass
 class _Stream:
-    """What was seen of one topic so far."""
+    """The messages of one topic so far."""
 
     last_ns: int | None = None
     n_yielded: int = 0
@@ -48,9 +48,9 @@ class BagRecording:
 
     Attributes:
         path: the bag's file or folder.
-        notes: topics taken, and after reading what was left out and why.
+        notes: topics taken, and after reading what was skipped and why.
         key: fingerprint of the bag.
-        n_samples: number of messages with pictures and scans on the topics taken.
+        n_samples: number of messages with images and scans on the topics taken.
         streams: what is read, with its span where the bag holds events or is a part of a recording.
     """
 
@@ -80,11 +80,11 @@ class BagRecording:
             self.notes.append(f"{path.name}: damaged ({self._bag.damage}); read as far as it goes")
 
     def samples(self) -> Iterator[Sample]:
-        """Yield pictures and scans in the order the recorder received them, and events by their stamps.
+        """Yield images and scans in the order the recorder received them, and events by their timestamps.
 
-        Each sensor's stamps rise. Messages sent twice, late, or damaged are left out and counted in `notes`.
-        Where the clock of a camera or LiDAR is set back by more than a second its stamps start again from
-        there.
+        Each sensor's timestamps rise. Messages sent twice, late, or damaged are skipped and counted in
+        `notes`. Where the clock of a camera or LiDAR is set back by more than a second its timestamps start
+        again from there.
 
         Raises:
             SourceError: no message of a topic could be decoded; or, after all that can be read, the bag is
@@ -117,7 +117,7 @@ class BagRecording:
         """Take the topics of raw events out of the others and open them.
 
         Raises:
-            SourceError: events of another resolution; or no events, and no pictures either.
+            SourceError: events of another resolution; or no events, and no images either.
         """
         opened: dict[Stream, CameraEvents] = {}
         for topic, target in list(self._targets.items()):
@@ -149,7 +149,7 @@ class BagRecording:
         return streams
 
     def _first_stamps(self) -> dict[str, tuple[int, int]]:
-        """Find (stamp, time of receipt) of the first message of each topic, as far as they come early."""
+        """Find (timestamp, time of receipt) of the first message of each topic, as far as they come early."""
         found: dict[str, tuple[int, int]] = {}
         try:
             for message in islice(self._bag.messages(self._targets.keys()), _N_PROBED):
@@ -233,7 +233,7 @@ def _typestore(is_ros1: bool) -> Any:
 
 
 def _is_in_order(sample: Image | Scan, stream: _Stream) -> bool:
-    """Tell whether a sample's stamp is later than its predecessor's; count it where it is not."""
+    """Return whether a sample's timestamp is later than its predecessor's; count it where it is not."""
     stamp_ns = sample.stamp_ns
     if stamp_ns is None or stream.last_ns is None or stamp_ns > stream.last_ns:
         stream.last_ns = stamp_ns

@@ -1,15 +1,15 @@
-"""Which sensor of the rig a recording's data belongs to."""
+"""Assignment of a recording's data to the sensors of the rig."""
 
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.sources.base import SourceOptions
-from lce_rig.sources.rig_time import event_channel
+from lce_rig.timing.rig_time import event_channel
 
 
 def choose_camera(
     rig: Rig, options: SourceOptions, notes: list[str], camera: str | None = None
 ) -> tuple[str, str]:
-    """Name the (camera, channel) that a folder's pictures belong to: as asked, else the rig's only camera.
+    """Name the (camera, channel) that a folder's images belong to: as asked, else the rig's only camera.
 
     Args:
         rig: the profile.
@@ -33,7 +33,7 @@ def choose_camera(
 
 
 def _only_camera(rig: Rig) -> str:
-    """Name the rig's camera; pictures of one that were taken for another's would spoil both extrinsics.
+    """Name the rig's camera; images of one that were taken for another's would spoil both extrinsics.
 
     Raises:
         SourceError: it has several.
@@ -49,7 +49,7 @@ def _only_camera(rig: Rig) -> str:
 
 
 def choose_lidar(rig: Rig, options: SourceOptions, notes: list[str]) -> str:
-    """Name the LiDAR that a folder's clouds belong to: as asked, else the rig's first.
+    """Name the LiDAR that a folder's point clouds belong to: as asked, else the rig's first.
 
     Raises:
         SourceError: the rig has no such LiDAR.

@@ -1,14 +1,15 @@
-"""Which topic of a bag belongs to which sensor of the rig."""
+"""Assignment of a bag's topics to the sensors of the rig."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
+from lce_rig.core.data import Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.sources.bag_file import list_topics
-from lce_rig.sources.base import SourceOptions, Stream
+from lce_rig.sources.base import SourceOptions
 from lce_rig.sources.events.bag import EVENT_TYPES
 
 CLOUD_TYPES = frozenset({"sensor_msgs/PointCloud2"})
@@ -22,7 +23,7 @@ class Target:
     """A camera channel, or a LiDAR (channel None).
 
     Attributes:
-        has_events: whether the channel is of kind events: raw ones, or pictures that others made of them.
+        has_events: whether the channel is of kind events: raw ones, or images that others made of them.
     """
 
     sensor: str
@@ -60,7 +61,7 @@ def choose_topics(
         Sensor by topic; at least one camera channel and one LiDAR, one of the two in a part of a recording.
 
     Raises:
-        SourceError: a topic that was asked for is not there or of another type, or no picture or cloud is
+        SourceError: a topic that was asked for is not there or of another type, or no image or point cloud is
             left; the hint lists the topics that are there.
     """
     there = list_topics(topics)

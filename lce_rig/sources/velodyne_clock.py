@@ -1,40 +1,25 @@
-"""Whether a VLP-16's time can be trusted, and what to stamp its scans with where it cannot.
+"""The check of a VLP-16's time, and the timestamps of its scans if it fails.
 
 The counter in the packets runs free from power-up, and looks no different then: only pulses and sentences,
 which the position packets report, tie it to UTC. The hour is never sent.
 """
 
 from collections import deque
-from dataclasses import dataclass
 
 from lce_rig.core import velodyne
-from lce_rig.core.clock import NS_PER_S, resolve_hour
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.sources.velodyne_packet import DataPacket, PositionPacket
+from lce_rig.timing.clock import resolve_hour
 
 #: Clocks further apart than this do not both show UTC.
 MAX_DISAGREEMENT_NS = 100_000_000
-# Position packets come 50 to 150 times a second; a sentence stays until the next, a second later.
+# Position packets come 50 to 150 times per second; a sentence stays until the next, a second later.
 _MAX_AGE_S = 3
 _SENTENCE_LAG_S = (0, 1)
 # The least delayed arrival of a tenth of a second tells the host's time of a firing best. Of twenty of them
 # the lower quartile is safe from late arrivals and from a damaged packet.
 _WINDOW_NS = 100_000_000
 _N_WINDOWS = 20
-
-
-@dataclass(frozen=True)
-class ClockState:
-    """What scans are stamped with.
-
-    Attributes:
-        is_device: whether it is the sensor's own time, UTC.
-        text: whose time it is and why, in words.
-        remedy: what to do to get the sensor's own time; "" where it is had.
-    """
-
-    is_device: bool
-    text: str
-    remedy: str = ""
 
 
 class VelodyneClock:
@@ -92,54 +77,52 @@ class VelodyneClock:
         host_ns = self._host_ns(elapsed_ns)
         if host_ns is None:
             return None
-        if not self.state().is_device:
+        if not self.is_utc:
             return host_ns
         past_hour_ns = 1000 * self._last_us + elapsed_ns - self._last_elapsed_ns
         return resolve_hour(past_hour_ns, host_ns)
 
-    def state(self) -> ClockState:
-        """Say whose time scans are stamped with, and why.
+    @property
+    def is_utc(self) -> bool:
+        """Whether scans are timestamped with the sensor's own time, UTC."""
+        return not self._doubt()
+
+    def state(self) -> Finding:
+        """Find whose time scans are timestamped with, and why it is not the sensor's.
 
         The sensor's time is trusted where it is locked to pulses, the sentence it holds is of the second that
         its counter shows, and the host's clock agrees.
         """
-        cause, remedy = self._doubt()
-        if not cause:
-            ahead_ms = 1e-6 * (self.ahead_ns() or 0)
-            return ClockState(True, f"UTC by PPS and NMEA, {ahead_ms:+.1f} ms from this computer's clock")
-        return ClockState(False, f"this computer's clock, by arrival: {cause}", remedy)
+        code, ahead_ns, position = self._doubt(), self.ahead_ns(), self._position
+        figures: dict[str, Figure] = {} if ahead_ns is None else {"ahead_s": ahead_ns * 1e-9}
+        if position is not None:
+            figures |= {"pps": velodyne.PPS_STATES[position.pps], "is_fix": position.is_fix}
+            figures["nmea_past_hour_s"] = position.nmea_s
+        if not code:
+            return Finding("clock.lidar_utc", "note", figures=figures)
+        is_usual = code in ("clock.host_wanted", "clock.arrivals_unknown")
+        return Finding(code, "note" if is_usual else "warning", figures=figures)
 
-    def _doubt(self) -> tuple[str, str]:
-        """Find the first reason not to trust the sensor's time, and its remedy; ("", "") for none."""
+    def _doubt(self) -> str:
+        """Find the first reason not to trust the sensor's time, as its code; "" for none."""
         if not self._is_device_wanted:
-            return "the profile says so (timestamps.clock: host)", ""
+            return "clock.host_wanted"
         position, ahead_ns = self._position, self.ahead_ns()
         if position is None:
-            remedy = f"open port {velodyne.POSITION_PORT} in the firewall, and record it beside the data"
-            return "no position packets have come, which tell of PPS", remedy
+            return "clock.no_position_packets"
         age_s = ((self._last_us - position.us) % velodyne.HOUR_US) // 1_000_000
         # A position packet may have overtaken the data packets it belongs to.
         if _MAX_AGE_S <= age_s < 3600 - _MAX_AGE_S:
-            return "its position packets have stopped, or count otherwise", "check the network and the sensor"
+            return "clock.position_packets_stopped"
         if position.pps != velodyne.PPS_LOCKED:
-            state = velodyne.PPS_STATES[position.pps]
-            return (
-                f"PPS is {state}",
-                "check the pulse at the LiDAR's interface box: 1 Hz, 3 to 15 V, rising edge",
-            )
+            return "clock.pps_not_locked"
         if position.nmea_s is None:
-            what = "a damaged sentence" if position.nmea else "no NMEA"
-            return f"PPS is locked, but {what} arrives", "send $GPRMC at 9600 baud with RS-232 polarity"
+            return "clock.nmea_damaged" if position.nmea else "clock.no_nmea"
         if (position.us // 1_000_000 - position.nmea_s) % 3600 not in _SENTENCE_LAG_S:
-            minute, second = divmod(position.nmea_s, 60)
-            what = f"PPS is locked, but NMEA says {minute:02d}:{second:02d} past the hour, not the sensor"
-            return what, "send each sentence after its pulse, within a second"
+            return "clock.nmea_of_other_second"
         if ahead_ns is None:
-            return "arrivals are not known, and so neither is the hour", ""
-        if abs(ahead_ns) > MAX_DISAGREEMENT_NS:
-            what = f"the LiDAR's UTC is {ahead_ns / NS_PER_S:+.2f} s from it"
-            return what, "set this computer's clock by the same source (chrony with gpsd, or NTP)"
-        return "", ""
+            return "clock.arrivals_unknown"
+        return "clock.lidar_utc_differs" if abs(ahead_ns) > MAX_DISAGREEMENT_NS else ""
 
     def _host_ns(self, elapsed_ns: int) -> int | None:
         if not self._delays_ns:

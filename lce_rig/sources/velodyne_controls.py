@@ -1,4 +1,4 @@
-"""What `driver.controls` of a VLP-16 may hold."""
+"""The `driver.controls` of a VLP-16."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ _KEYS = ("position_port", "cut_deg")
 
 @dataclass(frozen=True)
 class Vlp16Controls:
-    """How packets are taken and cut into scans.
+    """Settings for receiving packets and cutting them into scans.
 
     Attributes:
         position_port: UDP port of position packets.

@@ -17,7 +17,7 @@ _SPEED_WEIGHT = 0.1
 
 
 class Place(Enum):
-    """Where a packet belongs."""
+    """The position of a packet."""
 
     NEXT = "next"
     HELD = "held back"
@@ -26,12 +26,12 @@ class Place(Enum):
 
 @dataclass
 class OrderCounts:
-    """What the sensor's counter told.
+    """Counts from the sensor's counter.
 
     Attributes:
         n_lost: packets that never arrived.
-        n_late: packets out of order or sent twice; left out.
-        n_astray: packets whose time fits neither the counter nor the host's clock; left out.
+        n_late: packets out of order or sent twice; skipped.
+        n_astray: packets whose time fits neither the counter nor the host's clock; skipped.
         n_steps: how often the sensor's clock was set.
     """
 
@@ -46,7 +46,7 @@ class PacketOrder:
 
     Attributes:
         counts: what was found so far.
-        elapsed_ns: of the counter since the first packet; hours are counted on, and steps left out.
+        elapsed_ns: of the counter since the first packet; hours are counted on, and steps excluded.
     """
 
     def __init__(self) -> None:
@@ -57,9 +57,10 @@ class PacketOrder:
         self._steps_per_ns = 0.0
 
     def place(self, packet: DataPacket) -> Place:
-        """Say where the next packet that arrived belongs; HELD packets are to be left out.
+        """Say where the next packet that arrived belongs; HELD packets are to be skipped.
 
-        A packet that goes astray is damaged, unless the next one goes on from there: then the sensor's clock
+        A packet that goes astray is damaged, unless the next one continues from there: then the sensor's
+            clock
         was set, as it is when it locks to a pulse.
         """
         if self._last is None:
@@ -73,7 +74,7 @@ class PacketOrder:
             self.counts.n_late += 1
             return Place.HELD
         if self._held is not None and 1 <= self._packets_ahead(self._held, packet) <= _MAX_BLIND:
-            # The packet held back was sound, but the revolution that it belongs to is broken anyhow.
+            # The packet held back was sound, but the revolution that it belongs to is broken anyway.
             self._held = None
             self.counts.n_steps += 1
             return self._accept(packet, 0, Place.AFTER_STEP)
@@ -110,7 +111,7 @@ class PacketOrder:
         return n_ahead if is_on_grid and self._has_turned(before, after, n_ahead * spacing_ns) else 0
 
     def _has_turned(self, before: DataPacket, after: DataPacket, step_ns: int) -> bool:
-        """Tell whether the rotor turned as it should from the one's last block to the other's first."""
+        """Return whether the rotor turned as it should from the one's last block to the other's first."""
         half = velodyne.AZIMUTH_STEPS // 2
         steps_per_block = self._steps_per_ns * velodyne.BLOCK_NS
         expected = self._steps_per_ns * (step_ns - velodyne.packet_ns(before.is_dual)) + steps_per_block
@@ -127,7 +128,7 @@ def _gap_ns(before: DataPacket, after: DataPacket) -> int:
 
 
 def _agrees(before: DataPacket, after: DataPacket, step_ns: int) -> bool:
-    """Tell whether the host saw about the same time go by; it may not know."""
+    """Return whether the host saw about the same time go by; it may not know."""
     if not before.host_ns or not after.host_ns:
         return True
     return abs(after.host_ns - before.host_ns - step_ns) <= _MAX_DISAGREEMENT_NS

@@ -1,4 +1,4 @@
-"""Packets of a VLP-16, checked before they are believed: UDP carries whatever anybody sends to its port."""
+"""Checked packets of a VLP-16: UDP delivers anything sent to the port."""
 
 import re
 import struct
@@ -24,17 +24,22 @@ _RMC = re.compile(
 
 
 class BadPacketError(ValueError):
-    """A payload that is no packet of a VLP-16.
+    """A payload that is not a packet of a VLP-16.
 
-    The message is one of a few: they are counted by kind, and kinds must not grow with what anybody sends.
+    Attributes:
+        code: what is wrong, one of a few: they are counted by it, and must not grow with what anybody sends.
     """
+
+    def __init__(self, code: str) -> None:
+        super().__init__(code)
+        self.code = code
 
 
 class OtherModelError(BadPacketError):
-    """A sound packet of another Velodyne."""
+    """A valid packet of another Velodyne."""
 
     def __init__(self, model: str) -> None:
-        super().__init__(f"from a {model}")
+        super().__init__("packet.other_model")
         self.model = model
 
 
@@ -71,7 +76,7 @@ class DataPacket:
 
 @dataclass(frozen=True)
 class PositionPacket:
-    """What the sensor says of its clock.
+    """The sensor's report on its clock.
 
     Attributes:
         host_ns: arrival at the host; 0 where unknown.
@@ -101,28 +106,28 @@ def read_data_packet(payload: bytes | memoryview, host_ns: int) -> DataPacket:
         BadPacketError: it is damaged, or no data packet.
     """
     if len(payload) != velodyne.DATA_BYTES:
-        raise BadPacketError("of a wrong length")
-    # Twelve numbers at a time are faster without NumPy; packets come 754 times a second.
+        raise BadPacketError("packet.wrong_length")
+    # Twelve numbers at a time are faster without NumPy; packets come 754 times per second.
     *heads, us, mode, product = _HEADS.unpack_from(payload)
     flags, azimuth = heads[0::2], heads[1::2]
     if flags != _FLAGS:
-        raise BadPacketError("with a wrong block flag")
+        raise BadPacketError("packet.wrong_flag")
     if us >= velodyne.HOUR_US:
-        raise BadPacketError("with a time beyond the hour")
+        raise BadPacketError("packet.time_beyond_hour")
     if max(azimuth) >= velodyne.AZIMUTH_STEPS:
-        raise BadPacketError("with an azimuth beyond 360 deg")
+        raise BadPacketError("packet.azimuth_beyond_360")
     if product != velodyne.VLP16 and product in velodyne.PRODUCTS and mode in velodyne.RETURN_MODES:
         raise OtherModelError(velodyne.PRODUCTS[product])
     if product != velodyne.VLP16 or mode not in velodyne.RETURN_MODES:
-        raise BadPacketError("with unknown factory bytes (firmware before 3.0.29 sends none)")
+        raise BadPacketError("packet.unknown_factory_bytes")
     if not _is_even(azimuth, mode == velodyne.DUAL):
-        raise BadPacketError("with uneven azimuths")
+        raise BadPacketError("packet.uneven_azimuths")
     fields = np.frombuffer(payload, velodyne.DATA_PACKET)[0]
     return DataPacket(host_ns, us, mode, np.array(azimuth, np.int64), fields)
 
 
 def _is_even(azimuth: list[int], is_dual: bool) -> bool:
-    """Tell whether 12 blocks advance as those of a turning rotor."""
+    """Return whether 12 blocks advance as those of a turning rotor."""
     steps = [(b - a) % velodyne.AZIMUTH_STEPS for a, b in pairwise(azimuth)]
     if is_dual:
         if any(steps[0::2]):
@@ -143,16 +148,16 @@ def read_position_packet(payload: bytes | memoryview, host_ns: int) -> PositionP
     """Read what the sensor says of its clock.
 
     Raises:
-        BadPacketError: it is no position packet.
+        BadPacketError: it is not a position packet.
     """
     if len(payload) != velodyne.POSITION_BYTES:
-        raise BadPacketError("of a wrong length")
+        raise BadPacketError("packet.wrong_length")
     fields = np.frombuffer(payload, velodyne.POSITION_PACKET)[0]
     us, pps = int(fields["us"]), int(fields["pps"])
     if us >= velodyne.HOUR_US:
-        raise BadPacketError("with a time beyond the hour")
+        raise BadPacketError("packet.time_beyond_hour")
     if pps >= len(velodyne.PPS_STATES):
-        raise BadPacketError("with an unknown PPS state")
+        raise BadPacketError("packet.unknown_pps")
     raw = bytes(fields["nmea"]).split(b"\0")[0]
     nmea_s, is_fix = _read_rmc(raw)
     nmea = raw.strip().decode("ascii", "replace")

@@ -1,7 +1,7 @@
 """From data packets to points, by velodyne-decoder.
 
 What it does is kept, and said where it matters: it adds the vertical offsets of the lasers (up to 11 mm,
-which ROS 1 drivers leave out), and between two azimuths takes the rotor's mean speed over the packet, where
+which ROS 1 drivers omit), and between two azimuths takes the rotor's mean speed over the packet, where
 drivers interpolate block by block (up to 0.025 deg apart).
 """
 

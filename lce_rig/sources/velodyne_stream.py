@@ -7,6 +7,7 @@ import numpy as np
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
+from lce_rig.core.findings import Finding
 from lce_rig.rig import LidarSettings
 from lce_rig.sources.velodyne_clock import VelodyneClock
 from lce_rig.sources.velodyne_controls import read_controls
@@ -14,6 +15,7 @@ from lce_rig.sources.velodyne_order import OrderCounts, PacketOrder, Place
 from lce_rig.sources.velodyne_packet import (
     BadPacketError,
     DataPacket,
+    OtherModelError,
     read_data_packet,
     read_position_packet,
 )
@@ -21,7 +23,8 @@ from lce_rig.sources.velodyne_points import Vlp16Decoder, keep_brighter
 
 # A scan with more of its packets lost is not worth looking at.
 _MIN_COVERAGE = 0.5
-# Stamps by arrival and by the sensor may differ by a tenth of a second when one takes over from the other.
+# Timestamps by arrival and by the sensor may differ by a tenth of a second when one takes over from the
+# other.
 _MAX_OVERLAP_NS = 1_000_000_000
 
 
@@ -48,18 +51,20 @@ class _Piece:
 
 @dataclass
 class StreamCounts:
-    """What came, and what became of it.
+    """Counts of received packets and scans.
 
     Attributes:
         n_data: data packets that passed the checks.
         n_position: position packets that did.
         n_scans: revolutions handed on.
-        n_partial: revolutions left out because they had begun before, or the sensor's clock was set.
-        n_thin: revolutions left out because more than half of their packets were lost.
+        n_partial: revolutions skipped because they began before, or the sensor's clock was set.
+        n_thin: revolutions skipped because more than half of their packets were lost.
         n_empty: revolutions without a single return.
-        n_not_rising: scans left out because it turned out that those before were stamped late.
-        bad: packets left out, by what is wrong with them.
-        order: what the sensor's counter told.
+        n_not_rising: scans skipped because it turned out that those before were timestamped late.
+        bad: data packets skipped, by the code of what is wrong with them.
+        bad_positions: position packets skipped, likewise.
+        other_models: data packets of other models, by name.
+        order: packet order by the sensor's counter.
     """
 
     n_data: int = 0
@@ -70,15 +75,31 @@ class StreamCounts:
     n_empty: int = 0
     n_not_rising: int = 0
     bad: Counter[str] = field(default_factory=Counter)
+    bad_positions: Counter[str] = field(default_factory=Counter)
+    other_models: Counter[str] = field(default_factory=Counter)
     order: OrderCounts = field(default_factory=OrderCounts)
+
+    @property
+    def n_bad(self) -> int:
+        """Packets of both kinds skipped."""
+        return self.bad.total() + self.bad_positions.total()
+
+    def flaws(self) -> list[Finding]:
+        """List what was wrong with packets, each with how many."""
+        kinds = (("data", self.bad), ("position", self.bad_positions))
+        return [
+            Finding(code, "warning", figures={"n": n, "of": kind})
+            for kind, bad in kinds
+            for code, n in sorted(bad.items())
+        ]
 
 
 class Vlp16Stream:
-    """Puts packets of one sensor together.
+    """Assembles the packets of one sensor into scans.
 
     Attributes:
         counts: what came so far.
-        clock: what scans are stamped with.
+        clock: what scans are timestamped with.
         mode: return mode of the packet that came last, of velodyne.RETURN_MODES; 0 before the first.
         rotor_hz: speed of the rotor as it was last; 0 before the first packet.
 
@@ -107,7 +128,7 @@ class Vlp16Stream:
         try:
             packet = read_position_packet(payload, host_ns)
         except BadPacketError as error:
-            self.counts.bad[f"position packets {error}"] += 1
+            self.counts.bad_positions[error.code] += 1
             return
         self.counts.n_position += 1
         self.clock.see_position(packet)
@@ -122,7 +143,9 @@ class Vlp16Stream:
         try:
             packet = read_data_packet(payload, host_ns)
         except BadPacketError as error:
-            self.counts.bad[f"data packets {error}"] += 1
+            self.counts.bad[error.code] += 1
+            if isinstance(error, OtherModelError):
+                self.counts.other_models[error.model] += 1
             return None
         place = self._order.place(packet)
         if place is Place.HELD:
@@ -169,7 +192,7 @@ class Vlp16Stream:
         return closed or scan
 
     def _passed_cut_before(self, packet: DataPacket, elapsed_ns: int, past_cut: int) -> bool:
-        """Tell whether the rotor passed the cut between the last packet and this one."""
+        """Return whether the rotor passed the cut between the last packet and this one."""
         last = self._pieces[-1]
         before = self._past_cut(int(last.packet.azimuth[-1]))
         turned = packet.steps_per_ns * (elapsed_ns - last.elapsed_ns)
@@ -220,7 +243,7 @@ class Vlp16Stream:
         )
 
     def _rises(self, stamp_ns: int | None) -> bool:
-        """Tell whether a stamp follows the one before; where a clock is set back far, stamps start anew."""
+        """Return whether a timestamp follows the one before; a clock that is set back far starts again."""
         last_ns = self._last_stamp_ns
         if stamp_ns is None or (last_ns is not None and 0 <= last_ns - stamp_ns < _MAX_OVERLAP_NS):
             return stamp_ns is None

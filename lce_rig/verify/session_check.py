@@ -1,4 +1,4 @@
-"""An extrinsic held against every capture of a session: residuals, one picture each, one sheet for all."""
+"""An extrinsic compared with every capture of a session: residuals, one image each, one sheet for all."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 
 from lce_rig.calibrate import Clocks
-from lce_rig.calibrate.estimate import CaptureResidual
 from lce_rig.calibrate.matching import match_candidates
 from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.calibrate.options import CaptureCandidates
 from lce_rig.calibrate.verdict import residuals_beyond
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SessionError
-from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, Metrics, Observation
+from lce_rig.core.results import Calibration, CaptureResidual, ImageBoard, LidarBoard, Metrics, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
@@ -24,35 +23,36 @@ from lce_rig.verify.event_picture import CameraView
 from lce_rig.verify.moving import Meeting, bring_together
 from lce_rig.verify.overlay import camera_part, draw_overlay
 from lce_rig.verify.writing import write_overlays
+from lce_rig.words import describe
 
 Progress = Callable[[int, int], None]
 # Boards that a wrong extrinsic puts a little off are measured; what lies farther away is another thing.
 _ELSEWHERE_M = 0.5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SessionCheck:
-    """How an extrinsic fits the captures of a session.
+    """How an extrinsic fits what one channel and the LiDAR saw in the captures of a session.
 
     Attributes:
         pair: the sensors.
-        verdict: of the calibration that is checked.
+        calibration: that is checked.
         doubts: why these captures contradict it; empty where they agree.
         residuals: of each capture in which both sensors see the board.
         metrics: their summary; None without any.
-        used: captures that the calibration was fitted to.
-        pictures: one a capture.
-        contact_sheet: all of them on one sheet.
+        meetings: by capture, the boards behind the residuals.
+        pictures: one a capture, once they are drawn.
+        contact_sheet: all of them on one sheet; None before.
     """
 
     pair: Pair
-    verdict: str
+    calibration: Calibration
     doubts: tuple[str, ...]
     residuals: tuple[CaptureResidual, ...]
     metrics: Metrics | None
-    used: tuple[str, ...]
-    pictures: tuple[Path, ...]
-    contact_sheet: Path | None
+    meetings: Mapping[str, Meeting]
+    pictures: tuple[Path, ...] = ()
+    contact_sheet: Path | None = None
 
     def moved(self, old: Path, new: Path) -> "SessionCheck":
         """Name the files by the folder that theirs has become."""
@@ -69,12 +69,12 @@ class SessionCheck:
             "camera": self.pair.camera,
             "channel": self.pair.channel,
             "lidar": self.pair.lidar,
-            "verdict": self.verdict,
+            "verdict": self.calibration.verdict,
             "doubts": list(self.doubts),
             "metrics": None
             if self.metrics is None
             else {**asdict(self.metrics), "mge_m": self.metrics.mge_m},
-            "captures": {r.capture: _figures(r, self.used) for r in self.residuals},
+            "captures": {r.capture: _figures(r, self.calibration.captures_used) for r in self.residuals},
             "pictures": [str(path) for path in self.pictures],
         }
 
@@ -85,67 +85,70 @@ def _figures(residual: CaptureResidual, used: tuple[str, ...]) -> dict[str, Any]
 
 
 def check_session(
-    session: Session,
-    detections: Detections,
-    calibration: Calibration,
-    channel: str,
-    folder: Path,
-    *,
-    clocks: Clocks,
-    view_of: Callable[[Capture], CameraView | None],
-    progress: Progress,
+    rig: Rig, detections: Detections, calibration: Calibration, channel: str, clocks: Clocks
 ) -> SessionCheck:
-    """Measure and draw how an extrinsic fits what one channel and the LiDAR saw in every capture.
+    """Measure how an extrinsic fits what one channel and the LiDAR saw in every capture of a session.
 
     Boards are brought to the time at which the LiDAR saw them, where the calibration did so.
 
     Args:
-        session: whose captures are looked at; the calibration may come from another of the same rig.
+        rig: the session's.
         detections: of the session.
-        calibration: the extrinsic.
+        calibration: the extrinsic; it may come from another session of the same rig.
         channel: of the calibration's channels.
-        folder: receives `<capture>.png` and `contact_sheet.png`.
         clocks: what the profile says of the two sensors' times.
+    """
+    pair = Pair(calibration.camera, channel, calibration.lidar)
+    board = rig.board.to_board()
+    meetings = _meetings(rig, detections, channel, calibration, clocks)
+    residuals = [
+        capture_residual(calibration.T_cam_lidar, meeting.at_sweep, board) for meeting in meetings.values()
+    ]
+    metrics = summarise(residuals) if residuals else None
+    n_seen = sum(_sees_board(detections, pair, name) for name in detections.captures(pair))
+    doubts = contradictions(metrics, rig, n_seen - len(residuals), n_seen)
+    return SessionCheck(pair, calibration, doubts, tuple(residuals), metrics, meetings)
+
+
+def draw_check(
+    session: Session,
+    detections: Detections,
+    check: SessionCheck,
+    folder: Path,
+    *,
+    view_of: Callable[[Capture], CameraView | None],
+    progress: Progress,
+) -> SessionCheck:
+    """Draw the LiDAR of every capture into its picture, and say where the pictures are.
+
+    Args:
+        session: whose captures are drawn.
+        detections: of the session.
+        check: of one channel on these captures.
+        folder: receives `<capture>.png` and `contact_sheet.png`.
         view_of: gives the channel's picture in a capture; None where it cannot be read.
         progress: called with (done, total).
 
     Raises:
         SessionError: a picture cannot be written.
     """
-    pair = Pair(calibration.camera, channel, calibration.lidar)
-    board = session.rig.board.to_board()
-    meetings = _meetings(session.rig, detections, channel, calibration, clocks)
-    residuals = {
-        name: capture_residual(calibration.T_cam_lidar, meeting.at_sweep, board)
-        for name, meeting in meetings.items()
-    }
+    residuals = {residual.capture: residual for residual in check.residuals}
 
     def overlays() -> Iterator[tuple[str, Picture, Picture]]:
-        names = detections.captures(pair)
+        names = detections.captures(check.pair)
         for done, name in enumerate(names, start=1):
             capture = session.capture(name)
-            view, (image, _) = view_of(capture), detections.of(pair, name)
+            view, (image, _) = view_of(capture), detections.of(check.pair, name)
             if view is not None:
-                title = f"{session.rig.name}  {pair}  {name}"
-                meeting = meetings.get(name)
-                legend = _legend(name, residuals.get(name), meeting, calibration)
+                title = f"{session.rig.name}  {check.pair}  {name}"
+                meeting = check.meetings.get(name)
+                legend = _legend(name, residuals.get(name), meeting, check.calibration)
                 seen = image if isinstance(image, ImageBoard) else None
-                yield from _draw(capture, session.rig, calibration, view, seen, meeting, legend, title)
+                yield from _draw(capture, session.rig, check.calibration, view, seen, meeting, legend, title)
             progress(done, len(names))
 
     files = write_overlays(folder, overlays())
-    metrics = summarise(list(residuals.values())) if residuals else None
-    n_seen = sum(_sees_board(detections, pair, name) for name in detections.captures(pair))
-    return SessionCheck(
-        pair,
-        calibration.verdict,
-        contradictions(metrics, session.rig, n_seen - len(residuals), n_seen),
-        tuple(residuals.values()),
-        metrics,
-        calibration.captures_used,
-        tuple(files[:-1]),
-        files[-1] if files else None,
-    )
+    return replace(check, pictures=tuple(files[:-1]), contact_sheet=files[-1] if files else None)
 
 
 def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: int) -> tuple[str, ...]:
@@ -158,7 +161,8 @@ def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: 
             LiDAR missed among other things of its size is no contradiction, many are.
         n_seen: captures in which both sensors saw something.
     """
-    doubts = [] if metrics is None else residuals_beyond(metrics, rig.quality)
+    beyond = [] if metrics is None else residuals_beyond(metrics, rig.quality)
+    doubts = [describe(finding) for finding in beyond]
     if 4 * n_elsewhere > n_seen:
         text = (
             f"in {n_elsewhere} of {n_seen} captures nothing in the scan is where the extrinsic puts the board"

@@ -4,6 +4,26 @@ Each family of codes has a module with a table PHRASES. A phrase is a template o
 a function where one template does not serve. Only screens, pages, reports and messages import this.
 """
 
-from lce_rig.words.rendering import Phrase, as_json, describe, recommend, sentence
+from lce_rig.words.rendering import (
+    Phrase,
+    as_json,
+    as_line,
+    describe,
+    enumerated,
+    is_renderable,
+    recommend,
+    refusal_as_json,
+    sentence,
+)
 
-__all__ = ["Phrase", "as_json", "describe", "recommend", "sentence"]
+__all__ = [
+    "Phrase",
+    "as_json",
+    "as_line",
+    "describe",
+    "enumerated",
+    "is_renderable",
+    "recommend",
+    "refusal_as_json",
+    "sentence",
+]

@@ -2,15 +2,18 @@
 
 import math
 import string
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Figure, Finding
 
-FAMILIES: tuple[str, ...] = ()
+if TYPE_CHECKING:
+    from lce_rig.core.results import Refusal
+
+FAMILIES: tuple[str, ...] = ("detection", "drivers", "doctor", "extrinsics")
 """Modules of this package with a table PHRASES of their own."""
 
 Template = str | Callable[[Finding], str]
@@ -45,6 +48,8 @@ class _Figures(string.Formatter):
     """Format figures; {rms_m:mm}, {tilt_deg:1deg}, {share:percent} scale and add the unit."""
 
     def format_field(self, value: Any, spec: str) -> str:
+        if value is None:
+            return "unknown"
         unit = next((unit for unit in _UNITS if spec.endswith(unit)), None)
         if unit is None:
             return str(format(value, spec))
@@ -85,16 +90,56 @@ def sentence(finding: Finding) -> str:
     return f"{describe(finding)}: {action}" if action else describe(finding)
 
 
+def as_line(text: str) -> str:
+    """Write words as a line of their own: a capital first, a full stop last."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+
+
+def enumerated(finding: Finding, reasons: Iterable[Finding]) -> str:
+    """Say what was found and what makes it so, in one line."""
+    return f"{describe(finding)}: {'; '.join(sentence(reason) for reason in reasons)}"
+
+
 def as_json(finding: Finding) -> dict[str, object]:
-    """Write a finding for programs: code, severity, subject and figures are stable, the text is not."""
+    """Write a finding for programs: texts may change, everything else is stable."""
     return {
         "code": finding.code,
         "severity": finding.severity,
         "subject": finding.subject,
-        "figures": dict(finding.figures),
+        "figures": {name: _finite(figure) for name, figure in finding.figures.items()},
+        "action_code": finding.action,
         "text": describe(finding),
         "action": recommend(finding),
     }
+
+
+def refusal_as_json(refusal: "Refusal") -> dict[str, object]:
+    """Write why a capture is refused for programs: stage, code, figures and action's code are stable."""
+    record = as_json(refusal)
+    return {
+        "stage": refusal.stage,
+        "code": refusal.code,
+        "figures": record["figures"],
+        "action_code": refusal.action,
+        "cause": record["text"],
+        "action": record["action"],
+    }
+
+
+def is_renderable(finding: Finding) -> bool:
+    """Tell whether code, figures and action of a finding, as a file gives them, have words here."""
+    try:
+        sentence(finding)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return False
+    return True
+
+
+def _finite(figure: Figure) -> Figure:
+    """Give None for a number that JSON has no word for."""
+    if isinstance(figure, tuple):
+        return tuple(_finite(each) for each in figure)
+    return None if isinstance(figure, float) and not math.isfinite(figure) else figure
 
 
 def _render(template: Template, finding: Finding) -> str:

@@ -140,7 +140,7 @@ def _see(rig: Rig, image: Image) -> ImageDetection:
     try:
         return BoardFinder(rig).image(image)
     except ProfileError as error:
-        return Refusal("image", error.what, error.hint)
+        return Refusal.of_error("image", error)
 
 
 def _gather(rig: Rig, truth: Array, captures: Iterator[SimulatedCapture]) -> Samples:

@@ -188,7 +188,7 @@ def _judge(
 
 
 def _calibrate(rig: Rig, found: Detections, method: Method) -> Calibration:
-    (calibration, _), *_ = pipeline.calibrate(rig, found, CalibrateOptions(method=method))[0]
+    calibration, *_ = pipeline.calibrate_detections(rig, found, CalibrateOptions(method=method))[0]
     return calibration
 
 

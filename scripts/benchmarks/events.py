@@ -11,7 +11,6 @@ import numpy as np
 
 from benchmarks.tables import compare, print_head, print_row, rms
 from lce_rig import pipeline
-from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference, transform
 from lce_rig.core.results import ImageBoard
@@ -129,7 +128,7 @@ def _assess(
         run.corner_px[channel] = list(_corner_errors(rig, channel, found, captures))
     for channels in choices:
         try:
-            calibration, _ = pipeline.calibrate(rig, detections, CalibrateOptions(), channels=channels)[0][0]
+            (calibration, *_), _ = pipeline.calibrate_detections(rig, detections, channels=channels)
         except NotEnoughDataError:
             continue
         deg, mm = compare(calibration.T_cam_lidar, truth)

@@ -59,11 +59,11 @@ class _Photographer:
     def _see(self, T_cam_board: Array) -> ImageDetection:
         pixels, is_valid = self.lens.project(transform(T_cam_board, self.corners))
         if not (is_valid.all() and self.lens.is_inside(pixels, 1.0).all()):
-            return Refusal("image", "the board leaves the picture", "move it into the picture")
+            return Refusal("image.near_border")
         pixels = pixels + _CORNER_SIGMA_PX[self.rig.name] * self.rng.standard_normal(pixels.shape)
         solved = solve_planar_pose(pixels, self.rig.board.to_board().corners(), _lens(self.rig))
         if solved is None or solved.reprojection_px > self.rig.quality.max_reprojection_px:
-            return Refusal("image", "corners fit no board", "check the intrinsics")
+            return Refusal("image.no_pose")
         return board_from_pose(pixels, solved)
 
 

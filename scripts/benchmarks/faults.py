@@ -76,7 +76,7 @@ def _calibrate(case: Case) -> Outcome:
     detections = pipeline.Detections({(camera, "frames"): case.images}, {lidar: case.scans})
     options = CalibrateOptions(n_draws=_N_DRAWS)
     try:
-        (calibration, _), *_ = pipeline.calibrate(rig, detections, options)[0]
+        calibration, *_ = pipeline.calibrate_detections(rig, detections, options)[0]
     except NotEnoughDataError as error:
         return Outcome("refused", float("inf"), (str(error),))
     rotation_deg, translation_mm = compare(calibration.T_cam_lidar, case.T_cam_lidar)

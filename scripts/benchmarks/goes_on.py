@@ -17,8 +17,7 @@ import numpy as np
 
 from benchmarks.tables import print_head, print_row
 from lce_rig.collect.guidance import HeldPose, Novelty, Person, View, build_pose, model_sensors
-from lce_rig.collect.live.collection import make_guides
-from lce_rig.collect.live.guide import Guide
+from lce_rig.collect.live.guide import Guide, make_guides
 from lce_rig.core.geometry import Array, rotation_angle
 from lce_rig.rig import Rig, load_rig
 from lce_rig.session import Session

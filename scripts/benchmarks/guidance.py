@@ -232,12 +232,12 @@ def judge_session(name: str, seed: int, visits: list[Visit], *, is_offset: bool)
     scans = {name: lengthen(visit.scan, offset_m) for name, visit in zip(names, visits, strict=True)}
     detections = pipeline.Detections({(camera, "frames"): images}, {lidar: scans})
     try:
-        result, estimate = pipeline.calibrate(rig, detections, CalibrateOptions(seed=seed))[0][0]
+        (result, *_), _ = pipeline.calibrate_detections(rig, detections, CalibrateOptions(seed=seed))
     except NotEnoughDataError:
         return
-    used = np.array([v.T_cam_board for n, v in zip(names, visits, strict=True) if n in estimate.used])
+    used = np.array([v.T_cam_board for n, v in zip(names, visits, strict=True) if n in result.captures_used])
     model = model_sensors(rig, camera, lidar)
-    figures = estimate.diagnostics
+    figures = result.diagnostics
     errors = model.errors.learned(figures["fit_plane_rms_m"], figures["fit_edge_rms_m"], len(used))
     errors = errors if is_offset else replace(errors, range_offset_m=0.0)
     nominal = rig.nominal(camera, lidar)
@@ -246,7 +246,7 @@ def judge_session(name: str, seed: int, visits: list[Visit], *, is_offset: bool)
     rotation, translation = sigmas(combine(evidence, errors).cov)
     truth = truth_extrinsics(rig, seed, SimulationOptions.for_rig(name))[camera, lidar]
     yield Outcome(
-        difference(estimate.T_cam_lidar, truth),
+        difference(result.T_cam_lidar, truth),
         (float(rotation), float(translation)),
         (float(np.radians(result.sigma_rotation_deg)), result.sigma_translation_m),
     )

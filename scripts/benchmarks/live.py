@@ -28,10 +28,11 @@ from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.sync import SyncSettings
 from lce_rig.session import Session
-from lce_rig.sources.live.base import LiveSource, SourceStatus
+from lce_rig.sources.live.base import SourceStatus
 from lce_rig.sources.live.davis import DavisSource
 from lce_rig.sources.live.davis_device import OpenedCamera
 from lce_rig.sources.live.opening import open_live
+from lce_rig.sources.live.reading import LiveSource
 
 LOOPS_PER_HOLD = 10
 N_PLACEMENTS = 20
@@ -229,7 +230,7 @@ def print_load(load: Load) -> None:
     gaps_s = np.diff(load.shown_ns) * 1e-9
     latencies_s = load.report.latencies_s
     sent = load.sent
-    n_packets, n_events = lidar.figures["data_packets"], davis.figures["n_events"]
+    n_packets, n_events = lidar.n_packets or 0, davis.figures["n_events"]
     print_head("what", "figure")
     print_row("duration", f"{load.wall_s:.1f} s")
     print_row("packets sent, taken, lost by us", f"{sent['lidar']['sent']}, {n_packets:.0f}, {lidar.n_lost}")

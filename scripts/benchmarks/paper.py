@@ -2,12 +2,12 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.baselines import COMPARED, settings_of
 from benchmarks.paper_plots import (
     frame_errors,
     in_order,
@@ -30,26 +30,30 @@ from benchmarks.paper_recorded import Recording, errors_by_frames, open_recordin
 from benchmarks.paper_runs import MIDDLE_LEVEL, Run, measure, simulated_runs
 from benchmarks.paper_sets import LEVELS, N_CAPTURES, paper_set
 from benchmarks.tables import print_head, print_row, rms
-from lce_rig.calibrate import CalibrateOptions
-from lce_rig.calibrate.calibrate import METHODS
+from lce_rig.calibrate import Algorithm1Parts, EstimateSettings
 from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.residuals.features import FeatureSettings
 from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M
 
-# The final solution uses all captures: draws cost time and judge it, but do not change it.
-_NO_DRAWS = CalibrateOptions(method="paper", n_draws=0)
+
+def _changed(**parts: Any) -> EstimateSettings:
+    """Change parts of Algorithm 1; draws cost time and judge the solution, but do not change it."""
+    return EstimateSettings(n_draws=0, parts=Algorithm1Parts(**parts))
+
+
 # The paper's switches by the names of its table III, then ours.
-_VARIANTS: dict[str, dict[str, Any]] = {
-    "full (I = 100)": {"n_draws": 100},
-    "without point projection": {"point_projection": "none"},
-    "without uncertainty model": {"use_uncertainty": False},
-    "without point-to-plane": {"use_ptpl": False},
-    "without point-to-line": {"use_ptl": False},
-    "I = 1": {"n_draws": 1},
-    "I = 5": {"n_draws": 5},
-    "projection along the normal": {"point_projection": "normal"},
-    "without half step": {"half_step": False},
-    "without edge shift": {"edge_shift": "off"},
-    "without refusal of outliers": {"reject_outliers": False},
+_VARIANTS: dict[str, EstimateSettings] = {
+    "full (I = 100)": EstimateSettings(n_draws=100),
+    "without point projection": _changed(features=FeatureSettings(point_projection="none")),
+    "without uncertainty model": _changed(use_uncertainty=False),
+    "without point-to-plane": _changed(use_planes=False),
+    "without point-to-line": _changed(use_ends=False),
+    "I = 1": EstimateSettings(n_draws=1),
+    "I = 5": EstimateSettings(n_draws=5),
+    "projection along the normal": _changed(features=FeatureSettings(point_projection="normal")),
+    "without half step": _changed(features=FeatureSettings(half_step=False)),
+    "without edge shift": _changed(is_shift_free=False),
+    "without refusal of outliers": _changed(reject_outliers=False),
 }
 
 
@@ -65,11 +69,11 @@ def bench_paper(n_seeds: int, folder: Path, anew: Sequence[str] = (), only: str 
     if only in ("", "simulated"):
         _bench_simulated(n_seeds, folder, anew)
     if only != "simulated" and os.environ.get("LCE_RIG_DATA"):
-        _bench_recorded(open_recordings(folder, only), folder, anew or in_order(METHODS))
+        _bench_recorded(open_recordings(folder, only), folder, anew or in_order(COMPARED))
 
 
 def _bench_simulated(n_seeds: int, folder: Path, anew: Sequence[str]) -> None:
-    runs = simulated_runs(folder, n_seeds, list(METHODS), anew)
+    runs = simulated_runs(folder, n_seeds, COMPARED, anew)
     normals_deg = _normals_deg(folder, n_seeds)
     _print_noise(runs, normals_deg)
     _print_frames(runs)
@@ -79,8 +83,7 @@ def _bench_simulated(n_seeds: int, folder: Path, anew: Sequence[str]) -> None:
     print(f"\nAblation of Algorithm 1, simulated at level {MIDDLE_LEVEL}: deg / mm, rms over sets\n")
     print_head("", "error")
     sets = [paper_set(folder / "sets", seed) for seed in range(n_seeds)]
-    for variant, switches in _VARIANTS.items():
-        options = replace(_NO_DRAWS, **switches)
+    for variant, options in _VARIANTS.items():
         own = [measure(seen, variant, MIDDLE_LEVEL, k, N_CAPTURES, options) for k, seen in enumerate(sets)]
         deg, mm = (rms(np.array([getattr(run, name) for run in own])) for name in ("deg", "mm"))
         print_row(variant, f"{deg:.3f} / {mm:.2f}")
@@ -153,7 +156,7 @@ def _print_recorded(recordings: Sequence[Recording], methods: Sequence[str]) -> 
             name = recording.name if len(choices) == 1 else f"{recording.name} {' + '.join(channels)}"
             found = " + ".join(recording.count_found(channel) for channel in channels)
             for method in methods:
-                cells = _cells(recording, channels, CalibrateOptions(method=method))
+                cells = _cells(recording, channels, settings_of(method))
                 print_row(name, label_of(method), *cells, found)
             published = RECORDED.get((recording.name, channels[0]), {}) if len(channels) == 1 else {}
             for source, run in published.items():
@@ -168,7 +171,7 @@ def _print_recorded(recordings: Sequence[Recording], methods: Sequence[str]) -> 
                 )
 
 
-def _cells(recording: Recording, channels: Sequence[str], options: CalibrateOptions) -> list[str]:
+def _cells(recording: Recording, channels: Sequence[str], options: EstimateSettings) -> list[str]:
     try:
         deg, mm, mge_mm, paper_mm = recording.errors(recording.estimate(channels, options))
     except NotEnoughDataError as error:
@@ -180,8 +183,7 @@ def _print_ablation(recordings: Sequence[Recording]) -> None:
     names = [recording.name for recording in recordings]
     print("\nAblation of Algorithm 1 on recorded sets: EGT, deg / mm\n")
     print_head("", *names, *(f"{name}, {LCE_CALIB}" for name in names))
-    for variant, switches in _VARIANTS.items():
-        options = replace(_NO_DRAWS, **switches)
+    for variant, options in _VARIANTS.items():
         cells = []
         for recording in recordings:
             deg, mm, *_ = _cells(recording, ("frames",), options)

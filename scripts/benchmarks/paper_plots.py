@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.baselines import COMPARED
 from benchmarks.paper_published import (
     CORNERS,
     LCE_CALIB,
@@ -19,7 +20,6 @@ from benchmarks.paper_published import (
 from benchmarks.paper_runs import FRAME_COUNTS, MIDDLE_LEVEL, Run
 from benchmarks.paper_sets import LEVELS, N_CAPTURES
 from benchmarks.tables import rms
-from lce_rig.calibrate.calibrate import METHODS
 from lce_rig.core.geometry import Array
 from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M
 
@@ -132,7 +132,7 @@ def level_rms(
 
 
 def _style(method: str) -> dict[str, Any]:
-    k = in_order(METHODS).index(method)
+    k = in_order(COMPARED).index(method)
     return {"marker": _MARKERS[k], "color": _COLOURS[k], "label": label_of(method), **_LINE}
 
 

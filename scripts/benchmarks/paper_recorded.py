@@ -7,14 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.baselines import settings_of
 from benchmarks.paper_runs import paper_mge_m
 from benchmarks.recordings import SETS, RecordedSet, detect
 from benchmarks.tables import compare
 from lce_rig import pipeline
-from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate, CaptureCandidates, calibrate
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageBoard
+from lce_rig.core.results import Calibration, ImageBoard
 from lce_rig.pipeline import Detections
 from lce_rig.rig import Rig
 
@@ -45,12 +46,10 @@ class Recording:
         return f"{n_found} of {len(names)}"
 
     @property
-    def options(self) -> CalibrateOptions:
+    def options(self) -> EstimateSettings:
         """What the profile says of the LiDAR's errors."""
         (lidar,) = self.rig.lidars.values()
-        return CalibrateOptions(
-            laser_bias_sigma_m=lidar.laser_bias_sigma_m, range_offset_sigma_m=lidar.range_offset_sigma_m
-        )
+        return EstimateSettings.of(CalibrateOptions(), lidar)
 
     def candidates(self) -> list[CaptureCandidates]:
         """Gather the captures of the only channel in which both sensors found a board."""
@@ -62,16 +61,16 @@ class Recording:
             if isinstance(image, ImageBoard) and isinstance(scan, list)
         ]
 
-    def estimate(self, channels: Sequence[str], options: CalibrateOptions) -> CalibrationEstimate:
+    def estimate(self, channels: Sequence[str], options: CalibrateOptions) -> Calibration:
         """Calibrate as `lce-rig calibrate` does.
 
         Raises:
             NotEnoughDataError: the captures are too few or leave a direction undetermined.
         """
-        results, _ = pipeline.calibrate(self.rig, self.detections, options, channels=channels)
-        return results[0][1]
+        pairs, _ = pipeline.calibrate_detections(self.rig, self.detections, options, channels=channels)
+        return pairs[0]
 
-    def errors(self, estimate: CalibrationEstimate) -> tuple[float, float, float, float]:
+    def errors(self, estimate: Calibration) -> tuple[float, float, float, float]:
         """Give EGT in deg and mm, and MGE in mm, ours and as the paper counts it."""
         deg, mm = compare(estimate.T_cam_lidar, self.reference)
         board = self.rig.board.to_board()
@@ -99,9 +98,9 @@ def errors_by_frames(recording: Recording, counts: Sequence[int], methods: Seque
         for j in range(N_SUBSETS if n < len(every) else 1):
             subset = [every[i] for i in np.sort(rng.choice(len(every), n, replace=False))]
             for method in methods:
-                options = replace(recording.options, method=method, n_draws=0)
+                options = settings_of(method, replace(recording.options, n_draws=0))
                 try:
-                    T = calibrate(subset, board, options).T_cam_lidar
+                    T = fit_extrinsic(subset, board, options).T_cam_lidar
                 except NotEnoughDataError:
                     continue
                 errors[method][k, j] = compare(T, recording.reference)

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.baselines import settings_of
 from benchmarks.kept import kept_folder
 from benchmarks.paper_sets import LEVELS, N_CAPTURES, PaperSet, paper_rig, paper_set
 from benchmarks.tables import compare
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate, capture_residual
+from lce_rig.calibrate import CaptureCandidates, EstimateSettings, capture_residual, fit_extrinsic
 from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array
@@ -67,7 +68,7 @@ def simulated_runs(folder: Path, n_seeds: int, methods: Sequence[str], anew: Seq
         for level in LEVELS:
             counts = FRAME_COUNTS if level == MIDDLE_LEVEL else (N_CAPTURES,)
             for method in missing:
-                options = CalibrateOptions(method=method, n_draws=0)
+                options = settings_of(method, EstimateSettings(n_draws=0))
                 runs += [measure(seen, method, level, seed, n, options) for n in counts]
         print(f"set {seed + 1} of {n_seeds} done", file=sys.stderr, flush=True)
         write_runs(path, runs)
@@ -75,12 +76,12 @@ def simulated_runs(folder: Path, n_seeds: int, methods: Sequence[str], anew: Seq
 
 
 def measure(
-    seen: PaperSet, name: str, level: int, seed: int, n_captures: int, options: CalibrateOptions
+    seen: PaperSet, name: str, level: int, seed: int, n_captures: int, options: EstimateSettings
 ) -> Run:
     """Calibrate the first captures of a set at a level and hold the result against the truth."""
     board = paper_rig().board.to_board()
     try:
-        estimate = calibrate(_candidates(seen, level, n_captures), board, options)
+        estimate = fit_extrinsic(_candidates(seen, level, n_captures), board, options)
     except NotEnoughDataError:
         return Run(name, level, n_captures, seed, *[float("nan")] * 4)
     deg, mm = compare(estimate.T_cam_lidar, seen.T_cam_lidar)

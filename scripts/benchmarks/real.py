@@ -6,18 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.baselines import settings_of
 from benchmarks.recordings import SETS, RecordedSet, detect
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig import pipeline
-from lce_rig.calibrate import CalibrateOptions
-from lce_rig.calibrate.options import Method
+from lce_rig.calibrate import EstimateSettings
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.results import ImageBoard
 from lce_rig.pipeline import Detections
 from lce_rig.rig import Rig
 
 
-def bench_real(n_splits: int, only: str, method: Method) -> None:
+def bench_real(n_splits: int, only: str, method: str) -> None:
     """Tabulate every recorded set that is there, each channel alone and all together."""
     head = (
         "set, captures, picture, LiDAR, used, EGT deg, EGT mm, split deg, split mm, MGE mm, claimed deg / mm"
@@ -53,12 +53,12 @@ def _row(
     detections: Detections,
     channels: tuple[str, ...],
     n_splits: int,
-    method: Method,
+    method: str,
 ) -> tuple[object, ...]:
     pairs = [pair for pair in detections.pairs if pair.channel in channels]
     seen = [detections.of(pair, name) for pair in pairs for name in detections.captures(pair)]
-    options = CalibrateOptions(method=method)
-    calibration, _ = pipeline.calibrate(rig, detections, options, channels=channels)[0][0]
+    options = settings_of(method)
+    (calibration, *_), _ = pipeline.calibrate_detections(rig, detections, options, channels=channels)
     deg, mm = compare(calibration.T_cam_lidar, recorded.reference())
     split_deg, split_mm = _split_halves(rig, detections, channels, n_splits, method)
     return (
@@ -78,7 +78,7 @@ def _row(
 
 
 def _split_halves(
-    rig: Rig, detections: Detections, channels: tuple[str, ...], n_splits: int, method: Method
+    rig: Rig, detections: Detections, channels: tuple[str, ...], n_splits: int, method: str
 ) -> tuple[float, float]:
     """Calibrate random halves of the scans apart and give the rms of their differences, deg and mm."""
     rng = np.random.default_rng(0)
@@ -95,12 +95,12 @@ def _split_halves(
         halves = [{keys[i] for i in part} for part in np.array_split(order, 2)]
         try:
             T = [
-                pipeline.calibrate(
+                pipeline.calibrate_detections(
                     rig,
                     _only(detections, {n for n, key in prints.items() if key in half}),
-                    CalibrateOptions(n_draws=0, method=method),
+                    settings_of(method, EstimateSettings(n_draws=0)),
                     channels=channels,
-                )[0][0][0].T_cam_lidar
+                )[0][0].T_cam_lidar
                 for half in halves
             ]
         except NotEnoughDataError:
@@ -118,7 +118,7 @@ def _only(detections: Detections, names: set[str]) -> Detections:
 
 
 def _clock_rows(recorded: RecordedSet, rig: Rig, detections: Detections) -> Iterator[tuple[object, ...]]:
-    calibration, _ = pipeline.calibrate(rig, detections, CalibrateOptions())[0][0]
+    (calibration, *_), _ = pipeline.calibrate_detections(rig, detections)
     figures = calibration.diagnostics
     apart = f"{figures['channels_rotation_deg']:.2f} / {1000 * figures['channels_translation_m']:.1f}"
     for result in calibration.channel_results:

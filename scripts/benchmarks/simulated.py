@@ -45,9 +45,9 @@ def _simulated_runs(name: str, n_seeds: int, n_captures: int) -> Iterator[tuple[
             scans[f"{capture.index:06d}"] = BoardFinder(rig).scan(capture.scans[0])
         camera, lidar = next(iter(rig.cameras)), next(iter(rig.lidars))
         detections = pipeline.Detections({(camera, "frames"): images}, {lidar: scans})
-        calibration, estimate = pipeline.calibrate(rig, detections, CalibrateOptions(seed=seed))[0][0]
-        error = difference(estimate.T_cam_lidar, truth_extrinsics(rig, seed, options)[camera, lidar])
-        nees = float(error @ np.linalg.solve(estimate.cov, error))
+        (calibration, *_), _ = pipeline.calibrate_detections(rig, detections, CalibrateOptions(seed=seed))
+        error = difference(calibration.T_cam_lidar, truth_extrinsics(rig, seed, options)[camera, lidar])
+        nees = float(error @ np.linalg.solve(calibration.cov, error))
         yield (
             float(np.degrees(np.linalg.norm(error[3:]))),
             float(1000 * np.linalg.norm(error[:3])),

@@ -14,8 +14,7 @@ import numpy as np
 from benchmarks.recordings import SETS
 from benchmarks.tables import print_head, print_row
 from lce_rig import pipeline
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates
-from lce_rig.calibrate import calibrate as estimate_extrinsic
+from lce_rig.calibrate import CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.finder import BoardFinder
 
@@ -57,7 +56,7 @@ def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
     thirty = (candidates * 2)[:30]
     thirty = [CaptureCandidates(f"{k:06d}", c.image, c.lidar) for k, c in enumerate(thirty)]
     start = time.process_time()
-    estimate_extrinsic(thirty, board, CalibrateOptions(n_draws=100))
+    fit_extrinsic(thirty, board, EstimateSettings(n_draws=100))
     yield "Algorithm 1, N = 30, I = 100, with certificates", f"{time.process_time() - start:.2f} s"
 
 

@@ -10,15 +10,15 @@ from scipy.stats import chi2
 
 from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate
-from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, SHIFTS, EdgeRows
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.likelihood.end_density import density
 from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import stack_pictures
 from lce_rig.calibrate.likelihood.refine import to_extrinsic
-from lce_rig.calibrate.likelihood.scans import N_FIELDS, interior, stack_scans
 from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, Terms, assemble, linearise
+from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.geometry import Array, difference, invert
+from lce_rig.residuals.along_rays import N_FIELDS, N_SHIFTS, SHIFTS, EdgeRows, interior, stack_scans
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import LidarNoise, SimulationOptions
 
@@ -109,21 +109,16 @@ def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[R
     rig = load_rig(case.rig)
     board = rig.board.to_board()
     lidar = next(iter(rig.lidars.values()))
-    options = CalibrateOptions(
-        method="ml",
-        n_draws=0,
-        laser_bias_sigma_m=lidar.laser_bias_sigma_m,
-        range_offset_sigma_m=lidar.range_offset_sigma_m,
-    )
+    options = EstimateSettings.of(CalibrateOptions("ml", n_draws=0), lidar)
     sessions = [
         still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder)
         for seed in range(n_seeds)
     ]
     at_truth = [_at_truth(rig, session) for session in sessions]
     levels = _true_levels(case.options().lidar_noise, [terms.edges for terms in at_truth])
-    priors = Priors(offset_m=options.range_offset_sigma_m, shift_m=options.edge_shift_sigma_m)
+    priors = Priors(offset_m=options.range_offset_sigma_m, shift_m=EDGE_SHIFT_SIGMA_M)
     for session, terms in zip(sessions, at_truth, strict=True):
-        estimate = calibrate(session.candidates, board, options)
+        estimate = fit_extrinsic(session.candidates, board, options)
         bound = cramer_rao_bound(terms, levels, priors, session.T_cam_lidar)
         yield Run(difference(estimate.T_cam_lidar, session.T_cam_lidar), estimate.cov, bound)
 
@@ -140,7 +135,7 @@ def cramer_rao_bound(terms: Terms, levels: Levels, priors: Priors, T_cam_lidar: 
         priors: of the constant errors.
         T_cam_lidar: (4, 4) the truth.
     """
-    information = assemble(terms, levels, priors).information
+    information = assemble(terms, levels, priors).cost.information
     J = to_extrinsic(T_cam_lidar, 0, len(information))
     return np.asarray(J @ np.linalg.inv(information) @ J.T)
 

@@ -245,11 +245,11 @@ def _result(folder: Path) -> None:
     from lce_rig.export.result import read_result, result_text
 
     saved = read_result(folder / "result.json")
-    for calibration in saved.calibrations:
+    for calibration in saved.pairs:
         sanity.check_pose(calibration.T_cam_lidar)
         sanity.require(calibration.cov.shape == (6, 6), "a covariance of another shape")
         require_known(calibration, small_rig())
-    result_text(saved.rig, saved.calibrations, saved.inputs_sha256)
+    result_text(saved.rig, saved.pairs, saved.inputs_sha256)
 
 
 def _reference(folder: Path) -> None:

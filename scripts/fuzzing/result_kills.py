@@ -20,7 +20,7 @@ from pathlib import Path
 
 from fuzzing.report import Report
 from lce_rig.core.errors import LceRigError
-from lce_rig.export import write_exports
+from lce_rig.export import export
 from lce_rig.export.result import read_result
 from lce_rig.rig import load_rig
 
@@ -51,7 +51,7 @@ class Verb:
 
 
 VERBS = {
-    "calibrate": Verb("calibration", (("--draws", "5"), ("--draws", "5", "--no-half-step"))),
+    "calibrate": Verb("calibration", (("--draws", "5"), ("--draws", "5", "--method", "ml"))),
     "verify": Verb("calibration/overlays", ((), ())),
     "intrinsics": Verb("intrinsics", (("--model", "radtan5"), ("--model", "rational"))),
 }
@@ -165,8 +165,8 @@ def _misread(session: Path, folder: Path) -> list[str]:
     try:
         saved = read_result(folder / "result.json")
         with tempfile.TemporaryDirectory() as own:
-            usable = [c for c in saved.calibrations if c.verdict != "fail"]
-            write_exports(usable, load_rig(session / "rig.yaml"), Path(own))
+            usable = [c for c in saved.pairs if c.verdict != "fail"]
+            export(usable, load_rig(session / "rig.yaml"), Path(own))
             exports = content_of(Path(own))
     except LceRigError as error:
         return [str(error)]

@@ -68,7 +68,7 @@ def cache_entries(_samples: Samples) -> list[Files]:
     items: Iterable[Any] = (
         _filled(ImageBoard, rng),
         [_filled(LidarBoard, rng)],
-        Refusal("image", "no board", "show it"),
+        Refusal("image.no_events"),
     )
     seeds = []
     for item in items:
@@ -123,7 +123,7 @@ def calibration() -> Calibration:
         n_captures=4,
         n_detected=3,
         captures_used=("000000", "000002"),
-        captures_refused={"000003": Refusal("calibrate", "12 cm off", "repeat it")},
+        captures_refused={"000003": Refusal("pair.no_candidate")},
         verdict="pass",
         reasons=(),
         diagnostics={"split_half_deg": 0.1, "b": 1 / 3},
@@ -162,10 +162,10 @@ def truth(samples: Samples) -> list[Files]:
 
 def exports(_samples: Samples) -> list[Files]:
     """Every file of a result."""
-    from lce_rig.export import write_exports
+    from lce_rig.export import export
 
     with tempfile.TemporaryDirectory() as folder:
-        write_exports([calibration()], small_rig(), Path(folder))
+        export([calibration()], small_rig(), Path(folder))
         return [files_in(Path(folder))]
 
 

@@ -71,10 +71,7 @@ def test_three_rivals_at_every_capture_and_a_third_of_them_without_the_board_are
     assert all(found[item.capture] is item.lidar[-1] for item in right)
     for capture, refusal in consensus.refused.items():
         assert int(capture) % 3 == 0
-        assert refusal.stage == "pair"
-        assert "best of 3 places" in refusal.cause
-        assert "cm" in refusal.cause
-        assert refusal.action
+        assert (refusal.code, refusal.figures["n_candidates"]) == ("pair.elsewhere", 3)
 
 
 def test_the_second_pose_is_taken_where_the_picture_chose_the_wrong_one():

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, Clocks, calibrate, calibrate_channels
+from lce_rig.calibrate import Clocks, EstimateSettings, calibrate_channels, fit_extrinsic
 from lce_rig.calibrate.motion import deskew, fit_motions, sample_poses
 from lce_rig.core.geometry import Array, difference, invert
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, random_pose, scan_board
 from tests.calibrate.moving_boards import Moving, simulate_moving, skew
 
-OPTIONS = CalibrateOptions(n_draws=0)
+OPTIONS = EstimateSettings(n_draws=0)
 TRACKED = Moving(tracked=("events",))
 
 
@@ -94,8 +94,10 @@ def test_time_offsets_are_found_from_two_pictures_a_capture():
 
 
 def test_compensation_brings_the_error_of_moving_boards_down_to_that_of_still_ones(followed):
-    compensated = [errors(result.estimate.T_cam_lidar) for _, result in followed]
-    plain = [errors(calibrate(captures["events"], BOARD, OPTIONS).T_cam_lidar) for captures, _ in followed]
+    compensated = [errors(result.T_cam_lidar) for _, result in followed]
+    plain = [
+        errors(fit_extrinsic(captures["events"], BOARD, OPTIONS).T_cam_lidar) for captures, _ in followed
+    ]
     rms, plain_rms = (np.sqrt(np.mean(np.square(e), axis=0)) for e in (compensated, plain))
     assert np.all(rms < plain_rms / 2)
     assert np.all(rms < [0.07, 2.5])
@@ -104,8 +106,8 @@ def test_compensation_brings_the_error_of_moving_boards_down_to_that_of_still_on
 def test_the_extrinsics_covariance_covers_boards_that_moved(followed):
     nees = []
     for _, result in followed:
-        off = difference(result.estimate.T_cam_lidar, T_FORWARD)
-        nees.append(off @ np.linalg.solve(result.estimate.cov, off))
+        off = difference(result.T_cam_lidar, T_FORWARD)
+        nees.append(off @ np.linalg.solve(result.cov, off))
     # The mean of four chi-squared variables of six freedoms lies between these with 99.9 %.
     assert 1.9 < np.mean(nees) < 13.0
 
@@ -122,7 +124,7 @@ def test_a_channel_that_is_followed_is_compensated_alone():
     (events,) = result.channels
     assert abs(events.time_offset_s - 0.06) < 4 * events.time_offset_sigma_s
     assert events.depth_scatter_m < events.depth_scatter_still_m / 3
-    assert np.all(errors(result.estimate.T_cam_lidar) < [0.1, 4.0])
+    assert np.all(errors(result.T_cam_lidar) < [0.1, 4.0])
 
 
 def test_the_expected_offset_of_the_profile_is_taken_off_first():
@@ -137,8 +139,7 @@ def test_pictures_without_stamps_are_timed_by_the_motion_between_channels():
     captures = simulate_moving(25, 0, moving)
     result = calibrate_channels(captures, BOARD, OPTIONS, Clocks())
     assert np.all(
-        errors(result.estimate.T_cam_lidar)
-        < errors(calibrate(captures["frames"], BOARD, OPTIONS).T_cam_lidar)
+        errors(result.T_cam_lidar) < errors(fit_extrinsic(captures["frames"], BOARD, OPTIONS).T_cam_lidar)
     )
     for channel in result.channels:
         assert abs(channel.time_offset_s - dict(moving.offset_s)[channel.channel]) < 0.02
@@ -147,18 +148,18 @@ def test_pictures_without_stamps_are_timed_by_the_motion_between_channels():
 def test_boards_that_stand_still_are_not_moved_and_say_nothing_of_time():
     captures = simulate_moving(20, 4, Moving(speed_mps=0.0, turn_deg_s=0.0))
     together = calibrate_channels(captures, BOARD, OPTIONS, Clocks())
-    assert np.all(errors(together.estimate.T_cam_lidar) < [0.06, 2.5])
+    assert np.all(errors(together.T_cam_lidar) < [0.06, 2.5])
     assert all(channel.time_offset_s is None for channel in together.channels)
 
 
 def test_one_channel_that_is_not_followed_is_calibrated_as_before():
     captures = simulate_moving(12, 0)["frames"]
-    plain = calibrate(captures, BOARD, OPTIONS)
+    plain = fit_extrinsic(captures, BOARD, OPTIONS)
     result = calibrate_channels({"frames": captures}, BOARD, OPTIONS, Clocks())
-    np.testing.assert_array_equal(result.estimate.T_cam_lidar, plain.T_cam_lidar)
-    np.testing.assert_array_equal(result.estimate.cov, plain.cov)
+    np.testing.assert_array_equal(result.T_cam_lidar, plain.T_cam_lidar)
+    np.testing.assert_array_equal(result.cov, plain.cov)
     assert result.channels[0].time_offset_s is None
-    assert result.difference is None
+    assert result.channel_difference is None
 
 
 def test_pictures_that_read_the_board_upside_down_are_turned(followed):
@@ -170,16 +171,16 @@ def test_pictures_that_read_the_board_upside_down_are_turned(followed):
         else item
         for k, item in enumerate(captures["events"])
     ]
-    turned = calibrate_channels({**captures, "events": flipped}, BOARD, OPTIONS, Clocks()).estimate
-    np.testing.assert_allclose(turned.T_cam_lidar, right.estimate.T_cam_lidar, atol=1e-6)
+    turned = calibrate_channels({**captures, "events": flipped}, BOARD, OPTIONS, Clocks())
+    np.testing.assert_allclose(turned.T_cam_lidar, right.T_cam_lidar, atol=1e-6)
 
 
 def test_the_same_scan_in_two_captures_is_one_placement_seen_twice():
     captures = simulate_moving(15, 0)
     elsewhere = [replace(item, capture=f"1{item.capture[1:]}") for item in captures["events"]]
     result = calibrate_channels({"frames": captures["frames"], "events": elsewhere}, BOARD, OPTIONS, Clocks())
-    assert len(result.estimate.used) == 15
-    assert "000003+100003" in result.estimate.used
+    assert len(result.used) == 15
+    assert "000003+100003" in result.used
 
 
 def test_channels_that_put_the_camera_in_two_places_are_held_against_each_other(followed):
@@ -189,8 +190,9 @@ def test_channels_that_put_the_camera_in_two_places_are_held_against_each_other(
     )
 
     def surprise(result):
-        return result.difference @ np.linalg.solve(result.difference_cov, result.difference)
+        apart = result.channel_difference
+        return apart @ np.linalg.solve(result.channel_difference_cov, apart)
 
     assert all(surprise(result) < 16.81 for _, result in followed)
     assert surprise(moved) > 50
-    assert np.degrees(np.linalg.norm(moved.difference[3:])) == pytest.approx(1.0, abs=0.3)
+    assert np.degrees(np.linalg.norm(moved.channel_difference[3:])) == pytest.approx(1.0, abs=0.3)

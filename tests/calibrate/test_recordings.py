@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate, error_to_reference
+from lce_rig.calibrate import CaptureCandidates, EstimateSettings, error_to_reference, fit_extrinsic
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.pcd import decode_pcd
 from lce_rig.core.results import Refusal
@@ -54,7 +54,7 @@ def detect(folder: Path, rig: Rig) -> list[CaptureCandidates]:
 )
 def test_the_extrinsic_is_near_the_reference(recordings, recording, profile, n_captures, max_deg, max_m):
     rig = load_rig(profile)
-    estimate = calibrate(detect(recordings / recording, rig), rig.board.to_board())
+    estimate = fit_extrinsic(detect(recordings / recording, rig), rig.board.to_board())
     reference = np.array(json.loads((recordings / recording / "reference.json").read_text())["T_cam_lidar"])
     angle_deg, distance_m = error_to_reference(estimate.T_cam_lidar, reference)
     assert angle_deg <= max_deg
@@ -71,7 +71,7 @@ def test_random_halves_of_a_recording_agree(recordings):
     for _ in range(20):
         order = rng.permutation(len(captures))
         halves = [[captures[k] for k in half] for half in np.array_split(order, 2)]
-        T = [calibrate(half, board, CalibrateOptions(n_draws=5)).T_cam_lidar for half in halves]
+        T = [fit_extrinsic(half, board, EstimateSettings(n_draws=5)).T_cam_lidar for half in halves]
         differences.append(error_to_reference(*T))
     angle_deg, distance_m = np.sqrt(np.mean(np.square(differences), axis=0))
     assert angle_deg <= 0.25

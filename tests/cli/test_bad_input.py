@@ -39,7 +39,7 @@ def test_inner_corners_counted_wrongly_are_named_with_what_is_seen(lce_rig, sess
     edit_profile(session, board__inner_corners=[8, 5])
     outcome = lce_rig("calibrate", session)
     assert outcome.code == 6
-    assert "8x5 inner corners wanted, 9x6 seen" in outcome.err
+    assert "8x5" in outcome.err and "9x6" in outcome.err
 
 
 @pytest.mark.parametrize(("square_m", "measured"), [(0.064, "6[78]"), (0.072, "6[78]")])

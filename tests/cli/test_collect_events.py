@@ -5,10 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from lce_rig.core.data import Events, Image
+from lce_rig.core.data import Events, Image, Sample
 from lce_rig.session import Session
 from lce_rig.sources.bag_recorder import BagRecorder
-from lce_rig.sources.base import Sample
 from lce_rig.sources.events.aedat4_writer import Aedat4Writer, write_aedat4
 from tests.collect import simulated_moves as moves
 from tests.sources.events.aedat4_files import RawFrame, write_davis

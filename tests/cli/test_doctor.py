@@ -16,8 +16,10 @@ from pathlib import Path
 
 import pytest
 
+from lce_rig.core.findings import Finding
 from lce_rig.rig import dump_rig
 from lce_rig.simulate.vlp16_packets import Vlp16Clock
+from lce_rig.words import Phrase, rendering, sentence
 from tests.collect.health.attached import Attached, attach, picture_of, scan_of
 from tests.collect.health.observed import make_rig
 
@@ -37,7 +39,7 @@ def test_absent_devices_are_red_with_what_to_check_and_exit_with_5(lce_rig, abse
     assert done.code == 5
     for group in ("lidar", "cam", "sync"):
         assert any(line.startswith(f"FAIL {group} ") for line in done.out.splitlines())
-    assert "-> Check plug and cable, and sync.device" in done.out
+    assert "sync.device" in done.out
     assert str(tmp_path) in done.out
     assert "3 FAIL" in done.out.splitlines()[-1]
     assert "watching lidar, cam, sync" in done.err
@@ -58,17 +60,20 @@ def test_on_a_small_terminal_lines_that_are_ok_share_one(absent):
     lines = re.sub(r"\x1b\[[0-9;]*m", "", screen).splitlines()
     assert max(map(len, lines)) <= n_columns
     folded = next(line for line in lines if line.startswith("ok   computer"))
-    assert "python, packages, libraries" in folded
+    assert all(name in folded for name in ("python", "packages", "libraries"))
     assert sum(line.startswith("FAIL") for line in lines) == 3
 
 
 def test_json_holds_every_line_with_its_figures(lce_rig, absent):
     done = lce_rig("doctor", "--rig", absent, "--duration", "1", "--json")
     document = json.loads(done.out)
-    assert (done.code, document["severity"], document["rig"]) == (5, "red", "attached")
-    lines = {(line["group"], line["name"]): line for line in document["checks"]}
-    assert lines["computer", "disk"]["values"]["free_mb"] > 0
-    assert lines["lidar", "device"]["severity"] == "red" and lines["lidar", "device"]["remedy"]
+    assert (done.code, document["severity"], document["rig"]) == (5, "error", "attached")
+    assert document["format_version"] == 2
+    lines = {(line["subject"], line["name"]): line for line in document["checks"]}
+    assert lines["computer", "disk"]["findings"][0]["figures"]["free_mb"] > 0
+    (failed,) = lines["lidar", "device"]["findings"]
+    assert (failed["code"], failed["severity"], failed["subject"]) == ("sensor.failed", "error", "lidar")
+    assert failed["text"] and failed["action"]
 
 
 def test_warnings_alone_exit_with_0(lce_rig, tmp_path):
@@ -85,9 +90,55 @@ def test_warnings_alone_exit_with_0(lce_rig, tmp_path):
                 break
     marks = {tuple(line.split()[:2]): line for line in done.out.splitlines()}
     assert ("ok", "lidar") in marks and ("ok", "cam") in marks
-    assert marks["warn", "PPS"].split()[2].startswith("absent")
+    assert "absent" in marks["warn", "PPS"]
     assert "FAIL" not in done.out and done.code == 0
-    assert done.out.splitlines()[-1].endswith("fit to collect, with the limits above")
+    assert "warn" in done.out.splitlines()[-1]
+
+
+BUSY = {("computer", "disk"), *((name, "stream") for name in ("lidar", "cam")), ("cam", "pulses")}
+BUSY |= {("sync", "pulses"), ("sync", "clock"), ("rig", "clocks"), ("rig", "sync")}
+"""Lines that depend on how busy the computer is, and on what the board has been told before."""
+
+
+@pytest.fixture
+def mute(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every rendered text is its code alone."""
+    told = {
+        code: Phrase(code, code, dict.fromkeys(phrase.actions or (), code))
+        for code, phrase in rendering.phrases().items()
+    }
+    monkeypatch.setattr(rendering, "phrases", lambda: told)
+
+
+def judged(lce_rig, path: Path, n_lines: int) -> tuple[int, dict[tuple[str, str], tuple[str, list[str]]]]:
+    """Examine a rig; gives the exit code, and severity and codes by line."""
+    for duration_s in ("2", "6", "18"):  # longer where a computer that is busy with others sends too late
+        done = lce_rig("doctor", "--rig", path, "--duration", duration_s, "--json")
+        checks = json.loads(done.out)["checks"]
+        if len(checks) >= n_lines:
+            break
+    lines = {(each["subject"], each["name"]): each for each in checks}
+    return done.code, {
+        key: (line["severity"], [found["code"] for found in line["findings"]])
+        for key, line in lines.items()
+        if key not in BUSY
+    }
+
+
+@pytest.mark.parametrize("is_attached", [False, True])
+def test_words_decide_nothing(lce_rig, tmp_path, is_attached, request):
+    rig = make_rig()
+    board = rig.board.to_board()
+    unlocked = Vlp16Clock("absent", has_nmea=False, error_us=721_000_000)
+    there = Attached(rig, picture_of(board) // 6, scan_of(board, 2.2), unlocked)
+    path, n_lines = tmp_path / "rig.yaml", 20 if is_attached else 9
+    with attach(there if is_attached else Attached(rig, has_board=False), tmp_path) as (reached, _):
+        path.write_text(dump_rig(reached))
+        said = judged(lce_rig, path, n_lines)
+        request.getfixturevalue("mute")
+        assert sentence(Finding("clock.missing")) == "clock.missing: clock.missing"
+        assert judged(lce_rig, path, n_lines) == said
+    assert said[0] == 5 and said[1]["lidar", "PPS" if is_attached else "device"][0] == "error"
 
 
 def test_a_rig_without_driver_lines_says_what_to_add(lce_rig, tmp_path):
@@ -98,12 +149,12 @@ def test_a_rig_without_driver_lines_says_what_to_add(lce_rig, tmp_path):
     path.write_text(dump_rig(type(make_rig()).model_validate(document)))
     done = lce_rig("doctor", "--rig", path, "--duration", "1")
     assert done.code == 5
-    assert "Add to cameras.cam: driver: {type: v4l2, device: /dev/video0}" in done.out
+    assert "/dev/video0}" in done.out
 
 
 def test_help_says_what_the_exit_code_means(lce_rig):
     done = lce_rig("doctor", "--help")
-    assert done.code == 0 and "Exits with 5" in done.out
+    assert done.code == 0 and "with 5" in done.out
 
 
 def test_an_unknown_rig_is_an_error_of_the_profile(lce_rig):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lce_rig.cli.main import run
-from lce_rig.rig import load_rig
+from lce_rig.rig import find_profile, load_rig
 
 
 def test_called_bare_it_lists_the_profiles(capsys: pytest.CaptureFixture[str]) -> None:
@@ -24,13 +24,16 @@ def test_the_list_for_machines_is_json(capsys: pytest.CaptureFixture[str]) -> No
     assert rigs["rles"]["cameras"] == {"davis": ["frames", "events"]}
 
 
-def test_show_gives_the_figures_and_marks_what_is_not_default(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["rigs", "show", "rles"]) == 0
+def test_show_gives_the_figures_and_marks_what_is_not_default(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"{find_profile('rles').read_text(encoding='utf-8')}\nquality: {{min_rings: 7}}\n")
+    assert run(["rigs", "show", str(path)]) == 0
     out = capsys.readouterr().out
     assert all(text in out for text in ("davis/events", "9 x 6", "68 mm", "346x260"))
-    row = next(line for line in out.splitlines() if "calibration.edge_weight" in line)
-    assert "10" in row
-    assert "3" in row
+    row = next(line for line in out.splitlines() if "quality.min_rings" in line)
+    assert row.split()[1:] == ["7", "4"]
 
 
 def test_show_prints_a_profile_that_loads_again(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -130,12 +130,6 @@ def test_captures_of_another_session_never_count_as_used(lce_rig, calibrated_few
     assert not any(figures["was_used"] for figures in pair["captures"].values())
 
 
-def test_nothing_to_fit_is_a_usage_error(lce_rig, session):
-    outcome = lce_rig("calibrate", session, "--no-ptpl", "--no-ptl")
-    assert outcome.code == 2
-    assert "leave nothing to fit" in outcome.err
-
-
 def test_a_run_without_result_leaves_the_earlier_one_untouched_and_says_so(lce_rig, calibrated_few):
     lce_rig("verify", calibrated_few)
     folder = calibrated_few / "calibration"
@@ -245,11 +239,6 @@ def test_a_damaged_capture_is_named_and_the_others_still_count(lce_rig, session)
     assert "15 of 16 captures can be used" in outcome.out
     assert "000004: read:" in outcome.out
     assert "lidar.pcd" in outcome.out
-
-
-def test_switched_off_terms_still_calibrate(lce_rig, session):
-    for switch in ("--no-ptl", "--no-uncertainty", "--no-half-step"):
-        assert lce_rig("calibrate", session, switch, "--draws", "5").code in (0, 7), switch
 
 
 def test_simulating_into_a_session_that_exists_exits_with_4(lce_rig, session):

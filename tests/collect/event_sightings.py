@@ -4,12 +4,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lce_rig.collect.event_buffer import AFTER_NS, BEFORE_NS, EventBuffer
-from lce_rig.collect.pairing import Frame
 from lce_rig.collect.watching import Sighting
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.rig import Rig
+from lce_rig.timing.event_buffer import AFTER_NS, BEFORE_NS, EventBuffer
+from lce_rig.timing.scan_pairing import Frame
 
 T0_NS = 1_700_000_000 * 10**9
 S = 10**9

@@ -29,7 +29,7 @@ def test_two_stands_become_two_captures_and_the_way_between_none(collected, path
     path, report = collected
     captures = Session.open(path).captures
     assert report.captured == [c.name for c in captures] == ["000000", "000001"]
-    assert report.counts["the board stood as in a capture before"] == 1
+    assert report.counts.by_code()["calibrate.same_placement"] == 1
     assert not report.errors
     for capture, placement in zip(captures, (paths["left"], paths["right"]), strict=True):
         truth = paths["T_cam_lidar"] @ placement.to_pose()
@@ -83,7 +83,7 @@ def test_clocks_that_are_apart_are_said_and_bridged_by_the_profile(tmp_path, sta
     bag = write_bag(tmp_path / "a.bag", samples)
     with Session.create(tmp_path / "apart", rig) as session:
         report = collect(session, [open_recording(bag, rig)])
-    assert report.captured == [] and report.counts["no picture at the time of the scan"] == 9
+    assert report.captured == [] and report.counts.by_code()["read.no_image_at_scan"] == 9
     assert any("scans without a picture; the nearest was 2.2" in note for note in report.notes)
     channel = rig.cameras["cam"].channels["frames"]
     stamps = channel.timestamps.model_copy(update={"expected_offset_s": -3.0})

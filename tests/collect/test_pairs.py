@@ -70,7 +70,7 @@ def test_damaged_files_are_refused_with_their_cause_and_the_rest_is_captured(tmp
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, folder, rig)
     assert len(report.captured) == N_PAIRS - 2 and not report.errors
-    causes = {label: refusal.cause for label, refusal in report.refused.items()}
+    causes = {label: refusal.figures["what"] for label, refusal in report.refused.items()}
     assert "00001.png: it is a truncated PNG" in causes["00001.png + 00001.pcd"]
     assert "00002.pcd: it is truncated" in causes["00002.png + 00002.pcd"]
     assert {refusal.stage for refusal in report.refused.values()} == {"read"}

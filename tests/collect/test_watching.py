@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.collect.pairing import Frame
 from lce_rig.collect.stillness import StillnessOptions, find_still_moments
 from lce_rig.collect.watching import BoardWatcher, Moment, Sighting
 from lce_rig.core.geometry import transform
 from lce_rig.core.results import Refusal
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
+from lce_rig.timing.scan_pairing import Frame
 from tests.collect.live.replay import placements, rig
 
 T0_NS = 1_700_000_000_000_000_000
@@ -60,16 +60,16 @@ def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> 
     assert all(("davis", "frames") in each.images for each in seen)
     assert not any(each.is_usable for each in seen)
     refusal = seen[-1].unfit["davis", "frames"]
-    assert refusal.stage == "image" and "1000" in refusal.cause
+    assert refusal.code == "image.small_squares" and refusal.figures["min_square_px"] == 1000
     assert list(find_still_moments(seen, watcher.finder.board, StillnessOptions())) == []
-    assert sum(watcher.refusals.counts().values()) == 30
+    assert watcher.refusals.by_code()["image.small_squares"] == 30
 
 
 def test_candidates_beyond_the_profiles_limits_are_no_board_in_the_scan() -> None:
     watcher = BoardWatcher(strict(min_points=100_000), 0.3)
     sighting = see(watcher, 0, 0.0)
     assert sighting.images and not sighting.lidars and not sighting.is_usable
-    assert "100000 needed" in sighting.unscanned["lidar"].cause
+    assert sighting.unscanned["lidar"].figures["min_points"] == 100_000
 
 
 def test_live_and_offline_take_the_same_boards() -> None:

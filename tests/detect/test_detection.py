@@ -27,8 +27,19 @@ def test_boards_of_both_sensors_come_back_as_they_were():
 
 
 def test_a_refusal_comes_back_as_it_was():
-    refusal = Refusal("lidar", "2 rings on the board", "come 0.8 m closer")
+    refusal = Refusal(
+        "image.flat", figures={"n_cols": 9, "n_rows": 6, "grey_1": 1.5, "grey_99": 30.0}, action="events"
+    )
     assert from_arrays(to_arrays(refusal)) == refusal
+
+
+@pytest.mark.parametrize(
+    "refusal",
+    [Refusal("image.renamed"), Refusal("image.too_dark"), Refusal("image.no_events", action="otherwise")],
+)
+def test_a_refusal_that_has_no_words_is_no_detection(refusal):
+    with pytest.raises(ValueError, match="not a detection"):
+        from_arrays(to_arrays(refusal))
 
 
 def test_arrays_that_are_no_detection_are_refused():
@@ -39,7 +50,7 @@ def test_arrays_that_are_no_detection_are_refused():
 
 
 def test_a_pair_shares_the_captures_that_hold_samples_of_both_sensors():
-    refusal = Refusal("image", "no board", "show it")
+    refusal = Refusal("image.no_events")
     images = {
         ("cam", "frames"): {"000000": refusal, "000001": refusal},
         ("cam", "events"): {"000002": refusal},

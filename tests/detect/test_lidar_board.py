@@ -257,7 +257,7 @@ def test_empty_scan_is_refused_with_its_count():
     nothing = Scan("lidar", 0, np.zeros((3, 3), np.float32), np.zeros(3, np.float32), np.zeros(3, np.int16))
     refusal = find(nothing)
     assert isinstance(refusal, Refusal)
-    assert refusal.cause.startswith("3 points, none of them")
+    assert (refusal.code, refusal.figures["n_points"]) == ("lidar.no_returns", 3)
     assert isinstance(find(nothing.select(np.zeros(0, dtype=int))), Refusal)
 
 
@@ -265,29 +265,30 @@ def test_two_rings_are_refused_with_the_way_to_go():
     T = place(5.0, 30, 0, 0, 60)
     refusal = find(cast([board_plate(T), *room(16.0)], sigma_m=0.01))
     assert isinstance(refusal, Refusal)
-    assert "2 rings on the board at 5.0 m (4 needed)" in refusal.cause
-    assert refusal.action == "come 2.5 m closer"
+    assert (refusal.code, refusal.figures["n_rings"]) == ("lidar.too_few_rings", 2)
+    assert refusal.figure("closer_m") == pytest.approx(2.5, abs=0.05)
 
 
 def test_room_without_a_board_is_refused_with_the_size_that_was_sought():
     refusal = find(cast(ROOM, sigma_m=0.01))
     assert isinstance(refusal, Refusal)
-    assert "no plate of the board's size (0.77 x 0.63 m) between 0.4 and 6 m" in refusal.cause
+    assert refusal.code == "lidar.no_plate"
+    assert (refusal.figures["board_width_m"], refusal.figures["max_range_m"]) == (BOARD.width_m, 6.0)
 
 
 def test_plate_of_another_size_is_named_with_its_size():
     T = place(2.5, 30)
     refusal = find(cast([Plate(T, 0.92, 0.74), *ROOM], sigma_m=0.01))
     assert isinstance(refusal, Refusal)
-    assert "0.77 x 0.63 m" in refusal.cause
-    assert "rig profile" in refusal.action
+    assert refusal.code == "lidar.other_plate"
+    assert refusal.figure("width_m") == pytest.approx(0.92, abs=0.1)
 
 
 def test_board_that_is_part_of_a_larger_surface_is_refused():
     T = place(2.5, 30)
     refusal = find(cast([Plate(T, 1.42, 0.63), *ROOM], sigma_m=0.01))
     assert isinstance(refusal, Refusal)
-    assert "touches another surface" in refusal.cause
+    assert refusal.code == "lidar.touching"
 
 
 def test_bent_board_is_refused_for_its_thickness():
@@ -299,7 +300,7 @@ def test_bent_board_is_refused_for_its_thickness():
     bent = Scan("lidar", 0, transform(T, local).astype(np.float32), scan.intensity, scan.ring)
     refusal = find(bent)
     assert isinstance(refusal, Refusal)
-    assert "thick" in refusal.cause
+    assert refusal.code == "lidar.too_thick" and refusal.figure("rms_m") > refusal.figure("max_rms_m")
 
 
 def test_plate_with_much_else_in_its_plane_is_no_rival_of_a_clear_board():

@@ -37,7 +37,7 @@ def test_board_that_left_is_reported_lost():
     board = find_lidar_boards(view(place(2.5, 40)), BOARD, beam=BEAM)[0]
     refusal = track_lidar_board(view(place(2.5, 200)), BOARD, board, beam=BEAM)
     assert isinstance(refusal, Refusal)
-    assert refusal.cause.startswith("lost near its last place")
+    assert (refusal.code, refusal.figures["cause"]) == ("lidar.lost", "lidar.no_returns")
 
 
 def test_board_held_still_is_measured_as_well_as_by_the_full_search():

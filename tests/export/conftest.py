@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.core.results import Calibration, Certificate, Metrics, Refusal
 from lce_rig.rig import Rig, load_rig
@@ -34,6 +35,9 @@ def three_sensor_rig() -> Rig:
     return Rig.model_validate(data)
 
 
+_UNCERTAIN = {"sigma_deg": 0.3, "target_deg": 0.2, "by_axis_deg": (0.1, 0.2, 0.2), "weakest": "about x"}
+
+
 def calibration(T_cam_lidar: Array | None = None, **changes: Any) -> Calibration:
     """Build a plausible result."""
     sides = np.diag([1e-3, 1e-3, 2e-3, 1e-4, 2e-4, 1e-4])
@@ -50,11 +54,20 @@ def calibration(T_cam_lidar: Array | None = None, **changes: Any) -> Calibration
         "n_detected": 3,
         "captures_used": ("000000", "000002"),
         "captures_refused": {
-            "000003": Refusal("calibrate", "12 cm off", "repeat it"),
-            "000001": Refusal("lidar", "2 rings on the board", "come 0.8 m closer – näher"),
+            "000003": Refusal(
+                "calibrate.known_placement", figures={"capture": "000002", "instruction": "näher – ¼ m"}
+            ),
+            "000001": Refusal(
+                "lidar.too_few_rings",
+                figures={"n_rings": 2, "min_rings": 4, "distance_m": 1.6, "closer_m": 0.8},
+            ),
         },
         "verdict": "pass",
         "reasons": (),
+        "findings": (
+            Finding("verdict.widened", "note", figures={"ratio": 1.5, "spread": "halves"}),
+            Finding("verdict.rotation_uncertain", "warning", figures=_UNCERTAIN, action="measure_ranges"),
+        ),
         "diagnostics": {"split_half_deg": 0.1, "b": 1 / 3},
     }
     return Calibration(**(fields | changes))

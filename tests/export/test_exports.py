@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from lce_rig.core.errors import LceRigError, ResultRefusedError, UsageError
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.core.results import Calibration
-from lce_rig.export import EXPORTS, load_exporter, write_exports
+from lce_rig.export import EXPORTS, export, load_exporter
 from lce_rig.export.camera_info import read_camera_info
 from lce_rig.export.frames import T_BODY_OPTICAL, build_trees, check_tree
 from lce_rig.export.probes import check_pose, probe_points
@@ -46,7 +46,7 @@ def body_poses() -> Iterator[Any]:
 @given(T_lidar_body=body_poses())
 def test_every_format_survives_any_pose(rles: Rig, make: Make, tmp_path: Path, T_lidar_body: Array) -> None:
     T_cam_lidar = invert(T_lidar_body @ T_BODY_OPTICAL)
-    paths = write_exports([make(T_cam_lidar)], rles, tmp_path)
+    paths = export([make(T_cam_lidar)], rles, tmp_path)
     assert {path.name for path in paths} == {
         *("extrinsics.yaml", "rles.urdf", "camera_info_davis.yaml", "static_transforms.txt"),
         *("camchain_lidar.yaml", "sensor_kit_calibration.yaml"),
@@ -62,7 +62,7 @@ def test_extrinsics_agree_in_every_notation_and_the_worked_points_hold(
     rles: Rig, make: Make, tmp_path: Path
 ) -> None:
     calibration = make()
-    (path,) = write_exports([calibration], rles, tmp_path, formats=["extrinsics"])
+    (path,) = export([calibration], rles, tmp_path, formats=["extrinsics"])
     (pair,) = yaml.safe_load(path.read_text(encoding="utf-8"))["pairs"]
     for name, wanted in (
         ("T_cam_lidar", calibration.T_cam_lidar),
@@ -96,7 +96,7 @@ def test_camera_info_projects_as_opencv_does_for_every_lens(
     three_sensor_rig: Rig, make: Make, tmp_path: Path
 ) -> None:
     calibrations = [make(camera=name, lidar="front") for name in ("davis", "left", "fish")]
-    write_exports(calibrations, three_sensor_rig, tmp_path, formats=["camera_info"])
+    export(calibrations, three_sensor_rig, tmp_path, formats=["camera_info"])
     models = {"davis": ("plumb_bob", 5), "left": ("rational_polynomial", 8), "fish": ("equidistant", 4)}
     for calibration in calibrations:
         data = yaml.safe_load(
@@ -123,7 +123,7 @@ def test_camera_info_projects_as_opencv_does_for_every_lens(
 
 def test_static_transforms_for_both_ros_versions_say_the_same(rles: Rig, make: Make, tmp_path: Path) -> None:
     calibration = make()
-    (path,) = write_exports([calibration], rles, tmp_path, formats=["static_tf"])
+    (path,) = export([calibration], rles, tmp_path, formats=["static_tf"])
     text = path.read_text(encoding="utf-8")
     number = r"(-?\d\S*)"
     ros1 = re.findall(
@@ -156,7 +156,7 @@ def test_several_cameras_and_lidars_hang_in_one_tree_under_the_base(
     rig = three_sensor_rig.model_copy(update={"base_frame": base})
     pairs = [("davis", "front"), ("left", "front"), ("left", "back"), ("fish", "back")]
     calibrations = [make(random_pose(i), camera=c, lidar=lidar) for i, (c, lidar) in enumerate(pairs)]
-    paths = write_exports(calibrations, rig, tmp_path)
+    paths = export(calibrations, rig, tmp_path)
     assert [path.name for path in paths if path.suffix == ".urdf"] == ["trio.urdf"]
     poses = read_urdf(tmp_path / "trio.urdf")
     assert next(iter(poses)) == (base or "velodyne")
@@ -171,7 +171,7 @@ def test_sensors_that_no_calibration_connects_get_a_urdf_each(
     three_sensor_rig: Rig, make: Make, tmp_path: Path
 ) -> None:
     calibrations = [make(camera="davis", lidar="front"), make(camera="left", lidar="back")]
-    paths = write_exports(calibrations, three_sensor_rig, tmp_path, formats=["urdf"])
+    paths = export(calibrations, three_sensor_rig, tmp_path, formats=["urdf"])
     assert [path.name for path in paths] == ["trio.urdf", "trio-velodyne_back.urdf"]
 
 
@@ -180,7 +180,7 @@ def test_a_loop_of_calibrations_stays_a_tree(three_sensor_rig: Rig, make: Make, 
     calibrations = [make(random_pose(i), camera=c, lidar=lidar) for i, (c, lidar) in enumerate(pairs)]
     (tree,) = build_trees(calibrations, three_sensor_rig)
     check_tree(tree.frames, [(joint.parent, joint.child) for joint in tree.joints])
-    assert write_exports(calibrations, three_sensor_rig, tmp_path)
+    assert export(calibrations, three_sensor_rig, tmp_path)
 
 
 def test_of_two_channels_the_better_verdict_and_then_the_surer_gives_the_place(rles: Rig, make: Make) -> None:
@@ -213,11 +213,11 @@ def test_what_is_no_tree_is_named(links: list[str], joints: list[tuple[str, str]
 def test_a_result_that_failed_is_not_exported_and_removes_what_an_earlier_run_left(
     rles: Rig, make: Make, tmp_path: Path
 ) -> None:
-    write_exports([make()], rles, tmp_path)
+    export([make()], rles, tmp_path)
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     failed = make(verdict="fail", reasons=("translation known to 80 mm only",))
     with pytest.raises(ResultRefusedError, match="davis/frames and lidar failed") as caught:
-        write_exports([failed], rles, tmp_path)
+        export([failed], rles, tmp_path)
     assert "80 mm" in caught.value.hint
     assert caught.value.exit_code == 7
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
@@ -227,7 +227,7 @@ def test_a_forced_export_of_a_failed_result_says_so_in_every_file(
     rles: Rig, make: Make, tmp_path: Path
 ) -> None:
     failed = make(verdict="fail", reasons=("sigma -- 80 mm\nand more",))
-    paths = write_exports([failed], rles, tmp_path, is_forced=True)
+    paths = export([failed], rles, tmp_path, is_forced=True)
     assert len(paths) == len(EXPORTS)
     for path in paths:
         head = path.read_text(encoding="utf-8")[:500]
@@ -238,8 +238,8 @@ def test_a_forced_export_of_a_failed_result_says_so_in_every_file(
 
 
 def test_the_same_result_gives_the_same_bytes(rles: Rig, make: Make, tmp_path: Path) -> None:
-    first = {path.name: path.read_bytes() for path in write_exports([make()], rles, tmp_path / "a")}
-    second = {path.name: path.read_bytes() for path in write_exports([make()], rles, tmp_path / "b")}
+    first = {path.name: path.read_bytes() for path in export([make()], rles, tmp_path / "a")}
+    second = {path.name: path.read_bytes() for path in export([make()], rles, tmp_path / "b")}
     assert first == second
 
 
@@ -271,13 +271,13 @@ def test_digits_lost_on_the_way_to_the_file_are_noticed(
 def test_a_result_of_another_rig_is_refused(rles: Rig, make: Make, tmp_path: Path) -> None:
     for change in ({"camera": "cam"}, {"lidar": "other"}, {"channel": "depth"}):
         with pytest.raises(LceRigError, match="which rig rles does not have"):
-            write_exports([make(**change)], rles, tmp_path)
+            export([make(**change)], rles, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unknown_format_lists_the_known_ones(rles: Rig, make: Make, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no export format is called sdf"):
-        write_exports([make()], rles, tmp_path, formats=["sdf"])
+        export([make()], rles, tmp_path, formats=["sdf"])
 
 
 def test_kalibrs_chain_leads_from_each_camera_to_the_next(
@@ -285,7 +285,7 @@ def test_kalibrs_chain_leads_from_each_camera_to_the_next(
 ) -> None:
     names = ("davis", "left", "fish")
     calibrations = [make(random_pose(i), camera=name, lidar="front") for i, name in enumerate(names)]
-    (path,) = write_exports(calibrations, three_sensor_rig, tmp_path, formats=["kalibr"])
+    (path,) = export(calibrations, three_sensor_rig, tmp_path, formats=["kalibr"])
     chain = yaml.safe_load(path.read_text(encoding="utf-8"))
     # Kalibr's radtan ends at p2: the camera with eight coefficients cannot be said in it.
     assert list(chain) == ["cam0", "cam1"]
@@ -296,7 +296,7 @@ def test_kalibrs_chain_leads_from_each_camera_to_the_next(
 
 def test_autowares_file_gives_bodies_in_the_kits_frame(rles: Rig, make: Make, tmp_path: Path) -> None:
     calibration = make()
-    (path,) = write_exports([calibration], rles, tmp_path, formats=["autoware"])
+    (path,) = export([calibration], rles, tmp_path, formats=["autoware"])
     block = yaml.safe_load(path.read_text(encoding="utf-8"))["velodyne"]["davis_link"]
     assert list(block) == ["x", "y", "z", "roll", "pitch", "yaw"]
     x, y, z, *angles = block.values()

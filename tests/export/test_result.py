@@ -44,14 +44,28 @@ def test_the_published_fields_are_there_in_order(make: Make) -> None:
     assert document["pairs"][0]["certificate"] == {"is_optimal": True, "gap": 1.25e-9}
     refused = document["pairs"][0]["captures_refused"]
     assert list(refused) == ["000001", "000003"]
-    assert refused["000003"] == {"stage": "calibrate", "cause": "12 cm off", "action": "repeat it"}
+    assert list(refused["000001"]) == ["stage", "code", "figures", "action_code", "cause", "action"]
+    assert (refused["000001"]["stage"], refused["000001"]["code"]) == ("lidar", "lidar.too_few_rings")
+    assert refused["000001"]["figures"] == make().captures_refused["000001"].figures
+
+
+def test_refusals_of_earlier_and_of_later_versions_are_kept_as_text(make: Make, tmp_path: Path) -> None:
+    document = to_json_dict("rles", [make()])
+    refused = document["pairs"][0]["captures_refused"]
+    refused["000001"] = {"stage": "lidar", "cause": "2 rings", "action": "come closer"}
+    refused["000003"] |= {"code": "calibrate.of_tomorrow"}
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(document))
+    first, second = read_result(path).pairs[0].captures_refused.values()
+    assert (first.code, first.figures) == ("lidar.text", {"text": "2 rings", "advice": "come closer"})
+    assert (second.code, second.figures["text"]) == ("calibrate.text", refused["000003"]["cause"])
 
 
 def test_the_method_is_told_and_read_back(make: Make, tmp_path: Path) -> None:
     path = tmp_path / "result.json"
     write_result(path, "rles", [make(method="other")])
     assert json.loads(path.read_text())["pairs"][0]["method"] == "other"
-    assert read_result(path).calibrations[0].method == "other"
+    assert read_result(path).pairs[0].method == "other"
 
 
 def test_hashes_of_inputs_are_read_back_and_what_is_no_hash_is_refused(make: Make, tmp_path: Path) -> None:
@@ -110,8 +124,8 @@ def test_what_is_read_equals_what_was_written_to_the_last_digit(
     assert saved.rig == "rles"
     written = [replace(c, captures_refused=dict(sorted(c.captures_refused.items()))) for c in calibrations]
     written = [replace(c, diagnostics=dict(sorted(c.diagnostics.items()))) for c in written]
-    assert all(same(a, b) for a, b in zip(saved.calibrations, written, strict=True))
-    assert path.read_text(encoding="utf-8") == result_text("rles", saved.calibrations)
+    assert all(same(a, b) for a, b in zip(saved.pairs, written, strict=True))
+    assert path.read_text(encoding="utf-8") == result_text("rles", saved.pairs)
 
 
 def test_the_order_of_mappings_does_not_change_the_bytes(make: Make) -> None:
@@ -178,7 +192,7 @@ def test_fields_of_later_versions_are_ignored(make: Make, tmp_path: Path) -> Non
     document["later"] = document["pairs"][0]["later"] = {"x": 1}
     path = tmp_path / "result.json"
     path.write_text(json.dumps(document), encoding="utf-8")
-    assert len(read_result(path).calibrations) == 1
+    assert len(read_result(path).pairs) == 1
 
 
 @pytest.mark.parametrize(
@@ -239,7 +253,7 @@ def test_what_the_uncertainty_means_at_distances_is_read_back(make: Make, tmp_pa
     stated = (PointUncertainty(5.0, 1.25, 0.0125, 1.5, 0.015), PointUncertainty(10.0, 1.0, 0.02, 1.2, 0.03))
     path = tmp_path / "result.json"
     write_result(path, "rles", [replace(make(), uncertainty=stated)])
-    assert read_result(path).calibrations[0].uncertainty == stated
+    assert read_result(path).pairs[0].uncertainty == stated
     document = json.loads(path.read_text())
     assert document["pairs"][0]["uncertainty"][0]["corner_m"] == 0.015
     document["pairs"][0]["uncertainty"][0]["corner_m"] = -1.0

@@ -13,7 +13,7 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import difference, invert
 from lce_rig.core.results import Refusal
 from lce_rig.detect.detection import Detections
-from lce_rig.export import write_exports
+from lce_rig.export import export
 from lce_rig.export.result import read_result, write_result
 from lce_rig.export.urdf import read_urdf
 from lce_rig.rig import load_rig
@@ -26,7 +26,7 @@ TURNED = np.array([0, 0, 0, 0, np.radians(0.6), 0])
 
 def detections(session, **kept):
     """What detectors would have seen; `kept` names captures by camera in which it saw the board."""
-    unseen = Refusal("image", "no board", "hold it into the picture")
+    unseen = Refusal("image.too_dark", figures={"grey_99": 20.0})
     images = {
         (name, "frames"): {
             c.capture: c.image if k in kept.get(name, range(len(captures))) else unseen
@@ -38,9 +38,9 @@ def detections(session, **kept):
 
 
 def calibrated(seen, options, rig=RIG):
-    results, troubles = pipeline.calibrate(rig, seen, options)
-    assert not troubles
-    return {calibration.camera: calibration for calibration, _ in results}
+    pairs, shortages = pipeline.calibrate_detections(rig, seen, options)
+    assert not shortages
+    return {calibration.camera: calibration for calibration in pairs}
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def test_cameras_without_a_common_board_stay_by_themselves(session):
 
 
 def test_the_camera_asked_for_is_calibrated_as_if_there_were_no_other(session):
-    ((asked, _),), _ = pipeline.calibrate(RIG, detections(session), ML, cameras=[RIGHT])
+    (asked,), _ = pipeline.calibrate_detections(RIG, detections(session), ML, cameras=[RIGHT])
     (alone,) = calibrated(detections({RIGHT: session[RIGHT]}), ML, only(RIGHT)).values()
     assert asked.camera == RIGHT
     assert np.array_equal(asked.T_cam_lidar, alone.T_cam_lidar)
@@ -143,7 +143,7 @@ def test_the_camera_asked_for_is_calibrated_as_if_there_were_no_other(session):
 
 def test_why_no_camera_could_be_calibrated_is_told_of_each(session):
     with pytest.raises(NotEnoughDataError) as caught:
-        pipeline.calibrate(RIG, detections(session, left=range(3), right=range(4)), PAPER)
+        pipeline.calibrate_detections(RIG, detections(session, left=range(3), right=range(4)), PAPER)
     assert "left.frames and lidar" in caught.value.what
     assert "in 3 of 12 captures" in caught.value.what
     assert "right.frames and lidar: the board was found by both sensors in 4 of 12" in caught.value.hint
@@ -155,11 +155,8 @@ def test_a_nudged_camera_is_told_at_both_and_not_estimated_with_the_other(option
     for own in found.values():
         assert own.verdict in ("marginal", "fail")
         assert own.estimated_with == ()
-        (reason,) = (
-            text for text in own.reasons if text.startswith("left to right, by their pictures alone")
-        )
-        assert "captures before 000006" in reason
-        assert "nudged" in reason
+        (change,) = (each for each in own.findings if each.code == "verdict.camera_changed")
+        assert (change.subject, change.figures["capture"]) == ("left to right", "000006")
     # The left camera, which nobody touched, is what it is without the other.
     error = difference(found[LEFT].T_cam_lidar, TRUTH[LEFT])
     assert error @ np.linalg.solve(found[LEFT].cov, error) < 25
@@ -195,7 +192,7 @@ def test_the_result_file_holds_it_and_gives_it_back(together, by_paper, tmp_path
     for results in (together, by_paper):
         path = tmp_path / "result.json"
         write_result(path, RIG.name, list(results.values()))
-        for read in read_result(path).calibrations:
+        for read in read_result(path).pairs:
             written = results[read.camera]
             assert read.estimated_with == written.estimated_with
             (other,), (expected,) = read.other_cameras, written.other_cameras
@@ -206,7 +203,7 @@ def test_the_result_file_holds_it_and_gives_it_back(together, by_paper, tmp_path
 
 
 def test_exports_put_both_cameras_where_they_are(together, tmp_path):
-    write_exports(list(together.values()), RIG, tmp_path, is_forced=False)
+    export(list(together.values()), RIG, tmp_path, is_forced=False)
     links = read_urdf(tmp_path / "two_cameras.urdf")
     T = invert(links["right_optical_frame"]) @ links["left_optical_frame"]
     assert np.allclose(T, together[RIGHT].other_cameras[0].T_cam_other, atol=1e-9)

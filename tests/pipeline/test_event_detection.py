@@ -11,7 +11,7 @@ from lce_rig import pipeline
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.results import ImageBoard, Refusal
-from lce_rig.pipeline.event_detection import picture_stamp_ns
+from lce_rig.pipeline.detection import picture_stamp_ns
 from lce_rig.rig import Rig, load_rig, parse_rig
 from lce_rig.session import Session
 from tests.calibrate.boards import simulate
@@ -125,7 +125,7 @@ def test_the_stamp_is_the_median_firing_time_of_the_first_lidars_board(seen):
 
     assert stamp({"lidar": [timed, lidar]}) == SCAN_NS + round(np.median(offset_ns))
     assert stamp({"lidar": [lidar]}) == SCAN_NS + 50 * MS
-    assert stamp({"lidar": Refusal("lidar", "no plate", "show it")}) == SCAN_NS + 50 * MS
+    assert stamp({"lidar": Refusal("lidar.no_plate")}) == SCAN_NS + 50 * MS
     assert stamp({}) is None
 
 
@@ -145,7 +145,7 @@ def test_another_scan_under_the_same_name_gives_another_picture(tmp_path, stream
 def test_a_stored_picture_is_taken_unless_one_is_asked_for(tmp_path, stream):
     blank = Image("dvs", "events", SCAN_NS, np.full((HEIGHT_PX, WIDTH_PX), 128, np.uint8))
     session = session_of(tmp_path, stream, images=[blank])
-    assert "contrast too low" in found_in(session).cause
+    assert found_in(session).code == "image.flat"
     assert isinstance(found_in(session, event_image="network"), ImageBoard)
 
 
@@ -154,7 +154,7 @@ def test_damaged_events_are_a_refusal_that_says_so(tmp_path, stream):
     path = session.captures[0].path / "dvs.events.npz"
     path.write_bytes(path.read_bytes()[:-100])
     board = found_in(session)
-    assert board.stage == "read" and "damaged" in board.cause
+    assert board.code == "read.error" and "damaged" in board.figures["what"]
 
 
 def with_network(path: str) -> str:

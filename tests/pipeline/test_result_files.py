@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from lce_rig.core.errors import ResultRefusedError, SessionError
+from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError
 from lce_rig.export.result import read_result
-from lce_rig.pipeline.result_files import is_usable, keep_earlier, result_content, write_results
+from lce_rig.pipeline.result_files import Result, is_usable, keep_earlier, result_content, write_results
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from tests.export.conftest import calibration, some_pose
@@ -34,7 +34,7 @@ def names(folder):
 
 
 def pose_in(folder):
-    return read_result(folder / "result.json").calibrations[0].T_cam_lidar
+    return read_result(folder / "result.json").pairs[0].T_cam_lidar
 
 
 def test_the_earlier_result_becomes_the_previous_one_with_its_exports(session, folder):
@@ -82,17 +82,17 @@ def test_no_number_of_runs_of_one_camera_takes_the_other_ones_result_away(tmp_pa
     for k in range(3):
         again = replace(OTHER, camera="left", reasons=(f"{k}",))
         assert write_results(session, [again], force=False).only_previous == ("right and lidar",)
-        kept = read_result(folder / "previous" / "result.json").calibrations
+        kept = read_result(folder / "previous" / "result.json").pairs
         assert [c.camera for c in kept] == ["left", "right"]
     assert write_results(session, [left, right], force=False).only_previous == ()
-    assert [c.camera for c in read_result(folder / "previous" / "result.json").calibrations] == ["left"]
+    assert [c.camera for c in read_result(folder / "previous" / "result.json").pairs] == ["left"]
 
 
 def test_without_a_usable_result_the_last_failed_one_is_kept(session, folder):
     write_results(session, [FAILED], force=False)
     written = write_results(session, [calibration(verdict="fail", captures_used=())], force=True)
     assert written.previous is not None and not written.has_usable_previous
-    assert read_result(folder / "previous" / "result.json").calibrations[0].reasons == ("too few",)
+    assert read_result(folder / "previous" / "result.json").pairs[0].reasons == ("too few",)
 
 
 def test_a_forced_failure_does_not_count_as_usable(session, folder):
@@ -194,3 +194,22 @@ def test_a_folder_in_place_of_the_result_is_no_result_and_is_kept(session, folde
     write_results(session, [GOOD], force=False)
     assert (pose_in(folder) == GOOD.T_cam_lidar).all()
     assert (folder / "previous" / "result.json" / "note").read_text() == "mine"
+
+
+def test_a_result_in_a_folder_elsewhere_leaves_the_session_as_it_is(session, tmp_path):
+    result = Result(session, (GOOD,))
+    for pair, has_exports in ((GOOD, True), (FAILED, False)):
+        written = Result(session, (pair,)).write(tmp_path / "elsewhere")
+        assert (len(written.files) > 1) == has_exports
+        assert names(tmp_path / "elsewhere") == {path.name for path in written.files}
+    assert not (session.path / "calibration").exists()
+    in_session = result.write(str(session.path / "calibration"))
+    assert result_content(session) == result.text().encode()
+    assert in_session.files[0].parent == session.path / "calibration"
+
+
+def test_the_extrinsic_of_a_camera_is_given_by_its_name(session):
+    result = Result(session, (GOOD,))
+    assert result.of(GOOD.camera) is result.of(GOOD.camera, GOOD.lidar) is GOOD
+    with pytest.raises(NotEnoughDataError):
+        result.of("another")

@@ -31,7 +31,7 @@ def test_a_missing_key_is_added_at_the_end_of_its_block() -> None:
     rig = parse_rig(text)
     assert rig.calibration.target_sigma_m == 0.02
     assert (rig.quality.min_rings, rig.quality.min_points) == (5, 50)
-    assert rig.calibration.edge_weight == load_rig("rles").calibration.edge_weight
+    assert rig.calibration.target_sigma_deg == load_rig("rles").calibration.target_sigma_deg
 
 
 def test_entries_of_lists_are_reached_by_their_place() -> None:

@@ -39,7 +39,6 @@ def test_shipped_profiles_carry_the_published_numbers() -> None:
     assert rlfs.cameras["cam"].to_intrinsics().fx_px == 897.4566
     assert rlfs.cameras["cam"].to_intrinsics().distortion == (-0.4398, 0.2329, -0.0011, 0.00020984, -0.0730)
     assert (rlfs.board.to_board().width_m, rlfs.board.to_board().height_m) == (0.767, 0.626)
-    assert (rlfs.calibration.edge_weight, rles.calibration.edge_weight) == (3, 10)
     assert rles.board.inner_corners == (9, 6)
     assert [channel.kind for channel in rles.cameras["davis"].channels.values()] == ["frames", "events"]
     assert sss.cameras["cam"].to_intrinsics().distortion == ()
@@ -194,7 +193,12 @@ def test_all_problems_are_listed_at_once_in_the_files_order() -> None:
 
 
 def test_a_key_in_the_wrong_block_is_sent_to_the_right_one() -> None:
-    assert "it belongs into calibration" in refusal(("calibration:", "edge_weight: 3\ncalibration:"))
+    assert "it belongs into calibration" in refusal(("board:", "target_sigma_m: 0.02\nboard:"))
+
+
+def test_weights_in_profiles_of_earlier_sessions_change_nothing() -> None:
+    weights = "calibration: {plane_weight: 1.0, edge_weight: 3.0}\n"
+    assert parse_rig(RLFS + weights) == parse_rig(RLFS)
 
 
 def test_a_missing_block_is_named() -> None:

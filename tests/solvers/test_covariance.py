@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lce_rig.solvers.covariance import symmetric_inverse, systematic_covariance
+from lce_rig.solvers.covariance import symmetric_inverse, systematic_covariances
 
 
 def test_a_direction_without_information_gets_a_large_finite_variance():
@@ -17,5 +17,5 @@ def test_shared_errors_scatter_the_estimate_as_their_covariance_says():
     own = 0.2 * rng.normal(size=(100_000, 5))
     sources = own - own.mean(axis=1, keepdims=True) + 0.3 * rng.normal(size=(100_000, 1))
     sampled = np.cov(sources @ sensitivities.T, rowvar=False)
-    expected = systematic_covariance(sensitivities, 0.2, 0.3)
+    expected = sum(systematic_covariances(sensitivities, 0.2, 0.3))
     np.testing.assert_allclose(sampled, expected, atol=0.02 * np.trace(expected))

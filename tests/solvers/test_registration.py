@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.geometry import exp_so3, project_to_so3, rotation_angle
+from lce_rig.residuals.plane_and_ends import residual_rows
 from lce_rig.solvers.certificate import solve_globally
 from lce_rig.solvers.registration import (
     cube_rotations,
@@ -12,7 +13,6 @@ from lce_rig.solvers.registration import (
     linear_unknowns,
     minimise_on_so3,
     moment_matrix,
-    residual_rows,
     rotation_cost,
     vec_rotation,
     with_one,

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.rig import Rig
 from lce_rig.sources import open_recording
 from lce_rig.sources.bag_recorder import BagRecorder
-from lce_rig.sources.base import ContinuousRecording, Sample, SourceOptions
+from lce_rig.sources.base import ContinuousRecording, SourceOptions
 from lce_rig.sources.events import open_events
 
 T0_NS = 1_700_000_000_123_456_789

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig, load_rig
 from lce_rig.sources import SourceOptions, open_recording
-from lce_rig.sources.base import ContinuousRecording, Sample, Stream
+from lce_rig.sources.base import ContinuousRecording
 from lce_rig.sources.events.bag_writer import open_bag_writer
-from lce_rig.sources.rig_time import rig_time_ns
+from lce_rig.timing.rig_time import rig_time_ns
 from tests.sources.events import encoders
 from tests.sources.events.bags import write_packet_bag
 from tests.sources.events.encoders import listed

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Events, Image
+from lce_rig.core.data import Events, Image, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.event_file import encode_events
 from lce_rig.rig import Rig, load_rig
 from lce_rig.sources import SourceOptions, open_recording
-from lce_rig.sources.base import ContinuousRecording, Stream
+from lce_rig.sources.base import ContinuousRecording
 from lce_rig.sources.events.aedat4_writer import Aedat4Writer, write_aedat4
 from tests.sources.events import encoders
 from tests.sources.events.aedat4_files import RawFrame, write_davis

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig, load_rig
-from lce_rig.sources.base import ContinuousRecording, Sample, Span, Stream
+from lce_rig.sources.base import ContinuousRecording, Span
 from lce_rig.sources.joining import JoinedRecording, join_recordings, require_sensors
 from lce_rig.sources.merging import merge_by_time
 

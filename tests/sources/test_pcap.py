@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from lce_rig.core import velodyne
-from lce_rig.core.data import Scan
+from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.simulate.vlp16_packets import SensorPacket
 from lce_rig.sources import open_recording
-from lce_rig.sources.base import ContinuousRecording, SourceOptions, Stream
+from lce_rig.sources.base import ContinuousRecording, SourceOptions
 from lce_rig.sources.datagrams import Datagram, build_frame
 from lce_rig.sources.pcap import PcapRecording
 from lce_rig.sources.pcap_file import PcapFile
@@ -286,7 +286,7 @@ def test_frames_cut_short_by_the_recorder_are_named(
     frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
 ) -> None:
     path = write_pcap(tmp_path / "a.pcap", frames, snaplen=96)
-    with pytest.raises(SourceError, match=r"cut short by the recorder \(record with tcpdump -s 0\)"):
+    with pytest.raises(SourceError, match="243 datagrams"):
         read(path, rig)
 
 

@@ -19,7 +19,7 @@ def test_many_boards_that_are_not_where_the_extrinsic_puts_them_are_one():
 
 def test_large_residuals_are_named_with_their_limit():
     (doubt,) = contradictions(Metrics(0.05, 0.006, 0.1), RIG, n_elsewhere=0, n_seen=30)
-    assert "50 mm on average, limit 30 mm" in doubt
+    assert "50 mm" in doubt and "30 mm" in doubt
 
 
 def test_a_session_without_boards_cannot_agree():

@@ -88,7 +88,7 @@ def test_an_overlay_shows_the_events_and_the_ring_ends_below_the_legend() -> Non
 
 @pytest.mark.parametrize("is_found", [True, False])
 def test_a_debug_picture_has_the_events_below_the_reconstruction(is_found: bool) -> None:
-    refusal = Refusal("image", "the board hardly moved", "move the board sideways slowly, about 10 cm/s")
+    refusal = Refusal("image.no_events")
     drawn = draw_debug(
         IMAGE,
         scan_of(wall()),

@@ -134,7 +134,7 @@ def test_an_empty_scan_and_missing_boards_are_drawn_too() -> None:
 @pytest.mark.parametrize("has_lidar", [True, False])
 def test_a_debug_picture_is_made_of_whatever_there_is(has_image: bool, has_lidar: bool) -> None:
     points = wall()
-    refusal = Refusal("image", "no board: 8x6 inner corners wanted, none seen", "show the whole print " * 12)
+    refusal = Refusal("image.text", figures={"text": "no board", "advice": "show the whole pattern " * 12})
     drawn = draw_debug(
         Image("cam", "frames", None, grey(FOLDING)) if has_image else None,
         scan_of(points) if has_lidar else None,

@@ -8,21 +8,20 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.expansion import Expansion
-from lce_rig.calibrate.features import extract_features
-from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.refine import JointEstimate, refine
 from lce_rig.calibrate.likelihood.spread import inflate
 from lce_rig.calibrate.likelihood.system import PER_CAMERA
 from lce_rig.calibrate.metrics import error_to_reference
-from lce_rig.calibrate.options import CalibrateOptions
-from lce_rig.calibrate.placements import group_placements
+from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M, EstimateSettings
 from lce_rig.calibrate.report import name_sigmas, report_estimate
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
-from lce_rig.solvers.covariance import symmetric_inverse
+from lce_rig.residuals.along_rays import N_SHIFTS, SHIFTS
+from lce_rig.residuals.features import extract_features
+from lce_rig.residuals.placements import group_placements
+from lce_rig.residuals.quadratics import Quadratics
 
 # A profile that states no error of the ranges is taken at its word.
 _EXACT_M = 1e-6
@@ -31,7 +30,7 @@ _EXACT_M = 1e-6
 def calibrate_by_likelihood(
     observations: Sequence[Observation],
     board: Board,
-    options: CalibrateOptions,
+    options: EstimateSettings,
     progress: Callable[[int, int], None] | None = None,
 ) -> CalibrationEstimate:
     """Estimate T_cam_lidar from boards whose pairing is settled.
@@ -65,9 +64,9 @@ def calibrate_by_likelihood(
     return replace(estimate, expansion=expand_joint(joint, 0, placement))
 
 
-def what_is_known(options: CalibrateOptions) -> tuple[Priors, Levels]:
+def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
     """Read off the options what is known of constant errors and of noise before any capture is seen."""
-    priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=options.edge_shift_sigma_m)
+    priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=EDGE_SHIFT_SIGMA_M)
     return priors, Levels(laser_m=options.laser_bias_sigma_m)
 
 
@@ -78,7 +77,7 @@ def describe(
     start: CalibrationEstimate,
     used: Sequence[Observation],
     board: Board,
-    options: CalibrateOptions,
+    options: EstimateSettings,
     figures: Mapping[str, float],
 ) -> CalibrationEstimate:
     """Report one camera's extrinsic of a joint estimate.
@@ -93,7 +92,7 @@ def describe(
         options: switches of the features.
         figures: diagnostics; those of the start are overwritten.
     """
-    features = [extract_features(observation, board, options) for observation in used]
+    features = [extract_features(observation, board, options.parts.features) for observation in used]
     return report_estimate(
         joint.T_cam_lidar[camera],
         cov,
@@ -107,7 +106,7 @@ def describe(
     )
 
 
-def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp]) -> Expansion:
+def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp]) -> Quadratics:
     """Expand the cost about a joint estimate, in the extrinsics alone, the camera's own first.
 
     Constant errors are held where they are.
@@ -120,16 +119,9 @@ def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp])
     n_cameras = len(joint.T_cam_lidar)
     order = [camera, *(c for c in range(n_cameras) if c != camera)]
     mine = np.concatenate([np.arange(6) + PER_CAMERA * c for c in order])
-    T = joint.T_cam_lidar[camera]
-    return Expansion(
-        T,
-        joint.system.gradients[:, mine],
-        joint.system.hessians[:, mine[:, None], mine],
-        # Shares of captures that another camera did not see leave its extrinsic open: 1 m, 1 rad.
-        np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6)),
-        placement,
-        (T @ joint.T_lidar_board)[:, :3, 3],
-    )
+    # Shares of captures that another camera did not see leave its extrinsic open: 1 m, 1 rad.
+    prior = np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6))
+    return replace(joint.cost.of(mine), prior=prior, prior_gradient=np.zeros(len(mine)), placement=placement)
 
 
 def figures_of(joint: JointEstimate, camera: int) -> dict[str, float]:
@@ -164,9 +156,9 @@ def _sigmas(joint: JointEstimate, camera: int) -> dict[str, float]:
 
     With information H = sum_k H_k + P, the covariance H^-1 is H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1.
     """
-    system = joint.system
-    J = joint.to_extrinsics[camera] @ symmetric_inverse(system.information)
+    cost = joint.cost
+    J = joint.to_extrinsics[camera] @ cost.covariance()
     figures: dict[str, float] = {}
-    for name, part in (("scatter", system.hessians.sum(axis=0)), ("systematic", system.prior)):
+    for name, part in (("scatter", cost.hessians.sum(axis=0)), ("systematic", cost.prior)):
         figures |= name_sigmas(name, J @ part @ J.T)
     return figures

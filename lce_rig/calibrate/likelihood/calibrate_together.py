@@ -16,13 +16,12 @@ from lce_rig.calibrate.likelihood.calibrate_jointly import (
 from lce_rig.calibrate.likelihood.levels import PoseLevels
 from lce_rig.calibrate.likelihood.refine import refine
 from lce_rig.calibrate.likelihood.spread import inflate
-from lce_rig.calibrate.options import CalibrateOptions
-from lce_rig.calibrate.placements import group_shared_placements
-from lce_rig.calibrate.shared_scans import REMOVE_OTHERS, take_apart
+from lce_rig.calibrate.options import EstimateSettings
+from lce_rig.calibrate.shared_scans import take_apart
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation, Refusal
-from lce_rig.solvers.covariance import symmetric_inverse
+from lce_rig.residuals.placements import group_shared_placements
 
 # Diagnostics that hold a camera's pose errors beyond corner noise, by the level that they are.
 _POSE_FIGURES = {
@@ -58,7 +57,7 @@ class TogetherEstimate:
 
 
 def calibrate_together(
-    alone: Mapping[str, CalibrationEstimate], board: Board, options: CalibrateOptions
+    alone: Mapping[str, CalibrationEstimate], board: Board, options: EstimateSettings
 ) -> TogetherEstimate:
     """Estimate the extrinsics of cameras that share scans of one LiDAR in one likelihood.
 
@@ -96,7 +95,7 @@ def calibrate_together(
             estimated_with=tuple(other for other in names if other != name),
         )
     scale = np.concatenate(scales)
-    cov = scale[:, None] * (J @ symmetric_inverse(joint.system.information) @ J.T) * scale
+    cov = scale[:, None] * (J @ joint.cost.covariance() @ J.T) * scale
     return TogetherEstimate(names, estimates, cov)
 
 
@@ -124,8 +123,8 @@ def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
             for capture in sorted(take_apart([observation.capture])):
                 other, held = seen.setdefault(capture, (camera, key))
                 if held != key:
-                    cause = f"{other} and {camera} put the board at different places of the scan"
-                    found[capture] = Refusal("pair", cause, REMOVE_OTHERS)
+                    figures = {"first": other, "second": camera}
+                    found[capture] = Refusal("pair.two_places", figures=figures)
     return found
 
 

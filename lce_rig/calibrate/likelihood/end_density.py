@@ -18,6 +18,7 @@ from functools import lru_cache
 import numpy as np
 
 from lce_rig.core.geometry import Array
+from lce_rig.residuals.along_rays import EdgeRows
 
 STRAY = 0.01
 """Share b of (1), as in simulated and recorded captures; a is theirs to say."""
@@ -78,6 +79,34 @@ def information(blur: Array, lost_share: float) -> Array:
     between = table[low] + (row - low) * (table[low + 1] - table[low])
     inside = np.exp(np.interp(np.log(np.maximum(blur, _NARROWEST)), np.log(_BLURS), between))
     return np.asarray(inside * np.minimum(_BLURS[-1] / np.maximum(blur, _NARROWEST), 1.0) ** 2)
+
+
+def edge_system(
+    edges: EdgeRows, edge_rad: float, backed_rad: float, lost_share: float, n_captures: int
+) -> Array:
+    """Expand -2 ln p of the ring ends to second order, by capture: (F, 16, 16).
+
+    With J a row without its residual: J J^T times the information, J times the score in the last column, and
+    -2 ln p itself in the corner. The information is the mean over all ring ends of such a blur: that of a
+    single one is zero in the middle of its interval, and no Hessian to step by.
+    """
+    size = edges.rows.shape[1]
+    system = np.zeros((n_captures, size, size))
+    if len(edges.rows):
+        D, blur = edges.step_m, edges.blur_m(edge_rad, backed_rad) / edges.step_m
+        p, slope = density(edges.rows[:, -1] / D, blur, lost_share)
+        weighted = [
+            edges.products * (information(blur, lost_share) / D**2),
+            edges.columns * (-slope / p / D),
+            -2 * np.log(p / D)[None],
+        ]
+        first = np.flatnonzero(np.diff(edges.capture, prepend=-1))
+        sums = np.add.reduceat(np.concatenate(weighted), first, axis=1).T
+        seen, (i, j) = edges.capture[first], np.triu_indices(size - 1)
+        system[seen[:, None], i, j] = system[seen[:, None], j, i] = sums[:, : len(i)]
+        system[seen, :-1, -1] = system[seen, -1, :-1] = sums[:, len(i) : -1]
+        system[seen, -1, -1] = sums[:, -1]
+    return system
 
 
 @lru_cache(maxsize=1)

@@ -29,7 +29,7 @@ class Levels:
     Attributes:
         range_m: noise of a single range.
         ring_m: error that the returns of one ring in one capture share, beyond the laser's offset.
-        edge_rad: blur of the ends of a ring end's interval, across the beam, by range (`edge_terms`).
+        edge_rad: blur of the ends of a ring end's interval, across the beam, by range (`along_rays`).
         backed_rad: the same where something stands close behind.
         lost_share: of ring ends whose last returns are missing; a share, not a deviation.
         tilt_rad, spin_rad: errors of a board's turn in a picture beyond corner noise.
@@ -82,11 +82,11 @@ class Priors:
 
     Attributes:
         offset_m: range offset common to all lasers.
-        shift_m: edge shift d_0, `edge_terms`.
+        shift_m: edge shift d_0, `along_rays`.
         growth: c, its change with range; recordings show none.
         background_m: d_1, d_2 and d_3, by what is behind the edge.
         displacement_m: displacement of all ring ends against the returns between them.
-        lateral_m: lens beside the LiDAR's axis, `scans`.
+        lateral_m: lens beside the LiDAR's axis, `along_rays`.
         vertical_m: its height, per rad of elevation.
         scale: of the camera's distances, by which squares or focal length are off.
     """
@@ -102,7 +102,7 @@ class Priors:
 
     @property
     def shifts(self) -> Array:
-        """Deviations (7,) in the order of `edge_terms.SHIFTS`."""
+        """Deviations (7,) in the order of `along_rays.SHIFTS`."""
         return np.array([self.shift_m, self.growth, *self.background_m, *2 * [self.displacement_m]])
 
 

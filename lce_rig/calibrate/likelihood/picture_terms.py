@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lce_rig.calibrate.likelihood.levels import PoseLevels
-from lce_rig.calibrate.likelihood.scans import Indices
 from lce_rig.core.geometry import Array, difference, skew
 from lce_rig.core.results import ImageBoard
+from lce_rig.residuals.along_rays import Indices
 
 
 @dataclass(frozen=True, eq=False)

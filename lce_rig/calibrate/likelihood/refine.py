@@ -9,17 +9,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS
 from lce_rig.calibrate.likelihood.levels import NO_LASER_M, Levels, PoseLevels, Priors
 from lce_rig.calibrate.likelihood.levels_fit import fit_levels
 from lce_rig.calibrate.likelihood.picture_terms import Pictures, stack_pictures
-from lce_rig.calibrate.likelihood.scans import N_FIELDS, StackedScans, interior, lens_fields, stack_scans
-from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, System, Terms, assemble, linearise
-from lce_rig.calibrate.placements import group_placements
+from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, Terms, assemble, linearise
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import Observation
-from lce_rig.solvers.covariance import symmetric_inverse
+from lce_rig.residuals.along_rays import N_FIELDS, N_SHIFTS, StackedScans, interior, lens_fields, stack_scans
+from lce_rig.residuals.placements import group_placements
+from lce_rig.residuals.quadratics import Quadratics
 
 # Steps between changes of the levels, and at most in the end.
 _STEPS, _LAST_STEPS = 3, 20
@@ -41,12 +40,12 @@ class JointEstimate:
         cov: (C, 6, 6) of each extrinsic, everything else marginalised, tangent (translation m, rotation rad).
         to_extrinsics: (C, 6, G) derivative of each extrinsic's tangent by the unknowns z of `system`.
         offset_m: (L,) by which ranges of each ring read too long.
-        lens_m: (2,) lateral and vertical displacement of the LiDAR's lens, `scans`.
-        shifts: (7,) of ring ends, `edge_terms.SHIFTS`.
+        lens_m: (2,) lateral and vertical displacement of the LiDAR's lens, `along_rays`.
+        shifts: (7,) of ring ends, `along_rays.SHIFTS`.
         scale: (C,) by how much of themselves each camera's distances are too short.
         constants_sigma: (L + 9,) standard deviations of offsets, lens and shifts.
         levels: of the noise.
-        system: normal equations at the optimum.
+        cost: of the F captures at the optimum, in the unknowns z of `system`.
     """
 
     T_cam_lidar: Array
@@ -59,7 +58,7 @@ class JointEstimate:
     scale: Array
     constants_sigma: Array
     levels: Levels
-    system: System
+    cost: Quadratics
 
 
 def refine(
@@ -158,9 +157,9 @@ def to_extrinsic(T_cam_lidar: Array, camera: int, n_unknowns: int) -> Array:
 
 
 def _summarise(state: State, terms: Terms, levels: Levels, priors: Priors) -> JointEstimate:
-    system = assemble(terms, levels, priors)
+    cost = assemble(terms, levels, priors).cost
     C, constants = len(state.T_cam_lidar), state.constants
-    cov = symmetric_inverse(system.information)
+    cov = cost.covariance()
     J = np.stack([to_extrinsic(T, c, len(cov)) for c, T in enumerate(state.T_cam_lidar)])
     rest = constants[PER_CAMERA * C :]
     return JointEstimate(
@@ -174,5 +173,5 @@ def _summarise(state: State, terms: Terms, levels: Levels, priors: Priors) -> Jo
         scale=constants[PER_CAMERA * np.arange(C) + 6],
         constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
         levels=levels,
-        system=system,
+        cost=cost,
     )

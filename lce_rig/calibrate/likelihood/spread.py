@@ -1,17 +1,19 @@
 """Do placements disagree by more than the likelihood says they may?
 
-The spread of the optimum without each placement (`lce_rig.solvers.jackknife`) knows nothing of the noise
+The spread of the optimum without each placement (`lce_rig.residuals.quadratics`) knows nothing of the noise
 model; where it exceeds the model's covariance by more than chance allows, errors are at work that the model
 does not have, and the covariance is multiplied.
 """
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.likelihood.refine import JointEstimate
 from lce_rig.core.geometry import Array
+from lce_rig.residuals.quadratics import jackknife_scatter
 from lce_rig.solvers.covariance import symmetric_inverse
-from lce_rig.solvers.jackknife import jackknife_scatter, leave_one_out_moves, sum_by_group
 
 # So many standard deviations of its own must the ratio of covariances lie above 1 to count.
 _SURE = 2.0
@@ -42,7 +44,5 @@ def inflate(
 
 def jackknife(joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0) -> Array:
     """Compute the jackknife covariance (6, 6) of a camera's extrinsic over placements."""
-    system = joint.system
-    gradients, hessians = (sum_by_group(each, placement) for each in (system.gradients, system.hessians))
-    moves = leave_one_out_moves(gradients, hessians, system.information)
-    return jackknife_scatter(moves @ joint.to_extrinsics[camera].T)
+    cost = replace(joint.cost, placement=placement)
+    return jackknife_scatter(cost.moves() @ joint.to_extrinsics[camera].T)

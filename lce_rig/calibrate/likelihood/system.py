@@ -15,13 +15,23 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, EdgeRows, edge_rows, edge_system
+from lce_rig.calibrate.likelihood.end_density import edge_system
 from lce_rig.calibrate.likelihood.levels import Levels, PoseLevels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import Pictures, picture_rows
-from lce_rig.calibrate.likelihood.range_terms import RangeSums, range_system, sum_ranges, weigh_ranges
-from lce_rig.calibrate.likelihood.scans import N_FIELDS, StackedScans
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, perturb
+from lce_rig.residuals.along_rays import (
+    N_FIELDS,
+    N_SHIFTS,
+    EdgeRows,
+    RangeSums,
+    StackedScans,
+    edge_rows,
+    range_system,
+    sum_ranges,
+    weigh_ranges,
+)
+from lce_rig.residuals.quadratics import Quadratics
 
 PER_CAMERA = 7
 # The mean of the lasers' own offsets is not theirs but the common one: this much of it is left.
@@ -93,37 +103,28 @@ def linearise(scans: StackedScans, pictures: Sequence[Pictures], board: Board, s
 
 
 @dataclass(frozen=True, eq=False)
-class System:
+class Reduced:
     """Normal equations with the board poses eliminated.
 
     Attributes:
-        hessians: (F, G, G) each capture's information on z.
-        gradients: (F, G) half the gradient of its cost, at the constants' present values.
-        prior: (G, G) information of the priors.
-        prior_gradient: (G,) half the gradient of theirs.
+        cost: of F captures in z, at the constants' present values.
         board_steps: (F, 6, G + 1), y = -board_steps [z; 1].
         minus_2_log_evidence: -2 ln p(data | levels) up to a constant, all unknowns integrated out.
     """
 
-    hessians: Array
-    gradients: Array
-    prior: Array
-    prior_gradient: Array
+    cost: Quadratics
     board_steps: Array
     minus_2_log_evidence: float
 
-    @property
-    def information(self) -> Array:
-        """(G, G) of all captures and priors."""
-        return np.asarray(self.hessians.sum(axis=0) + self.prior)
-
     def step(self) -> tuple[Array, Array]:
         """Solve for z (G,) and y (F, 6)."""
-        z = -np.linalg.solve(self.information, self.gradients.sum(axis=0) + self.prior_gradient)
+        # Priors of constants differ by many orders of magnitude, too many for `Quadratics.optimum`.
+        gradient = self.cost.gradients.sum(axis=0) + self.cost.prior_gradient
+        z = -np.linalg.solve(self.cost.information, gradient)
         return z, -self.board_steps @ np.append(z, 1.0)
 
 
-def assemble(terms: Terms, levels: Levels, priors: Priors) -> System:
+def assemble(terms: Terms, levels: Levels, priors: Priors) -> Reduced:
     """Weigh all terms and eliminate the board poses.
 
     Args:
@@ -150,7 +151,7 @@ class Assembly:
         self._edge_block = lru_cache(maxsize=2)(partial(_edge_block, terms))
         self._picture_block = lru_cache(maxsize=2)(partial(_picture_block, terms))
 
-    def at(self, levels: Levels) -> System:
+    def at(self, levels: Levels) -> Reduced:
         """Weigh all terms and eliminate the board poses."""
         of_ranges, range_volume = self._range_block(levels.range_m, levels.ring_m)
         of_edges = self._edge_block(levels.edge_rad, levels.backed_rad, levels.lost_share)
@@ -202,20 +203,20 @@ def _no_block(terms: Terms) -> Array:
     return np.zeros((len(terms.ranges.sums), size, size))
 
 
-def _eliminate(M: Array, terms: Terms, levels: Levels, priors: Priors, log_volume: float) -> System:
+def _eliminate(M: Array, terms: Terms, levels: Levels, priors: Priors, log_volume: float) -> Reduced:
     """Take the board poses out of M (F, 6 + G + 1, 6 + G + 1) and add the priors."""
     of_boards, rest = M[:, :6, :6], M[:, :6, 6:]
     steps = np.linalg.solve(of_boards, rest)
     reduced = M[:, 6:, 6:] - np.swapaxes(rest, 1, 2) @ steps
     hessians, gradients, costs = reduced[:, :-1, :-1], reduced[:, :-1, -1], reduced[:, -1, -1]
     prior, log_prior_volume = _prior(terms, levels, priors)
-    prior_gradient = np.asarray(prior @ terms.constants)
-    information, gradient = hessians.sum(axis=0) + prior, gradients.sum(axis=0) + prior_gradient
-    cost = costs.sum() + terms.constants @ prior_gradient
-    cost -= gradient @ np.linalg.solve(information, gradient)
+    summed = Quadratics(gradients, hessians, prior, prior @ terms.constants, np.arange(len(M)))
+    information, gradient = summed.information, gradients.sum(axis=0) + summed.prior_gradient
+    least = costs.sum() + terms.constants @ summed.prior_gradient
+    least -= gradient @ np.linalg.solve(information, gradient)
     log_volume += np.linalg.slogdet(of_boards)[1].sum() + np.linalg.slogdet(information)[1]
-    evidence = float(cost + log_volume + log_prior_volume)
-    return System(hessians, gradients, prior, prior_gradient, np.asarray(steps), evidence)
+    evidence = float(least + log_volume + log_prior_volume)
+    return Reduced(summed, np.asarray(steps), evidence)
 
 
 def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, float]:

@@ -20,7 +20,7 @@ SEEN_SHARE = 0.8
 REACH_M = (-0.9, 0.8)
 #: Least side of a square, foreshortened by the tilt, from which corners are found without fail.
 LEAST_SQUARE_PX = 5.0
-# Free border of the picture, as a share of its width: people do not hold the board to the pixel.
+# Free border of the image, as a share of its width: people do not hold the board to the pixel.
 _MARGIN = 0.03
 _GRAZING_COSINE = 0.45
 # Powers of 1/g with g^4 = g + 1 fill three dimensions evenly (M. Roberts, 2018).
@@ -52,7 +52,7 @@ def spread_candidates(view: View, n_places: int = 60, n_tilts: int = 8) -> Array
 
     Args:
         view: the sensors.
-        n_places: places of the board's centre, over the picture and the distances, that are tried.
+        n_places: places of the board's centre, over the image and the distances, that are tried.
         n_tilts: tilts, of `TILTS_DEG` in eight directions, that are tried at each; the next ones at the next.
     """
     lens = view.model.lens
@@ -98,7 +98,7 @@ def facing_axes(view: View, rays: Array) -> Array:
 
 
 def is_reachable(view: View, T_cam_board: Array) -> NDArray[np.bool_]:
-    """Tell which poses (N, 4, 4) a person can hold and both sensors see, (N,)."""
+    """Find which poses (N, 4, 4) a person can hold and both sensors see, (N,)."""
     model, limits = view.model, view.model.limits
     centre, normal = T_cam_board[:, :3, 3], T_cam_board[:, :3, 2]
     distance_m = np.linalg.norm(centre, axis=1)

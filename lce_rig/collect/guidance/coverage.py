@@ -21,7 +21,7 @@ class Coverage:
     """Five bars, each 0..1.
 
     Attributes:
-        left_right, up_down: how far apart in the picture boards were.
+        left_right, up_down: how far apart in the image boards were.
         near_far: how much farther the farthest was than the nearest.
         tilt: a quarter for each of top, bottom, left and right that was towards the rig by `LEANS_DEG`.
         roll: how differently boards were turned in their plane.
@@ -50,7 +50,7 @@ def measure_coverage(view: View, held: Array, reachable: Array) -> Coverage:
     poses = [describe_pose(view, T_cam_board) for T_cam_board in held]
     lean = np.array([[pose.tilt_deg, pose.turn_deg] for pose in poses])
     leanings = np.concatenate([lean.max(axis=0) > LEANS_DEG, lean.min(axis=0) < -LEANS_DEG])
-    # A print looks the same from either end.
+    # A pattern looks the same from either end.
     roll = np.array([(pose.roll_deg - DIAMOND_DEG + 90) % 180 - 90 for pose in poses])
     return Coverage(
         left_right=float(left_right),
@@ -62,10 +62,10 @@ def measure_coverage(view: View, held: Array, reachable: Array) -> Coverage:
 
 
 def _places(view: View, T_cam_board: Array) -> Array:
-    """Where board centres lie in the picture, px, and how far away they are, as a logarithm, (N, 3)."""
+    """Where board centres lie in the image, px, and how far away they are, as a logarithm, (N, 3)."""
     centre = T_cam_board[:, :3, 3]
     pixels, _ = view.model.lens.project(centre)
-    # A centre out of sight counts as one at the picture's middle.
+    # A centre out of sight counts as one at the image's middle.
     middle = [view.model.lens.cx_px, view.model.lens.cy_px]
     pixels = np.where(np.isfinite(pixels), pixels, middle)
     return np.column_stack([pixels, np.log(np.linalg.norm(centre, axis=1))])

@@ -1,6 +1,6 @@
 """What a board placement tells about the extrinsic, before it is captured; sums over placements just add.
 
-The estimate minimises sum_k f_k (calibrate/problem.py). With half Hessians H_k, half gradients whose noise
+The estimate minimises sum_k f_k (residuals/moments.py). With half Hessians H_k, half gradients whose noise
 has covariance B_k, and half gradients that move by D_k b when the L lasers measure b too long, the estimate
 errs by -H^-1 sum_k (noise + D_k b), H = sum_k H_k + prior, hence
 
@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 from lce_rig.collect.guidance.rings import Rings, cross_board
 from lce_rig.collect.guidance.sensors import SensorModel
 from lce_rig.core.geometry import Array, invert, skew
+from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS, differentiate, freedoms_of_plane
 from lce_rig.solvers.covariance import symmetric_inverse
 
 #: Extrinsic tangent (translation m, rotation rad, axes of the camera) and the edge shift.
 N_UNKNOWNS = 7
-_PLANE_FREEDOMS = 3
 # Ring ends of a usual capture: what weighs edges against planes.
 _USUAL_ENDS = 14
-_EDGE_NORMALS = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
 # A ring is represented by its ends and its middle, with Simpson's weights: exact for second moments.
 _NODES = np.array([0.0, 0.5, 1.0])
 _SHARES = np.array([1.0, 4.0, 1.0]) / 6
@@ -99,19 +98,19 @@ def _in_board_frame(
     n_ends = 2 * n_lasers
     moments = _plane_moments(rings)
     total = np.maximum(rings.n_points.sum(axis=1), 1.0)[:, None, None]
-    # Rows of planes are -(0, 0, 1, v, -u, 0, 0).
-    rows = np.zeros((N_UNKNOWNS, _PLANE_FREEDOMS))
-    rows[2, 0], rows[3, 2], rows[4, 1] = -1.0, -1.0, 1.0
-    w_plane = _PLANE_FREEDOMS / errors.plane_m**2
+    rows = np.zeros((N_UNKNOWNS, PLANE_FREEDOMS))
+    rows[:6] = -freedoms_of_plane().T
+    w_plane = PLANE_FREEDOMS / errors.plane_m**2
     hessian = w_plane * rows @ (moments / total) @ rows.T
     by_plane = -w_plane * rows @ (moments / total)
 
     is_seen = (rings.n_points > 0)[..., None]
-    ends, normal = rings.ends, _EDGE_NORMALS[rings.edge]
-    lever = ends[..., 0] * normal[..., 1] - ends[..., 1] * normal[..., 0]
-    edge_rows = np.zeros((*rings.edge.shape, N_UNKNOWNS))
-    edge_rows[..., :2], edge_rows[..., 5], edge_rows[..., 6] = -normal, -lever, 1.0
-    edge_rows = (edge_rows * is_seen[..., None]).reshape(n, n_ends, N_UNKNOWNS)
+    ends, edge_normals = rings.ends, model.board.edges()[1]
+    normal = edge_normals[rings.edge]
+    levers = np.concatenate([ends, np.zeros_like(ends[..., :1])], axis=-1)
+    by_shift = np.ones_like(ends[..., :1])
+    edge_rows = np.concatenate([differentiate(normal, levers), by_shift], axis=-1)
+    edge_rows, normal = (edge_rows * is_seen[..., None]).reshape(n, n_ends, N_UNKNOWNS), normal[..., :2]
     n_seen = np.maximum(2 * rings.n_rings, 1)[:, None, None]
     w_edge = _USUAL_ENDS / errors.edge_m**2 / n_seen
     edge_T = np.swapaxes(edge_rows, 1, 2)
@@ -121,7 +120,7 @@ def _in_board_frame(
     # A plane too far along the normal moves its ring ends sideways, along their rays.
     sideways = np.sum(normal * (ends - eye[..., :2]), axis=-1) / -eye[..., 2]
     basis = np.concatenate([np.ones((*ends.shape[:-1], 1)), ends], axis=-1)
-    by_plane -= w_edge * edge_T @ (sideways[..., None] * basis).reshape(n, n_ends, _PLANE_FREEDOMS)
+    by_plane -= w_edge * edge_T @ (sideways[..., None] * basis).reshape(n, n_ends, PLANE_FREEDOMS)
 
     chord = ends[:, :, 1] - ends[:, :, 0]
     direction = chord / np.maximum(np.linalg.norm(chord, axis=-1, keepdims=True), 1e-9)
@@ -129,7 +128,7 @@ def _in_board_frame(
     # Edges lie anywhere between a ring's last point and the next one.
     variance = (across * rings.spacing_m[..., None]) ** 2 / 12 + errors.ring_end_m**2
     edge_noise = w_edge**2 * ((edge_T * variance.reshape(n, 1, n_ends)) @ edge_rows)
-    by_side = w_edge * edge_T @ np.eye(len(_EDGE_NORMALS))[rings.edge.reshape(n, n_ends)]
+    by_side = w_edge * edge_T @ np.eye(len(edge_normals))[rings.edge.reshape(n, n_ends)]
     edge_noise += errors.side_m**2 * by_side @ np.swapaxes(by_side, 1, 2)
     return hessian, by_plane, edge_noise
 

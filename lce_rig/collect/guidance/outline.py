@@ -1,4 +1,4 @@
-"""The board's outline in the picture, to be drawn where the board is and where it should be."""
+"""The board's outline in the image, to be drawn where the board is and where it should be."""
 
 import numpy as np
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lce_rig.collect.guidance.candidates import View, spread_candidates
 from lce_rig.collect.guidance.evidence import Evidence, weigh_placements
 from lce_rig.collect.guidance.precision import Precision, combine, combine_with_each, shortfall, sigmas
-from lce_rig.collect.guidance.words import NOWHERE_ELSE, instruct, is_there, say
+from lce_rig.collect.guidance.words import instruct, is_there, say
 from lce_rig.core.geometry import Array, rotation_angle
 from lce_rig.core.results import Refusal
 
@@ -65,7 +65,7 @@ class Planner:
     """Chooses placements of the board before one camera and one LiDAR.
 
     Args:
-        view: the sensors, and the extrinsic as far as it is known.
+        view: the sensors, and the extrinsics as far as known.
         novelty: which placements count as the same.
         n_places: how many places of the board's centre are considered, with eight tilts each.
     """
@@ -126,7 +126,7 @@ class Planner:
         """Refuse a placement that would hardly shrink the predicted covariance.
 
         Once the target is predicted to be met, and where nothing brings much any more, only a placement that
-        was captured before is refused: whoever goes on wants more captures.
+        was captured before is refused: a user who continues wants more captures.
 
         Args:
             held: (N, 4, 4) T_cam_board of the captures so far.
@@ -140,21 +140,21 @@ class Planner:
         """
         guidance = self.guide(held, present, avoid)
         wanted = guidance.T_cam_board
-        action = NOWHERE_ELSE if wanted is None else say(instruct(self.view, present, wanted))
+        action = "nowhere" if wanted is None else ""
+        instruction = "" if wanted is None else say(instruct(self.view, present, wanted))
         alike = np.flatnonzero(self._is_like(held, present[None], guidance.spacing)[:, 0])
         if len(alike):
             name = str(alike[0] + 1) if names is None else names[alike[0]]
-            return Refusal("calibrate", f"the board stands where capture {name} shows it", action)
+            figures = {"capture": name, "instruction": instruction}
+            return Refusal("calibrate.known_placement", figures=figures, action=action)
         is_asked = asked is not None and is_there(self.view, present, asked)
         if wanted is None or guidance.is_enough or is_asked:
             return None
         own, best = self._gains(held, np.stack([present, wanted]))
         if best < LEAST_GAIN or own >= LEAST_SHARE * best:
             return None
-        cause = (
-            f"this placement makes the result {max(100 * own, 0.0):.1f} % better, another {100 * best:.0f} %"
-        )
-        return Refusal("calibrate", cause, action)
+        figures = {"gain": max(float(own), 0.0), "best_gain": float(best), "instruction": instruction}
+        return Refusal("calibrate.little_gain", figures=figures)
 
     def _gains(self, held: Array, placements: Array) -> Array:
         """Compute by which share each of some placements (N, 4, 4) shrinks what can be shrunk, (N,)."""
@@ -193,8 +193,8 @@ class Planner:
         return None, SPACINGS[-1]
 
     def _is_like(self, held: Array, others: Array, spacing: float) -> NDArray[np.bool_]:
-        """Tell which of others (M, 4, 4) stand where one of those held (N, 4, 4) does, (N, M)."""
-        # The print may be read from either end.
+        """Find which of others (M, 4, 4) stand where one of those held (N, 4, 4) does, (N, M)."""
+        # The pattern may be read from either end.
         R, R_others = held[:, None, :3, :3], others[None, :, :3, :3]
         turn = np.minimum(rotation_angle(R, R_others), rotation_angle(R @ _HALF_TURN, R_others))
         is_turned = turn >= np.radians(spacing * self.novelty.min_turn_deg)

@@ -7,7 +7,7 @@ import numpy as np
 from lce_rig.collect.guidance.evidence import N_UNKNOWNS, Evidence, weigh_placements
 from lce_rig.collect.guidance.sensors import ErrorModel, SensorModel
 from lce_rig.core.geometry import Array
-from lce_rig.solvers.covariance import symmetric_inverse
+from lce_rig.solvers.covariance import symmetric_inverse, systematic_covariances
 
 # What is known a priori (a rough extrinsic), so that no direction is ever infinitely uncertain.
 PRIOR_SIGMA_M, PRIOR_SIGMA_RAD = 1.0, 0.5
@@ -43,8 +43,8 @@ class Precision:
     def claimed(self, n_captures: int) -> Array:
         """Predict the covariance (..., 6, 6) that the calibration will state after so many captures.
 
-        It estimates the scatter from the captures themselves, and makes up for how few they are (equation (2)
-        of `jackknife_covariance`).
+        It estimates the scatter from the captures themselves, and makes up for how few they are (as
+        `Quadratics.jackknife_covariance` does).
         """
         few = (n_captures - 1) / max(n_captures - N_UNKNOWNS - 2, 2)
         return np.asarray(max(few, 1.0) * self.scatter + self.lasers + self.offset)
@@ -102,10 +102,5 @@ def _precision(hessian: Array, noise: Array, drift: Array, errors: ErrorModel) -
     inverse = symmetric_inverse(hessian + prior)
     # The prior's own error counts where captures leave a direction open.
     scatter = inverse @ (noise + prior) @ inverse
-    sensitivity = inverse @ drift
-    n_lasers = sensitivity.shape[-1]
-    mean = sensitivity.mean(axis=-1)
-    each = sensitivity - mean[..., None]
-    lasers = errors.laser_bias_m**2 * each @ np.swapaxes(each, -1, -2)
-    offset = (errors.range_offset_m * n_lasers) ** 2 * mean[..., :, None] * mean[..., None, :]
+    lasers, offset = systematic_covariances(inverse @ drift, errors.laser_bias_m, errors.range_offset_m)
     return Precision(scatter[..., :6, :6], lasers[..., :6, :6], offset[..., :6, :6])

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lce_rig.collect.guidance.sensors import SensorModel
 from lce_rig.core.geometry import Array
 
-# Shorter rings are no line to the detector.
+# The detector does not use shorter rings as lines.
 FEWEST_POINTS = 6
 _SAMPLES = 48
 

@@ -21,7 +21,6 @@ DEAD_BANDS = {"sideways": 0.12, "nearer": 0.15, "height": 0.10, "tilt": 8.0, "tu
 #: Within so many dead bands of every wanted figure the board is there.
 THERE = 1.5
 #: Where no reachable placement is known that was not captured.
-NOWHERE_ELSE = "no other place is left: you may stop"
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,7 @@ def say(instructions: Sequence[Instruction]) -> str:
 
 
 def is_there(view: View, present: Array, wanted: Array) -> bool:
-    """Tell whether a board (4, 4) is as near to where it should be as people can hold it."""
+    """Return whether a board (4, 4) is as near to where it should be as people can hold it."""
     changes = _changes(view, present, wanted)
     return all(abs(amount) <= THERE * DEAD_BANDS[kind] for kind, amount in changes.items())
 
@@ -132,7 +131,7 @@ def is_there(view: View, present: Array, wanted: Array) -> bool:
 def _changes(view: View, present: Array, wanted: Array) -> dict[Kind, float]:
     """Compute the signed changes by kind, m and deg, as `Instruction.amount`."""
     now, then = describe_pose(view, present), describe_pose(view, wanted)
-    # A print looks the same from either end.
+    # A pattern looks the same from either end.
     roll_deg = (then.roll_deg - now.roll_deg + 90) % 180 - 90
     # Forwards is towards the rig from where the person stands.
     sight = np.array([now.right_m, now.ahead_m]) / max(np.hypot(now.right_m, now.ahead_m), 1e-9)

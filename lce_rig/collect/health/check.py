@@ -1,11 +1,22 @@
-"""One line of the doctor's: what was looked at, how it is, and what to do about it."""
+"""One line of the doctor's: what was looked at, and what was found."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Literal
 
-Severity = Literal["green", "yellow", "red"]
-_ORDER: tuple[Severity, ...] = ("green", "yellow", "red")
+from lce_rig.core.findings import Figure, Finding, Severity, worst
+from lce_rig.sources.live.base import SourceStatus
+
+Topic = Literal["device", "stream", "clock", "buffer"]
+
+# To which line a driver's problem belongs, by the family of its code.
+_TOPICS: Mapping[str, Topic] = {
+    "device": "device",
+    "stream": "stream",
+    "packet": "stream",
+    "clock": "clock",
+    "buffer": "buffer",
+}
 
 
 @dataclass(frozen=True)
@@ -13,22 +24,34 @@ class Check:
     """One thing looked at.
 
     Attributes:
-        group: "computer", a sensor's name in the profile, or "rig" for what concerns several.
+        subject: "computer", a sensor's name in the profile, or "rig" for what concerns several.
         name: what was looked at, in a word.
-        severity: green, yellow (collecting works, less well) or red (it does not, or its data are wrong).
-        figure: what was seen, in words and figures.
-        remedy: what to do, a line for each thing; "" where nothing is to be done.
-        values: figures for machines, by name with units.
+        findings: what was found; how it is first, as a note, then what is wrong: a warning where collecting
+            works, less well, an error where it does not or its data are wrong.
     """
 
-    group: str
+    subject: str
     name: str
-    severity: Severity
-    figure: str
-    remedy: str = ""
-    values: Mapping[str, float] = field(default_factory=dict)
+    findings: tuple[Finding, ...]
+
+    @staticmethod
+    def of(subject: str, name: str, *findings: Finding | None) -> "Check":
+        """Make a line of what was found; findings without a subject get the line's."""
+        found = (each for each in findings if each is not None)
+        named = tuple(each if each.subject else replace(each, subject=subject) for each in found)
+        return Check(subject, name, named)
+
+    @property
+    def severity(self) -> Severity:
+        """The worst of the findings."""
+        return worst(self.findings)
+
+    @property
+    def figures(self) -> dict[str, Figure]:
+        """The figures of all findings together."""
+        return {name: figure for each in self.findings for name, figure in each.figures.items()}
 
 
-def worst(severities: Iterable[Severity]) -> Severity:
-    """Give the most severe; green where there is none."""
-    return max(severities, key=_ORDER.index, default="green")
+def problems_of(status: SourceStatus, topic: Topic) -> list[Finding]:
+    """Give a driver's problems of one topic."""
+    return [problem for problem in status.problems if _TOPICS[problem.family] == topic]

@@ -1,23 +1,21 @@
 """The streams' clocks: what each is tied to, how they lie apart and drift, and whether boards may move."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from lce_rig.collect.edge_clock import EdgeClock
-from lce_rig.collect.health.check import Check, Severity
+from lce_rig.collect.health.check import Check, problems_of
 from lce_rig.collect.health.examination import Examination
 from lce_rig.collect.health.observing import Observation
-from lce_rig.collect.health.remarks import as_remedy, remarks
-from lce_rig.collect.health.sensors import SYNC, driver_of
-from lce_rig.collect.sync import CommonClock, judge_sync
-from lce_rig.core.clock import ClockModel
-from lce_rig.core.clock_fit import fit_arrivals
+from lce_rig.collect.health.sensors import driver_of
+from lce_rig.core.data import Image, Pulse
+from lce_rig.core.findings import Figure, Finding, Severity
+from lce_rig.rig.sync import BOARD
+from lce_rig.timing.clock import ClockModel
+from lce_rig.timing.clock_fit import fit_arrivals
+from lce_rig.timing.rig_clock import RigClock, edge_line
 
 _RIG = "rig"
-_PPS_LINE = "pps"
-# A locked VLP-16 counts whole microseconds.
-_LOCKED_SIGMA_NS = 1_000.0
-# A DAVIS takes the computer's time when it is opened; as `collect` has it.
-_COARSE_EDGE_NS = 100_000_000.0
 _MAX_DRIFT_PPM = 200.0
 _STREAMS = ("scans", "events", "frames")
 
@@ -27,99 +25,85 @@ def check_clock(exam: Examination, sensor: str) -> Check | None:
     status = exam.seen[sensor].status
     if status is None:
         return None
-    problems = remarks(status, "clock")
-    figure, figures = status.clock or "no stamps yet", status.figures
-    if "delay_ms" in figures:
-        figure += f"; {figures['delay_ms']:.0f} ms old on arrival"
-    if "round_trip_us" in figures:
-        figure += f"; round trip {figures['round_trip_us'] / 1000:.1f} ms"
-    severity: Severity = "yellow" if problems else "green"
-    return Check(sensor, "clock", severity, figure, as_remedy(problems), figures)
+    state = Finding("clock.no_timestamps", "note") if status.clock is None else status.clock.finding
+    return Check.of(sensor, "clock", state, *problems_of(status, "clock"))
 
 
 def check_edges(exam: Examination, sensor: str) -> Check | None:
     """Fit the clock of a camera that sees the board's pulses to them."""
     if not _sees_edges(exam, sensor):
         return None
-    model, problem, n_sent = _fit_edges(exam, sensor)
-    n_seen = len(exam.seen[sensor].pulses)
+    board, line = exam.seen[BOARD], edge_line(exam.rig, sensor)
+    model, problem = tie(exam).edge_clock(sensor)
+    if board.host_clock is None:
+        problem = Finding("clock.board_not_tied")
+    n_sent = sum(pulse.sensor == line for pulse in board.pulses)
+    figures: dict[str, Figure] = {"n_edges": len(exam.seen[sensor].pulses), "n_pulses": n_sent}
     if model is None:
-        figure = f"{n_seen} edges seen of {n_sent} pulses, clock not fitted"
-        return Check(sensor, "edges", "red", figure, as_remedy([problem]))
-    drift_ppm, rms_us = -1e6 * model.drift, model.rms_ns / 1000
-    values = {"drift_ppm": drift_ppm, "rms_us": rms_us, "n_edges": float(n_seen), "n_pulses": float(n_sent)}
-    figure = f"{n_seen} of {n_sent} pulses, drift {drift_ppm:+.1f} ppm, scatter {rms_us:.1f} us"
-    return Check(sensor, "edges", "green", figure, values=values)
+        return Check.of(sensor, "edges", Finding("edges.not_fitted", figures=figures), problem)
+    figures |= {"drift_ppm": -1e6 * model.drift, "rms_us": model.rms_ns / 1000}
+    return Check.of(sensor, "edges", Finding("edges.fitted", "note", figures=figures))
 
 
 def check_offsets(exam: Examination) -> Check | None:
     """Measure every stream's offset and drift against this computer's clock, by when its samples arrive."""
-    words, strays = list[str](), list[str]()
-    values: dict[str, float] = {}
+    offsets, strays = list[Finding](), list[Finding]()
     for sensor, seen in exam.seen.items():
-        model = seen.host_clock if sensor == SYNC else _by_arrivals(exam, seen)
+        model = seen.host_clock if sensor == BOARD else _by_arrivals(exam, seen)
         if model is None:
             continue
         # The model has the computer's time on the sensor's clock: its drift is the other way round.
         drift_ppm, sigma_ppm = -1e6 * model.drift, 1e6 * float(np.sqrt(model.cov[1, 1]))
-        values |= {f"{sensor}.drift_ppm": drift_ppm, f"{sensor}.drift_sigma_ppm": sigma_ppm}
-        offset_ms = _offset_ms(seen, model)
-        if offset_ms is not None:
-            values[f"{sensor}.offset_ms"] = offset_ms
-        if sensor != SYNC:  # the board's own line has it
-            offset = "" if offset_ms is None else f" {_duration(offset_ms)},"
-            words.append(f"{sensor}{offset} {drift_ppm:+.0f} +- {max(sigma_ppm, 1):.0f} ppm")
+        figures = {
+            "offset_ms": _offset_ms(seen, model),
+            "drift_ppm": drift_ppm,
+            "drift_sigma_ppm": max(sigma_ppm, 1),
+        }
+        offsets.append(Finding("clock.offset", "note", sensor, figures))
         if abs(drift_ppm) > _MAX_DRIFT_PPM + 3 * sigma_ppm:
-            strays.append(
-                f"the clock of {sensor} drifts as no crystal does: is one being set, or the computer busy?"
-            )
-    if not words:
-        return None
-    severity: Severity = "yellow" if strays else "green"
-    return Check(_RIG, "clocks", severity, "; ".join(words), as_remedy(strays), values)
+            limit = {"drift_ppm": drift_ppm, "limit_ppm": _MAX_DRIFT_PPM}
+            strays.append(Finding("clock.drifts", "warning", sensor, limit))
+    is_empty = all(found.subject == BOARD for found in offsets)  # the board's own line says as much
+    return None if is_empty else Check.of(_RIG, "clocks", *offsets, *strays)
 
 
 def check_sync(exam: Examination) -> Check | None:
     """Judge whether boards may move while they are captured; absent sensors are left out of it."""
-    rig, verdict = exam.rig, judge_sync(exam.rig, tie(exam))
-    if not verdict.requires_still_boards:
-        return Check(_RIG, "sync", "green", str(verdict))
+    rig, verdict = exam.rig, tie(exam).verdict()
     absent = [sensor for sensor, seen in exam.seen.items() if not seen.has_opened]
-    reasons = [reason.partition(";")[0] for reason in verdict.reasons]
-    reasons = [
-        reason for reason in reasons if not any(f"the clock of {name} is" in reason for name in absent)
-    ]
+    if not verdict.requires_still_boards:
+        return None if absent else Check.of(_RIG, "sync", verdict.finding)
+    reasons = [each for each in verdict.reasons if each.code != "sync.not_tied" or each.subject not in absent]
     if not reasons:
         return None
-    figure = f"boards must stand still while they are captured: {'; '.join(reasons)}"
-    if all(sync == "none" for sync in _promises(exam)):
-        return Check(_RIG, "sync", "green", figure)
-    if rig.sync is None:
-        remedy = "The profile has no sync board: add `sync` (docs/wiring-and-sync.md) to let boards move."
-    else:
-        remedy = "See the lines of these sensors and of the sync board."
-    return Check(_RIG, "sync", "yellow", figure, remedy)
+    is_promised = any(sync != "none" for sync in _promises(exam))
+    severity: Severity = "warning" if is_promised else "note"
+    action = ("add_board" if rig.sync is None else "see_lines") if is_promised else ""
+    judged = replace(verdict.finding, severity=severity, action=action)
+    named = [replace(reason, severity=severity, action="named") for reason in reasons]
+    return Check.of(_RIG, "sync", judged, *named)
 
 
-def tie(exam: Examination) -> CommonClock:
-    """Put every sensor that can be onto the rig's clock: UTC as the sync board or this computer has it."""
-    clock, board = CommonClock(), exam.seen.get(SYNC)
-    host = None
-    if board is not None and board.host_clock is not None and board.utc_clock is not None:
-        host = board.host_clock.inverse().then(board.utc_clock)
-    for sensor, seen in exam.seen.items():
-        if seen.status is None or sensor == SYNC:
-            continue
-        model = host
-        if seen.status.figures.get("is_device_time"):
-            model = ClockModel.identity(_LOCKED_SIGMA_NS, "UTC by PPS and NMEA")
-        elif _sees_edges(exam, sensor):
-            fitted, _, _ = _fit_edges(exam, sensor)
-            utc = None if board is None else board.utc_clock
-            model = None if fitted is None or utc is None else fitted.then(utc)
-        if model is not None:
-            clock.tie(sensor, model)
+def tie(exam: Examination) -> RigClock:
+    """Put every sensor that can be onto the rig's clock, as `collect` does with the same samples."""
+    board = exam.seen.get(BOARD)
+    has_board = board is not None and board.status is not None
+    cameras = [name for name in exam.rig.cameras if driver_of(exam.rig, name) == "davis"]
+    clock = RigClock(exam.rig, has_board=has_board, edge_cameras=cameras)
+    models = (None, None) if board is None else (board.host_clock, board.utc_clock)
+    locked = [name for name, seen in exam.seen.items() if _is_utc(seen)]
+    clock.refresh(*models, locked)
+    came: list[tuple[str, Pulse | Image]] = []
+    for name, seen in exam.seen.items():
+        came += [(name, pulse) for pulse in seen.pulses] + [(name, image) for image in seen.frames]
+    for name, sample in sorted(came, key=lambda pair: pair[1].host_ns or 0):
+        clock.take(name, sample)
+    clock.refresh(*models, locked)
     return clock
+
+
+def _is_utc(seen: Observation) -> bool:
+    return seen.status is not None and seen.status.clock is not None and seen.status.clock.is_utc
 
 
 def _promises(exam: Examination) -> list[str]:
@@ -131,26 +115,9 @@ def _promises(exam: Examination) -> list[str]:
 
 
 def _sees_edges(exam: Examination, sensor: str) -> bool:
-    board, seen = exam.seen.get(SYNC), exam.seen[sensor]
+    board, seen = exam.seen.get(BOARD), exam.seen[sensor]
     is_davis = driver_of(exam.rig, sensor) == "davis"
     return is_davis and seen.status is not None and board is not None and board.status is not None
-
-
-def _fit_edges(exam: Examination, sensor: str) -> tuple[ClockModel | None, str, int]:
-    """Fit the board's time on a sensor's clock; gives why not as well, and how many pulses were sent."""
-    board, seen = exam.seen[SYNC], exam.seen[sensor]
-    assert exam.rig.sync is not None
-    line = sensor if sensor in exam.rig.sync.triggers else _PPS_LINE
-    sent = [pulse for pulse in board.pulses if pulse.sensor == line]
-    edges = EdgeClock(sensor, _COARSE_EDGE_NS)
-    if board.host_clock is None:
-        return None, "the board's clock is not tied to this computer's", len(sent)
-    edges.set_clock(board.host_clock.inverse())
-    for pulse in sent:
-        edges.take_sent(pulse)
-    for pulse in seen.pulses:
-        edges.take_seen(pulse)
-    return edges.fit(), edges.problem.removeprefix(f"{sensor}: "), len(sent)
 
 
 def _by_arrivals(exam: Examination, seen: Observation) -> ClockModel | None:
@@ -158,7 +125,7 @@ def _by_arrivals(exam: Examination, seen: Observation) -> ClockModel | None:
     stream = next((name for name in _STREAMS if name in seen.stamps), None)
     if stream is None or seen.status is None or driver_of(exam.rig, seen.sensor) == "command":
         return None
-    if stream == "scans" and not seen.status.figures.get("is_device_time"):
+    if stream == "scans" and not _is_utc(seen):
         return None
     stamps, arrivals = seen.times(stream)
     # A LiDAR's first scans may be stamped by arrival yet, until its position packets have come.
@@ -174,13 +141,9 @@ def _offset_ms(seen: Observation, model: ClockModel) -> float | None:
     whose clock counts from when it was switched on.
     """
     assert seen.status is not None
-    if seen.sensor == SYNC:
+    if seen.sensor == BOARD:
         return None
     if "scans" in seen.stamps:
-        ahead_s = seen.status.figures.get("device_ahead_s")
-        return None if ahead_s is None else 1000 * ahead_s
+        clock = seen.status.clock
+        return None if clock is None or clock.ahead_s is None else 1000 * clock.ahead_s
     return (model.anchor_ns - model.reference_ns) * 1e-6
-
-
-def _duration(ms: float) -> str:
-    return f"{ms / 1000:+.3g} s" if abs(ms) >= 1000 else f"{ms:+.1f} ms"

@@ -12,9 +12,10 @@ from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
-from lce_rig.collect.health.check import Check, Severity
+from lce_rig.collect.health.check import Check
 from lce_rig.collect.health.sensors import uses_driver
 from lce_rig.core import velodyne
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.rig import Rig
 from lce_rig.sources.live.vlp16_socket import PACKET_COST_BYTES, WANTED_BUFFER_BYTES
 
@@ -54,41 +55,44 @@ _TIMEX_LONGS, _MAX_ERROR_LONG, _TIME_ERROR = 32, 3, 5
 def check_python(rig: Rig, folder: Path) -> Check:
     """Name Python, numpy and the machine; the drivers read 64-bit interfaces of Linux only."""
     n_bits = 8 * ctypes.sizeof(ctypes.c_void_p)
-    figure = (
-        f"Python {platform.python_version()}, numpy {metadata.version('numpy')}, "
-        f"{platform.system()} {platform.machine()}, {n_bits} bit"
-    )
-    if sys.platform != "linux" or n_bits != 64:
-        remedy = "Live sensors are read on 64-bit Linux only; recordings are read here too."
-        return Check(_GROUP, "python", "red", figure, remedy)
-    return Check(_GROUP, "python", "green", figure)
+    figures: dict[str, Figure] = {
+        "python": platform.python_version(),
+        "numpy": metadata.version("numpy"),
+        "system": platform.system(),
+        "machine": platform.machine(),
+        "n_bits": n_bits,
+    }
+    is_fit = sys.platform == "linux" and n_bits == 64
+    wrong = None if is_fit else Finding("computer.not_linux_64")
+    return Check.of(_GROUP, "python", Finding("computer.python", "note", figures=figures), wrong)
 
 
 def check_packages(rig: Rig, folder: Path) -> Check:
     """Look for the packages, and for dv-processing where the rig has a DAVIS."""
-    missing = [name for module, name in _PACKAGES.items() if find_spec(module) is None]
+    missing = tuple(name for module, name in _PACKAGES.items() if find_spec(module) is None)
     if missing:
-        remedy = f"Run: pip install {' '.join(missing)}"
-        return Check(_GROUP, "packages", "red", f"missing: {', '.join(missing)}", remedy)
-    n_found, davis = len(_PACKAGES), ""
-    if uses_driver(rig, "davis"):
-        if find_spec("dv_processing") is None:
-            remedy = "Run: pip install 'lce-rig[davis]' (Linux, Python 3.10 to 3.13)"
-            return Check(_GROUP, "packages", "red", "missing: dv-processing, which reads the DAVIS", remedy)
-        davis = f", dv-processing {metadata.version('dv-processing')}"
-    opencv = metadata.version("opencv-python-headless") if _has("opencv-python-headless") else "another build"
-    return Check(_GROUP, "packages", "green", f"all {n_found} installed; OpenCV {opencv}{davis}")
+        figures: dict[str, Figure] = {"packages": missing}
+        return Check.of(_GROUP, "packages", Finding("computer.packages_missing", figures=figures))
+    needs_davis = uses_driver(rig, "davis")
+    if needs_davis and find_spec("dv_processing") is None:
+        return Check.of(_GROUP, "packages", Finding("computer.dv_processing_missing"))
+    found = {
+        "n": len(_PACKAGES),
+        "opencv": _version("opencv-python-headless"),
+        "dv_processing": _version("dv-processing") if needs_davis else None,
+    }
+    return Check.of(_GROUP, "packages", Finding("computer.packages", "note", figures=found))
 
 
 def check_libraries(rig: Rig, folder: Path) -> Check:
     """Try to load the system libraries that Open3D is linked with; only `simulate` needs it."""
-    missing = [name for name in _OPEN3D_LIBRARIES if not _loads(name)]
+    missing = tuple(name for name in _OPEN3D_LIBRARIES if not _loads(name))
     if missing:
-        packages = " ".join(_OPEN3D_LIBRARIES[name] for name in missing)
-        figure = f"missing: {', '.join(missing)}; Open3D, which `lce-rig simulate` uses, does not load"
-        return Check(_GROUP, "libraries", "yellow", figure, f"Run: sudo apt install {packages}")
-    found = ", ".join(name.partition(".so")[0] for name in _OPEN3D_LIBRARIES)
-    return Check(_GROUP, "libraries", "green", found)
+        packages = tuple(_OPEN3D_LIBRARIES[name] for name in missing)
+        absent: dict[str, Figure] = {"libraries": missing, "packages": packages}
+        return Check.of(_GROUP, "libraries", Finding("computer.libraries_missing", "warning", figures=absent))
+    figures: dict[str, Figure] = {"libraries": tuple(_OPEN3D_LIBRARIES)}
+    return Check.of(_GROUP, "libraries", Finding("computer.libraries", "note", figures=figures))
 
 
 def check_disk(rig: Rig, folder: Path) -> Check:
@@ -96,20 +100,17 @@ def check_disk(rig: Rig, folder: Path) -> Check:
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     try:
         free_mb = shutil.disk_usage(there).free / _MB
-        speed_mbps = _write_speed_mbps(there)
+        write_mbps = _write_speed_mbps(there)
     except OSError as error:
-        figure = f"{there} cannot be written: {error.strerror}"
-        return Check(_GROUP, "disk", "red", figure, "Choose another folder with -o, or make room there.")
-    figure = f"{free_mb / 1000:.1f} GB free, {speed_mbps:.0f} MB/s flushed, in {there}"
-    values = {"free_mb": free_mb, "write_mbps": speed_mbps}
+        refused = {"folder": str(there), "cause": error.strerror}
+        return Check.of(_GROUP, "disk", Finding("computer.disk_not_writable", figures=refused))
+    figures: dict[str, Figure] = {"free_mb": free_mb, "write_mbps": write_mbps, "folder": str(there)}
+    wrong = None
     if free_mb < _SCARCE_MB:
-        severity: Severity = "red" if free_mb < _MIN_FREE_MB else "yellow"
-        return Check(_GROUP, "disk", severity, figure, "Make room, or choose another disk with -o.", values)
-    if speed_mbps < _SLOW_WRITE_MBPS:
-        severity = "red" if speed_mbps < _MIN_WRITE_MBPS else "yellow"
-        remedy = "Write to an SSD (-o FOLDER), and record no raw streams beside the captures."
-        return Check(_GROUP, "disk", severity, figure, remedy, values)
-    return Check(_GROUP, "disk", "green", figure, values=values)
+        wrong = Finding("computer.disk_full", "error" if free_mb < _MIN_FREE_MB else "warning")
+    elif write_mbps < _SLOW_WRITE_MBPS:
+        wrong = Finding("computer.disk_slow", "error" if write_mbps < _MIN_WRITE_MBPS else "warning")
+    return Check.of(_GROUP, "disk", Finding("computer.disk", "note", figures=figures), wrong)
 
 
 def check_socket_buffer(rig: Rig, folder: Path) -> Check | None:
@@ -121,27 +122,23 @@ def check_socket_buffer(rig: Rig, folder: Path) -> Check | None:
         # Linux doubles what was asked for, for its own accounts, and reports the double.
         granted_bytes = port.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     buffer_s = granted_bytes / PACKET_COST_BYTES * velodyne.packet_ns(False) * 1e-9
-    figure = f"{granted_bytes >> 11} KiB granted: {buffer_s:.2f} s of a VLP-16's packets"
-    values = {"granted_bytes": float(granted_bytes), "buffer_s": buffer_s}
-    if buffer_s < _MIN_BUFFER_S:
-        remedy = (
-            f"Run: sudo sysctl -w net.core.rmem_max={WANTED_BUFFER_BYTES}\n"
-            f"To keep it: echo net.core.rmem_max={WANTED_BUFFER_BYTES} | sudo tee /etc/sysctl.d/60-lidar.conf"
-        )
-        return Check(_GROUP, "buffer", "yellow", figure, remedy, values)
-    return Check(_GROUP, "buffer", "green", figure, values=values)
+    figures = {
+        "buffer_s": buffer_s,
+        "granted_kib": granted_bytes >> 11,
+        "wanted_bytes": WANTED_BUFFER_BYTES,
+    }
+    wrong = Finding("computer.buffer_small", "warning", figures=figures) if buffer_s < _MIN_BUFFER_S else None
+    return Check.of(_GROUP, "buffer", Finding("computer.buffer", "note", figures=figures), wrong)
 
 
 def check_clock(rig: Rig, folder: Path) -> Check:
     """Ask the kernel whether something keeps the computer's clock right; a VLP-16's hour is taken from it."""
     timex = (ctypes.c_long * _TIMEX_LONGS)()
     state = ctypes.CDLL(None).adjtimex(ctypes.byref(timex))
-    error_ms = timex[_MAX_ERROR_LONG] / 1000
     if state in (-1, _TIME_ERROR):
-        remedy = "Run: timedatectl set-ntp true, or let chrony follow the rig's GPS."
-        return Check(_GROUP, "clock", "yellow", "not synchronised, says the kernel", remedy)
-    figure = f"synchronised, off by {error_ms:.0f} ms at most"
-    return Check(_GROUP, "clock", "green", figure, values={"max_error_ms": error_ms})
+        return Check.of(_GROUP, "clock", Finding("computer.clock_not_synchronised", "warning"))
+    figures = {"max_error_ms": timex[_MAX_ERROR_LONG] / 1000}
+    return Check.of(_GROUP, "clock", Finding("computer.clock", "note", figures=figures))
 
 
 COMPUTER_CHECKS = (
@@ -155,12 +152,11 @@ COMPUTER_CHECKS = (
 """Every check of the computer: each takes the rig and the folder of sessions; None where there is no need."""
 
 
-def _has(distribution: str) -> bool:
+def _version(distribution: str) -> str | None:
     try:
-        metadata.version(distribution)
+        return metadata.version(distribution)
     except metadata.PackageNotFoundError:
-        return False
-    return True
+        return None
 
 
 def _loads(library: str) -> bool:

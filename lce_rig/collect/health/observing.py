@@ -9,11 +9,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.clock import ClockModel
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, LiveSample, Pulse, Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.sources.live.base import LiveSample, LiveSource, Pulse, SourceStatus
+from lce_rig.sources.live.base import SourceStatus
+from lce_rig.sources.live.reading import LiveSource
 from lce_rig.sources.live.sync_board import SyncBoard
+from lce_rig.timing.clock import ClockModel
 
 # A sync board that its port's opening resets takes some seconds to speak; nobody waits longer.
 PATIENCE_S = 3.0
@@ -141,7 +142,7 @@ def _goes_on(watches: list["_Watch"], elapsed_s: float, duration_s: float) -> bo
 
 
 class _Watch:
-    """One sensor's two threads: one opens, waits and closes, the other takes samples.
+    """One sensor's thread: opens it, takes samples, and closes it.
 
     Attributes:
         stop: set to end the watch.
@@ -168,15 +169,16 @@ class _Watch:
 
     def _run(self) -> None:
         try:
-            source = self._make()
-            with source:
+            with self._make() as source:
                 self.opened_s = time.monotonic()
-                taker = threading.Thread(target=self._take, args=(source,), daemon=True)
-                taker.start()
-                while not self.stop.wait(_POLL_S) and taker.is_alive():
-                    continue
+                try:
+                    while not self.stop.is_set():
+                        sample = source.take(_POLL_S)
+                        if sample is not None:
+                            self._seen.take(sample)
+                except SourceError as error:
+                    self._seen.failure = error
                 self._close(source, self.opened_s)
-            taker.join()
         except SourceError as error:
             self._seen.failure = self._seen.failure or error
         except Exception as error:  # A bug in one driver must not hide what is known of the others.
@@ -192,14 +194,3 @@ class _Watch:
         self._seen.watched_s, self._seen.ended_ns = time.monotonic() - opened_s, time.time_ns()
         if isinstance(source, SyncBoard):
             self._seen.host_clock, self._seen.utc_clock = source.host_clock, source.utc_clock
-
-    def _take(self, source: LiveSource) -> None:
-        try:
-            for sample in source.samples():
-                if self.stop.is_set():
-                    return
-                self._seen.take(sample)
-        except SourceError as error:
-            self._seen.failure = error
-        except Exception as error:
-            self._seen.failure = SourceError(f"its driver failed: {error!r}", "This is a bug: report it.")

@@ -1,13 +1,16 @@
 """What a camera's pictures and events are like, and the board in them and in a LiDAR's scans."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from lce_rig.collect.event_buffer import join_events
-from lce_rig.collect.health.check import Check, Severity
+from lce_rig.collect.health.check import Check
 from lce_rig.collect.health.examination import Examination
+from lce_rig.core.findings import Finding
 from lce_rig.core.results import Refusal
-from lce_rig.detect.event_gate import explain_missing_board
+from lce_rig.detect.event_gate import events_problem
 from lce_rig.detect.image_quality import strongest_edge_px
+from lce_rig.timing.event_buffer import join_events
 
 _BLACK, _WHITE = 5, 250
 _MAX_WHITE, _MAX_BLACK = 0.2, 0.6
@@ -17,7 +20,7 @@ _MAX_EDGE_PX = 6.0
 
 
 def check_picture(exam: Examination, sensor: str) -> Check | None:
-    """Judge the exposure and sharpness of the last picture."""
+    """Judge the exposure and sharpness of the last image."""
     images = exam.seen[sensor].images
     if not images:
         return None
@@ -25,23 +28,17 @@ def check_picture(exam: Examination, sensor: str) -> Check | None:
     low, high = (float(value) for value in np.percentile(grey, (1, 99)))
     white, black = float(np.mean(grey >= _WHITE)), float(np.mean(grey <= _BLACK))
     edge_px = strongest_edge_px(grey, high - low)
-    values = {"grey_1": low, "grey_99": high, "white_share": white, "black_share": black}
-    figure = f"grey {low:.0f} to {high:.0f}, {100 * white:.0f} % white"
+    figures = {"grey_1": low, "grey_99": high, "white_share": white, "black_share": black, "edge_px": edge_px}
+    wrong = None
     if high - low < _FLAT_GREY:
-        remedy = "Take the lens cap off; is the cable in the right port?"
-        return Check(sensor, "picture", "red", f"{figure}: nothing to be seen", remedy, values)
-    values["edge_px"] = edge_px
-    problem = ""
-    if high < _DARK_GREY or black > _MAX_BLACK:
-        problem = f"underexposed ({100 * black:.0f} % black): expose longer, open the lens, or add light"
+        wrong = Finding("exposure.nothing_visible")
+    elif high < _DARK_GREY or black > _MAX_BLACK:
+        wrong = Finding("exposure.dark", "warning", figures={"black_share": black})
     elif white > _MAX_WHITE:
-        problem = "overexposed: expose shorter, or turn away from the light"
+        wrong = Finding("exposure.bright", "warning", figures={"white_share": white})
     elif edge_px > _MAX_EDGE_PX:
-        problem = "blurred: focus the lens, clean it, and expose shorter"
-    severity: Severity = "yellow" if problem else "green"
-    figure += f", edges {edge_px:.1f} px"
-    remedy = problem[:1].upper() + problem[1:] + "." if problem else ""
-    return Check(sensor, "picture", severity, figure, remedy, values)
+        wrong = Finding("exposure.blurred", "warning", figures={"limit_px": _MAX_EDGE_PX})
+    return Check.of(sensor, "picture", Finding("exposure.grey", "note", figures=figures), wrong)
 
 
 def check_events(exam: Examination, sensor: str) -> Check | None:
@@ -50,19 +47,16 @@ def check_events(exam: Examination, sensor: str) -> Check | None:
     if not seen.events:
         return None
     events = join_events(list(seen.events))
-    fine = Refusal("image", "", "")
-    doubt = explain_missing_board(events, int(events.t_ns[-1]) + 1, fine, exam.rig.quality)
-    if doubt is fine:
-        return Check(sensor, "events", "green", "moving edges, no flicker, no hot pixels to speak of")
-    return Check(sensor, "events", "yellow", doubt.cause, doubt.action)
+    problem = events_problem(events, int(events.t_ns[-1]) + 1, exam.rig.quality)
+    found = Finding("exposure.events", "note") if problem is None else replace(problem, severity="warning")
+    return Check.of(sensor, "events", found)
 
 
 def check_board(exam: Examination, sensor: str) -> Check | None:
     """Say whether the sensor sees the board now."""
-    sights = {channel: sight for (name, channel), sight in exam.boards.items() if name == sensor}
-    if not sights:
+    found = [board for (name, _), board in exam.boards.items() if name == sensor]
+    if not found:
         return None
-    best = min(sights.values(), key=lambda sight: sight.refusal is not None)
-    if best.refusal is None:
-        return Check(sensor, "board", "green", best.figure, values=best.values)
-    return Check(sensor, "board", "yellow", best.refusal.cause, best.refusal.action)
+    # Where any channel sees it, it is there.
+    seen = next((board for board in found if not isinstance(board, Refusal)), None)
+    return Check.of(sensor, "board", seen or replace(found[0], severity="warning"))

@@ -2,11 +2,9 @@
 
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import DriverSettings, Rig
-from lce_rig.sources.live.base import LiveSource
+from lce_rig.rig.sync import BOARD
 from lce_rig.sources.live.opening import driver_type, open_live
-
-SYNC = "sync"
-"""Name of the sync board among the sensors."""
+from lce_rig.sources.live.reading import LiveSource
 
 # What to add for each driver that must be told where its sensor is.
 _LINES = {
@@ -17,7 +15,7 @@ _LINES = {
 
 def sensors(rig: Rig) -> list[str]:
     """Name the sensors: LiDARs, cameras, then the sync board."""
-    return [*rig.lidars, *rig.cameras, *([SYNC] if rig.sync is not None else [])]
+    return [*rig.lidars, *rig.cameras, *([BOARD] if rig.sync is not None else [])]
 
 
 def driver_of(rig: Rig, sensor: str) -> str:
@@ -51,7 +49,7 @@ def source_of(rig: Rig, sensor: str) -> LiveSource:
     alone = {
         "lidars": {name: lidar for name, lidar in rig.lidars.items() if name == sensor},
         "cameras": {name: camera for name, camera in rig.cameras.items() if name == sensor},
-        "sync": rig.sync if sensor == SYNC else None,
+        "sync": rig.sync if sensor == BOARD else None,
     }
     return open_live(rig.model_copy(update=alone))[0]
 

@@ -1,16 +1,16 @@
 """A VLP-16: how its web page says that it is set, and whether pulses and sentences give it UTC."""
 
-from lce_rig.collect.health.check import Check, Severity
+from dataclasses import replace
+
+from lce_rig.collect.health.check import Check
 from lce_rig.collect.health.examination import Examination
-from lce_rig.collect.health.remarks import as_remedy
 from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
-from lce_rig.rig import LidarSettings, Rig
+from lce_rig.core.findings import Figure, Finding, Severity
+from lce_rig.rig import Rig
 from lce_rig.sources.live.velodyne_web import VelodyneWeb, WebReport, find_problems
 
 _WEB_TIMEOUT_S = 1.0
-_PPS_PROBLEM = "PPS is "
-_CLOCK_FIGURES = ("pps_state", "nmea_fix", "device_ahead_s")
 
 
 def read_web(rig: Rig, lidar: str, port: int = 80) -> WebReport | SourceError:
@@ -23,72 +23,40 @@ def read_web(rig: Rig, lidar: str, port: int = 80) -> WebReport | SourceError:
 
 
 def check_settings(exam: Examination, sensor: str) -> Check | None:
-    """Hold what the web page says against the profile."""
+    """Compare what the web page says with the profile."""
     report = exam.web.get(sensor)
     if report is None:
         return None
     if isinstance(report, SourceError):
-        # A sensor that sends nothing has a red line already, with all there is to check.
+        # A sensor that sends nothing has a line already, with all there is to check.
         if not exam.seen[sensor].has_opened:
             return None
-        remedy = "Firmware and settings stay unknown. Is driver.address its own, and no firewall in the way?"
-        return Check(sensor, "settings", "yellow", report.what, remedy)
-    problems = [
-        problem
-        for problem in find_problems(report, exam.rig.lidars[sensor])
-        if not problem.startswith(_PPS_PROBLEM)
-    ]
-    return Check(
-        sensor, "settings", "yellow" if problems else "green", _setting_words(report), as_remedy(problems)
-    )
+        unknown = Finding("settings.unknown", "warning", figures={"what": report.what})
+        return Check.of(sensor, "settings", unknown)
+    problems = find_problems(report, exam.rig.lidars[sensor])
+    # The pulse has a line of its own.
+    others = [problem for problem in problems if problem.code != "settings.pps"]
+    figures: dict[str, Figure] = {
+        "rotor_hz": report.rotor_hz,
+        "returns": report.returns,
+        "fov_deg": report.fov_deg,
+        "host": report.host,
+        "data_port": report.data_port,
+    }
+    return Check.of(sensor, "settings", Finding("settings.read", "note", figures=figures), *others)
 
 
 def check_pulse(exam: Examination, sensor: str) -> Check | None:
     """Say whether the sensor is locked to pulses and knows UTC, and whose time its scans are stamped with."""
     seen, report, lidar = exam.seen[sensor], exam.web.get(sensor), exam.rig.lidars[sensor]
-    if seen.status is None:
+    if seen.status is None or seen.status.clock is None:
         return None
-    figures = seen.status.figures
-    if "pps_state" in figures:
-        state = velodyne.PPS_STATES[round(figures["pps_state"])]
-    else:
-        state = report.pps if isinstance(report, WebReport) and report.pps else "unknown"
-    figure = f"{state}, {_nmea_words(figures)}"
-    values = {name: value for name, value in figures.items() if name in _CLOCK_FIGURES}
-    if figures.get("is_device_time"):
-        return Check(sensor, "PPS", "green", f"{figure}; {seen.status.clock}", values=values)
-    cause = seen.status.clock.partition("by arrival: ")[2]
-    is_said = cause in ("", f"PPS is {state}", f"PPS is {state}, but no NMEA arrives")
-    figure += "; scans are stamped by arrival" if is_said else f"; scans are stamped by arrival: {cause}"
-    remedy = _lost_time_remedy(seen.status.clock, seen.status.problems)
-    return Check(sensor, "PPS", _without_lock(lidar), figure, remedy, values)
-
-
-def _without_lock(lidar: LidarSettings) -> Severity:
-    """Judge a clock that runs freely by what the profile promises."""
-    if lidar.timestamps.clock != "utc":
-        return "green"
-    return "red" if lidar.timestamps.sync == "hardware" else "yellow"
-
-
-def _nmea_words(figures: dict[str, float]) -> str:
-    if "nmea_past_hour_s" in figures:
-        minute, second = divmod(round(figures["nmea_past_hour_s"]), 60)
-        fix = "" if figures.get("nmea_fix") else ", no fix"
-        return f"NMEA {minute:02d}:{second:02d} past the hour{fix}"
-    return "no NMEA" if "pps_state" in figures else "no position packets"
-
-
-def _lost_time_remedy(clock: str, problems: tuple[str, ...]) -> str:
-    begin = f"scans are stamped with {clock}; "
-    found = [problem.removeprefix(begin) for problem in problems if problem.startswith(begin)]
-    otherwise = "without hardware: lidars.*.timestamps sync: none, clock: host; boards must then stand still"
-    return as_remedy([*found, otherwise]) if found else ""
-
-
-def _setting_words(report: WebReport) -> str:
-    rotor = None if report.rotor_hz is None else f"{60 * report.rotor_hz:.0f} rpm"
-    view = None if report.fov_deg is None else f"{report.fov_deg[0]:.0f} to {report.fov_deg[1]:.0f} deg"
-    port = f":{report.data_port}" if report.data_port else ""
-    host = f"to {report.host}{port}" if report.host or port else None
-    return ", ".join(filter(None, (rotor, report.returns, view, host)))
+    clock = seen.status.clock
+    told = report.pps if isinstance(report, WebReport) and report.pps else None
+    figures: dict[str, Figure] = {"pps": told, "has_position": "pps" in clock.finding.figures}
+    pulse = Finding("clock.pulse", "note", figures=figures | dict(clock.finding.figures))
+    if clock.is_utc or lidar.timestamps.clock != "utc":
+        return Check.of(sensor, "PPS", pulse, replace(clock.finding, severity="note"))
+    severity: Severity = "error" if lidar.timestamps.sync == "hardware" else "warning"
+    way_out = Finding("clock.without_pulses", "note")
+    return Check.of(sensor, "PPS", pulse, replace(clock.finding, severity=severity), way_out)

@@ -1,7 +1,8 @@
 """The live loop: see the board in the newest frame, say where it goes, capture it when it is there.
 
-Threads: one reads each sensor (its source), one forwards what it read (`Pumps`), one pairs (`FrameFeed`), one
-writes captures (`Keeper`); this loop alone looks for the board, decides and tells the views.
+Threads: one reads each sensor into one queue (`AttachedSensors`), one pairs (`FrameFeed`), one writes
+captures (`Keeper`); this loop alone decides and tells the views. Processes: one looks for the board
+(`BoardSearch`), one calibrates what was captured (`Learning`).
 """
 
 import sys
@@ -9,29 +10,27 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from lce_rig.collect.live.frame_feed import FrameFeed
+from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
 from lce_rig.collect.live.gates import LiveGate, SlowBoards, StillBoards
-from lce_rig.collect.live.guide import GIVE_UP_S, Guide
+from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
 from lce_rig.collect.live.keeper import Keeper, Task
+from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.live.monitor import Monitor
 from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_unseen
 from lce_rig.collect.live.options import Ending, Key, LiveOptions, LiveReport
-from lce_rig.collect.live.pumps import Pumps
 from lce_rig.collect.live.recorder import SampleRecorder
-from lce_rig.collect.live.rig_clock import RigClock, SyncTimes
+from lce_rig.collect.live.search import BoardSearch
 from lce_rig.collect.live.state import LiveState
 from lce_rig.collect.novelty import Placements, capture_poses
-from lce_rig.collect.sync import pair_times
-from lce_rig.collect.watching import BoardWatcher, ImageKey, Moment, Sighting
+from lce_rig.collect.watching import Moment, Sighting
 from lce_rig.core.errors import LceRigError
-from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
-from lce_rig.sources.live.base import LiveSource
+from lce_rig.sources.live.opening import edge_cameras
+from lce_rig.sources.live.reading import AttachedSensors, LiveSource
+from lce_rig.timing.rig_clock import RigClock
+from lce_rig.timing.sync import pair_times
+from lce_rig.words import describe, sentence
 
-#: How often a picture without a board is searched thoroughly, during which nothing is said.
-THOROUGH_S = 3.0
-#: How often a scan is searched for other things of the board's size while all that are known are followed.
-RESCAN_S = 1.0
 _WAIT_S = 0.1
 _TURN_S = 0.0005
 _NOVEL_M, _NOVEL_DEG = 0.15, 10.0
@@ -67,13 +66,17 @@ def collect_live(
     for capture in session.captures:
         _count_in(capture, session, guides)
     # Leaving closes in turn: nothing new comes, what was decided is written, the devices are let go.
-    with _swift_turns(), Pumps(sources) as pumps:
-        clock = RigClock(rig, board)
+    search = BoardSearch(rig, options.search_interval_s)
+    with _swift_turns(), search, AttachedSensors(sources) as sensors:
+        clock = RigClock(rig, has_board=board is not None, edge_cameras=edge_cameras(rig))
         with (
-            Keeper(session, guides, rig.quality.min_captures) as keeper,
-            FrameFeed(rig, pumps, clock, None if recorder is None else recorder.put) as feed,
+            Learning(rig, guides) as learning,
+            Keeper(session, learning) as keeper,
+            FrameFeed(rig, sensors, clock, board, None if recorder is None else recorder.put) as feed,
         ):
-            loop = _Loop(session, options, pumps, clock, feed, keeper, guides, show, recorder)
+            loop = _Loop(
+                session, options, sensors, clock, feed, search, learning, keeper, guides, show, recorder
+            )
             report = loop.run(keys)
         loop.take_kept()
         loop.close_books()
@@ -93,15 +96,6 @@ def _swift_turns() -> Iterator[None]:
         yield
     finally:
         sys.setswitchinterval(before_s)
-
-
-def make_guides(rig: Rig) -> list[Guide]:
-    """Make a guide for every camera with every LiDAR: by its frames where it has any."""
-    keys: list[ImageKey] = [
-        (name, camera.first_channel("frames") or next(iter(camera.channels)))
-        for name, camera in rig.cameras.items()
-    ]
-    return [Guide(rig, key, lidar) for key in keys for lidar in rig.lidars]
 
 
 def _count_in(capture: Capture, session: Session, guides: Sequence[Guide]) -> None:
@@ -125,9 +119,11 @@ class _Loop:
         self,
         session: Session,
         options: LiveOptions,
-        pumps: Pumps,
+        sensors: AttachedSensors,
         clock: RigClock,
         feed: FrameFeed,
+        search: BoardSearch,
+        learning: Learning,
         keeper: Keeper,
         guides: Sequence[Guide],
         show: Callable[[LiveState], None],
@@ -135,21 +131,19 @@ class _Loop:
     ) -> None:
         self.report = LiveReport()
         self._session, self._rig, self._options = session, session.rig, options
-        self._pumps, self._clock, self._feed, self._keeper = pumps, clock, feed, keeper
+        self._sensors, self._clock, self._feed, self._keeper = sensors, clock, feed, keeper
         self._guides = guides
         self._show = show
         self._recorder = recorder
         self._began_s = time.monotonic()
-        self._watcher = BoardWatcher(
-            self._rig, options.search_interval_s, thorough_interval_s=THOROUGH_S, rescan_interval_s=RESCAN_S
-        )
+        self._search, self._learning = search, learning
         self._gate: LiveGate | None = None
         self._n_captures = len(session.captures)
         names = [capture.name for capture in session.captures]
         self._first_number = int(names[-1]) + 1 if names else 0
         self._n_asked = 0
         self._captured_s = self._began_s
-        self._monitor = Monitor(session, options, pumps, clock)
+        self._monitor = Monitor(session, options, sensors, clock)
         self._last: Sighting | None = None
 
     def run(self, keys: Callable[[], Key | None]) -> LiveReport:
@@ -158,8 +152,11 @@ class _Loop:
             frame = self._feed.take(_WAIT_S)
             self.take_kept()
             if frame is not None:
+                sighting = self._search.sight(frame)
+                if not self.report.n_frames:
+                    self._captured_s = time.monotonic()  # The search had to start first.
                 self.report.n_frames += 1
-                self._see(self._watcher.sight(frame))
+                self._see(sighting)
             key = keys()
             self._obey(key)
             ending = self._find_ending(key)
@@ -170,7 +167,8 @@ class _Loop:
                 return self.report
 
     def take_kept(self) -> None:
-        """Count the captures that have become safe."""
+        """Count the captures that have become safe, and take what they taught."""
+        self._learning.teach()
         for kept in self._keeper.take():
             self._n_captures += 1
             self.report.captured.append(kept.name)
@@ -181,13 +179,15 @@ class _Loop:
         """Gather what was lost on the way, and write it into the session's journal."""
         report = self.report
         report.n_skipped = self._feed.n_skipped
-        report.lost = {name: error for name, (error, _) in self._pumps.lost().items()}
-        for name, status in self._pumps.statuses().items():
+        report.lost = {name: error for name, (error, _) in self._sensors.lost().items()}
+        for name, status in self._sensors.statuses().items():
             report.n_lost[name] = status.n_lost + status.n_dropped
         if report.ending == "exhausted":
             waited_s = time.monotonic() - self._captured_s
             report.notes.append(f"no capture in the last {waited_s:.0f} s, {self._monitor.last_words()}")
-        report.notes += self._keeper.notes() + self._clock.problems() + self._clock.account()
+        ties = self._clock.problems() + self._clock.account()
+        report.notes += self._keeper.notes() + self._learning.notes()
+        report.notes += [f"{each.subject}: {sentence(each)}" for each in ties]
         if self._recorder is not None:
             report.notes += self._recorder.problems()
         self._session.journal(
@@ -229,12 +229,12 @@ class _Loop:
         present = sighting.images[guide.key].T_cam_board
         refusal = guide.adds_nothing(present)
         if refusal is None:
-            confirmed = self._watcher.confirm(moment)
+            confirmed = self._search.confirm(moment)
             if isinstance(confirmed, Moment):
                 self._capture(confirmed)
                 return Narration("saving", "captured")
             refusal = confirmed
-        self._monitor.cue("refused", f"not captured: {refusal.cause}")
+        self._monitor.cue("refused", f"not captured: {describe(refusal)}")
         guide.note_refusal(present)
         guide.plan(present, _time_s(sighting))
         return narrate_refused(guide, present, refusal)
@@ -270,15 +270,15 @@ class _Loop:
         if self._seeing_guide(sighting) is None:
             self._monitor.cue("refused", "not captured: not every sensor sees the board")
             return
-        confirmed = self._watcher.confirm(Moment(sighting, {"by_hand": 1.0}))
+        confirmed = self._search.confirm(Moment(sighting, {"by_hand": 1.0}))
         if isinstance(confirmed, Moment):
             self._capture(confirmed)
         else:
-            self._monitor.cue("refused", f"not captured: {confirmed.cause}: {confirmed.action}")
+            self._monitor.cue("refused", f"not captured: {sentence(confirmed)}")
 
     def _find_ending(self, key: Key | None) -> Ending | None:
         options, elapsed_s = self._options, time.monotonic() - self._began_s
-        lost = self._pumps.lost()
+        lost = self._sensors.lost()
         vital = {name: why for name, why in lost.items() if name in {*self._rig.lidars, *self._rig.cameras}}
         for error, since_s in vital.values():
             if time.monotonic() - since_s > options.lost_s:

@@ -1,25 +1,50 @@
 """Samples in, the newest frame out: paired in a thread of its own, so that slow detection stops nothing."""
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from types import TracebackType
+from typing import Protocol, runtime_checkable
 
 from lce_rig.collect.event_pictures import with_event_pictures
-from lce_rig.collect.live.pumps import Pumps
-from lce_rig.collect.live.rig_clock import RigClock
-from lce_rig.collect.pairing import Frame, PairingCounts, pair_by_time
 from lce_rig.collect.tally import Tally
+from lce_rig.core.data import Sample
 from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.rig import Rig
-from lce_rig.sources.base import Sample
 from lce_rig.sources.live.base import Mailbox
-from lce_rig.sources.rig_time import event_channel
+from lce_rig.sources.live.reading import AttachedSensors
+from lce_rig.timing.clock import ClockModel
+from lce_rig.timing.rig_clock import SLOW_TRIGGERS_HZ, RigClock
+from lce_rig.timing.rig_time import event_channel
+from lce_rig.timing.scan_pairing import Frame, PairingCounts, pair_by_time
 
 _WAIT_S = 0.1
+_REFRESH_S = 0.5
+
+
+@runtime_checkable
+class SyncTimes(Protocol):
+    """What the rig's clock needs of a sync board."""
+
+    sensor: str
+
+    @property
+    def host_clock(self) -> ClockModel | None:
+        """The computer's time on the board's clock."""
+        ...
+
+    @property
+    def utc_clock(self) -> ClockModel | None:
+        """UTC on the board's clock."""
+        ...
+
+    def start_triggers(self, rate_hz: float | None = None) -> None:
+        """Let the pulses begin, at the profile's rates or at another one."""
+        ...
 
 
 class FrameFeed:
-    """Reads the pumps, places samples on the rig's clock and pairs them; open while its `with` block lasts.
+    """Reads the sensors, places samples on the rig's clock and pairs them; open while its `with` block lasts.
 
     Attributes:
         counts: how pairing goes.
@@ -27,21 +52,30 @@ class FrameFeed:
     """
 
     def __init__(
-        self, rig: Rig, pumps: Pumps, clock: RigClock, record: Callable[[Sample], None] | None = None
+        self,
+        rig: Rig,
+        sensors: AttachedSensors,
+        clock: RigClock,
+        board: SyncTimes | None,
+        record: Callable[[Sample], None] | None = None,
     ) -> None:
         """Prepare.
 
         Args:
             rig: the profile.
-            pumps: open.
+            sensors: open.
             clock: ties the stamps.
+            board: the sync board; None where there is none.
             record: takes every sample too, as it came but for its time; must not block.
         """
         self.counts = PairingCounts()
         self._rig = rig
-        self._pumps = pumps
+        self._sensors = sensors
         self._clock = clock
+        self._board = board
         self._record = record
+        self._refreshed_s = -1e9
+        self._is_slow = False
         self._frames: Mailbox[Frame] = Mailbox(1)
         self._stop = threading.Event()
         self._failure: BaseException | None = None
@@ -94,10 +128,24 @@ class FrameFeed:
             return self._samples()
         return with_event_pictures(self._samples(), self._rig, cameras, Tally())
 
+    def _refresh_clock(self) -> None:
+        """Let the clock take what sensors and board know, and the board's lines run as it needs them."""
+        if time.monotonic() - self._refreshed_s < _REFRESH_S:
+            return
+        self._refreshed_s = time.monotonic()
+        states = {name: status.clock for name, status in self._sensors.statuses().items()}
+        locked = [name for name, state in states.items() if state is not None and state.is_utc]
+        board = self._board
+        host, utc = (None, None) if board is None else (board.host_clock, board.utc_clock)
+        self._clock.refresh(host, utc, locked)
+        if board is not None and self._clock.needs_slow_triggers != self._is_slow:
+            self._is_slow = not self._is_slow
+            board.start_triggers(SLOW_TRIGGERS_HZ if self._is_slow else None)
+
     def _samples(self) -> Iterator[Sample]:
         while not self._stop.is_set():
-            self._clock.refresh(self._pumps.statuses)
-            came = self._pumps.take(_WAIT_S)
+            self._refresh_clock()
+            came = self._sensors.take(_WAIT_S)
             if came is None:
                 continue
             for sample in self._clock.take(*came):

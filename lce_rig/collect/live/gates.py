@@ -2,7 +2,6 @@
 
 from typing import Protocol
 
-from lce_rig.collect.event_buffer import EventCut
 from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.narration import Narration, narrate_moving, narrate_still
@@ -14,6 +13,7 @@ from lce_rig.collect.watching import Moment, Sighting
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
+from lce_rig.timing.event_buffer import EventCut
 
 #: A live moment waits for a better one of its place no longer than this.
 LIVE_PATIENCE_S = 0.7

@@ -207,3 +207,12 @@ class Guide:
 
     def _held_poses(self) -> Array:
         return np.stack(self._held) if self._held else np.zeros((0, 4, 4))
+
+
+def make_guides(rig: Rig) -> list[Guide]:
+    """Make a guide for every camera with every LiDAR: by its frames where it has any."""
+    keys: list[ImageKey] = [
+        (name, camera.first_channel("frames") or next(iter(camera.channels)))
+        for name, camera in rig.cameras.items()
+    ]
+    return [Guide(rig, key, lidar) for key in keys for lidar in rig.lidars]

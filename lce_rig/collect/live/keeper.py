@@ -1,4 +1,4 @@
-"""Captures to the disk, and first calibrations of them, in a thread: guidance waits for no slow disk."""
+"""Captures to the disk, in a thread: guidance waits for no slow disk."""
 
 import threading
 import time
@@ -7,19 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 
-import numpy as np
-
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, calibrate
-from lce_rig.collect.event_buffer import EventCut
-from lce_rig.collect.guidance import Planner
-from lce_rig.collect.live.guide import Guide, Learned
+from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.novelty import board_figures
 from lce_rig.collect.stored_events import StoredEvents
-from lce_rig.collect.watching import ImageKey, Moment, Sighting
+from lce_rig.collect.watching import ImageKey, Moment
 from lce_rig.core.data import Image
-from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError
+from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.core.results import ImageBoard
 from lce_rig.session import Session
+from lce_rig.timing.event_buffer import EventCut
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,27 +53,23 @@ class Kept:
 
 
 class Keeper:
-    """Writes captures one after the other, and calibrates what it has; open while its `with` block lasts.
+    """Writes captures one after the other; open while its `with` block lasts.
 
     What is being written when the block ends is finished first.
     """
 
-    def __init__(self, session: Session, guides: Sequence[Guide], min_captures: int) -> None:
+    def __init__(self, session: Session, learning: Learning) -> None:
         """Prepare.
 
         Args:
             session: open for writing.
-            guides: to be taught by a calibration of their sensors after each capture.
-            min_captures: fewer are not calibrated.
+            learning: is shown what is safe.
         """
         self._session = session
-        self._guides = guides
-        self._min_captures = min_captures
+        self._learning = learning
         self._stored = StoredEvents()
-        self._candidates: dict[int, list[CaptureCandidates]] = {k: [] for k in range(len(guides))}
         self._tasks: deque[Task] = deque()
         self._kept: deque[Kept] = deque()
-        self._taught: deque[tuple[Guide, Planner]] = deque()
         self._failure: LceRigError | None = None
         self._changed = threading.Condition()
         self._is_closing = False
@@ -121,12 +113,9 @@ class Keeper:
             SessionError: one cannot be written: the disk is full, or gone.
         """
         with self._changed:
-            kept, taught = list(self._kept), list(self._taught)
+            kept = list(self._kept)
             self._kept.clear()
-            self._taught.clear()
             failure = self._failure
-        for guide, planner in taught:
-            guide.adopt(planner)
         if failure is not None and not kept:
             raise failure
         return kept
@@ -146,18 +135,12 @@ class Keeper:
             with self._changed:
                 self._tasks.popleft()
                 self._failure = failure
-                is_free = not self._tasks and not self._is_closing
-            if failure is None and is_free:
-                try:
-                    self._teach()
-                except Exception as error:  # Captures must be written, whatever a calibration trips over.
-                    self._session.journal("calibration failed", error=repr(error))
 
     def _store(self, task: Task) -> LceRigError | None:
         sighting = task.moment.sighting
         meta = {**task.meta, **task.moment.figures, **board_figures(sighting.images)}
         try:
-            events = self._stored.join(task.events)
+            events = [cut.events for cut in task.events]
             name = self._session.add_capture(task.images, sighting.frame.scans, meta, events)
         except LceRigError as error:
             return error
@@ -165,33 +148,7 @@ class Keeper:
             return SessionError(f"{self._session.path} cannot be written: {error!r}", "Please report it.")
         with self._changed:
             self._kept.append(Kept(name, sighting.images, time.monotonic() - task.asked_s))
-        self._gather(name, sighting)
+        # Nobody waits for this any more.
+        self._stored.note(task.events)
+        self._learning.show(name, sighting)
         return None
-
-    def _gather(self, name: str, sighting: Sighting) -> None:
-        for k, guide in enumerate(self._guides):
-            if guide.sees(sighting):
-                image, scans = sighting.images[guide.key], sighting.lidars[guide.lidar]
-                self._candidates[k].append(CaptureCandidates(name, image, scans))
-
-    def _teach(self) -> None:
-        """Calibrate what each guide's sensors have shown in this run, and let it know."""
-        for k, guide in enumerate(self._guides):
-            if len(self._candidates[k]) < self._min_captures:
-                continue
-            try:
-                board = self._session.rig.board.to_board()
-                estimate = calibrate(self._candidates[k], board, CalibrateOptions(n_draws=0))
-            except (NotEnoughDataError, np.linalg.LinAlgError):
-                continue  # More captures will tell.
-            figures = estimate.diagnostics
-            learned = Learned(
-                estimate.T_cam_lidar,
-                figures["fit_plane_rms_m"],
-                figures["fit_edge_rms_m"],
-                len(estimate.used),
-            )
-            planner = guide.prepare(learned)
-            if planner is not None:
-                with self._changed:
-                    self._taught.append((guide, planner))

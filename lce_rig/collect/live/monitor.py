@@ -8,14 +8,15 @@ import numpy as np
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.narration import Narration, image_figures, scan_figures, stream_name
 from lce_rig.collect.live.options import LiveOptions
-from lce_rig.collect.live.pumps import Pumps
-from lce_rig.collect.live.rig_clock import RigClock
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, Phase, Sound, StreamState
 from lce_rig.collect.watching import Sighting
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
 from lce_rig.session import Session
 from lce_rig.sources.live.base import SourceStatus
+from lce_rig.sources.live.reading import AttachedSensors
+from lce_rig.timing.rig_clock import RigClock
+from lce_rig.words import enumerated, sentence
 
 _EVERY_S = 0.5
 _N_CUES, _N_LOG = 8, 40
@@ -34,12 +35,14 @@ class Monitor:
         reasons: why the board is not seen, by the stream's name.
     """
 
-    def __init__(self, session: Session, options: LiveOptions, pumps: Pumps, clock: RigClock) -> None:
+    def __init__(
+        self, session: Session, options: LiveOptions, sensors: AttachedSensors, clock: RigClock
+    ) -> None:
         """Begin with nothing seen."""
         self.reasons: dict[str, Refusal] = {}
         self._session = session
         self._options = options
-        self._pumps = pumps
+        self._sensors = sensors
         self._clock = clock
         self._began_s = self._told_s = self._asked_s = time.monotonic()
         self._statuses: dict[str, SourceStatus] = {}
@@ -150,7 +153,7 @@ class Monitor:
             return "ended", "collection has ended", said.headline if is_enough else ""
         if self._lost:
             name = sorted(self._lost)[0]
-            error = self._pumps.lost().get(name)
+            error = self._sensors.lost().get(name)
             return "lost", f"{name} is lost", "" if error is None else f"{error[0].what} {error[0].hint}"
         if is_enough and not self._options.is_open:
             return "enough", _ENOUGH, said.headline
@@ -177,8 +180,8 @@ class Monitor:
         """Ask how sensors do, and log those that go and come back."""
         if not self._statuses or time.monotonic() - self._asked_s > _EVERY_S:
             self._asked_s = time.monotonic()
-            self._statuses = self._pumps.statuses()
-        lost = self._pumps.lost()
+            self._statuses = self._sensors.statuses()
+        lost = self._sensors.lost()
         for name in sorted(lost.keys() - self._lost):
             self.cue("lost", f"{name} is lost: {lost[name][0].what}")
         for name in sorted(self._lost - lost.keys()):
@@ -197,7 +200,7 @@ class Monitor:
             for channel, given in camera.channels.items():
                 # Of two kinds of one camera only its source can tell the rates apart.
                 otherwise_hz = status.rate_hz if given.kind == "frames" else 0.0
-                kind_hz = status.figures.get(f"{given.kind}_hz", otherwise_hz)
+                kind_hz = status.rates_hz.get(given.kind, otherwise_hz)
                 streams.append(self._camera_stream(name, channel, given.kind == "frames", kind_hz, status))
         for name in rig.lidars:
             streams.append(self._lidar_stream(name, self._statuses.get(name, SourceStatus(name))))
@@ -218,7 +221,7 @@ class Monitor:
         board = sighting.images.get((camera, channel))
         if board is None or (camera, channel) in sighting.unfit:
             why = self.reasons.get(name)
-            reason = self._trouble(camera) or (f"{why.cause}: {why.action}" if why else "no board")
+            reason = self._trouble(camera) or (sentence(why) if why else "no board")
             return StreamState(name, rate_hz, n_lost, False, reason)
         return StreamState(name, rate_hz, n_lost, True, self._trouble(camera), image_figures(board))
 
@@ -229,23 +232,23 @@ class Monitor:
         boards = sighting.lidars.get(lidar)
         if not boards:
             why = self.reasons.get(lidar)
-            reason = self._trouble(lidar) or (f"{why.cause}: {why.action}" if why else "no board")
+            reason = self._trouble(lidar) or (sentence(why) if why else "no board")
             return StreamState(lidar, status.rate_hz, n_lost, False, reason)
         return StreamState(lidar, status.rate_hz, n_lost, True, self._trouble(lidar), scan_figures(boards[0]))
 
     def _trouble(self, sensor: str) -> str:
         """Say what is wrong with a sensor now; "" where nothing is."""
-        lost = self._pumps.lost().get(sensor)
+        lost = self._sensors.lost().get(sensor)
         return "" if lost is None else f"lost: {lost[0].what}"
 
     def _notes(self) -> tuple[str, ...]:
         verdict = self._clock.verdict()
-        notes = [str(verdict)] if verdict.requires_still_boards else []
-        notes += self._clock.problems()
+        notes = [enumerated(verdict.finding, verdict.reasons)] if verdict.requires_still_boards else []
+        notes += [f"{each.subject}: {sentence(each)}" for each in self._clock.problems()]
         named: dict[str, list[str]] = {}
         for name, status in self._statuses.items():
             for problem in status.problems:
-                named.setdefault(problem, []).append(name)
+                named.setdefault(sentence(problem), []).append(name)
         notes += [f"{', '.join(names)}: {problem}" for problem, names in named.items()]
         if self._guide is not None and self._guide.problem:
             notes.append(self._guide.problem)

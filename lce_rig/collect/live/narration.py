@@ -9,6 +9,7 @@ from lce_rig.collect.live.state import Phase
 from lce_rig.collect.watching import ImageKey, Moment, Sighting
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.words import describe, recommend, sentence
 
 _HOLD = "hold still"
 _SHOW = "show the board to the camera"
@@ -41,14 +42,14 @@ def narrate_unseen(sighting: Sighting, guide: Guide, reasons: dict[str, Refusal]
         why = reasons.get(stream_name(guide.key))
         # A picture without a board hardly tells why; one with half a board does.
         headline = f"show the board to {guide.key[0]}" if sighting.images else _SHOW
-        return Narration("searching", headline, f"{why.cause}: {why.action}" if why else "")
+        return Narration("searching", headline, sentence(why) if why else "")
     if guide.key in sighting.unfit:
         why = sighting.unfit[guide.key]
-        headline = _next(guide, sighting.images[guide.key].T_cam_board, why.action)
-        return Narration("moving", headline, f"cannot be used here: {why.cause}")
+        headline = _next(guide, sighting.images[guide.key].T_cam_board, recommend(why))
+        return Narration("moving", headline, f"cannot be used here: {describe(why)}")
     why = reasons.get(guide.lidar)
-    headline = why.action if why else "the LiDAR does not see the board"
-    return Narration("searching", headline, f"{guide.lidar}: {why.cause}" if why else "")
+    headline = recommend(why) if why else "the LiDAR does not see the board"
+    return Narration("searching", headline, f"{guide.lidar}: {describe(why)}" if why else "")
 
 
 def narrate_still(
@@ -72,7 +73,7 @@ def narrate_still(
 
 def narrate_refused(guide: Guide, present: Array, refusal: Refusal) -> Narration:
     """Say why a board is not captured where it is, and where it goes instead."""
-    return Narration("refused", _next(guide, present, refusal.action), f"not here: {refusal.cause}")
+    return Narration("refused", _next(guide, present, recommend(refusal)), f"not here: {describe(refusal)}")
 
 
 def narrate_moving(
@@ -81,7 +82,7 @@ def narrate_moving(
     """Say where a board goes that has to move slowly to be captured."""
     headline = _next(guide, present, f"move it slowly, about {100 * options.best_speed_mps:.0f} cm/s")
     if isinstance(judged, Refusal):
-        return Narration("moving", headline, f"{judged.cause}: {judged.action}")
+        return Narration("moving", headline, sentence(judged))
     if isinstance(judged, Moment) and guide.is_there(present):
         return Narration("holding", "good: go on slowly", f"{judged.figures['speed_mps']:.2f} m/s")
     return Narration("moving", headline, guide.problem)

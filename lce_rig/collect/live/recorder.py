@@ -6,10 +6,9 @@ from types import TracebackType
 
 import numpy as np
 
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
-from lce_rig.sources.base import Sample
 from lce_rig.sources.folder_recorder import FolderRecorder
 from lce_rig.sources.live.base import Mailbox
 

@@ -5,12 +5,11 @@ once and measured anew for each picture and scan; on its way it is rendered ever
 is too slow for that, all of it goes in slow motion: sensors, stamps and the person keep one simulated time.
 """
 
+import math
 import multiprocessing
-import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from multiprocessing import resource_tracker
+from collections.abc import Mapping
 from multiprocessing.connection import Connection
 from types import TracebackType
 
@@ -19,14 +18,16 @@ import numpy as np
 from lce_rig.collect.guidance import HeldPose, Person, View, build_pose, model_sensors
 from lce_rig.collect.live.simulated_pace import SimulatedPace
 from lce_rig.collect.live.state import LiveState
+from lce_rig.collect.live.worker import start_without_interrupts
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError, ProfileError, SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene, between
-from lce_rig.sources.live.base import LiveSource, Mailbox, SourceStatus
-from lce_rig.sources.live.reading import RateMeter
+from lce_rig.sources.live.base import ClockState, Mailbox, SourceStatus
+from lce_rig.sources.live.reading import LiveSource
 
 # For each camera: what it sees of the room is rendered first.
 START_S = 120.0
@@ -42,17 +43,16 @@ _PERSON_STREAM = 101
 _WAIT_S, _N_SLOTS = 0.2, 32
 
 
-class SimulatedSource:
+class SimulatedSource(LiveSource):
     """One simulated sensor; see `LiveSource`."""
 
     def __init__(self, sensor: str, pace: SimulatedPace | None = None) -> None:
-        self.sensor = sensor
+        super().__init__(sensor, sensor, _N_SLOTS, math.inf)
         self._pace = pace
         self._mailbox: Mailbox[Image | Scan] = Mailbox(_N_SLOTS)
         self._failure: SourceError | None = None
-        self._rate = RateMeter()
 
-    def __enter__(self) -> "SimulatedSource":
+    def open(self) -> None:
         """Begin to take samples.
 
         Raises:
@@ -61,34 +61,30 @@ class SimulatedSource:
         if self._failure is not None:
             raise self._failure
         self._mailbox = Mailbox(_N_SLOTS)
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def read(self) -> list[Image | Scan]:
+        """Give what the simulation has put; see `LiveSource`."""
+        sample = self._mailbox.take(_WAIT_S)
+        return [] if sample is None else [sample]
+
+    def close(self) -> None:
+        """End."""
         self._mailbox.close()
 
-    def samples(self) -> Iterator[Image | Scan]:
-        """Yield samples as they come, until the source is closed."""
-        yield from self._mailbox.items(_WAIT_S)
-
-    def status(self) -> SourceStatus:
+    def describe(self) -> SourceStatus:
         """Say how the sensor does."""
-        box, problem = self._mailbox, self._pace.problem() if self._pace else ""
+        problem = self._pace.problem() if self._pace else None
         return SourceStatus(
             self.sensor,
-            box.n_put,
-            box.n_dropped,
-            rate_hz=self._rate.rate_hz,
-            clock="simulated",
-            problems=(problem,) if problem else (),
+            n_lost=self._mailbox.n_dropped,
+            clock=ClockState(Finding("clock.simulated", "note")),
+            problems=() if problem is None else (problem,),
             device="simulated",
         )
 
     def put(self, sample: Image | Scan) -> None:
         """Take a sample of the simulation."""
         self._mailbox.put(sample)
-        self._rate.add(1)
 
     def fail(self, error: SourceError) -> None:
         """End for good."""
@@ -148,7 +144,7 @@ class SimulatedRig:
         self._connection, theirs = context.Pipe()
         arguments = theirs, self._rig, self._seed, self._person, dict(self._views)
         self._process = context.Process(target=_simulate, args=arguments, name="simulated rig", daemon=True)
-        _start_without_interrupts(self._process)
+        start_without_interrupts(self._process)
         theirs.close()
         try:
             if not self._connection.poll(START_S * len(self._views)):
@@ -201,17 +197,6 @@ class SimulatedRig:
             self._by_sensor[sample.sensor].put(sample)
             if sample.sensor == self._counted:
                 self.pace.turn()
-
-
-def _start_without_interrupts(process: multiprocessing.process.BaseProcess) -> None:
-    """Start a process that Ctrl-C does not reach: a terminal sends it to both, and ours ends the other."""
-    # Starting the tracker would let interrupts through again.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        process.start()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _view(rig: Rig, camera: str) -> View:

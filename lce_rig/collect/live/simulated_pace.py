@@ -5,12 +5,15 @@ import time
 from collections import deque
 from collections.abc import Callable
 
+from lce_rig.core.findings import Finding
+
 #: Longer than the board is on its way, when everything has to be rendered anew.
 WINDOW_S = 10.0
 #: Rendering a moving board takes longer than the sensors would: no slower than this is as it should be.
 USUAL = 2.0
 #: Nothing is said of what has only begun.
 LEAST_S = 4.0
+_FACTORS = (2, 3, 5, 10, 20, 50)
 
 
 class SimulatedPace:
@@ -61,19 +64,12 @@ class SimulatedPace:
             n_due = (now_s - since_s) / self._period_s
             return max(n_due / max(len(self._turns_s), 1), 1.0)
 
-    def problem(self) -> str:
-        """Say what the computer is too slow for; "" where it is not."""
+    def problem(self) -> Finding | None:
+        """Find whether the computer is too slow; None where it is not."""
         slowness = self.slowness
         if slowness < USUAL:
-            return ""
-        return (
-            f"simulated {_round(slowness)} times slower than real time: "
-            "this computer is too busy, or too slow; no sensor is at fault"
-        )
-
-
-def _round(factor: float) -> str:
-    """Round to what can be remembered, so that it is not said anew with every sample."""
-    known = (2, 3, 5, 10, 20, 50)
-    below = [value for value in known if value <= factor * 1.1]
-    return f"about {below[-1]}" if factor <= known[-1] * 1.2 else f"more than {known[-1]}"
+            return None
+        # Rounded, so that it is not said again with every sample.
+        factor = max(value for value in _FACTORS if value <= slowness * 1.1)
+        figures = {"factor": factor, "is_more": slowness > factor * 1.2 and factor == _FACTORS[-1]}
+        return Finding("stream.simulated_slowly", "warning", figures=figures)

@@ -93,7 +93,7 @@ def guarded(gate: Gate, welcome: Callable[[web.Request], None]) -> Middleware:
 
     Args:
         gate: refuses requests.
-        welcome: told of every request that it lets in.
+        welcome: called for every request that it lets in.
     """
 
     @web.middleware

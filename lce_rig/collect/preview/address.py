@@ -21,7 +21,7 @@ def parse_address(text: str) -> tuple[str, int]:
     """Take an address apart: "host:port", "host", "port", ":port", "[ipv6]:port", "ipv6".
 
     Args:
-        text: what is left out is this computer alone, port 8765.
+        text: by default this computer alone, port 8765.
 
     Returns:
         Host without brackets, and port; port 0 is any free one.
@@ -62,7 +62,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def is_loopback(opened: socket.socket) -> bool:
-    """Tell whether only programs on this computer reach a socket."""
+    """Return whether only programs on this computer reach a socket."""
     return ipaddress.ip_address(_bound_to(opened)).is_loopback
 
 

@@ -81,7 +81,7 @@ class Connections:
         Args:
             opened: the listening socket.
             server: makes the protocol of each connection.
-            troubles: told of refused connections.
+            troubles: receives refused connections.
         """
         self._opened = opened
         self._server = server
@@ -164,7 +164,7 @@ class Connections:
             visitor.abort()
 
     def _make_room(self, peer: str) -> bool:
-        """Tell whether a newcomer can stay, and end another connection where it takes that."""
+        """Return whether a newcomer can stay, and end another connection where it takes that."""
         staying = [each for each in self._visitors.values() if not each.is_ending]
         of_peer = [each for each in staying if each.peer == peer]
         if len(of_peer) < MAX_OF_ONE_PEER and len(staying) < MAX_CONNECTIONS:

@@ -26,7 +26,7 @@ class Feed:
         return None if newest is None else (newest[0], newest[2])
 
     def age_s(self) -> float | None:
-        """Tell how long ago the newest state came."""
+        """Compute how long ago the newest state came."""
         newest = self._newest
         return None if newest is None else time.monotonic() - newest[1]
 

@@ -1,4 +1,4 @@
-"""What the page is told: a state in JSON, and its picture as JPEG."""
+"""What the page is told: a state in JSON, and its image as JPEG."""
 
 import asyncio
 import json
@@ -24,7 +24,7 @@ _MAX_LOG = 50
 
 
 def to_json(state: LiveState, update: int, *, has_picture: bool) -> str:
-    """Write a state, without its picture, for the page; what is not known is null.
+    """Write a state, without its image, for the page; what is not known is null.
 
     Args:
         state: the state.
@@ -62,16 +62,16 @@ def beat(age_s: float | None) -> str:
 
 
 def encode_picture(pixels: Pixels) -> bytes:
-    """Compress a picture, (H, W) or (H, W, 3) BGR, at most `MAX_WIDTH_PX` wide."""
+    """Compress an image, (H, W) or (H, W, 3) BGR, at most `MAX_WIDTH_PX` wide."""
     _, jpeg = cv2.imencode(".jpg", _shrunk(pixels), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     return bytes(jpeg)
 
 
 class Encoder:
-    """Compresses each picture once, however many watch, in a thread of its own.
+    """Compresses each image once, however many watch, in a thread of its own.
 
     Attributes:
-        n_encoded: pictures compressed.
+        n_encoded: images compressed.
     """
 
     def __init__(self) -> None:
@@ -81,12 +81,12 @@ class Encoder:
         self._thread = ThreadPoolExecutor(1, "preview-pictures")
 
     async def encode(self, pixels: Pixels) -> bytes:
-        """Compress a picture, or give what it was compressed to before."""
+        """Compress an image, or give what it was compressed to before."""
         if self._jpeg is None or self._pixels is not pixels:
             loop = asyncio.get_running_loop()
             self._pixels, self._jpeg = pixels, loop.run_in_executor(self._thread, encode_picture, pixels)
             self.n_encoded += 1
-        # One viewer that leaves must not take the picture from the others.
+        # One viewer that leaves must not take the image from the others.
         return await asyncio.shield(self._jpeg)
 
     def close(self) -> None:

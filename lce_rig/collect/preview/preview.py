@@ -74,11 +74,11 @@ class Preview:
 
     @property
     def n_pictures(self) -> int:
-        """Pictures that were compressed, 0 while nobody watches."""
+        """Images that were compressed, 0 while nobody watches."""
         return 0 if self._server is None else self._server.encoder.n_encoded
 
     def notes(self) -> list[str]:
-        """Report what went wrong with the page, and how often; a collection goes on whatever it is."""
+        """Report the page's failures, and how often; the collection continues after any of them."""
         return self._troubles.notes()
 
     def close(self) -> None:
@@ -106,7 +106,7 @@ class Preview:
         with self._troubles, opened:
             try:
                 asyncio.run(self._serve(opened))
-            except Exception:  # Whatever ends the page, the collection goes on.
+            except Exception:  # Whatever ends the page, the collection continues.
                 self._troubles.log.exception("the page has ended, the collection goes on")
             finally:
                 self._is_ready.set()

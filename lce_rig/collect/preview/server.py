@@ -39,7 +39,7 @@ class Server:
     """What answers requests.
 
     Attributes:
-        encoder: compresses the pictures.
+        encoder: compresses the images.
         connections: through which requests come; None before it serves.
     """
 

@@ -6,7 +6,7 @@ from types import TracebackType
 
 from aiohttp.http_exceptions import HttpProcessingError
 
-#: Kinds that are told apart; whoever connects may cause any number.
+#: Kinds that are counted separately; clients may cause any number.
 _MAX_KINDS = 20
 _MAX_TEXT = 120
 # asyncio reports by itself what its connections trip over.

@@ -25,7 +25,7 @@ ANSWER_S = 5.0
 class Viewer:
     """Feeds one connection.
 
-    The page answers each update with its number once it is on the screen, and pictures are sent to pages that
+    The page answers each update with its number once it is on the screen, and images are sent to pages that
     are looked at. Nothing else is read from it.
     """
 
@@ -55,7 +55,7 @@ class Viewer:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     def is_up_to_date(self) -> bool:
-        """Tell whether the newest state has been sent."""
+        """Return whether the newest state has been sent."""
         newest = self._feed.newest()
         return newest is None or newest[0] <= self._delivered
 
@@ -113,7 +113,7 @@ class Viewer:
             return False
         self._n_shown = shown
         if is_looked_at and not self._is_looked_at:
-            # What was sent meanwhile had no picture.
+            # What was sent meanwhile had no image.
             self._pixels, self._state = None, 0
         self._is_looked_at = is_looked_at
         if self._n_sent - self._n_shown < MAX_UNDER_WAY:

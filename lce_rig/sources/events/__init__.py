@@ -1,4 +1,4 @@
-"""Recordings of event cameras behind one door: `open_events` finds the reader for a path."""
+"""Recordings of event cameras: `open_events` finds the reader for a path."""
 
 from importlib import import_module
 from pathlib import Path

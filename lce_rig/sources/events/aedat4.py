@@ -29,7 +29,7 @@ class Aedat4Events:
 
         Raises:
             NoEventsError: it has no events.
-            SourceError: it is no AEDAT4 file.
+            SourceError: it is not an AEDAT4 file.
         """
         self._file = Aedat4File(path)
         number = self._file.first_stream("EVTS")

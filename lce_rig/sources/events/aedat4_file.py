@@ -33,7 +33,7 @@ _STREAM_NUMBER = re.compile("[0-9]{1,9}")
 
 @dataclass(frozen=True)
 class Aedat4Header:
-    """What the head of a file says.
+    """The header of a file.
 
     Attributes:
         begin: where the packets begin.
@@ -48,11 +48,11 @@ class Aedat4Header:
 
 @dataclass(frozen=True)
 class PacketPlace:
-    """Where a packet lies.
+    """The position of a packet.
 
     Attributes:
         stream: number of its stream.
-        at, n_bytes: of its content, its head left out.
+        at, n_bytes: of its content, without its header.
         where: "packet 12 at byte 4711", for messages.
     """
 
@@ -75,7 +75,7 @@ class Aedat4File:
         """Read the head.
 
         Raises:
-            SourceError: it is no AEDAT4 file, or its head is damaged.
+            SourceError: it is not an AEDAT4 file, or its header is damaged.
         """
         self.path = path
         self.header = read_header(path)
@@ -92,7 +92,7 @@ class Aedat4File:
         return numbers[0] if numbers else None
 
     def packets(self, stream: int, findings: Findings) -> Iterator[tuple[str, bytes]]:
-        """Yield the packets of a stream as flatbuffers, with their place; damaged ones are left out."""
+        """Yield the packets of a stream as flatbuffers, with their place; damaged ones are skipped."""
         with open_recorded(self.path) as file:
             for place in self._places(file, findings):
                 if place.stream != stream:
@@ -165,7 +165,7 @@ def read_header(path: Path) -> Aedat4Header:
     """Read what an AEDAT4 file says about its streams.
 
     Raises:
-        SourceError: it is no AEDAT4 file, or its head is damaged.
+        SourceError: it is not an AEDAT4 file, or its header is damaged.
     """
     with open_recorded(path) as file:
         if file.read(len(MAGIC)) != MAGIC:

@@ -1,7 +1,8 @@
-"""Frames of iniVation's AEDAT4 files, stamped at the middle of their exposure.
+"""Frames of iniVation's AEDAT4 files, with timestamps at the middle of their exposure.
 
-What a frame's own stamp means has changed: DV's stamps were the middle of the exposure, dv-processing's are
-its start. Both also write its start and end, which mean the same in every file, and are taken.
+What a frame's own timestamp means has changed: DV's timestamps were the middle of the exposure,
+dv-processing's are its start. Both also write its start and end, which mean the same in every file, and are
+taken.
 
 References:
     https://gitlab.com/inivation/dv/dv-processing/-/blob/master/include/dv-processing/data/frame_base.hpp
@@ -29,16 +30,16 @@ _TIMESTAMP, _EXPOSURE_START, _EXPOSURE_END, _FORMAT, _WIDTH, _HEIGHT, _PIXELS, _
     10,
     11,
 )
-# OpenCV's type numbers of 8-bit pictures.
+# OpenCV's type numbers of 8-bit images.
 _CHANNELS = {0: 1, 16: 3, 24: 4}
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One picture of a file.
+    """One image of a file.
 
     Attributes:
-        mid_exposure_ns: device time; the frame's own stamp where the exposure is not known.
+        mid_exposure_ns: device time; the frame's own timestamp where the exposure is not known.
         exposure_ns: 0 where the file does not say.
         pixels: (H, W) grey or (H, W, 3) BGR, uint8.
     """
@@ -65,7 +66,7 @@ class Aedat4Frames:
         return self._file.n_packets(self._number)
 
     def frames(self, findings: Findings) -> Iterator[Frame]:
-        """Yield the frames as they lie in the file; damaged ones are left out and counted."""
+        """Yield the frames as they lie in the file; damaged ones are skipped and counted."""
         for where, table in self._file.packets(self._number, findings):
             try:
                 frame = decode_frame(table)
@@ -75,7 +76,7 @@ class Aedat4Frames:
             yield frame
 
     def span_ns(self) -> tuple[int, int] | None:
-        """Find the first and last stamp; frames between them are passed over. None where there is none."""
+        """Find the first and last timestamp, skipping the frames between them; None without frames."""
         first = self.first()
         table = self._file.last_packet(self._number)
         if first is None or table is None:

@@ -120,7 +120,7 @@ class Aedat4Writer:
 
 
 def write_aedat4(path: Path, stretches: Iterable[Events], camera_name: str = "lce_rig") -> None:
-    """Write a recording of events, at least one stretch, as AEDAT4; stamps are cut to microseconds.
+    """Write a recording of events, at least one stretch, as AEDAT4; timestamps are cut to microseconds.
 
     Raises:
         FileExistsError: the file is there already.

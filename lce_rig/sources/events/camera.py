@@ -15,13 +15,13 @@ _SINCE_1970_NS = 10**18
 class CameraEvents:
     """Events of one camera, in the order of time.
 
-    Sensors of some makers count from their own start. Where arrivals at the host are known the stamps are
-    moved by what they differ from those at least, so that they meet the stamps of other sensors.
+    Sensors of some makers count from their own start. Where arrivals at the host are known the timestamps are
+    moved by what they differ from those at least, so that they meet the timestamps of other sensors.
 
     Attributes:
         recording: the events on the sensor's own clock.
-        shift_ns: what is added to their stamps; whole microseconds.
-        span_ns: first and last stamp after that, the last within some ms.
+        shift_ns: what is added to their timestamps; whole microseconds.
+        span_ns: first and last timestamp after that, the last within some ms.
     """
 
     def __init__(self, recording: EventRecording) -> None:
@@ -32,7 +32,7 @@ class CameraEvents:
 
     @property
     def notes(self) -> list[str]:
-        """What was assumed, repaired or left out so far, in words."""
+        """What was assumed, repaired or skipped so far, in words."""
         if not self.shift_ns:
             return self.recording.notes
         tied = (
@@ -45,7 +45,7 @@ class CameraEvents:
         """Yield the events in packets.
 
         Raises:
-            SourceError: the stamps run back for good, or events lie off the sensor.
+            SourceError: the timestamps run back for good, or events lie off the sensor.
         """
         for events in self.recording:
             yield replace(events, t_ns=events.t_ns + self.shift_ns) if self.shift_ns else events

@@ -1,4 +1,4 @@
-"""The high part of a camera's clock, sent now and then as a counter that wraps."""
+"""The high part of a camera's clock, sent at intervals as a wrapping counter."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ class WrappingCounter:
 
     Attributes:
         n_bits: the counter wraps at 2**n_bits.
-        max_step_back: smaller steps back are no wraps; cameras mix their words a little.
+        max_step_back: smaller steps back are not wraps; cameras mix their words a little.
         last: value of the last word, wraps included; None before the first.
         n_repaired: words that did not fit those around them, for which the one before was taken.
     """

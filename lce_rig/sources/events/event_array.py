@@ -17,7 +17,7 @@ from lce_rig.sources.events.stream import EventColumns
 
 _FIELDS = [("x", "<u2"), ("y", "<u2"), ("sec", "<u4"), ("nsec", "<u4"), ("polarity", "?")]
 _ROS1_EVENT = np.dtype(_FIELDS)
-# CDR aligns each field: after the first event, whose 13 bytes begin aligned, the stamp of event k lies at
+# CDR aligns each field: after the first event, whose 13 bytes begin aligned, the timestamp of event k lies at
 # 16 k + 4 and the columns at 16 k - 2, so that strides of 16 bytes hold everything but the first x and y.
 _CDR_EVENT = np.dtype(
     {
@@ -32,7 +32,7 @@ _CDR_TAIL_BYTES = 1
 
 
 def decode_event_array(data: bytes, encoding: str) -> tuple[EventHeader, EventColumns]:
-    """Decode one message; its header's stamp is device time, so that the host's is left open.
+    """Decode one message; its header's timestamp is device time, so that the host's is left open.
 
     Args:
         data: the message as it lies in the bag.
@@ -69,7 +69,7 @@ def _cdr_events(reader: MessageReader, n_events: int) -> NDArray[np.void]:
 
 
 def encode_event_array(events: Events, frame_id: str, encoding: str, number: int = 0) -> bytes:
-    """Encode events as one dvs_msgs/EventArray, stamped with the first event's time.
+    """Encode events as one dvs_msgs/EventArray, timestamped with the first event's time.
 
     Args:
         events: at least one.

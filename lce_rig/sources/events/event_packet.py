@@ -29,7 +29,7 @@ class EventPacket:
 
     Attributes:
         number: of the message, as the driver counted them.
-        time_base_ns: what the stamps inside count from; 0 where they count from the sensor's start.
+        time_base_ns: what the timestamps inside count from; 0 where they count from the sensor's start.
         encoding: one of `ENCODINGS`.
         is_big_endian: byte order of the payload.
         payload: (N,) bytes.
@@ -92,7 +92,7 @@ def parse_packet(data: bytes, encoding: str) -> EventPacket:
 
 
 class PacketDecoder:
-    """Decodes the packets of one topic in turn; EVT3 goes on from one to the next."""
+    """Decodes the packets of one topic in turn; EVT3 continues from one to the next."""
 
     def __init__(self) -> None:
         self._evt3 = WordDecoder(EVT3)

@@ -21,11 +21,11 @@ _MAX_STEP_BACK = 1 << 10
 
 @dataclass
 class Evt2Decoder:
-    """Decodes EVT2 or EVT2.1 block by block; the time goes on from one to the next.
+    """Decodes EVT2 or EVT2.1 block by block; the time continues from one to the next.
 
     Attributes:
         has_vectors: EVT2.1, whose events carry 32 pixels each.
-        n_untimed: words with events met before any stamp, left out.
+        n_untimed: words with events met before any timestamp, skipped.
         n_unknown: words of no known code, passed over.
     """
 

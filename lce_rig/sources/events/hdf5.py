@@ -105,7 +105,7 @@ class Hdf5Events:
 
 
 class _Column:
-    """A column of events, read in stretches.
+    """A column of events, read in ranges.
 
     HDF5 takes what memory a deflated chunk unpacks to, however much more that is than it should. Chunks large
     enough for that to matter are unpacked here.
@@ -283,7 +283,7 @@ def _integer(holder: Any, name: str) -> int | None:
     """Read a number that is an attribute or a dataset of one; None where it is not there.
 
     Raises:
-        ValueError: it is no whole number.
+        ValueError: it is not a whole number.
     """
     if name in holder.attrs:
         attribute = holder.attrs.get_id(name)

@@ -1,4 +1,4 @@
-"""The few fields that event messages begin with, read from ROS 1's and ROS 2's serialisation.
+"""The first fields of event messages, read from ROS 1's and ROS 2's serialisation.
 
 rosbags' deserialiser makes one object an event and cannot parse every definition found in bags; the messages
 are few and fixed, so they are read by hand.
@@ -45,7 +45,7 @@ class MessageReader:
         return int(value)
 
     def text(self) -> str:
-        """Read a string; CDR's closing zero is left out."""
+        """Read a string; CDR's closing zero is skipped."""
         size = self.number("I")
         return bytes(self.block(size)).rstrip(b"\0").decode("utf-8", errors="replace")
 
@@ -68,7 +68,7 @@ class MessageReader:
 
 @dataclass(frozen=True)
 class EventHeader:
-    """What both kinds of event message begin with.
+    """The common first fields of both kinds of event message.
 
     Attributes:
         stamp_ns: of the header.

@@ -1,4 +1,4 @@
-"""Putting a stream of events in the order of time, with as little held in memory as that needs."""
+"""Sorting a stream of events by time, with minimal memory."""
 
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -10,18 +10,18 @@ from lce_rig.core import limits
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.events.stream import NS_PER_US, EventColumns, Findings, join, seconds_in
 
-# Recorders with several threads, and readout that is not in order, mix stamps by this much at most.
+# Recorders with several threads, and readout that is not in order, mix timestamps by this much at most.
 REORDER_NS = 20_000_000
 # Counters of 31 and 32 bits of microseconds are common; they wrap after 36 and 72 minutes.
 _WRAPS_NS = tuple((1 << bits) * NS_PER_US for bits in (31, 32))
 # Eight months.
 _MAX_WRAPS = 10_000
 _MAX_GAP_NS = 60_000_000_000
-# Within 20 ms, a hundred million a second: more than cameras send.
+# Within 20 ms, a hundred million per second: more than cameras send.
 _MAX_HELD_EVENTS = 1 << 21
 # Cameras may send a little before their clock is set at the start.
 _MAX_LEAD_NS = 1_000_000_000
-# More stray stamps than this are no damage here and there but a clock that was set.
+# More stray timestamps than this are not scattered damage but a clock that was set.
 _MAX_STRAY_SHARE = 0.01
 _MAX_DAMAGED_SHARE = 0.25
 
@@ -29,12 +29,12 @@ _MAX_DAMAGED_SHARE = 0.25
 def in_time_order(
     path: Path, stretches: Iterator[EventColumns], findings: Findings
 ) -> Iterator[EventColumns]:
-    """Yield stretches whose stamps never decrease, within and from one to the next.
+    """Yield stretches whose timestamps never decrease, within and from one to the next.
 
-    Stamps mixed within 20 ms are sorted; counters that wrap are unwrapped; stray stamps are left out.
+    Timestamps mixed within 20 ms are sorted; counters that wrap are unwrapped; stray timestamps are skipped.
 
     Raises:
-        SourceError: the stamps run back for good; everything before has been yielded.
+        SourceError: the timestamps run back for good; everything before has been yielded.
     """
     clock = _Clock(path)
     sorter = _Sorter(path, findings)
@@ -47,7 +47,7 @@ def in_time_order(
 
 
 def _on_any_clock(stretch: EventColumns, findings: Findings) -> EventColumns:
-    """Leave out stamps so far from zero that their differences overflow."""
+    """Leave out timestamps so far from zero that their differences overflow."""
     t_ns = stretch.t_ns
     limit = limits.MAX_TIME_NS
     if not len(t_ns) or (t_ns.min() > -limit and t_ns.max() < limit):
@@ -58,7 +58,7 @@ def _on_any_clock(stretch: EventColumns, findings: Findings) -> EventColumns:
 
 
 class _Sorter:
-    """Holds a stretch back until the next has shown that nothing earlier follows.
+    """Holds a range back until the next one shows that nothing earlier follows.
 
     Attributes:
         held: ordered events that have not been yielded.
@@ -116,7 +116,7 @@ class _Sorter:
         )
 
     def _tidied(self, events: EventColumns) -> EventColumns:
-        """Leave out stray stamps and sort the others."""
+        """Leave out stray timestamps and sort the others."""
         stray = _stray(events.t_ns)
         n_stray = int(np.count_nonzero(stray))
         if n_stray:
@@ -178,15 +178,16 @@ def _never_falls(t_ns: NDArray[np.int64]) -> bool:
 
 
 def _stray(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Find the stamps that do not fit the others, (N,)."""
+    """Find the timestamps that do not fit the others, (N,)."""
     late = np.maximum.accumulate(t_ns) - t_ns > REORDER_NS
     early = t_ns - np.minimum.accumulate(t_ns[::-1])[::-1] > REORDER_NS
-    # A stamp too far ahead makes all that follow look late, and the other way round: the fewer are astray.
+    # A timestamp too far ahead makes all that follow look late, and the other way round: the fewer are
+    # astray.
     return min(late, early, key=np.count_nonzero)
 
 
 def _find_reset(t_ns: NDArray[np.int64]) -> int | None:
-    """Find where a clock was set back: that divides a stream, while damage lies between stamps that go on."""
+    """Find where a clock was set back: that divides a stream; damage lies between continuous timestamps."""
     stray = _stray(t_ns)
     n_stray = int(np.count_nonzero(stray))
     is_between = not (stray[0] or stray[-1]) and n_stray <= _MAX_DAMAGED_SHARE * len(t_ns)

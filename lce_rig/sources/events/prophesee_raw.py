@@ -103,7 +103,7 @@ def _swapped(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def _looks_swapped(path: Path, begin: int) -> bool:
-    """Tell the order of EVT2.1's halves by the stamps, which rise in the right one."""
+    """Return the order of EVT2.1's halves by the timestamps, which rise in the right one."""
     with open_recorded(path) as file:
         file.seek(begin)
         block = file.read(_BLOCK_BYTES)

@@ -1,4 +1,4 @@
-"""A recording of events: checked, in the order of time, with an account of what was wrong."""
+"""A recording of events: checked, sorted by time, with a count of faults."""
 
 from collections.abc import Iterator
 from itertools import islice
@@ -67,13 +67,13 @@ class EventRecording:
 
     @property
     def notes(self) -> list[str]:
-        """What was assumed, repaired or left out so far, in words; grows while the recording is read."""
+        """What was assumed, repaired or skipped so far, in words; grows while the recording is read."""
         found = self._assumed + self._findings.lines()
         return self._stream.notes + [f"{self.path.name}: {line}" for line in found]
 
     @property
     def start_ns(self) -> int:
-        """First stamp, device time; only the beginning is read."""
+        """First timestamp, device time; only the beginning is read."""
         first = next(iter(self), None)
         if first is None:
             raise self._unordered()
@@ -81,7 +81,7 @@ class EventRecording:
 
     @property
     def span_ns(self) -> tuple[int, int]:
-        """First and last stamp, device time; the first call reads the whole recording."""
+        """First and last timestamp, device time; the first call reads the whole recording."""
         if self._span_ns is None:
             for _ in self:
                 pass
@@ -95,7 +95,7 @@ class EventRecording:
         return SourceError(what + (f": {said}" if said else ""))
 
     def extent_ns(self) -> tuple[int, int]:
-        """First and last stamp; the last may be off by some ms where that saves reading the recording."""
+        """First and last timestamp; the last may be off by some ms where that saves reading the recording."""
         duration_ns = self._stream.duration_ns() if isinstance(self._stream, KnowsItsLength) else None
         if self._span_ns is not None or duration_ns is None:
             return self.span_ns
@@ -109,7 +109,7 @@ class EventRecording:
         return (last_ns - first_ns) * 1e-9
 
     def host_offset_ns(self) -> int | None:
-        """Find what to add to device stamps to come to the host's clock; None where arrivals are unknown.
+        """Find what to add to device timestamps to come to the host's clock; None where arrivals are unknown.
 
         The least difference among the first packets: the one that waited least.
         """
@@ -124,7 +124,7 @@ class EventRecording:
         """Yield the events from the beginning, in the order of time.
 
         Raises:
-            SourceError: the stamps run back for good, or events lie off the sensor.
+            SourceError: the timestamps run back for good, or events lie off the sensor.
         """
         findings = Findings()
         first_ns = last_ns = None
@@ -213,7 +213,7 @@ class EventRecording:
 
 
 class _Window:
-    """The stretches that the last window touched, and the pass through the recording that goes on there."""
+    """The ranges of the last window, and the pass through the recording that continues there."""
 
     def __init__(self, recording: EventRecording) -> None:
         self._recording = recording

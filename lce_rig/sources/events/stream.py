@@ -1,4 +1,4 @@
-"""What the readers of event files share: columns of events, and the account of what was lost on the way."""
+"""The common interface of event readers: columns of events, and counts of losses."""
 
 import re
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ class NoEventsError(SourceError):
 
 @dataclass(frozen=True, eq=False)
 class EventColumns:
-    """Events as a reader finds them: not checked against a resolution, not yet put in order.
+    """Events as read: not checked against a resolution, not sorted.
 
     Attributes:
         t_ns: (N,) int64 device time.
@@ -79,7 +79,7 @@ def join_small(stretches: Iterator[EventColumns], n_events: int) -> Iterator[Eve
 
 @dataclass
 class Findings:
-    """What was left out or repaired while reading: how many, and where first.
+    """Events skipped or repaired while reading: their number, and the first position.
 
     Attributes:
         counts: how many by kind ("broken packets").
@@ -102,7 +102,7 @@ class Findings:
                 self.counts[kind], self.first[kind] = count, other.first[kind]
 
     def lines(self) -> list[str]:
-        """Say every finding in one line: "3 broken packets left out (first: message 17, 2.1 s in: ...)"."""
+        """Say every finding in one line: "3 damaged packets skipped (first: message 17, 2.1 s in: ...)"."""
         found = []
         for kind in sorted(self.counts):
             where = f" (first: {self.first[kind]})" if self.first[kind] else ""
@@ -139,15 +139,15 @@ class EventStream(Protocol):
 
 @runtime_checkable
 class KnowsItsLength(Protocol):
-    """A stream that can tell how long it is without being read."""
+    """A stream whose duration is known without reading it."""
 
     def duration_ns(self) -> int | None:
-        """Tell the time from the first event to the last, about; None where damage hides it."""
+        """Return the time from the first event to the last, about; None where damage hides it."""
         ...
 
 
 def seconds_in(t_ns: int, first_ns: int) -> str:
-    """Say how far into a recording a stamp lies: "2.125 s in"."""
+    """Say how far into a recording a timestamp lies: "2.125 s in"."""
     return f"{(t_ns - first_ns) * 1e-9:.3f} s in"
 
 
@@ -155,7 +155,7 @@ def open_recorded(path: Path) -> BinaryIO:
     """Open a file of a recording.
 
     Raises:
-        SourceError: it is no regular file, or may not be read.
+        SourceError: it is not a regular file, or may not be read.
     """
     try:
         return limits.open_regular(path)
@@ -167,7 +167,7 @@ def open_recorded(path: Path) -> BinaryIO:
 
 def parse_size(width: str, height: str) -> tuple[int, int] | None:
     """Read a resolution from a file's text, px; None where it is none that a camera has."""
-    # Longer ones are no pixels, and take Python long to read.
+    # Longer ones are not pixels, and take Python long to read.
     if not (_PIXELS.fullmatch(width) and _PIXELS.fullmatch(height)):
         return None
     size = int(width), int(height)

@@ -150,7 +150,7 @@ def _parse_lines(lines: Sequence[bytes]) -> tuple[NDArray[np.float64], NDArray[n
 
 
 def _is_sound(table: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which rows are events: times of a clock, whole pixels of any sensor, a polarity of 0, 1 or -1."""
+    """Find which rows are events: times of a clock, whole pixels of any sensor, a polarity of 0, 1 or -1."""
     t_s, x, y, polarity = table.T
     is_pixel = (x >= 0) & (x < 1 << 15) & (x == np.floor(x)) & (y >= 0) & (y < 1 << 15) & (y == np.floor(y))
     is_polarity = (polarity == 0) | (np.abs(polarity) == 1)

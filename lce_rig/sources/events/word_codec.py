@@ -53,11 +53,11 @@ LIBCAER_CMP = WordLayout(0, 1, 2, 3, 4, {5: 8}, frozenset(), is_line_x=True)
 
 @dataclass
 class WordDecoder:
-    """Decodes a stream block by block; the state goes on from one to the next.
+    """Decodes a stream block by block; the state continues from one to the next.
 
     Attributes:
         layout: what the codes mean.
-        n_untimed: events met before any stamp, left out.
+        n_untimed: events met before any timestamp, skipped.
         n_unknown: words of no known code, passed over.
     """
 
@@ -114,7 +114,7 @@ class WordDecoder:
     def _times(
         self, code: NDArray[np.uint8], payload: NDArray[np.uint16], emitting: NDArray[np.intp]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Give stamp (M,) us of every emitting word, and whether it has one."""
+        """Give timestamp (M,) us of every emitting word, and whether it has one."""
         at_high = np.flatnonzero(code == self.layout.time_high)
         at_low = np.flatnonzero(code == self.layout.time_low)
         timed_from = len(code)
@@ -129,7 +129,7 @@ class WordDecoder:
         low = payload[at_low]
         t_us = _held(at_high, high, last or 0, len(code))[emitting] << 12
         t_us |= _held(at_low, low, self._low or 0, len(code))[emitting]
-        # A stamp needs its low part after its high one.
+        # A timestamp needs its low part after its high one.
         if len(low) and timed_from < len(code):
             self._low = int(low[-1])
         return t_us, emitting >= timed_from
@@ -161,7 +161,7 @@ class WordDecoder:
             vectors = emitting[is_vector]
             steps = self._tables["width"][code[vectors]].astype(np.int64)
             base = payload[at_base]
-            # Every vector moves the base on by its width, until a word sets it anew.
+            # Every vector moves the base on by its width, until a word sets it again.
             moved = np.concatenate(([0], np.cumsum(steps)))
             group = _held(at_base, np.arange(1, len(base) + 1), 0, len(code))[vectors]
             begins = np.concatenate(([self._next], base & np.uint16(0x7FF))).astype(np.int64)

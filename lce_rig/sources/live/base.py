@@ -2,35 +2,29 @@
 
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from types import TracebackType
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
-from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Pulse:
-    """One edge that a trigger line made or a sensor saw.
+class ClockState:
+    """Whose time a sensor's timestamps are.
 
     Attributes:
-        sensor: name of the line: a camera that it triggers, or the sensor that saw it.
-        stamp_ns: device time of the board or sensor that reports it.
-        count: running number of its line; gaps are lost pulses.
-        host_ns: arrival at the host.
+        finding: whose time, and how it is tied to others.
+        is_utc: whether it is the sensor's own time, tied to UTC by pulses and sentences.
+        ahead_s: by how much the sensor's clock is ahead of this computer's; None where unknown.
     """
 
-    sensor: str
-    stamp_ns: int
-    count: int
-    host_ns: int
-
-
-LiveSample = Image | Scan | Events | Pulse
+    finding: Finding
+    is_utc: bool = False
+    ahead_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -43,10 +37,13 @@ class SourceStatus:
         n_dropped: samples that nobody took in time.
         n_lost: samples or packets that never arrived, by the device's own counters or stamps.
         rate_hz: samples a second over the last seconds; 0 before two have come.
-        clock: whose time the stamps are, and how it is tied to others, in words.
-        problems: what is wrong now, each a sentence with what to do.
-        figures: further figures by name.
+        clock: whose time the timestamps are; None before the first.
+        problems: what is wrong now.
+        figures: further counts and measurements by name, for people and logs.
         device: what answers: its model, serial number and firmware as far as it tells them.
+        rates_hz: what a device of several streams, or with a rotor, measures: by "scans", "frames", "events".
+        n_packets: data packets received; None of a sensor that sends none.
+        n_lost_by_line: of a sync board: pulses lost, by line.
     """
 
     sensor: str
@@ -54,46 +51,13 @@ class SourceStatus:
     n_dropped: int = 0
     n_lost: int = 0
     rate_hz: float = 0.0
-    clock: str = ""
-    problems: tuple[str, ...] = ()
-    figures: dict[str, float] = field(default_factory=dict)
+    clock: ClockState | None = None
+    problems: tuple[Finding, ...] = ()
+    figures: Mapping[str, float] = field(default_factory=dict)
     device: str = ""
-
-
-class LiveSource(Protocol):
-    """An attached sensor; open while its `with` block lasts.
-
-    Attributes:
-        sensor: its name in the profile.
-    """
-
-    sensor: str
-
-    def __enter__(self) -> "LiveSource":
-        """Open the device and start reading.
-
-        Raises:
-            SourceError: it is absent, busy or of another model; the hint says what to check.
-        """
-        ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop reading and close the device; never raises."""
-        ...
-
-    def samples(self) -> Iterator[LiveSample]:
-        """Yield samples as they come, until the source is closed.
-
-        Raises:
-            SourceError: the sensor fell silent, or failed for good.
-        """
-        ...
-
-    def status(self) -> SourceStatus:
-        """Say how the sensor does; may be called from any thread."""
-        ...
+    rates_hz: Mapping[str, float] = field(default_factory=dict)
+    n_packets: int | None = None
+    n_lost_by_line: Mapping[str, int] = field(default_factory=dict)
 
 
 class Mailbox(Generic[T]):

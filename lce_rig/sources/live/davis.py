@@ -6,26 +6,26 @@ clock can be fitted to that of the sync board which sends them.
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from types import TracebackType
+from collections.abc import Callable
 from typing import Any
 
+from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.rig import CameraSettings
-from lce_rig.sources.live.base import LiveSample, SourceStatus
+from lce_rig.sources.live.base import ClockState, SourceStatus
 from lce_rig.sources.live.davis_device import OpenedCamera, open_davis
 from lce_rig.sources.live.davis_samples import DavisSamples
-from lce_rig.sources.live.reading import RateMeter, ReaderThread
+from lce_rig.sources.live.reading import LiveSource, RateMeter
 
 # A batch of events lasts 10 ms: ten seconds of a taker's absence at three streams.
 _N_SLOTS = 2048
 _PAUSE_S = 0.002
-_MAX_CLOCK_ERROR_NS = 500_000_000
+_MAX_CLOCK_ERROR_MS = 500.0
 _SILENT_HINT = "Check the USB cable; unplug the camera for some seconds and start again."
 
 
-class DavisSource:
+class DavisSource(LiveSource):
     """A DAVIS346; see `LiveSource`. Yields `Events`, `Image` and `Pulse`.
 
     Args:
@@ -43,72 +43,53 @@ class DavisSource:
         open_camera: Callable[[str, CameraSettings], OpenedCamera] | None = None,
         silence_s: float = 5.0,
     ) -> None:
-        self.sensor = sensor
+        super().__init__(sensor, f"camera {sensor!r}", _N_SLOTS, silence_s, _SILENT_HINT)
         self._settings = settings
         self._open_camera = open_camera or open_davis
         self._samples = DavisSamples(sensor, settings)
-        self._reader = ReaderThread(f"camera {sensor!r}", self._read, _N_SLOTS, silence_s, _SILENT_HINT)
-        self._stack = ExitStack()
-        self._notes: tuple[str, ...] = ()
+        self._polls: list[Callable[[int], list[LiveSample]]] = []
+        self._notes: tuple[Finding, ...] = ()
         self._device = ""
         self._n_imu = 0
         self._rates = {"events": RateMeter(), "frames": RateMeter(), "pulses": RateMeter()}
         self._delays_ns: deque[int] = deque(maxlen=100)
 
-    def __enter__(self) -> "DavisSource":
+    def open(self) -> None:
         """Open and set up the camera.
 
         Raises:
             SourceError: it is absent, busy, another model, or cannot do what the profile wants.
         """
         opened = self._open_camera(self.sensor, self._settings)
-        with ExitStack() as stack:
-            self._input: Any = opened.input
-            stack.callback(self._let_go)
-            self._notes = opened.notes
-            self._device = opened.device
-            self._polls = self._find_streams()
-            self._reader.start()
-            stack.callback(self._reader.stop)
-            self._stack = stack.pop_all()
-        return self
+        self._input: Any = opened.input
+        self._notes = opened.notes
+        self._device = opened.device
+        self._polls = self._find_streams()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop and close the camera."""
-        self._stack.close()
+    def close(self) -> None:
+        """Close the camera."""
+        # dv-processing closes a device with its last reference.
+        self._input = None
+        self._polls = []
 
-    def samples(self) -> Iterator[LiveSample]:
-        """Yield events, frames and pulses as they come.
-
-        Raises:
-            SourceError: the camera fell silent or is gone.
-        """
-        yield from self._reader.samples()
-
-    def status(self) -> SourceStatus:
+    def describe(self) -> SourceStatus:
         """Say how the camera does."""
         counted = self._samples
-        figures = {f"{name}_hz": rate.rate_hz for name, rate in self._rates.items()} | {
+        figures = {
+            "pulses_hz": self._rates["pulses"].rate_hz,
             "n_events": float(counted.n_events),
             "n_frames": float(counted.n_frames),
             "n_pulses": float(counted.n_pulses),
             "n_imu": float(self._n_imu),
         }
-        delay_ns = self._delay_ns()
-        if delay_ns is not None:
-            figures["delay_ms"] = delay_ns * 1e-6
         return SourceStatus(
             self.sensor,
-            self._reader.n_samples,
-            self._reader.n_dropped,
-            counted.n_frames_lost,
-            self._reader.rate_hz,
-            "the camera's own, set to this computer's UTC on opening; drifts until fitted to trigger edges",
-            tuple(self._problems()),
-            figures,
-            self._device,
+            n_lost=counted.n_frames_lost,
+            clock=ClockState(Finding("clock.davis", "note", figures={"delay_ms": self._delay_ms()})),
+            problems=tuple(self._problems()),
+            figures=figures,
+            device=self._device,
+            rates_hz={kind: self._rates[kind].rate_hz for kind in ("events", "frames")},
         )
 
     def _find_streams(self) -> list[Callable[[int], list[LiveSample]]]:
@@ -131,7 +112,7 @@ class DavisSource:
         polls += [self._next_imu] if self._input.isImuStreamAvailable() else []
         return polls
 
-    def _read(self) -> list[LiveSample]:
+    def read(self) -> list[LiveSample]:
         """Ask every stream once: between them there is no order of time."""
         host_ns = time.time_ns()
         samples = [sample for poll in self._polls for sample in poll(host_ns)]
@@ -174,22 +155,17 @@ class DavisSource:
         self._n_imu += 0 if batch is None else len(batch)
         return []
 
-    def _delay_ns(self) -> int | None:
+    def _delay_ms(self) -> float | None:
         """Give how old the freshest of the last events were on arrival; None before any came."""
-        return min(self._delays_ns.copy(), default=None)
+        delay_ns = min(self._delays_ns.copy(), default=None)
+        return None if delay_ns is None else delay_ns * 1e-6
 
-    def _problems(self) -> list[str]:
+    def _problems(self) -> list[Finding]:
         found = list(self._notes)
-        delay_ns = self._delay_ns()
-        if delay_ns is not None and abs(delay_ns) > _MAX_CLOCK_ERROR_NS:
-            found.append(
-                f"its clock and this computer's differ by {abs(delay_ns) * 1e-9:.3g} s: "
-                "was the computer's set meanwhile? Open the camera again"
-            )
+        delay_ms = self._delay_ms()
+        if delay_ms is not None and abs(delay_ms) > _MAX_CLOCK_ERROR_MS:
+            figures = {"difference_s": abs(delay_ms) / 1000}
+            found.append(Finding("clock.differs_from_computer", "warning", figures=figures))
         if self._samples.n_resets:
-            found.append("its clock began anew while it ran: a sync cable sent a reset; open it again")
+            found.append(Finding("clock.restarted", "warning", figures={"n": self._samples.n_resets}))
         return found
-
-    def _let_go(self) -> None:
-        # dv-processing closes a device with its last reference.
-        del self._input

@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import Any
 
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.rig import CameraSettings
 
 Value = bool | int | float | str
@@ -35,12 +36,12 @@ class OpenedCamera:
     Attributes:
         input: dv-processing's object; its getNext* are asked.
         device: its model and serial number, and its firmware where it tells.
-        notes: what it does otherwise than asked, each in a sentence.
+        notes: what it does otherwise than asked.
     """
 
     input: Any
     device: str
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
 
 
 def open_davis(sensor: str, settings: CameraSettings) -> OpenedCamera:
@@ -107,7 +108,7 @@ def _absent(sensor: str, wanted: str, listing: str, n_davis: int) -> SourceError
     return SourceError(f"{what}; attached: {listing}" if listing else what, _CHECK)
 
 
-def _set_up_new(camera: Any, sensor: str, controls: Mapping[str, Value]) -> list[str]:
+def _set_up_new(camera: Any, sensor: str, controls: Mapping[str, Value]) -> list[Finding]:
     biases = {f"bias_{name.lower()}": bias for name, bias in camera.Davis346BiasCF.__members__.items()}
     _check_names(sensor, controls, [*_OLD_APS_PARAMETERS, *biases])
     notes = []
@@ -130,15 +131,13 @@ def _set_up_new(camera: Any, sensor: str, controls: Mapping[str, Value]) -> list
     camera.setDetectorFallingEdges(False)
     camera.setDetectorRunning(True)
     if not (camera.isDetectorRunning() and camera.getDetectorRisingEdges()):
-        notes.append("the trigger input does not switch on: its edges are not seen, and its clock drifts")
+        notes.append(Finding("clock.trigger_input_off", "warning"))
     if not camera.isMaster():
-        notes.append(
-            "it follows another camera's clock: unplug the sync cable, or let that one see the trigger"
-        )
+        notes.append(Finding("clock.follows_other_camera", "warning"))
     return notes
 
 
-def _set_up_old(camera: Any, sensor: str, controls: Mapping[str, Value]) -> list[str]:
+def _set_up_old(camera: Any, sensor: str, controls: Mapping[str, Value]) -> list[Finding]:
     _check_names(sensor, controls, list(_OLD_APS_PARAMETERS))
     given = dict(controls)
     if "exposure_us" in given:
@@ -187,10 +186,11 @@ def _check_names(sensor: str, controls: Mapping[str, Value], known: list[str]) -
             raise SourceError(what, f"{guess}It has: {', '.join(known)}.")
 
 
-def _deviation(name: str, wanted: float, given: float) -> list[str]:
+def _deviation(name: str, wanted: float, given: float) -> list[Finding]:
     if abs(given - wanted) <= 0.01 * wanted:
         return []
-    return [f"control {name} is {given:g}, the profile wants {wanted:g}: the camera does as it can"]
+    figures: dict[str, Figure] = {"control": name, "given": given, "expected": wanted}
+    return [Finding("device.control_differs", "warning", figures=figures)]
 
 
 def _first_line(error: Exception) -> str:

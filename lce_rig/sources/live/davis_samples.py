@@ -5,11 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from lce_rig.core.data import Events, Image
+from lce_rig.core.data import Events, Image, Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import CameraSettings
 from lce_rig.sources.events.stream import NS_PER_US
-from lce_rig.sources.live.base import Pulse
 
 _RISING, _RESET = "EXTERNAL_SIGNAL_RISING_EDGE", "TIMESTAMP_RESET"
 _US_S = 1e6

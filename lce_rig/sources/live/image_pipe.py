@@ -9,16 +9,16 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from fcntl import F_SETPIPE_SZ, fcntl
-from types import TracebackType
 from typing import IO
 
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.rig import CameraSettings
-from lce_rig.sources.live.base import LiveSample, SourceStatus
+from lce_rig.sources.live.base import ClockState, SourceStatus
 from lce_rig.sources.live.image_streams import JpegPictures, PictureStream, RawPictures, find_stream
 from lce_rig.sources.live.pixel_formats import FORMATS, find_format
-from lce_rig.sources.live.reading import ReaderThread
+from lce_rig.sources.live.reading import LiveSource
 
 _N_SLOTS = 16
 _WAIT_S = 0.25
@@ -33,7 +33,7 @@ _EXAMPLE = (
 )
 
 
-class ImagePipeSource:
+class ImagePipeSource(LiveSource):
     """A camera read by a command of the profile; see `LiveSource`.
 
     The command writes Y4M, PGM, PPM or JPEG pictures, one behind the other, or raw ones of a pixel_format.
@@ -47,19 +47,17 @@ class ImagePipeSource:
     """
 
     def __init__(self, sensor: str, settings: CameraSettings, silence_s: float = 10.0) -> None:
-        self.sensor = sensor
+        hint = f"Run its command in a shell: does it write pictures? {' '.join(settings.driver.command)}"
+        super().__init__(sensor, f"camera {sensor!r}", _N_SLOTS, silence_s, hint)
         self._settings = settings
         self._channel = settings.first_channel("frames") or "frames"
-        self._who = f"camera {sensor!r}"
-        hint = f"Run its command in a shell: does it write pictures? {' '.join(settings.driver.command)}"
-        self._reader = ReaderThread(self._who, self._read, _N_SLOTS, silence_s, hint)
         self._stack = ExitStack()
         self._stream: PictureStream | None = None
         self._begin = b""
         self._complaints = b""
-        self._n_pictures = 0
+        self._n_pictures = self._n_damaged_before = 0
 
-    def __enter__(self) -> "ImagePipeSource":
+    def open(self) -> None:
         """Start the command.
 
         Raises:
@@ -70,6 +68,7 @@ class ImagePipeSource:
             line = "driver: {type: command, command: [PROGRAM, ARGUMENT, ...]}"
             hint = f"Add to cameras.{self.sensor}: {line}\nAn example of a command: {_EXAMPLE}"
             raise SourceError(f"{self.sensor}: the profile does not say how it is reached", hint)
+        self._n_damaged_before += self._stream.n_damaged if self._stream else 0
         self._stream, self._begin, self._complaints, self._n_pictures = self._raw_stream(), b"", b"", 0
         with ExitStack() as stack:
             try:
@@ -92,43 +91,28 @@ class ImagePipeSource:
                 self._selector.register(pipe, selectors.EVENT_READ)
             with suppress(OSError):  # fewer, larger reads where the system allows
                 fcntl(self._pipes()[0].fileno(), F_SETPIPE_SZ, _PIPE_BYTES)
-            self._reader.start()
-            stack.callback(self._reader.stop)
             self._stack = stack.pop_all()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         """Stop the command."""
         self._stack.close()
 
-    def samples(self) -> Iterator[LiveSample]:
-        """Yield pictures as they come.
-
-        Raises:
-            SourceError: the command ended, fell silent, or writes something else.
-        """
-        yield from self._reader.samples()
-
-    def status(self) -> SourceStatus:
+    def describe(self) -> SourceStatus:
         """Say how the camera does."""
-        n_damaged = self._stream.n_damaged if self._stream else 0
-        problems = [f"{n_damaged} pictures came damaged: check the command"] if n_damaged else []
+        n_damaged = self._n_damaged_before + (self._stream.n_damaged if self._stream else 0)
+        problems = []
+        if n_damaged:
+            figures = {"n": n_damaged}
+            problems.append(Finding("stream.damaged_images", "warning", figures=figures, action="command"))
         if isinstance(self._stream, RawPictures) and self._stream.row_bytes % 4:
             n_row = self._stream.row_bytes
-            problems.append(
-                f"rows are taken to have {n_row} bytes, GStreamer pads them to {n_row + -n_row % 4}: "
-                "if the picture is slanted, let it write JPEG (jpegenc)"
-            )
+            figures = {"row_bytes": n_row, "padded_bytes": n_row + -n_row % 4}
+            problems.append(Finding("device.row_padding", "warning", figures=figures))
         return SourceStatus(
             self.sensor,
-            self._reader.n_samples,
-            self._reader.n_dropped,
-            n_damaged,
-            self._reader.rate_hz,
-            "arrival at this computer, later than the exposure by what the command takes",
-            tuple(problems),
+            n_lost=n_damaged,
+            clock=ClockState(Finding("clock.arrival", "note")),
+            problems=tuple(problems),
             device=" ".join(self._settings.driver.command),
         )
 
@@ -172,7 +156,8 @@ class ImagePipeSource:
         assert self._process.stdout is not None and self._process.stderr is not None  # both are pipes
         return self._process.stdout, self._process.stderr
 
-    def _read(self) -> list[LiveSample]:
+    def read(self) -> list[LiveSample]:
+        """Give what came; see `LiveSource`."""
         pictures, complaints = self._pipes()
         samples: list[LiveSample] = []
         for key, _ in self._selector.select(_WAIT_S):

@@ -6,7 +6,7 @@ from typing import Any
 
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import DriverSettings, Rig
-from lce_rig.sources.live.base import LiveSource
+from lce_rig.sources.live.reading import LiveSource
 
 LIVE = {
     "vlp16": "lce_rig.sources.live.vlp16:Vlp16Source",
@@ -68,6 +68,16 @@ def driver_type(kind: str, name: str, model: str, driver: DriverSettings) -> str
         raise SourceError(what, f"It can be {', '.join(known)}.")
     what = f"{kind} {name!r}: no driver goes with model {model!r}"
     raise SourceError(what, f"Set driver.type to one of {', '.join(known)} if it talks like one of these.")
+
+
+def edge_cameras(rig: Rig) -> list[str]:
+    """Name the cameras that stamp a sync board's edges themselves.
+
+    Raises:
+        SourceError: a camera's driver is unknown.
+    """
+    kinds = {name: driver_type("camera", name, each.model, each.driver) for name, each in rig.cameras.items()}
+    return [name for name, kind in kinds.items() if kind == "davis"]
 
 
 def _by_model(model: str) -> str | None:

@@ -4,18 +4,16 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
-from types import TracebackType
 
-from lce_rig.core.clock import NS_PER_S, ClockModel
+from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
-from lce_rig.rig.sync import SyncSettings
-from lce_rig.sources.live.base import Pulse, SourceStatus
-from lce_rig.sources.live.reading import ReaderThread
+from lce_rig.rig.sync import BOARD, SyncSettings
+from lce_rig.sources.live.base import SourceStatus
+from lce_rig.sources.live.reading import LiveSource
 from lce_rig.sources.live.sync_board_port import BoardPort
 from lce_rig.sources.live.sync_board_report import (
     BoardView,
-    clock_words,
+    clock_state,
     device_words,
     figures,
     problems,
@@ -24,6 +22,7 @@ from lce_rig.sources.live.sync_board_state import Arrival, BoardState
 from lce_rig.sources.live.sync_lines import DIALECTS, LineReader
 from lce_rig.sources.live.sync_lines.lce1 import VERSION
 from lce_rig.sources.live.sync_lines.messages import Hello
+from lce_rig.timing.clock import NS_PER_S, ClockModel
 
 # Opening the port may reset the board, and a VLP-16 takes 2.3 s to lock on its pulses again.
 HELLO_S = 6.0
@@ -41,7 +40,7 @@ _UTC_MIN_ANSWERS = 8
 _N_HEARD_BYTES = 2048
 
 
-class SyncBoard:
+class SyncBoard(LiveSource):
     """An attached sync board; a `LiveSource` of pulses.
 
     A reader thread always drains the port: some boards block, and hold their pulse high, when nobody does.
@@ -50,7 +49,7 @@ class SyncBoard:
     def __init__(
         self,
         settings: SyncSettings,
-        sensor: str = "sync",
+        sensor: str = BOARD,
         hello_s: float = HELLO_S,
         silence_s: float = SILENCE_S,
     ) -> None:
@@ -62,16 +61,15 @@ class SyncBoard:
             hello_s: how long to wait for its first words.
             silence_s: so long without a message is an error.
         """
-        self.sensor = sensor
+        super().__init__(sensor, f"sync board '{sensor}'", _N_SLOTS, math.inf)
         self._settings = settings
-        self._who = f"sync board '{sensor}'"
         self._hello_s, self._silence_ns = hello_s, silence_s * NS_PER_S
         self._reader = LineReader(DIALECTS[settings.type]())
         lines = {trigger.channel: camera for camera, trigger in settings.triggers.items()}
         self._state = BoardState(lines, self._reader.dialect.has_own_counts)
         self._lock = threading.Lock()
-        self._is_heard = threading.Event()
-        self._failure: SourceError | None = None
+        self._is_heard = False
+        self._early: list[Pulse] = []
         self._heard = deque[int](maxlen=_N_HEARD_BYTES)
         self._outbox: deque[bytes] = deque()
         self._are_triggers_on = True
@@ -80,63 +78,62 @@ class SyncBoard:
         self._cookie = 0
         self._opened_ns = self._line_ns = self._asked_ns = self._told_utc_ns = self._greeted_ns = 0
         self._busy_until_ns = 0
-        self._thread = ReaderThread(self._who, self._read, _N_SLOTS, math.inf, "")
         self._port: BoardPort | None = None
 
-    def __enter__(self) -> "SyncBoard":
+    def open(self) -> None:
         """Open the port, wait for the board's first words, set its lines and start them.
 
         Raises:
             SourceError: the port cannot be opened, or the board is silent or talks otherwise.
         """
         self._port = BoardPort(self._who, self._settings.device, self._settings.port_baud)
+        with self._lock:
+            # A board that was unplugged knows nothing any more.
+            self._is_heard, self._state.hello = False, None
+        self._early = []
         self._opened_ns = self._line_ns = self._busy_until_ns = time.monotonic_ns()
         self._busy_until_ns += _ASK_OFTEN_NS
-        self._thread.start()
-        try:
-            self._is_heard.wait(self._hello_s)
-            if self._failure is not None:
-                raise self._failure
-            if not self._is_heard.is_set():
+        until_s = time.monotonic() + self._hello_s
+        while not self._is_heard and not self.is_stopping:
+            self._early = self.read()
+            if not self._is_heard and time.monotonic() > until_s:
                 raise self._silent()
-            self._check_version()
-        except BaseException:
-            self.__exit__(None, None, None)
-            raise
-        return self
+        self._check_version()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop reading and close the port; the board's pulses go on, so that the LiDAR stays locked."""
-        self._thread.stop()
+    def close(self) -> None:
+        """Close the port; the board's pulses go on, so that the LiDAR stays locked."""
         if self._port is not None:
             self._port.close()
 
-    def samples(self) -> Iterator[Pulse]:
-        """Yield pulses as they come: `sensor` is the camera, or "pps"; stamps are the board's own time.
+    def read(self) -> list[Pulse]:
+        """Give the pulses that came, and say to the board what is due.
+
+        Their `sensor` is the camera, or "pps"; stamps are the board's own time.
 
         Raises:
             SourceError: the board was unplugged, or fell silent for good.
         """
-        for sample in self._thread.samples():
-            if isinstance(sample, Pulse):
-                yield sample
+        assert self._port is not None  # it is open
+        early, self._early = self._early, []
+        data = self._port.read()
+        arrival = Arrival(time.time_ns(), time.monotonic_ns())
+        with self._lock:
+            pulses = self._take(data, arrival)
+        self._talk(self._port, arrival.steady_ns)
+        return early + pulses
 
-    def status(self) -> SourceStatus:
+    def describe(self) -> SourceStatus:
         """Say how the board does."""
         with self._lock:
             view = self._view()
             return SourceStatus(
                 self.sensor,
-                n_samples=self._thread.n_samples,
-                n_dropped=self._thread.n_dropped,
                 n_lost=sum(self._state.counts.n_lost.values()),
-                rate_hz=self._thread.rate_hz,
-                clock=clock_words(view),
+                clock=clock_state(view),
                 problems=problems(view),
                 figures=figures(view),
                 device=device_words(view),
+                n_lost_by_line=dict(self._state.counts.n_lost),
             )
 
     @property
@@ -167,20 +164,6 @@ class SyncBoard:
             self._are_triggers_on = False
             self._outbox.append(self._reader.dialect.stop())
 
-    def _read(self) -> list[Pulse]:
-        assert self._port is not None
-        try:
-            data = self._port.read()
-            arrival = Arrival(time.time_ns(), time.monotonic_ns())
-            with self._lock:
-                pulses = self._take(data, arrival)
-            self._talk(self._port, arrival.steady_ns)
-        except SourceError as error:
-            self._failure = error
-            self._is_heard.set()
-            raise
-        return pulses
-
     def _take(self, data: bytes, arrival: Arrival) -> list[Pulse]:
         self._heard.extend(data)
         messages = self._reader.feed(data)
@@ -189,14 +172,14 @@ class SyncBoard:
             pulses += self._state.take(message, arrival)
         if messages:
             self._line_ns = arrival.steady_ns
-        elif arrival.steady_ns - self._line_ns > self._silence_ns and self._is_heard.is_set():
+        elif arrival.steady_ns - self._line_ns > self._silence_ns and self._is_heard:
             raise SourceError(
                 f"{self._who} fell silent: nothing for {self._silence_ns / NS_PER_S:g} s",
                 "Check its cable and power, and press its reset.",
             )
-        if not self._is_heard.is_set() and self._is_introduced(bool(messages)):
+        if not self._is_heard and self._is_introduced(bool(messages)):
             self._configure()
-            self._is_heard.set()
+            self._is_heard = True
         if self._state.counts.n_resets != self._n_resets_seen:
             self._n_resets_seen = self._state.counts.n_resets
             self._busy_until_ns = arrival.steady_ns + _ASK_OFTEN_NS
@@ -220,7 +203,7 @@ class SyncBoard:
 
     def _talk(self, port: BoardPort, now_ns: int) -> None:
         """Send what is due: greetings, commands, UTC, a time request."""
-        if not self._is_heard.is_set():
+        if not self._is_heard:
             if now_ns - self._greeted_ns > _GREET_AGAIN_NS:
                 self._greeted_ns = now_ns
                 self._send(port, self._reader.dialect.greeting())

@@ -6,7 +6,7 @@ are believed: the board, or one of its counters, began anew.
 
 from enum import Enum
 
-from lce_rig.core.clock import NS_PER_S
+from lce_rig.timing.clock import NS_PER_S
 
 # A line is written within milliseconds of what it tells, and read whenever the computer gets to it.
 ROOM_NS = 2 * NS_PER_S

@@ -6,10 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lce_rig.core.clock import NS_PER_S, ClockModel
-from lce_rig.core.clock_fit import fit_arrivals
-from lce_rig.core.clock_tracker import ClockTracker
-from lce_rig.sources.live.base import Pulse
+from lce_rig.core.data import Pulse
+from lce_rig.rig.sync import PPS_LINE
 from lce_rig.sources.live.sync_board_plausibility import ROOM_NS, BoardTime, RunningNumber, Verdict
 from lce_rig.sources.live.sync_lines.messages import (
     BoardError,
@@ -22,9 +20,9 @@ from lce_rig.sources.live.sync_lines.messages import (
     TriggerEdge,
     UtcTime,
 )
-
-PPS_LINE = "pps"
-"""Name of the line of the pulses per second, among those of the cameras."""
+from lce_rig.timing.clock import NS_PER_S, ClockModel
+from lce_rig.timing.clock_fit import fit_arrivals
+from lce_rig.timing.clock_tracker import ClockTracker
 
 _N_ARRIVALS = 2048
 

@@ -1,16 +1,15 @@
 """A camera of the kernel's video interface: pictures with the kernel's stamps, counted, in UTC."""
 
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
-from types import TracebackType
 
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.rig import CameraSettings
-from lce_rig.sources.live.base import LiveSample, SourceStatus
+from lce_rig.sources.live.base import ClockState, SourceStatus
 from lce_rig.sources.live.pixel_formats import FORMATS, PixelDecoder, find_format
-from lce_rig.sources.live.reading import ReaderThread
+from lce_rig.sources.live.reading import LiveSource
 from lce_rig.sources.live.v4l2_clock import StampClock
 from lce_rig.sources.live.v4l2_controls import apply_controls, list_controls, read_exposure_us
 from lce_rig.sources.live.v4l2_device import RawFrame, VideoDevice, video_devices
@@ -26,7 +25,7 @@ _SILENT_HINT = (
 )
 
 
-class V4l2Source:
+class V4l2Source(LiveSource):
     """A camera at /dev/video*; see `LiveSource`.
 
     Stamps are mid exposure in the computer's UTC: the driver's stamp, moved by the rules of `v4l2_timing` and
@@ -39,16 +38,16 @@ class V4l2Source:
     """
 
     def __init__(self, sensor: str, settings: CameraSettings, silence_s: float = 5.0) -> None:
-        self.sensor = sensor
+        super().__init__(sensor, f"camera {sensor!r}", _N_SLOTS, silence_s, _SILENT_HINT)
         self._settings = settings
         self._channel = settings.first_channel("frames") or "frames"
         self._clock = StampClock(settings.driver.frame_timing.clock)
-        self._reader = ReaderThread(f"camera {sensor!r}", self._read, _N_SLOTS, silence_s, _SILENT_HINT)
+        self._has_sent = False
         self._stack = ExitStack()
         self._last_sequence: int | None = None
         self._n_lost = 0
         self._n_damaged = 0
-        self._notes: list[str] = []
+        self._notes: list[Finding] = []
         self._device_in_words = ""
         self._mark: Mark = "start_of_frame"
         self._timing = FrameTiming(settings.resolution_px[1], None)
@@ -58,38 +57,24 @@ class V4l2Source:
         """How the rows are exposed; `to_mid_ns("trigger")` is what a pulse's stamp lacks to mid exposure."""
         return self._timing
 
-    def __enter__(self) -> "V4l2Source":
+    def open(self) -> None:
         """Open, set up and start the camera.
 
         Raises:
             SourceError: it is absent, busy, or cannot do what the profile wants.
         """
         with ExitStack() as stack:
-            self._open(stack)
-            self._reader.start()
-            stack.callback(self._reader.stop)
+            self._open_device(stack)
             self._stack = stack.pop_all()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         """Stop and close the camera."""
         self._stack.close()
 
-    def samples(self) -> Iterator[LiveSample]:
-        """Yield pictures as they come.
-
-        Raises:
-            SourceError: the camera fell silent or is gone.
-        """
-        yield from self._reader.samples()
-
-    def status(self) -> SourceStatus:
+    def describe(self) -> SourceStatus:
         """Say how the camera does."""
         figures = {
             "n_damaged": float(self._n_damaged),
-            "delay_ms": self._clock.delay_ns * 1e-6,
             "stamp_to_mid_exposure_ms": self._timing.to_mid_ns(self._mark) * 1e-6,
             "trigger_to_mid_exposure_ms": self._timing.to_mid_ns("trigger") * 1e-6,
         }
@@ -97,17 +82,14 @@ class V4l2Source:
             figures["exposure_ms"] = self._timing.exposure_ns * 1e-6
         return SourceStatus(
             self.sensor,
-            self._reader.n_samples,
-            self._reader.n_dropped,
-            self._n_lost,
-            self._reader.rate_hz,
-            self._clock_in_words(),
-            tuple(self._problems()),
-            figures,
-            self._device_in_words,
+            n_lost=self._n_lost,
+            clock=self._clock_state(),
+            problems=tuple(self._problems()),
+            figures=figures,
+            device=self._device_in_words,
         )
 
-    def _open(self, stack: ExitStack) -> None:
+    def _open_device(self, stack: ExitStack) -> None:
         driver = self._settings.driver
         if driver.device is None:
             found = ", ".join(video_devices()) or "none"
@@ -127,16 +109,13 @@ class V4l2Source:
         if driver.frame_rate_hz is not None:
             given_hz = self._device.set_rate(driver.frame_rate_hz)
             if given_hz is not None and abs(given_hz / driver.frame_rate_hz - 1) > 0.01:
-                self._notes.append(
-                    f"the camera sends {given_hz:.4g} pictures a second, the profile wants "
-                    f"{driver.frame_rate_hz:g}: see `v4l2-ctl --list-formats-ext`"
-                )
+                rates = {"rate_hz": given_hz, "expected_hz": driver.frame_rate_hz}
+                self._notes.append(Finding("stream.rate_refused", "warning", figures=rates))
         self._read_exposure()
         n_buffers = self._device.start(N_BUFFERS)
         if n_buffers < N_BUFFERS:
-            self._notes.append(
-                f"the driver grants {n_buffers} buffers, {N_BUFFERS} wanted: pictures may be lost"
-            )
+            buffers = {"n": n_buffers, "expected": N_BUFFERS}
+            self._notes.append(Finding("stream.few_buffers", "warning", figures=buffers))
 
     def _set_up_pictures(self) -> PixelDecoder:
         """Agree on the form of the pictures.
@@ -170,7 +149,8 @@ class V4l2Source:
             )
         return PixelDecoder(code, width, height, layout.stride)
 
-    def _read(self) -> list[LiveSample]:
+    def read(self) -> list[LiveSample]:
+        """Give what came; see `LiveSource`."""
         try:
             frame = self._device.read(_WAIT_S)
         except OSError:
@@ -187,6 +167,7 @@ class V4l2Source:
         host_ns = time.time_ns()
         utc_ns = self._clock.to_utc_ns(frame.stamp_ns)
         self._count(frame.sequence)
+        self._has_sent = True
         if frame.is_damaged:
             self._n_damaged += 1
             return None
@@ -213,23 +194,19 @@ class V4l2Source:
         asked = read_exposure_us(self._device, self._known) if given is None else None
         self._timing = frame_timing(self._settings.driver, self._settings.resolution_px[1], asked)
 
-    def _clock_in_words(self) -> str:
-        if not self._reader.n_samples:
-            return ""
+    def _clock_state(self) -> ClockState | None:
+        if not self._has_sent:
+            return None
         if self._clock.used is None:
-            return "arrival at this computer, later than the exposure"
-        moment = self._mark.replace("_", " ")
-        return f"{moment} by clock {self._clock.used}, as this computer's UTC; moved to mid exposure"
+            return ClockState(Finding("clock.arrival", "note"))
+        delay_ms = self._clock.delay_ns * 1e-6
+        figures: dict[str, Figure] = {"clock": self._clock.used, "mark": self._mark, "delay_ms": delay_ms}
+        return ClockState(Finding("clock.mid_exposure", "note", figures=figures))
 
-    def _problems(self) -> list[str]:
+    def _problems(self) -> list[Finding]:
         found = self._notes + self._clock.problems()
         if self._n_damaged:
-            found.append(
-                f"{self._n_damaged} pictures came damaged: check the camera's cable and `dmesg | tail`"
-            )
-        if self._clock.used is not None and self._timing.exposure_ns is None and self._reader.n_samples:
-            found.append(
-                "the camera does not tell its exposure, stamps are off by half of it: "
-                "set driver.frame_timing.exposure_us"
-            )
+            found.append(Finding("stream.damaged_images", "warning", figures={"n": self._n_damaged}))
+        if self._clock.used is not None and self._timing.exposure_ns is None and self._has_sent:
+            found.append(Finding("clock.exposure_unknown", "warning"))
         return found

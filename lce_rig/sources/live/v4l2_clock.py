@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from lce_rig.core.findings import Figure, Finding
+
 MAX_DELAY_NS = 200_000_000
 # A computer that stalls takes pictures late from the queue: no reason to doubt a clock once it is known.
 _MAX_STALL_NS = 2_000_000_000
@@ -50,9 +52,9 @@ class ClockChoice:
         """Whether clocks fit that differ by more than is harmless."""
         return self.spread_ns > HARMLESS_NS
 
-    def __str__(self) -> str:
-        ages = ", ".join(f"{name} {delay_ns / 1e6:.3g} ms" for name, delay_ns in self.delays_ns.items())
-        return f"age of a picture by {ages}"
+    def delays_ms(self) -> tuple[Figure, ...]:
+        """List how old the stamp would be by each clock, (clock, ms)."""
+        return tuple((name, delay_ns * 1e-6) for name, delay_ns in self.delays_ns.items())
 
 
 def read_clocks() -> dict[str, int]:
@@ -118,35 +120,26 @@ class StampClock:
         """Name of the clock behind the last stamp; None where arrival had to be taken."""
         return None if self._is_missing else self.clock
 
-    def problems(self) -> list[str]:
-        """Say what is doubtful about the stamps, each in a sentence."""
+    def problems(self) -> list[Finding]:
+        """Find what is doubtful about the stamps."""
         if self._is_missing:
-            return [
-                f"this computer has no clock {self.clock}: arrival is taken; set driver.frame_timing.clock"
-            ]
+            return [Finding("clock.missing", "warning", figures={"clock": self.clock})]
         if self._is_fixed:
-            return self._problems_of_fixed()
-        found = []
-        if self.choice is not None and self.choice.clock is None:
-            found.append(
-                f"no clock fits the stamps ({self.choice}): arrival is taken, late by an unknown time"
-            )
-        elif self.choice is not None and self.choice.is_ambiguous:
-            found.append(
-                f"the clock of the stamps is uncertain by {self.choice.spread_ns * 1e-6:.3g} ms "
-                f"({self.choice}): set driver.frame_timing.clock if you know it"
-            )
+            figures: dict[str, Figure] = {"clock": self.clock, "delay_ms": self.delay_ns * 1e-6}
+            is_right = 0 <= self.delay_ns <= _MAX_STALL_NS
+            return [] if is_right else [Finding("clock.does_not_fit", "warning", figures=figures)]
+        found, choice = [], self.choice
+        if choice is not None and choice.clock is None:
+            found.append(Finding("clock.none_fits", "warning", figures={"delays_ms": choice.delays_ms()}))
+        elif choice is not None and choice.is_ambiguous:
+            spread: dict[str, Figure] = {
+                "spread_ms": choice.spread_ns * 1e-6,
+                "delays_ms": choice.delays_ms(),
+            }
+            found.append(Finding("clock.ambiguous", "warning", figures=spread))
         if self.n_changes:
-            found.append(
-                f"the stamps left their clock {self.n_changes} times: check the camera's driver (dmesg)"
-            )
+            found.append(Finding("clock.changed", "warning", figures={"n": self.n_changes}))
         return found
-
-    def _problems_of_fixed(self) -> list[str]:
-        if 0 <= self.delay_ns <= _MAX_STALL_NS:
-            return []
-        age = f"{self.delay_ns * 1e-6:.3g} ms"
-        return [f"by clock {self.clock} pictures are {age} old: correct driver.frame_timing.clock"]
 
 
 def _read_with_utc() -> tuple[dict[str, int], int]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.sources.live import v4l2_abi as abi
 from lce_rig.sources.live.v4l2_device import VideoDevice
 
@@ -50,11 +51,11 @@ def list_controls(device: VideoDevice) -> dict[str, ControlInfo]:
     return found
 
 
-def apply_controls(device: VideoDevice, sensor: str, wanted: Mapping[str, Value]) -> list[str]:
+def apply_controls(device: VideoDevice, sensor: str, wanted: Mapping[str, Value]) -> list[Finding]:
     """Set what the profile wants: choices first, since automatic modes lock other settings.
 
     Returns:
-        What the device set otherwise than asked, each in a sentence.
+        What the device set otherwise than asked.
 
     Raises:
         SourceError: it has no such setting, or cannot take the value.
@@ -72,9 +73,8 @@ def apply_controls(device: VideoDevice, sensor: str, wanted: Mapping[str, Value]
         _set(device, sensor, name, info, value)
         given = read_control(device, info)
         if given is not None and given != value:
-            deviations.append(
-                f"control {name} is {given}, the profile wants {value}: the camera does as it can"
-            )
+            figures: dict[str, Figure] = {"control": name, "given": given, "expected": value}
+            deviations.append(Finding("device.control_differs", "warning", figures=figures))
     return deviations
 
 

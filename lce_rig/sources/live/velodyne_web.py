@@ -20,6 +20,7 @@ from urllib.request import ProxyHandler, Request, build_opener
 
 from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.rig import LidarSettings
 
 _TIMEOUT_S = 2.0
@@ -180,37 +181,38 @@ def to_report(
     )
 
 
-def find_problems(report: WebReport, settings: LidarSettings) -> list[str]:
-    """Say what on the web page keeps the profile's scans from coming, each with what to do."""
+def find_problems(report: WebReport, settings: LidarSettings) -> list[Finding]:
+    """Find what on the web page keeps the profile's scans from coming."""
     problems = []
     if report.model and velodyne.PRODUCTS[velodyne.VLP16] not in report.model.upper().replace(" ", "-"):
-        problems.append(f"the LiDAR is a {report.model}, not a VLP-16: its packets are not read")
+        problems.append(Finding("settings.other_model", "warning", figures={"model": report.model}))
     if report.is_motor_on is False:
-        problems.append("the motor is off: switch it on (rpm 600)")
+        problems.append(Finding("settings.motor_off", "warning"))
     if report.is_laser_on is False:
-        problems.append("the laser is off: switch it on")
+        problems.append(Finding("settings.laser_off", "warning"))
     wanted_hz = report.wanted_rotor_hz
     if wanted_hz is not None and not _is_near(wanted_hz, settings.rate_hz):
-        problems.append(
-            f"the rotor is set to {wanted_hz:.1f} Hz, the profile says {settings.rate_hz:g}: set rpm to "
-            f"{60 * settings.rate_hz:.0f}, or rate_hz in the profile"
-        )
+        figures = {
+            "set_hz": wanted_hz,
+            "expected_hz": settings.rate_hz,
+            "expected_rpm": 60 * settings.rate_hz,
+        }
+        problems.append(Finding("settings.rotor_rate", "warning", figures=figures))
     if report.fov_deg is not None and (report.fov_deg[1] - report.fov_deg[0]) % 360 < 359:
-        start, end = report.fov_deg
-        problems.append(f"the field of view is cut to {start:.0f} to {end:.0f} deg: set it to 0 to 359")
+        start_deg, end_deg = report.fov_deg
+        problems.append(
+            Finding("settings.fov_cut", "warning", figures={"start_deg": start_deg, "end_deg": end_deg})
+        )
     port = settings.driver.port or velodyne.DATA_PORT
     if report.data_port is not None and report.data_port != port:
-        problems.append(
-            f"data go to port {report.data_port}, the profile listens on {port}: set either of them"
-        )
+        ports = {"port": report.data_port, "expected_port": port}
+        problems.append(Finding("settings.data_port", "warning", figures=ports))
     position_port = int(settings.driver.controls.get("position_port", velodyne.POSITION_PORT))
     if report.position_port is not None and report.position_port != position_port:
-        problems.append(
-            f"telemetry goes to port {report.position_port}, not {position_port}: whether PPS is locked "
-            "stays unknown"
-        )
+        ports = {"port": report.position_port, "expected_port": position_port}
+        problems.append(Finding("settings.position_port", "warning", figures=ports))
     if settings.timestamps.clock == "utc" and report.pps and report.pps != "locked":
-        problems.append(f"PPS is {report.pps}: the LiDAR's clock is not UTC; check pulse and NMEA")
+        problems.append(Finding("settings.pps", "warning", figures={"pps": report.pps}))
     return problems
 
 

@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.sources.datagrams import Datagram
 from lce_rig.sources.live.base import Mailbox
 from lce_rig.sources.pcap_writer import PcapWriter
@@ -20,7 +21,7 @@ class PcapRecorder:
     Attributes:
         path: the pcap file.
         n_written: datagrams on their way to the disk.
-        failure: why recording stopped; "" while it goes on.
+        failure: why recording stopped; None while it goes on.
     """
 
     def __init__(self, path: Path) -> None:
@@ -31,7 +32,7 @@ class PcapRecorder:
         """
         self.path = path
         self.n_written = 0
-        self.failure = ""
+        self.failure: Finding | None = None
         try:
             self._writer = PcapWriter(path)
         except FileExistsError:
@@ -49,7 +50,7 @@ class PcapRecorder:
 
     def put(self, datagram: Datagram) -> None:
         """Record a datagram; never blocks."""
-        if not self.failure:
+        if self.failure is None:
             self._mailbox.put(datagram)
 
     def close(self) -> None:
@@ -62,7 +63,8 @@ class PcapRecorder:
             with self._writer as writer:
                 self._write_all(writer)
         except OSError as error:
-            self.failure = f"recording to {self.path} stopped: {error.strerror}: free some space"
+            figures = {"path": str(self.path), "cause": error.strerror}
+            self.failure = Finding("device.recording_stopped", "warning", figures=figures)
 
     def _write_all(self, writer: PcapWriter) -> None:
         flushed_s = time.monotonic()

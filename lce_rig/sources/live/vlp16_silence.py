@@ -6,6 +6,7 @@ from lce_rig.rig import LidarSettings
 from lce_rig.sources.live.velodyne_web import VelodyneWeb, WebReport, find_problems
 from lce_rig.sources.live.vlp16_status import Reception
 from lce_rig.sources.velodyne_stream import Vlp16Stream
+from lce_rig.words import as_line, describe, sentence
 
 _WEB_TIMEOUT_S = 1.0
 _EVERYBODY = "255.255.255.255"
@@ -26,15 +27,15 @@ def explain_silence(
     began = "have stopped" if stream.counts.n_data else "come"
     none = "" if stream.counts.n_data else "no "
     what = f"{sensor}: {none}data packets{whose} on UDP port {port} {began} (for {silence_s:g} s)"
-    others = [key.partition(" from a ")[2] for key in stream.counts.bad if " from a " in key]
+    others = stream.counts.other_models.most_common(1)
     if others:
         return SourceError(
-            f"{sensor}: the packets on UDP port {port} come from a {others[0]}, not a VLP-16",
-            "Only the VLP-16 (Puck, Puck LITE) is read; is driver.address the right sensor's?",
+            f"{sensor}: the packets on UDP port {port} come from a {others[0][0]}, not a VLP-16",
+            "Only the VLP-16 (Puck, Puck LITE) is read: check driver.address.",
         )
-    if stream.counts.bad:
-        bad = ", ".join(f"{n} {kind}" for kind, n in stream.counts.bad.most_common(_MAX_SHOWN))
-        return SourceError(f"{what}: only {bad}", "Does another program send to this port?")
+    if stream.counts.n_bad:
+        bad = ", ".join(describe(flaw) for flaw in stream.counts.flaws()[:_MAX_SHOWN])
+        return SourceError(f"{what}: only {bad}", "Check which program sends to this port.")
     if reception.strangers:
         there = ", ".join(sorted(reception.strangers))
         return SourceError(what, f"Packets come from {there}: set driver.address in the profile.")
@@ -53,7 +54,7 @@ def _ask_the_web_page(address: str, port: int, settings: LidarSettings, web_port
 
 
 def _advise(report: WebReport, port: int, settings: LidarSettings) -> list[str]:
-    problems = [f"{problem[0].upper()}{problem[1:]}." for problem in find_problems(report, settings)]
+    problems = [as_line(sentence(problem)) for problem in find_problems(report, settings)]
     if report.host and report.host != _EVERYBODY:
-        problems.append(f"Data go to {report.host} only: is that this computer?")
+        problems.append(f"Data go to {report.host} only: check that this is this computer.")
     return problems or [f"Open UDP port {port} in this computer's firewall (sudo ufw allow {port}/udp)."]

@@ -1,11 +1,12 @@
-"""How an attached VLP-16 does, in figures and in sentences."""
+"""How an attached VLP-16 does, as figures and findings."""
 
 from collections import Counter
 from dataclasses import dataclass, field
 
 from lce_rig.core import velodyne
+from lce_rig.core.findings import Finding
 from lce_rig.rig import LidarSettings
-from lce_rig.sources.live.base import SourceStatus
+from lce_rig.sources.live.base import ClockState, SourceStatus
 from lce_rig.sources.live.vlp16_recorder import PcapRecorder
 from lce_rig.sources.live.vlp16_socket import PACKET_COST_BYTES
 from lce_rig.sources.velodyne_stream import Vlp16Stream
@@ -23,8 +24,6 @@ class Reception:
 
     Attributes:
         address: whose packets are taken; "" before the first.
-        n_dropped: scans that nobody took in time.
-        rate_hz: scans a second.
         n_overflowed: datagrams that the kernel dropped because they were not taken in time.
         granted_bytes: receive buffer of a port.
         strangers: datagrams of other senders, by IP address; the first few.
@@ -32,8 +31,6 @@ class Reception:
     """
 
     address: str = ""
-    n_dropped: int = 0
-    rate_hz: float = 0.0
     n_overflowed: int = 0
     granted_bytes: int = 0
     strangers: Counter[str] = field(default_factory=Counter)
@@ -53,83 +50,60 @@ def to_status(
     reception: Reception,
     recorder: PcapRecorder | None,
 ) -> SourceStatus:
-    """Put everything into words and figures."""
+    """Gather everything as figures and findings."""
     if stream is None:
-        return SourceStatus(sensor, clock="closed")
+        return SourceStatus(sensor)
     counts, state = stream.counts, stream.clock.state()
-    n_bad, n_lost = counts.bad.total(), counts.order.n_lost
-    ahead_ns, position = stream.clock.ahead_ns(), stream.clock.position
+    ahead_ns = stream.clock.ahead_ns()
     figures = {
-        "data_packets": float(counts.n_data),
         "position_packets": float(counts.n_position),
-        "bad_packets": float(n_bad),
+        "bad_packets": float(counts.n_bad),
         "late_packets": float(counts.order.n_late),
         "overflowed_packets": float(reception.n_overflowed),
         "stranger_packets": float(reception.n_strange),
         "clock_steps": float(counts.order.n_steps),
         "receive_buffer_bytes": float(reception.granted_bytes),
-        "rotor_hz": stream.rotor_hz,
         "is_dual": float(stream.mode == velodyne.DUAL),
-        "is_device_time": float(state.is_device),
     }
-    if position is not None:
-        figures["pps_state"] = float(position.pps)
-        figures["nmea_fix"] = float(position.is_fix)
-        if position.nmea_s is not None:
-            figures["nmea_past_hour_s"] = float(position.nmea_s)
-    if ahead_ns is not None:
-        figures["device_ahead_s"] = ahead_ns * 1e-9
+    problems = _find_problems(settings, stream, reception)
     if recorder is not None:
         figures["recorded_packets"] = float(recorder.n_written)
         figures["unrecorded_packets"] = float(recorder.n_dropped)
-    problems = _find_problems(settings, stream, reception)
-    if recorder is not None and recorder.failure:
-        problems.append(recorder.failure)
+        problems += [recorder.failure] if recorder.failure is not None else []
     return SourceStatus(
         sensor,
-        counts.n_scans,
-        reception.n_dropped,
-        n_lost,
-        reception.rate_hz,
-        state.text,
-        tuple(problems),
-        figures,
-        f"{velodyne.PRODUCTS[velodyne.VLP16]} at {reception.address}" if reception.address else "",
+        n_lost=counts.order.n_lost,
+        clock=ClockState(state, stream.clock.is_utc, None if ahead_ns is None else ahead_ns * 1e-9),
+        problems=tuple(problems),
+        figures=figures,
+        device=f"{velodyne.PRODUCTS[velodyne.VLP16]} at {reception.address}" if reception.address else "",
+        rates_hz={"scans": stream.rotor_hz} if stream.rotor_hz else {},
+        n_packets=counts.n_data,
     )
 
 
-def _find_problems(settings: LidarSettings, stream: Vlp16Stream, reception: Reception) -> list[str]:
+def _find_problems(settings: LidarSettings, stream: Vlp16Stream, reception: Reception) -> list[Finding]:
     counts, state = stream.counts, stream.clock.state()
-    problems = []
-    if not state.is_device and state.remedy:
-        problems.append(f"scans are stamped with {state.text}; {state.remedy}")
+    problems = [] if state.severity == "note" else [state]
+    buffer_kib = reception.granted_bytes // 2048
     n_lost_on_way = counts.order.n_lost - reception.n_overflowed
     if n_lost_on_way > _MAX_LOST_SHARE * max(counts.n_data, 1):
-        share = 100 * n_lost_on_way / (counts.n_data + n_lost_on_way)
-        problems.append(
-            f"{share:.1f} % of the packets were lost on the way: check cable and switch, and that the "
-            "LiDAR's field of view is 0 to 359"
-        )
+        share = n_lost_on_way / (counts.n_data + n_lost_on_way)
+        problems.append(Finding("stream.packets_lost", "warning", figures={"share": share}))
     if reception.n_overflowed:
-        problems.append(
-            f"this computer was too slow for {reception.n_overflowed} packets: close other programs, and "
-            f"{_raise_limit(reception)}"
-        )
+        overflow = {"n": reception.n_overflowed, "buffer_kib": buffer_kib}
+        problems.append(Finding("stream.computer_too_slow", "warning", figures=overflow))
     packets_per_s = 1e9 / velodyne.packet_ns(stream.mode == velodyne.DUAL)
     buffer_s = reception.granted_bytes / PACKET_COST_BYTES / packets_per_s
     if 0 < buffer_s < _MIN_BUFFER_S:
-        problems.append(f"the receive buffer holds {1000 * buffer_s:.0f} ms: {_raise_limit(reception)}")
-    for what, n_bad in sorted(counts.bad.items()):
-        if n_bad > _MAX_LOST_SHARE * counts.n_data:
-            problems.append(f"{n_bad} {what} left out")
+        figures = {"buffer_s": buffer_s, "buffer_kib": buffer_kib}
+        problems.append(Finding("buffer.small", "warning", figures=figures))
+    problems += [flaw for flaw in counts.flaws() if flaw.figure("n") > _MAX_LOST_SHARE * counts.n_data]
     if stream.rotor_hz and abs(stream.rotor_hz / settings.rate_hz - 1) > _MAX_OFF_RATE:
-        problems.append(
-            f"the rotor turns at {stream.rotor_hz:.1f} Hz, the profile says {settings.rate_hz:g}: set "
-            f"rate_hz in the profile, or rpm {60 * settings.rate_hz:.0f} on the web page"
-        )
+        rates = {
+            "rotor_hz": stream.rotor_hz,
+            "expected_hz": settings.rate_hz,
+            "expected_rpm": 60 * settings.rate_hz,
+        }
+        problems.append(Finding("stream.rotor_rate", "warning", figures=rates))
     return problems
-
-
-def _raise_limit(reception: Reception) -> str:
-    now_kib = reception.granted_bytes // 2048
-    return f"raise its limit, now {now_kib} KiB: sudo sysctl -w net.core.rmem_max=4194304"

@@ -5,18 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, calibrate, error_to_reference
+from lce_rig.calibrate import EstimateSettings, error_to_reference, fit_extrinsic
 from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.likelihood.edge_terms import SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.refine import refine
-from lce_rig.calibrate.likelihood.scans import turn_about_z
 from lce_rig.calibrate.likelihood.spread import inflate
-from lce_rig.calibrate.placements import group_placements
 from lce_rig.core.geometry import difference, exp_so3, invert, perturb, pose
+from lce_rig.residuals.along_rays import SHIFTS, turn_about_z
+from lce_rig.residuals.placements import group_placements
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, simulate
 
-ML = CalibrateOptions(method="ml", n_draws=3, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
+ML = EstimateSettings(method="ml", n_draws=3, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
 REAL = Scenario(laser_bias_sigma_m=0.008, footprint_m=0.008, end_sigma_m=0.001)
 
 
@@ -29,7 +28,7 @@ def observations(n, seed, scenario, T_cam_lidar=T_FORWARD):
 @pytest.fixture(scope="module")
 def sessions():
     """Five sessions of 20 captures: lasers off by 8 mm, a beam that reaches 8 mm over edges."""
-    return [calibrate(simulate(20, seed, REAL), BOARD, ML) for seed in range(5)]
+    return [fit_extrinsic(simulate(20, seed, REAL), BOARD, ML) for seed in range(5)]
 
 
 def test_errors_of_lasers_hardly_reach_the_extrinsic_and_the_claim_says_so(sessions):
@@ -65,7 +64,7 @@ def test_the_claim_is_parted_in_what_differs_between_sessions_and_what_they_shar
 
 def test_an_offset_common_to_all_ranges_is_found_though_it_is_four_times_what_the_profile_says():
     scenario = replace(REAL, range_offset_m=0.02, footprint_m=0.003)
-    estimate = calibrate(simulate(30, 3, scenario), BOARD, ML)
+    estimate = fit_extrinsic(simulate(30, 3, scenario), BOARD, ML)
     angle_deg, distance_m = error_to_reference(estimate.T_cam_lidar, T_FORWARD)
     assert angle_deg < 0.05
     assert distance_m < 0.002
@@ -87,7 +86,7 @@ def raised(capture, metres_per_rad):
 
 def test_the_height_of_the_lasers_is_found_where_the_driver_left_it_out():
     captures = [raised(capture, -0.043) for capture in simulate(30, 2, REAL)]
-    estimate = calibrate(captures, BOARD, ML)
+    estimate = fit_extrinsic(captures, BOARD, ML)
     assert abs(estimate.diagnostics["lens_vertical_m_per_rad"] + 0.043) < 0.006
     error = difference(estimate.T_cam_lidar, T_FORWARD)
     assert error @ np.linalg.solve(estimate.cov, error) < 25  # 0.9997 of chi square with 6 degrees
@@ -140,7 +139,7 @@ def test_cameras_that_share_captures_share_what_the_lidar_says():
     ids=["grazing", "few rings", "ring ends lost"],
 )
 def test_hard_captures_are_no_worse_than_claimed(scenario):
-    estimate = calibrate(simulate(20, 4, scenario), BOARD, ML)
+    estimate = fit_extrinsic(simulate(20, 4, scenario), BOARD, ML)
     error = difference(estimate.T_cam_lidar, T_FORWARD)
     assert error @ np.linalg.solve(estimate.cov, error) < 30
     assert np.degrees(np.linalg.norm(error[3:])) < 0.15

@@ -8,13 +8,19 @@ import pytest
 from scipy.linalg import block_diag
 
 from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.likelihood.edge_terms import N_SHIFTS, SHIFTS, edge_rows
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.picture_terms import picture_rows, stack_pictures
-from lce_rig.calibrate.likelihood.range_terms import sum_ranges, weigh_ranges
-from lce_rig.calibrate.likelihood.scans import N_FIELDS, stack_scans
 from lce_rig.calibrate.likelihood.system import Assembly, State, assemble, linearise
 from lce_rig.core.geometry import difference, invert, perturb
+from lce_rig.residuals.along_rays import (
+    N_FIELDS,
+    N_SHIFTS,
+    SHIFTS,
+    edge_rows,
+    stack_scans,
+    sum_ranges,
+    weigh_ranges,
+)
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 STEP = 1e-6
@@ -48,14 +54,23 @@ def ranges_to(scans, T_lidar_board):
     return np.sum(T[:, :3, 2] * T[:, :3, 3], axis=1) / np.sum(T[:, :3, 2] * scans.rays, axis=1)
 
 
+def freedoms(scans, T_lidar_board):
+    """What each ray (N, 3) feels of its plane's freedoms: (1, x, y) over the cosine of its incidence."""
+    T = T_lidar_board[scans.capture]
+    hits = ranges_to(scans, T_lidar_board)[:, None] * scans.rays - T[:, :3, 3]
+    on_board = np.einsum("mji,mj->mi", T[:, :3, :2], hits)
+    cosine = np.sum(T[:, :3, 2] * scans.rays, axis=1, keepdims=True)
+    return np.column_stack([np.ones(len(hits)), on_board]) / cosine
+
+
 @pytest.mark.parametrize("axis", range(6))
 def test_derivatives_by_a_boards_pose_are_those_of_differences(scans, T_lidar_board, axis):
     tangent = STEP * np.eye(6)[axis]
     ahead, behind = perturb(T_lidar_board, tangent), perturb(T_lidar_board, -tangent)
     by_pose = sum_ranges(scans, T_lidar_board, np.zeros(len(scans.rings)), NO_LENS).by_pose[scans.capture]
-    r = ranges_to(scans, T_lidar_board)
     expected = (ranges_to(scans, ahead) - ranges_to(scans, behind)) / (2 * STEP)
-    assert np.allclose(r**2 * np.sum(scans.rays * by_pose[:, :, axis], axis=1), expected, atol=1e-6)
+    slopes = np.sum(freedoms(scans, T_lidar_board) * by_pose[:, :, axis], axis=1)
+    assert np.allclose(slopes, expected, atol=1e-6)
     rows = edge_rows(scans, T_lidar_board, BOARD, NO_LENS, NO_SHIFTS)
     inside = [
         (e.rows[:, -1] + e.step_m / 2)
@@ -128,7 +143,8 @@ def test_errors_shared_by_a_rings_returns_are_weighed_by_their_covariance(scans,
     ring = scans.ring[np.searchsorted(scans.capture, 1)]
     mine = (scans.capture == 1) & (scans.ring == ring)
     r = ranges_to(scans, T_lidar_board)[mine]
-    v = np.column_stack([r[:, None] ** 2 * scans.rays[mine], np.ones(len(r)), r - scans.range_m[mine]])
+    by_plane = freedoms(scans, T_lidar_board)[mine]
+    v = np.column_stack([by_plane, np.ones(len(r)), r - scans.range_m[mine]])
     cov = 0.01**2 * np.eye(len(r)) + 0.004**2
     plain = [0, 1, 2, 3, 6]
     assert np.allclose(weighted[1, ring][np.ix_(plain, plain)], v.T @ np.linalg.solve(cov, v), rtol=1e-8)
@@ -139,7 +155,7 @@ def test_errors_shared_by_a_rings_returns_are_weighed_by_their_covariance(scans,
     assert np.isclose(log_volume[1], total)
 
 
-def plain_rows(terms, scans, levels, r):
+def plain_rows(terms, scans, T_lidar_board, levels, r):
     """Rows [by z, by every board pose, residual] of all terms, and the covariance of their noise."""
     F, L, G = len(terms.ranges.sums), terms.n_rings, len(terms.constants)
     rows, noise = [], []
@@ -150,10 +166,11 @@ def plain_rows(terms, scans, levels, r):
         own[:, G + 6 * k : G + 6 * k + 6] = by_camera[k, :, 6:12]
         rows.append(own)
         noise.append(terms.pictures[0].total_cov(levels.pose)[k])
+    by_plane = freedoms(scans, T_lidar_board)
     for i, k in enumerate(scans.capture):
         own = np.zeros((1, G + 6 * F + 1))
-        n = terms_normal(terms, k)
-        own[0, G + 6 * k : G + 6 * k + 6] = r[i] ** 2 * scans.rays[i] @ terms.ranges.by_pose[k]
+        n = T_lidar_board[k, :3, 2]
+        own[0, G + 6 * k : G + 6 * k + 6] = by_plane[i] @ terms.ranges.by_pose[k]
         own[0, 7 + scans.ring[i]] = 1
         own[0, 7 + L : 7 + L + 2] = -n @ scans.fields[i] / (n @ scans.rays[i])
         own[0, -1] = r[i] - scans.range_m[i]
@@ -171,12 +188,6 @@ def without_ends(edges):
     return replace(edges, capture=none, **{name: getattr(edges, name)[none] for name in EDGE_FIELDS})
 
 
-def terms_normal(terms, k):
-    """Normal of a board in frame lidar: the part of the derivative by translation that all rays share."""
-    values, vectors = np.linalg.eigh(terms.ranges.by_pose[k][:, :3])
-    return vectors[:, np.argmax(np.abs(values))]
-
-
 def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, pictures, T_lidar_board):
     L, G = len(scans.rings), 7 + len(scans.rings) + N_FIELDS + N_SHIFTS
     terms = linearise(scans, (pictures,), BOARD, State(T_FORWARD[None], T_lidar_board, np.zeros(G)))
@@ -185,7 +196,7 @@ def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, pictu
     r = ranges_to(scans, T_lidar_board)
 
     def plainly(levels):
-        rows, cov = plain_rows(terms, scans, levels, r)
+        rows, cov = plain_rows(terms, scans, T_lidar_board, levels, r)
         lasers = levels.laser_m**2 * (np.eye(L) - 1 / L) + priors.offset_m**2 + 1e-12 * np.eye(L)
         constants = np.square([priors.lateral_m, priors.vertical_m, *priors.shifts])
         known = block_diag(priors.scale**-2, np.linalg.inv(lasers), np.diag(1 / constants))

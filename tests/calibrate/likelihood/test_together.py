@@ -5,21 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions, calibrate
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.likelihood.calibrate_together import calibrate_together
-from lce_rig.calibrate.placements import group_placements, group_shared_placements
 from lce_rig.calibrate.relative_pose import relative_pose
 from lce_rig.core.geometry import difference
 from lce_rig.core.results import Observation
+from lce_rig.residuals.placements import group_placements, group_shared_placements
 from tests.calibrate.boards import BOARD, simulate
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, only, simulate_two
 
-ML = CalibrateOptions(method="ml", n_draws=0, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
+ML = EstimateSettings(method="ml", n_draws=0, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
 FEW = 6
 
 
 def alone(session):
-    return {name: calibrate(captures, BOARD, ML) for name, captures in session.items()}
+    return {name: fit_extrinsic(captures, BOARD, ML) for name, captures in session.items()}
 
 
 def few_on_the_right(n, seed):
@@ -117,7 +117,8 @@ def test_captures_whose_scan_the_cameras_use_differently_are_left_out(runs):
     for estimate in together.estimates.values():
         assert "000002" not in estimate.used
         assert len(estimate.residuals) == len(estimate.used)
-        assert "left and right put the board at different places" in estimate.refused["000002"].cause
+        refusal = estimate.refused["000002"]
+        assert (refusal.code, refusal.figures) == ("pair.two_places", {"first": "left", "second": "right"})
 
 
 def test_placements_are_those_of_any_camera():

@@ -17,7 +17,6 @@ from lce_rig.collect.guidance import (
     sigmas,
 )
 from lce_rig.collect.guidance.planner import SPACINGS
-from lce_rig.collect.guidance.words import NOWHERE_ELSE
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import perturb
 from lce_rig.rig import load_rig
@@ -113,9 +112,9 @@ def test_it_is_enough_when_the_target_is_predicted_and_not_before(guided):
 def test_a_capture_of_what_is_held_is_refused_and_says_where_to_go(planner, guided):
     again = perturb(guided[2], np.array([0.02, 0.0, 0.02, 0.03, 0.0, 0.0]))
     refusal = planner.adds_nothing(guided[:6], again)
-    assert refusal.cause == "the board stands where capture 3 shows it"
-    assert refusal.action
-    assert planner.adds_nothing(guided[:6], again, names=list("abcdef")).cause.endswith("capture c shows it")
+    assert (refusal.code, refusal.figures["capture"]) == ("calibrate.known_placement", "3")
+    assert refusal.figures["instruction"]
+    assert planner.adds_nothing(guided[:6], again, names=list("abcdef")).figures["capture"] == "c"
 
 
 def test_a_new_placement_is_welcome(planner, guided):
@@ -128,7 +127,7 @@ def test_a_placement_that_tells_little_is_refused_with_its_figure():
     near = bold.guide(NONE).T_cam_board
     crowd = np.array([perturb(near, np.r_[0.02 * k, 0, 0, 0, 0, 0.01 * k]) for k in range(-4, 5)])
     refusal = bold.adds_nothing(crowd, perturb(near, np.array([0.012, 0.0, 0.0, 0.0, 0.0, 0.015])))
-    assert "% better, another" in refusal.cause
+    assert refusal.code == "calibrate.little_gain" and refusal.figure("gain") < refusal.figure("best_gain")
 
 
 def test_reach_ends_at_the_arms_the_border_and_the_lidar_s_field():
@@ -185,7 +184,7 @@ def test_who_stands_at_a_capture_is_always_told_to_move(planner, guided):
 
 def test_where_nothing_is_left_a_refusal_says_so(planner):
     refusal = planner.adds_nothing(planner.candidates, planner.candidates[7])
-    assert "stands where capture 8 shows it" in refusal.cause and refusal.action == NOWHERE_ELSE
+    assert (refusal.figures["capture"], refusal.action) == ("8", "nowhere")
 
 
 def crowded():
@@ -198,18 +197,18 @@ def crowded():
 
 def test_beyond_the_target_only_what_was_captured_is_refused():
     bold, crowd, present = crowded()
-    assert "% better" in bold.adds_nothing(crowd, present).cause
+    assert bold.adds_nothing(crowd, present).code == "calibrate.little_gain"
     modest = replace(model(), target_sigma_rad=np.radians(20.0), target_sigma_m=1.0)
     met = Planner(View.upright(modest, T_FORWARD), Novelty(0.001, 0.05), n_places=100)
     assert met.guide(crowd).is_enough
     assert met.adds_nothing(crowd, present) is None
-    assert "capture 3 shows it" in met.adds_nothing(crowd, crowd[2]).cause
+    assert met.adds_nothing(crowd, crowd[2]).figures["capture"] == "3"
 
 
 def test_where_it_was_sent_a_board_is_refused_only_if_it_was_captured_there():
     bold, crowd, present = crowded()
     assert bold.adds_nothing(crowd, present, asked=present) is None
-    assert "capture 3 shows it" in bold.adds_nothing(crowd, crowd[2], asked=crowd[2]).cause
+    assert bold.adds_nothing(crowd, crowd[2], asked=crowd[2]).figures["capture"] == "3"
 
 
 def test_no_board_is_refused_for_a_better_place_out_of_reach():

@@ -5,17 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CalibrateOptions
+from lce_rig.calibrate import EstimateSettings
 from lce_rig.calibrate.calibrate import calibrate_observations
-from lce_rig.calibrate.features import extract_features
-from lce_rig.calibrate.observability import linearise
-from lce_rig.calibrate.problem import Problem, Weights
 from lce_rig.calibrate.systematic import ring_sensitivities
 from lce_rig.collect.guidance import combine, predict_covariance, sigmas, weigh_placements
 from lce_rig.collect.guidance.precision import combine_with_each
 from lce_rig.collect.guidance.sensors import ErrorModel
 from lce_rig.core.geometry import difference, invert
 from lce_rig.core.results import Observation
+from lce_rig.residuals.features import FeatureSettings, extract_features
+from lce_rig.residuals.moments import Problem, Weights
 from lce_rig.solvers.covariance import symmetric_inverse
 from lce_rig.solvers.registration import vec_rotation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, scan_board
@@ -44,18 +43,17 @@ def linearised(poses):
     """The calibration's own matrices at the truth, with weights as the prediction's."""
     errors = replace(SURROGATE, plane_m=0.004, edge_m=0.005)
     observations = observe(poses, 6, Scenario(range_sigma_m=0.0, corner_sigma_px=1e-6))
-    options = CalibrateOptions()
-    features = [extract_features(each, BOARD, options) for each in observations]
+    features = [extract_features(each, BOARD) for each in observations]
     weights = Weights(3 / errors.plane_m**2, 14 / errors.edge_m**2, 1 / errors.edge_shift_m**2)
     problem = Problem(features, BOARD, weights)
     x = np.concatenate([vec_rotation(T_FORWARD[:3, :3]), T_FORWARD[:3, 3], [0.0, 1.0]])
     edge_ids = problem.associate(x[None])[0]
-    return errors, observations, options, problem, x, edge_ids
+    return errors, observations, problem, x, edge_ids
 
 
 def test_information_is_that_of_the_calibration(poses, linearised):
-    errors, _, _, problem, x, edge_ids = linearised
-    _, hessians = linearise(problem, x, edge_ids)
+    errors, _, problem, x, edge_ids = linearised
+    hessians = problem.quadratics(x, edge_ids).hessians
     predicted = weigh_placements(model(errors), poses, T_FORWARD).hessian
     scale = np.sqrt(np.einsum("nii->ni", hessians))
     difference_of = (predicted - hessians) / (scale[:, :, None] * scale[:, None, :])
@@ -65,11 +63,10 @@ def test_information_is_that_of_the_calibration(poses, linearised):
 
 
 def test_lasers_pull_as_in_the_calibration(poses, linearised):
-    errors, observations, options, problem, x, edge_ids = linearised
-    _, hessians = linearise(problem, x, edge_ids)
-    information = hessians.sum(axis=0)
-    information[6, 6] += 1 / errors.edge_shift_m**2
-    sensitivities = ring_sensitivities(observations, BOARD, options, problem, x, edge_ids, information)
+    errors, observations, problem, x, edge_ids = linearised
+    information = problem.quadratics(x, edge_ids).information
+    settings = FeatureSettings()
+    sensitivities = ring_sensitivities(observations, BOARD, settings, problem, x, edge_ids, information)
     rings = np.unique(np.concatenate([each.lidar.ring for each in observations]))
     predicted = -symmetric_inverse(information) @ weigh_placements(model(errors), poses, T_FORWARD).drift.sum(
         axis=0
@@ -81,7 +78,7 @@ def test_lasers_pull_as_in_the_calibration(poses, linearised):
 @pytest.mark.long
 def test_predicted_scatter_is_that_of_many_sessions(poses):
     scenario = Scenario(range_sigma_m=0.01, corner_sigma_px=0.1)
-    options = CalibrateOptions(n_draws=0)
+    options = EstimateSettings(n_draws=0)
     runs = [
         calibrate_observations(observe(poses, seed, scenario), BOARD, options) for seed in range(100, 125)
     ]

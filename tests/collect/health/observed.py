@@ -5,15 +5,20 @@ from typing import Any
 
 import numpy as np
 
+from lce_rig.collect.health import Check
 from lce_rig.collect.health.examination import Examination
 from lce_rig.collect.health.observing import Observation
-from lce_rig.core.clock import ClockModel
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Image, Pulse, Scan
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.rig import Rig
-from lce_rig.sources.live.base import Pulse, SourceStatus
+from lce_rig.sources.live.base import ClockState, SourceStatus
+from lce_rig.timing.clock import ClockModel
 
 S = 1_000_000_000
 START_NS = 1_753_000_000 * S
+UTC_FIGURES: dict[str, Figure] = {"pps": "locked", "is_fix": True, "nmea_past_hour_s": 754, "ahead_s": 0.0003}
+LOCKED = ClockState(Finding("clock.lidar_utc", "note", figures=UTC_FIGURES), True, 0.0003)
+UNLOCKED = ClockState(Finding("clock.pps_not_locked", "warning", figures={"pps": "absent"}))
 BOARD_NS = 5 * S
 """What the board's clock shows at START_NS."""
 
@@ -46,6 +51,12 @@ def examination(
     *seen: Observation, rig: Rig | None = None, web: Mapping[str, Any] | None = None
 ) -> Examination:
     return Examination(rig or make_rig(), {each.sensor: each for each in seen}, web or {}, {})
+
+
+def codes(line: Check | None) -> list[str]:
+    """List the codes of what a line of the doctor's found."""
+    assert line is not None
+    return [found.code for found in line.findings]
 
 
 def lidar(rate_hz: float = 10.0, duration_s: float = 5.0, **status: Any) -> Observation:

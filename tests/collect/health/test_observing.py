@@ -9,7 +9,7 @@ from lce_rig.collect.health.observing import observe
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import load_rig
 from lce_rig.rig.sync import SyncSettings
-from lce_rig.sources.live.base import LiveSource
+from lce_rig.sources.live.reading import LiveSource
 from lce_rig.sources.live.sync_board import SyncBoard
 from tests.sources.live.fake_board import FakeBoard
 

@@ -4,12 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
-from lce_rig.collect.health.examination import Examination, Sight
+from lce_rig.collect.health.examination import Examination
 from lce_rig.collect.health.pictures import check_board, check_events, check_picture
 from lce_rig.core.data import Events, Image
+from lce_rig.core.findings import Finding
 from lce_rig.core.results import Refusal
 
-from .observed import START_NS, S, camera, examination, make_rig
+from .observed import START_NS, S, camera, codes, examination, make_rig
 
 SHAPE = (260, 346)
 
@@ -29,21 +30,26 @@ def judged(pixels: np.ndarray):
 
 def test_a_sharp_picture_in_good_light_is_green() -> None:
     line = judged(chequered())
-    assert line.severity == "green" and line.figure == "grey 40 to 200, 0 % white, edges 1.4 px"
+    assert line.severity == "note" and (line.figures["grey_1"], line.figures["grey_99"]) == (40, 200)
+    assert line.figures["edge_px"] == pytest.approx(1.4, abs=0.05)
 
 
 @pytest.mark.parametrize(
-    ("pixels", "severity", "says"),
+    ("pixels", "severity", "code"),
     [
-        (np.full(SHAPE, 17, np.uint8), "red", "lens cap"),
-        ((chequered() // 6), "yellow", "underexposed"),
-        (np.where(np.indices(SHAPE)[1] < 120, 255, chequered()).astype(np.uint8), "yellow", "overexposed"),
-        (cv2.GaussianBlur(chequered(), (0, 0), 6), "yellow", "blurred"),
+        (np.full(SHAPE, 17, np.uint8), "error", "exposure.nothing_visible"),
+        ((chequered() // 6), "warning", "exposure.dark"),
+        (
+            np.where(np.indices(SHAPE)[1] < 120, 255, chequered()).astype(np.uint8),
+            "warning",
+            "exposure.bright",
+        ),
+        (cv2.GaussianBlur(chequered(), (0, 0), 6), "warning", "exposure.blurred"),
     ],
 )
-def test_what_spoils_a_picture_is_named(pixels: np.ndarray, severity: str, says: str) -> None:
+def test_what_spoils_a_picture_is_named(pixels: np.ndarray, severity: str, code: str) -> None:
     line = judged(pixels)
-    assert line.severity == severity and says in line.remedy.lower()
+    assert line.severity == severity and codes(line) == ["exposure.grey", code]
 
 
 def events(seed: int, n: int) -> Events:
@@ -57,24 +63,26 @@ def test_events_of_a_busy_scene_are_green_and_a_flickering_lamp_is_named() -> No
     busy = camera(duration_s=0.5)
     busy.take(events(1, 900_000))
     line = check_events(examination(busy), "cam")
-    assert line is not None and line.severity == "green"
+    assert line is not None and line.severity == "note"
     lamp = camera(duration_s=0.5)
     steady = events(1, 900_000)
     is_bright = (steady.t_ns // 5_000_000) % 2 == 0
     lamp.take(Events("cam", steady.t_ns, steady.x, steady.y, is_bright, SHAPE[1], SHAPE[0], steady.host_ns))
     line = check_events(examination(lamp), "cam")
-    assert line is not None and line.severity == "yellow" and "flickers at 100 Hz" in line.figure
+    assert (
+        line is not None and line.severity == "warning" and line.figures["frequency_hz"] == pytest.approx(100)
+    )
 
 
 def test_the_board_is_green_where_any_channel_sees_it() -> None:
-    unseen = Sight("", Refusal("image", "no board", "show the whole print"), {})
-    seen = Sight("2.1 m away", None, {"distance_m": 2.1})
+    unseen = Refusal("image.no_events")
+    seen = Finding("board.in_events", "note", figures={"distance_m": 2.1})
 
-    def line(*sights: Sight):
+    def line(*sights: Finding):
         boards = {("cam", f"channel{n}"): sight for n, sight in enumerate(sights)}
         return check_board(Examination(make_rig(), {}, {}, boards), "cam")
 
     assert line() is None
     both, none = line(unseen, seen), line(unseen)
-    assert both is not None and both.severity == "green" and both.values["distance_m"] == 2.1
-    assert none is not None and (none.severity, none.remedy) == ("yellow", "show the whole print")
+    assert both is not None and both.severity == "note" and both.figures["distance_m"] == 2.1
+    assert none is not None and (none.severity, codes(none)) == ("warning", ["image.no_events"])

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lce_rig.collect.live.collection import collect_live, make_guides
+from lce_rig.collect.live.collection import collect_live
+from lce_rig.collect.live.guide import make_guides
 from lce_rig.collect.live.options import Key, LiveOptions
 from lce_rig.collect.live.state import LiveState
 from lce_rig.core.errors import SessionError, SourceError

@@ -5,13 +5,13 @@ from functools import cache
 
 import numpy as np
 
-from lce_rig.collect.live.collection import make_guides
 from lce_rig.collect.live.gates import StillBoards
-from lce_rig.collect.pairing import Frame
+from lce_rig.collect.live.guide import make_guides
 from lce_rig.collect.watching import Sighting
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
+from lce_rig.timing.scan_pairing import Frame
 from tests.collect.live.replay import PERIOD_NS, placements, rig
 
 HOLD_S = 0.6

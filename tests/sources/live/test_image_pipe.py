@@ -188,7 +188,7 @@ def test_pictures_of_a_program_are_taken_as_they_arrive(kind: str, tmp_path: Pat
     assert before_ns < stamps[0] and stamps[-1] < time.time_ns()
     assert (images[0].sensor, images[0].channel) == ("cam", "frames")
     assert status.n_samples == 5
-    assert status.clock.startswith("arrival at this computer")
+    assert status.clock is not None and status.clock.finding.code == "clock.arrival"
 
 
 def test_raw_pictures_need_their_format_in_the_profile(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_raw_pictures_need_their_format_in_the_profile(tmp_path: Path) -> None:
         assert source.status().problems == ()
     with (
         ImagePipeSource("cam", camera(*command)) as source,
-        pytest.raises(SourceError, match="writes no Y4M, PGM, PPM or JPEG") as caught,
+        pytest.raises(SourceError, match="Y4M") as caught,
     ):
         take(source, 1)
     assert "driver.pixel_format" in caught.value.hint
@@ -209,17 +209,18 @@ def test_pictures_with_a_header_are_not_taken_for_raw_ones(tmp_path: Path) -> No
     command = child(tmp_path, header + raw(grey_pictures(2)))
     with (
         ImagePipeSource("cam", camera(*command, pixel_format="UYVY")) as source,
-        pytest.raises(SourceError, match="pixel_format says raw UYVY, but its command writes") as caught,
+        pytest.raises(SourceError, match="UYVY") as caught,
     ):
         take(source, 1)
-    assert "Leave pixel_format out" in caught.value.hint
+    assert "pixel_format" in caught.value.hint
 
 
 def test_rows_that_gstreamer_would_pad_are_warned_of(tmp_path: Path) -> None:
     odd = camera(*child(tmp_path, bytes(30 * HEIGHT)), pixel_format="GREY")
     with ImagePipeSource("cam", odd.model_copy(update={"resolution_px": (30, HEIGHT)})) as source:
         (problem,) = source.status().problems
-    assert problem.startswith("rows are taken to have 30 bytes, GStreamer pads them to 32")
+    assert problem.code == "device.row_padding"
+    assert problem.figures == {"row_bytes": 30, "padded_bytes": 32}
 
 
 def test_a_program_that_dies_is_quoted_with_what_it_left(tmp_path: Path) -> None:
@@ -228,11 +229,8 @@ def test_a_program_that_dies_is_quoted_with_what_it_left(tmp_path: Path) -> None
     with ImagePipeSource("cam", camera(*command)) as source, pytest.raises(SourceError) as caught:
         take(source, 5)
     n_left = WIDTH * HEIGHT * 3 // 2 - 100
-    assert caught.value.what == (
-        "camera 'cam': its command ended with exit code 3 after 1 pictures; "
-        f"{n_left} bytes of an unfinished picture were left out"
-    )
-    assert caught.value.hint == "It said: no signal | bye"
+    assert all(figure in caught.value.what for figure in ("code 3", "1 pictures", f"{n_left} bytes"))
+    assert "signal | bye" in caught.value.hint
 
 
 def test_a_program_that_is_killed_is_said_to_be(tmp_path: Path) -> None:

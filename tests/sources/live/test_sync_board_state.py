@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.sources.live.sync_board_plausibility import RunningNumber, Verdict
-from lce_rig.sources.live.sync_board_report import BoardView, clock_words, figures, problems
+from lce_rig.sources.live.sync_board_report import BoardView, clock_state, figures, problems
 from lce_rig.sources.live.sync_board_state import Arrival, BoardState
 from lce_rig.sources.live.sync_lines import LineReader
 from lce_rig.sources.live.sync_lines.lce1 import Lce1
@@ -20,6 +20,7 @@ from lce_rig.sources.live.sync_lines.messages import (
     TriggerEdge,
 )
 from lce_rig.sources.live.sync_lines.nmea import Nmea
+from lce_rig.words import sentence
 
 S = 1_000_000_000
 DAY_NS = 1_753_000_000 * S
@@ -145,7 +146,8 @@ def test_a_computer_whose_clock_is_set_is_noticed_followed_and_told():
     assert state.counts.n_resets == 0
     assert [round(step.size_ns / S) for step in state.host_tracker.steps] == [3]
     assert abs(state.host_clock.convert(115 * S) - DAY_NS - 18 * S) < 5000
-    assert any("clock jumped 1 times, last by +3.000 s" in problem for problem in problems(view(state)))
+    (jumped,) = [found for found in problems(view(state)) if found.code == "clock.computer_jumped"]
+    assert (jumped.figures["n"], jumped.figure("last_s")) == (1, pytest.approx(3, abs=1e-3))
 
 
 def test_utc_comes_from_pulses_that_know_their_second():
@@ -157,7 +159,8 @@ def test_utc_comes_from_pulses_that_know_their_second():
     assert [pulse.sensor for pulse in found] == ["pps"] * 10
     assert state.utc_clock.drift == pytest.approx(-40e-6, abs=0.1e-6)
     assert abs(state.utc_clock.convert(100 * S) - DAY_NS) < 1000
-    assert "UTC by 10 pulses per second" in clock_words(view(state))
+    told = clock_state(view(state)).finding
+    assert told.code == "clock.board" and told.figure("utc_drift_ppm") == pytest.approx(-40, abs=0.1)
 
 
 def test_falling_edges_and_strange_channels_make_no_pulses():
@@ -177,22 +180,21 @@ def test_boards_with_one_number_for_all_channels_lose_nothing_by_gaps():
     assert sum(state.counts.n_lost.values()) == 0
 
 
-def test_every_trouble_is_told_with_what_to_do():
+def test_every_trouble_is_told():
     state = BoardState({0: "cam"})
     state.take(HELLO, arrival(0))
-    assert problems(view(state, now_s=14.2, line_s=10)) == (
-        "nothing from the board for 4 s: check its cable and power, press its reset",
-    )
-    told = "\n".join(problems(view(state, n_unwritten=2)))
-    assert "did not take 2 commands" in told and "no pulses for cam: check sync.triggers.cam.channel" in told
-    assert "no pulse per second" in told and "not tied" in told
+    (silent,) = problems(view(state, now_s=14.2, line_s=10))
+    assert (silent.code, silent.figure("silent_s")) == ("device.board_silent", pytest.approx(4.2))
+    told = {found.code: found.figures for found in problems(view(state, n_unwritten=2))}
+    assert told["device.commands_not_taken"]["n"] == 2 and told["stream.no_pulses"]["line"] == "cam"
+    assert {"clock.no_pps", "clock.board_not_tied"} <= set(told)
     state.take(BoardError(4, "rate too high"), arrival(1))
     state.take(BoardStatus(0, 1, 9, (0,)), arrival(1))
     state.take(PpsEdge(1, 1_000_000, None, "I"), arrival(1))
-    told = "\n".join(problems(view(state)))
-    assert "the board says: rate too high (error 4)" in told and "dropped 9 lines" in told
-    assert "no pulse per second for 9 s" in told and "output of pulses per second is off" in told
-    assert "does not know UTC" in "\n".join(problems(view(state, now_s=2, line_s=2)))
+    told = {found.code: found.figures for found in problems(view(state))}
+    assert told["device.board_error"]["number"] == 4 and told["stream.lines_dropped_by_board"]["n"] == 9
+    assert told["clock.pps_stopped"]["silent_s"] == pytest.approx(9) and "clock.pps_output_off" in told
+    assert "clock.board_without_utc" in [found.code for found in problems(view(state, now_s=2, line_s=2))]
 
 
 def test_a_board_in_order_has_no_problems():
@@ -209,7 +211,8 @@ def test_a_board_in_order_has_no_problems():
 
 
 def test_a_receiver_without_a_fix_is_told_to_look_at_the_sky():
-    assert "sky" in problems(view(BoardState({}), dialect=Nmea(), wants=()))[0]
+    found = problems(view(BoardState({}), dialect=Nmea(), wants=()))
+    assert [each.code for each in found] == ["clock.receiver_no_time"]
 
 
 MESSAGES = st.one_of(
@@ -234,4 +237,4 @@ def test_whatever_is_said_in_whatever_order_breaks_nothing(said):
             assert pulse.sensor in ("cam", "davis", "pps")
     shown = view(state, now_s=steady_ns / S, line_s=steady_ns / S)
     assert all(isinstance(value, int | float) for value in figures(shown).values())
-    assert all(problem and clock_words(shown) for problem in problems(shown))
+    assert all(sentence(found) for found in (clock_state(shown).finding, *problems(shown)))

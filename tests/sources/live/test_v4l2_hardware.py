@@ -67,7 +67,7 @@ def test_pictures_come_counted_stamped_and_in_order(device_name: str) -> None:
     assert (np.diff(stamps) > 0).all()
     ages_s = np.array([image.host_ns for image in images if image.host_ns is not None]) * 1.0 - stamps
     assert (ages_s > -50e6).all() and (ages_s < 2e9).all()
-    assert "by clock" in status.clock
+    assert status.clock is not None and status.clock.finding.code == "clock.mid_exposure"
     assert status.n_samples >= 20
 
 
@@ -98,7 +98,7 @@ def test_an_unknown_control_names_the_nearest(vivid: None) -> None:
         V4l2Source("cam", camera({"brightnes": 1})),
     ):
         pass
-    assert "Did you mean brightness?" in caught.value.hint
+    assert "mean brightness?" in caught.value.hint
 
 
 @pytest.mark.parametrize(
@@ -159,13 +159,18 @@ def test_lost_pictures_are_counted(vivid: None) -> None:
 def test_the_flag_of_a_start_of_exposure_is_believed(vivid: None) -> None:
     with V4l2Source("cam", camera(VIVID)) as source:
         take(source, 2)
-        assert source.status().clock.startswith("start of exposure by clock monotonic")
+        told = source.status().clock
+        assert told is not None
+        assert (told.finding.figures["mark"], told.finding.figures["clock"]) == (
+            "start_of_exposure",
+            "monotonic",
+        )
 
 
 def test_stamps_in_the_future_are_not_trusted(vivid: None) -> None:
     with V4l2Source("cam", camera({"timestamp_source": "End of Frame"}, frame_rate_hz=5.0)) as source:
         take(source, 3)
-        assert any("clock" in problem for problem in source.status().problems)
+        assert any(problem.family == "clock" for problem in source.status().problems)
 
 
 def test_a_camera_without_pulses_falls_silent(vivid: None) -> None:

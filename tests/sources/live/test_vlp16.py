@@ -149,9 +149,10 @@ def test_packets_at_full_rate_arrive_without_a_loss_and_with_the_sensors_time(li
     assert np.abs(stamps(scans) - stamps(room.scans[:12])).max() <= 1000
     assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in room.scans[:12]]
     assert (status.n_lost, status.n_dropped, status.figures["overflowed_packets"]) == (0, 0, 0)
-    assert status.figures["bad_packets"] == 0 and status.figures["data_packets"] >= 900
-    assert status.clock.startswith("UTC by PPS and NMEA") and status.device == "VLP-16 at 127.0.0.1"
-    assert status.problems == () or all("receive buffer" in problem for problem in status.problems)
+    assert status.figures["bad_packets"] == 0 and (status.n_packets or 0) >= 900
+    assert status.clock is not None and status.clock.is_utc
+    assert status.clock.finding.code == "clock.lidar_utc" and HERE in status.device
+    assert {problem.code for problem in status.problems} <= {"buffer.small"}
     for scan in scans:
         # The last packet of a scan ends after it; the sender is up to 2 ms early.
         assert int(scan.host_ns or 0) - int(scan.stamp_ns or 0) >= PERIOD_NS - 2_000_000
@@ -171,8 +172,10 @@ def test_a_sensor_without_pulses_is_stamped_by_arrival_and_said_so(lidar: LidarS
         status = source.status()
     late_ns = stamps(scans) - stamps(room.scans[:4])
     assert late_ns.min() > -4_000_000 and late_ns.max() < 60 * 10**9
-    assert status.clock.startswith("this computer's clock, by arrival: PPS is absent")
-    assert any("check the pulse" in problem for problem in status.problems)
+    assert status.clock is not None and not status.clock.is_utc
+    (found,) = [each for each in status.problems if each.family == "clock"]
+    assert (found.code, found.figures["pps"]) == ("clock.pps_not_locked", "absent")
+    assert found == status.clock.finding
 
 
 def test_only_packets_of_the_profiles_address_are_taken(lidar: LidarSettings) -> None:
@@ -196,7 +199,7 @@ def test_without_an_address_the_sensor_heard_first_is_taken(lidar: LidarSettings
     second = Sender(lidar, source, ELSEWHERE)
 
     def make_late(start_ns: int) -> list[SensorPacket]:
-        wait_for(lambda: source.status().device == "VLP-16 at 127.0.0.1")
+        wait_for(lambda: HERE in source.status().device)
         return packets_of(room_scans(1))
 
     with Sender(lidar, source).sending(room), second.sending(make_late), source:
@@ -223,8 +226,9 @@ def test_a_third_of_the_packets_may_be_lost_on_the_way(lidar: LidarSettings) -> 
         scans = take(source, 4)
         status = source.status()
     assert all(len(scan.points) > 13_000 for scan in scans)
-    assert status.n_lost / (status.n_lost + status.figures["data_packets"]) == pytest.approx(0.3, abs=0.06)
-    assert any("lost on the way" in problem for problem in status.problems)
+    (found,) = [each for each in status.problems if each.code == "stream.packets_lost"]
+    assert found.figure("share") == pytest.approx(0.3, abs=0.06)
+    assert status.n_lost / (status.n_lost + (status.n_packets or 0)) == pytest.approx(0.3, abs=0.06)
 
 
 def test_an_open_source_ends_when_it_is_closed_and_can_be_opened_again(lidar: LidarSettings) -> None:
@@ -234,32 +238,6 @@ def test_an_open_source_ends_when_it_is_closed_and_can_be_opened_again(lidar: Li
             take(source, 1)
         assert len(list(source.samples())) <= 5
         assert f"read {source.sensor}" not in {thread.name for thread in threading.enumerate()}
-
-
-def test_a_source_may_be_closed_while_another_thread_opens_it_again(lidar: LidarSettings) -> None:
-    source, failures = Vlp16Source("lidar", lidar, silence_s=0.01, web_port=9), list[Exception]()
-    has_ended = threading.Event()
-
-    def open_again() -> None:
-        while not has_ended.is_set():
-            try:
-                source.__enter__()
-                source.__exit__(None, None, None)  # As whoever opened it does when all is closed.
-            except SourceError:
-                continue
-            except Exception as failure:
-                failures.append(failure)
-
-    opener = threading.Thread(target=open_again)
-    opener.start()
-    try:
-        until_s = time.monotonic() + 1.0
-        while time.monotonic() < until_s:
-            source.__exit__(None, None, None)
-    finally:
-        has_ended.set()
-        opener.join()
-    assert failures == []
 
 
 # What does not come
@@ -275,7 +253,7 @@ def explain(lidar: LidarSettings, packets: list[SensorPacket] | None = None, **o
 
 def test_an_absent_sensor_is_an_error_that_says_what_to_check(lidar: LidarSettings) -> None:
     error = explain(lidar)
-    assert error.what.startswith("lidar: no data packets from 127.0.0.1 on UDP port")
+    assert HERE in error.what and str(lidar.driver.port) in error.what
     for word in ("power", "cable", "192.168.1.x", "driver.address"):
         assert word in error.hint
 
@@ -294,25 +272,25 @@ def test_another_model_is_refused_by_name(lidar: LidarSettings) -> None:
         for p in packets_of(room_scans(1))
         if p.port == velodyne.DATA_PORT
     ]
-    assert "come from a HDL-32E, not a VLP-16" in explain(lidar, others).what
+    assert "HDL-32E" in explain(lidar, others).what
 
 
 def test_packets_of_another_address_are_named(lidar: LidarSettings) -> None:
     driver = lidar.driver.model_copy(update={"address": ELSEWHERE})
     error = explain(lidar.model_copy(update={"driver": driver}), packets_of(room_scans(1)))
-    assert "Packets come from 127.0.0.1: set driver.address" in error.hint
+    assert HERE in error.hint and "driver.address" in error.hint
 
 
 def test_rubbish_on_the_port_is_counted_and_named(lidar: LidarSettings) -> None:
     rubbish = [SensorPacket(velodyne.DATA_PORT, T0_NS, b"hello")] * 7
-    assert "only 7 data packets of a wrong length" in explain(lidar, rubbish).what
+    assert "7 data packets" in explain(lidar, rubbish).what
 
 
 def test_a_port_that_another_program_holds_is_named(lidar: LidarSettings) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("", lidar.driver.port))
         error = explain(lidar)
-    assert "is held by another program" in error.what and "ss -ulpn" in error.hint
+    assert str(lidar.driver.port) in error.what and "ss -ulpn" in error.hint
 
 
 # What is kept
@@ -332,7 +310,7 @@ def test_what_was_recorded_replays_to_the_same_scans(lidar: LidarSettings, rig: 
 def test_a_recording_is_never_written_over(lidar: LidarSettings, tmp_path: Path) -> None:
     path = tmp_path / "raw.pcap"
     path.write_bytes(b"kept")
-    assert "is there already" in explain(lidar, record_to=path).what
+    assert str(path) in explain(lidar, record_to=path).what
     assert path.read_bytes() == b"kept"
 
 
@@ -342,7 +320,7 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(lidar: LidarSettings, t
     try:
         with streaming(lidar, Room(6), record_to=tmp_path / "raw.pcap") as source:
             scans = take(source, 5)
-            wait_for(lambda: any("free some space" in p for p in source.status().problems))
+            wait_for(lambda: any(p.code == "device.recording_stopped" for p in source.status().problems))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert len(scans) == 5
@@ -362,15 +340,17 @@ def test_a_disk_that_stalls_costs_recorded_packets_and_no_scans(tmp_path: Path) 
 # What is said
 
 
-def test_every_figure_out_of_line_gets_a_sentence_with_what_to_do() -> None:
+def test_every_figure_out_of_line_is_a_problem_of_its_own() -> None:
     stream = Vlp16Stream("lidar", settings(rate_hz=20))
     push(stream, packets_of(room_scans(2)))
     reception = Reception(n_overflowed=12, granted_bytes=200_000)
     status = to_status("lidar", settings(rate_hz=20), stream, reception, None)
-    text = "\n".join(status.problems)
-    assert "too slow for 12 packets" in text
-    assert "the receive buffer holds 115 ms" in text and "sysctl -w net.core.rmem_max" in text
-    assert "the rotor turns at 10.0 Hz, the profile says 20" in text and "rpm 1200" in text
+    found = {problem.code: problem for problem in status.problems}
+    assert found["stream.computer_too_slow"].figures["n"] == 12
+    assert found["buffer.small"].figure("buffer_s") == pytest.approx(0.115, abs=0.001)
+    rotor = found["stream.rotor_rate"]
+    assert rotor.figure("rotor_hz") == pytest.approx(10, abs=0.1)
+    assert (rotor.figures["expected_hz"], rotor.figures["expected_rpm"]) == (20, 1200)
 
 
 def test_arrivals_are_stamped_by_the_kernel_not_when_they_are_taken() -> None:

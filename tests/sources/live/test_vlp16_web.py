@@ -146,16 +146,16 @@ def test_pages_that_say_nothing_of_use_give_an_empty_report(nonsense: dict[str, 
 def test_another_device_at_the_address_is_told_from_a_sensor(body: bytes) -> None:
     with (
         serving({**PAGES, "info": body}) as (_, web),
-        pytest.raises(SourceError, match="not what a Velodyne"),
+        pytest.raises(SourceError, match="cgi/info"),
     ):
         web.read()
 
 
 def test_an_address_where_nothing_answers_is_an_error_with_what_to_check() -> None:
-    with pytest.raises(SourceError, match="does not answer") as caught:
+    with pytest.raises(SourceError, match=":9/") as caught:
         VelodyneWeb("127.0.0.1", 9, 0.5).read()
     assert "192.168.1.x" in caught.value.hint
-    with pytest.raises(SourceError, match="does not answer"):
+    with pytest.raises(SourceError, match="no such host"):
         VelodyneWeb("no such host").read()
 
 
@@ -176,36 +176,45 @@ def test_a_setting_that_is_not_made_is_an_error(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("lce_rig.sources.live.velodyne_web._PAUSE_S", 0.0)
     with serving(PAGES) as (sensor, web):
         sensor.is_deaf = True
-        with pytest.raises(SourceError, match="rpm was set to 300, but reads back otherwise"):
+        with pytest.raises(SourceError, match="rpm"):
             web.set_rotor_hz(5)
 
 
-WRONG: dict[str, tuple[dict[str, Any], str]] = {
-    "another model": ({"info": {"model": "HDL-32E"}}, "is a HDL-32E"),
-    "motor": ({"status": {"motor": {"state": "Off"}}}, "motor is off"),
-    "laser": ({"status": {"laser": {"state": "Disabled"}}, "settings": {"laser": "Off"}}, "laser is off"),
-    "speed": ({"settings": {"rpm": 1200}}, "set to 20.0 Hz, the profile says 10: set rpm to 600"),
-    "field of view": ({"settings": {"fov": {"start": 270, "end": 90}}}, "cut to 270 to 90 deg"),
-    "data port": ({"settings": {"host": {"dport": 2369}}}, "data go to port 2369"),
-    "position port": ({"settings": {"host": {"tport": 8309}}}, "telemetry goes to port 8309"),
-    "pulses": ({"status": {"gps": {"pps_state": "Absent"}}}, "PPS is absent"),
+WRONG: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "settings.other_model": ({"info": {"model": "HDL-32E"}}, {"model": "HDL-32E"}),
+    "settings.motor_off": ({"status": {"motor": {"state": "Off"}}}, {}),
+    "settings.laser_off": ({"status": {"laser": {"state": "Disabled"}}, "settings": {"laser": "Off"}}, {}),
+    "settings.rotor_rate": (
+        {"settings": {"rpm": 1200}},
+        {"set_hz": 20.0, "expected_hz": 10.0, "expected_rpm": 600.0},
+    ),
+    "settings.fov_cut": (
+        {"settings": {"fov": {"start": 270, "end": 90}}},
+        {"start_deg": 270.0, "end_deg": 90.0},
+    ),
+    "settings.data_port": ({"settings": {"host": {"dport": 2369}}}, {"port": 2369, "expected_port": 2368}),
+    "settings.position_port": (
+        {"settings": {"host": {"tport": 8309}}},
+        {"port": 8309, "expected_port": 8308},
+    ),
+    "settings.pps": ({"status": {"gps": {"pps_state": "Absent"}}}, {"pps": "absent"}),
 }
 
 
-@pytest.mark.parametrize("name", sorted(WRONG))
-def test_what_keeps_scans_from_coming_is_said_with_what_to_do(name: str) -> None:
-    changes, cause = WRONG[name]
+@pytest.mark.parametrize("code", sorted(WRONG))
+def test_what_keeps_scans_from_coming_is_found_with_its_figures(code: str) -> None:
+    changes, figures = WRONG[code]
     with serving({key: {**page, **changes.get(key, {})} for key, page in PAGES.items()}) as (_, web):
         problems = find_problems(web.read(), settings())
-    assert len(problems) == 1 and cause in problems[0]
+    assert [(found.code, dict(found.figures)) for found in problems] == [(code, figures)]
 
 
 @pytest.mark.parametrize(
     ("host", "advice"),
     [
         ({"addr": "255.255.255.255", "dport": 2368}, "firewall"),
-        ({"addr": "192.168.1.77", "dport": 2368}, "Data go to 192.168.1.77 only"),
-        ({"addr": "255.255.255.255", "dport": 3000}, "Data go to port 3000"),
+        ({"addr": "192.168.1.77", "dport": 2368}, "192.168.1.77"),
+        ({"addr": "255.255.255.255", "dport": 3000}, "3000"),
     ],
 )
 def test_a_silent_sensor_is_asked_where_it_sends_to(host: dict[str, Any], advice: str) -> None:
@@ -213,5 +222,5 @@ def test_a_silent_sensor_is_asked_where_it_sends_to(host: dict[str, Any], advice
     with serving({**PAGES, "settings": {**SETTINGS, "host": host}}) as (_, web):
         port = int(web.url.rpartition(":")[2])
         error = explain_silence("lidar", lidar, Vlp16Stream("lidar", lidar), Reception(), 2.0, port)
-    assert error.what == "lidar: no data packets from 127.0.0.1 on UDP port 2368 come (for 2 s)"
-    assert "web page http://127.0.0.1 answers" in error.hint and advice in error.hint
+    assert all(figure in error.what for figure in ("127.0.0.1", "2368", "2 s"))
+    assert "http://127.0.0.1" in error.hint and advice in error.hint

@@ -1,0 +1,40 @@
+"""Calibrate a folder of images and point clouds: img/000000.png, ... and pcd/000000.pcd, ... side by side.
+
+python calibrate_folder.py RIG FOLDER SESSION
+"""
+
+import sys
+
+import numpy as np
+
+import lce_rig as lce
+
+
+def main(rig_name: str, folder: str, session_folder: str) -> None:
+    """Make a session of the folder, calibrate it, and write the result and the overlays."""
+    rig = lce.load_rig(rig_name)
+    session = lce.collect_from(rig, folder, session_folder)
+    result = lce.calibrate(session)
+    for pair in result.pairs:
+        print(f"{pair.camera} and {pair.lidar}: {pair.verdict}")
+        print(np.array_str(pair.T_cam_lidar, precision=4, suppress_small=True))
+        print(f"1 sigma: {pair.sigma_rotation_deg:.3f} deg, {1000 * pair.sigma_translation_m:.1f} mm")
+        for reason in pair.reasons:
+            print(f"  {reason}")
+        # A point 5 m ahead of the LiDAR, in the camera's frame: p_cam = R p_lidar + t.
+        point_cam = pair.T_cam_lidar @ [5.0, 0.0, 0.0, 1.0]
+        print(f"p_lidar (5, 0, 0) m is p_cam {np.round(point_cam[:3], 3)} m")
+    for shortage in result.shortages:
+        print(shortage)
+    written = result.write()
+    print(f"{len(written.files)} files in {written.files[0].parent}")
+    lce.verify(session, result).write()
+
+
+if __name__ == "__main__":
+    try:
+        main(*sys.argv[1:])
+    except lce.LceRigError as error:
+        # Each error says what is wrong and what to do; its exit code is that of the command line.
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_code)

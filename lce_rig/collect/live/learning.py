@@ -1,0 +1,114 @@
+"""What captures teach: calibrations of them in a process of its own, from which guidance learns."""
+
+import threading
+from collections import deque
+from collections.abc import Sequence
+from types import TracebackType
+
+import numpy as np
+
+from lce_rig.calibrate import CaptureCandidates, EstimateSettings, fit_extrinsic
+from lce_rig.collect.guidance import Planner
+from lce_rig.collect.live.guide import Guide, Learned, make_guides
+from lce_rig.collect.live.worker import Worker
+from lce_rig.collect.watching import Sighting
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.rig import Rig
+
+_NICE = 10
+
+
+class Learning:
+    """Calibrates the captures of each guide's sensors; open while its `with` block lasts."""
+
+    def __init__(self, rig: Rig, guides: Sequence[Guide]) -> None:
+        """Prepare; no process is started before there are captures enough."""
+        self._guides = guides
+        self._min_captures = rig.quality.min_captures
+        self._worker = Worker("calibrate captures", _Teacher, rig, nice=_NICE)
+        self._candidates: dict[int, list[CaptureCandidates]] = {k: [] for k in range(len(guides))}
+        self._due: deque[int] = deque()
+        self._taught: deque[tuple[Guide, Planner]] = deque()
+        self._problem = ""
+        self._changed = threading.Condition()
+        self._is_closing = False
+        self._thread = threading.Thread(target=self._run, name="learn from captures", daemon=True)
+
+    def __enter__(self) -> "Learning":
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End, whatever is being calibrated."""
+        with self._changed:
+            self._is_closing = True
+            self._changed.notify()
+        self._worker.__exit__(None, None, None)
+        self._thread.join()
+
+    def show(self, name: str, sighting: Sighting) -> None:
+        """Take what a capture shows; returns at once."""
+        with self._changed:
+            for k, guide in enumerate(self._guides):
+                if guide.sees(sighting):
+                    image, scans = sighting.images[guide.key], sighting.lidars[guide.lidar]
+                    self._candidates[k].append(CaptureCandidates(name, image, scans))
+                    if len(self._candidates[k]) >= self._min_captures and k not in self._due:
+                        self._due.append(k)
+            self._changed.notify()
+
+    def teach(self) -> None:
+        """Let the guides know what was learned since the last call."""
+        with self._changed:
+            taught = list(self._taught)
+            self._taught.clear()
+        for guide, planner in taught:
+            guide.adopt(planner)
+
+    def notes(self) -> list[str]:
+        """Say what went wrong."""
+        return [self._problem] if self._problem else []
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._due or self._is_closing)
+                if self._is_closing:
+                    return
+                k = self._due.popleft()
+                candidates = list(self._candidates[k])
+            try:
+                planner = self._worker.call("learn", k, candidates)
+            except Exception as error:  # Captures are safe whatever a calibration trips over.
+                if self._is_closing:
+                    return
+                self._problem = f"guidance does not learn from captures: {error}"
+                continue
+            if planner is not None:
+                with self._changed:
+                    self._taught.append((self._guides[k], planner))
+
+
+class _Teacher:
+    """What runs there."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._board = rig.board.to_board()
+        self._guides = make_guides(rig)
+
+    def learn(self, k: int, candidates: Sequence[CaptureCandidates]) -> Planner | None:
+        """Calibrate what one guide's sensors have shown; None where more captures are needed."""
+        try:
+            estimate = fit_extrinsic(list(candidates), self._board, EstimateSettings(n_draws=0))
+        except (NotEnoughDataError, np.linalg.LinAlgError):
+            return None
+        figures = estimate.diagnostics
+        learned = Learned(
+            estimate.T_cam_lidar,
+            figures["fit_plane_rms_m"],
+            figures["fit_edge_rms_m"],
+            len(estimate.used),
+        )
+        return self._guides[k].prepare(learned)

@@ -1,0 +1,88 @@
+"""Recordings into a session, unattended: by their paths, or by readers of one's own."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from lce_rig.collect import CollectOptions, CollectReport, collect
+from lce_rig.collect.tally import Tally
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.pipeline.detection import Progress, silent
+from lce_rig.rig import Rig
+from lce_rig.session import Session
+from lce_rig.sources import open_recordings
+from lce_rig.sources.base import Recording, SourceOptions
+from lce_rig.words import describe
+
+Source = Path | str | Recording
+
+
+def collect_from(
+    rig: Rig,
+    recordings: Source | list[Source] | tuple[Source, ...],
+    session: Path | str,
+    *,
+    options: CollectOptions | None = None,
+    sources: SourceOptions | None = None,
+    progress: Progress = silent,
+) -> Session:
+    """Build or continue a session from recordings.
+
+    Args:
+        rig: the profile.
+        recordings: paths of folders, bags and files, or readers with the attributes of `Recording`; several
+            are of one moment and read as one.
+        session: its folder.
+        options: what becomes a capture.
+        sources: how the paths are read, where the profile does not say.
+        progress: called with (done, total) samples.
+
+    Returns:
+        The session, open for reading.
+
+    Raises:
+        SourceError: a recording cannot be read, or not to its end; what was captured before is kept.
+        SessionError: the folder holds something else, or cannot be written.
+        NotEnoughDataError: no capture could be made; the commonest causes are named.
+    """
+    given: list[Source] = [*recordings] if isinstance(recordings, list | tuple) else [recordings]
+    part = replace(sources or SourceOptions(), is_part=len(given) > 1)
+    opened: list[Recording] = []
+    for source in given:
+        opened += open_recordings([Path(source)], rig, part) if isinstance(source, str | Path) else [source]
+    report = fill_session(rig, opened, session, options, progress)
+    if report.errors:
+        raise report.errors[0]
+    filled = Session.open(session)
+    if not filled.captures:
+        refused = Tally()
+        refused.update(report.counts)
+        for refusal in report.refused.values():
+            refused.add(refusal)
+        causes = "\n".join(f"{n} x {describe(why)}" for why, n in refused.counts()[:3])
+        raise NotEnoughDataError(f"{session}: no capture could be made", causes)
+    return filled
+
+
+def fill_session(
+    rig: Rig,
+    recordings: Sequence[Recording],
+    session: Path | str,
+    options: CollectOptions | None = None,
+    progress: Progress = silent,
+) -> CollectReport:
+    """Add what recordings hold to the session in a folder, or start one there.
+
+    Args:
+        rig: the profile.
+        recordings: open; see `collect_from`.
+        session: its folder.
+        options: what becomes a capture.
+        progress: called with (done, total) samples.
+
+    Raises:
+        SourceError: nothing could be read at all.
+        SessionError: the folder holds something else, or cannot be written.
+    """
+    with Session.resume(session, rig) as writer:
+        return collect(writer, recordings, options, lambda done, total, _message: progress(done, total))

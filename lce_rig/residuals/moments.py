@@ -1,0 +1,243 @@
+"""The cost of any set of captures as a sum of moment matrices, and its solution for many sets at once.
+
+Per capture k the cost is
+
+    w_plane mean_i (n_k . (g_k - R p_i - t))^2 + w_edge mean_j (m_e(j) . (h_e(j) - R q_j - t) + d)^2     (1)
+
+over the board's plane (n_k, g_k) and edges (m_e, h_e) as the camera sees them, points p_i and ring ends q_j
+of the LiDAR, the edge e(j) nearest to each ring end, and the edge shift d by which ring ends appear beyond
+the print. Means and not sums, so that a board nearby does not outvote one farther away by its many points:
+all points of a capture share the errors of the board's pose in the picture. Every ring end keeps one moment
+matrix for each of the four edges, so that association only chooses which are summed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, pose
+from lce_rig.residuals.features import CaptureFeatures
+from lce_rig.residuals.plane_and_ends import residual_rows
+from lce_rig.residuals.quadratics import Quadratics
+from lce_rig.solvers.certificate import Certificates, solve_globally
+from lce_rig.solvers.registration import (
+    eliminate_linear,
+    linear_unknowns,
+    tangent_basis,
+    vec_rotation,
+    with_one,
+)
+
+_EDGE_CHUNK = 4096
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of (1), and of the prior on the edge shift.
+
+    Attributes:
+        plane, edge: w_plane, w_edge.
+        shift_prior: weight of d^2; None holds d at zero.
+    """
+
+    plane: float
+    edge: float
+    shift_prior: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Solutions:
+    """Solutions of B sets of captures.
+
+    Attributes:
+        R: (B, 3, 3).
+        linear: (B, 3 + k): t, then the edge shift where it is free.
+        edge_ids: (B, n) edge of each ring end.
+        certificates: of each.
+    """
+
+    R: Array
+    linear: Array
+    edge_ids: NDArray[np.int8]
+    certificates: Certificates
+
+    @property
+    def T(self) -> Array:
+        """T_cam_lidar (B, 4, 4)."""
+        return pose(self.R, self.linear[:, :3])
+
+    @property
+    def x(self) -> Array:
+        """[vec R; t; d; 1] (B, m)."""
+        return with_one(np.concatenate([vec_rotation(self.R), self.linear], axis=1))
+
+
+class Problem:
+    """Moment matrices of F captures, as rows of their upper triangles.
+
+    Args:
+        features: one per capture.
+        board: the board.
+        weights: of the terms.
+        keep: per capture a mask of the plane points to use; all by default.
+    """
+
+    def __init__(
+        self,
+        features: Sequence[CaptureFeatures],
+        board: Board,
+        weights: Weights,
+        keep: Sequence[NDArray[np.bool_]] | None = None,
+    ) -> None:
+        self.n_captures = len(features)
+        self.keep = keep
+        self.n_shift = 0 if weights.shift_prior is None else 1
+        self.size = 13 + self.n_shift
+        self._upper = np.triu_indices(self.size)
+        self._board = board
+        masks = [np.ones(len(f.plane_points), dtype=bool) for f in features] if keep is None else keep
+        self.plane = np.stack([self._plane_moments(f, mask) for f, mask in zip(features, masks, strict=True)])
+        counts = [len(f.edge_points) for f in features]
+        self.edge_capture = np.repeat(np.arange(len(features)), counts)
+        self._edge_weight = 1.0 / np.maximum(np.array(counts), 1)[self.edge_capture]
+        self._edge_rows = np.concatenate([self._rows_of_edges(f) for f in features])
+        self._to_board = np.concatenate([_board_coordinates(f, self.size) for f in features])
+        outer = self._edge_rows[..., self._upper[0]] * self._edge_rows[..., self._upper[1]]
+        self.edge = outer * self._edge_weight[:, None, None]
+        self.weights = weights
+
+    def _plane_moments(self, f: CaptureFeatures, mask: NDArray[np.bool_]) -> Array:
+        shift = np.zeros((1, self.n_shift))
+        rows = residual_rows(f.normal, f.centre, f.plane_points[mask], shift)
+        return np.asarray((rows.T @ rows)[self._upper] / max(len(rows), 1))
+
+    def _rows_of_edges(self, f: CaptureFeatures) -> Array:
+        shift = np.ones((1, 1, self.n_shift))
+        return residual_rows(f.edge_normals[None], f.edge_anchors[None], f.edge_points[:, None], shift)
+
+    def associate(self, x: Array) -> NDArray[np.int8]:
+        """Find the nearest of the board's edges to each ring end.
+
+        Args:
+            x: (B, m).
+
+        Returns:
+            (B, n), as `Board.nearest_edge`.
+        """
+        xy_m = np.stack([x @ self._to_board[:, 0].T, x @ self._to_board[:, 1].T], axis=-1)
+        return self._board.nearest_edge(xy_m).astype(np.int8)
+
+    def moments(self, selection: Array, edge_ids: NDArray[np.int8], weights: Weights | None = None) -> Array:
+        """Sum (1) over sets of captures.
+
+        Args:
+            selection: (B, F) weight of each capture in each set.
+            edge_ids: (B, n).
+            weights: other weights than the problem's.
+
+        Returns:
+            (B, m, m).
+        """
+        w = weights or self.weights
+        # Most sets agree on most edges: sum those of the first set for all, then exchange what differs.
+        common = edge_ids[0]
+        chosen = self.edge[np.arange(len(common)), common]
+        per_capture = np.zeros((self.n_captures, len(self._upper[0])))
+        np.add.at(per_capture, self.edge_capture, chosen)
+        total = selection @ (w.plane * self.plane + w.edge * per_capture)
+        sets, ends = np.nonzero((edge_ids != common) & (selection[:, self.edge_capture] != 0))
+        for start in range(0, len(sets), _EDGE_CHUNK):
+            b, j = sets[start : start + _EDGE_CHUNK], ends[start : start + _EDGE_CHUNK]
+            change = self.edge[j, edge_ids[b, j]] - self.edge[j, common[j]]
+            change *= w.edge * selection[b, self.edge_capture[j], None]
+            first = np.flatnonzero(np.r_[True, np.diff(b) > 0])
+            total[b[first]] += np.add.reduceat(change, first, axis=0)
+        M = self._unpack(total)
+        if w.shift_prior is not None:
+            M[:, 12, 12] += w.shift_prior
+        return M
+
+    def _unpack(self, upper: Array) -> Array:
+        M = np.empty((len(upper), self.size, self.size))
+        M[:, self._upper[0], self._upper[1]] = upper
+        M[:, self._upper[1], self._upper[0]] = upper
+        return M
+
+    def solve(self, selection: Array, T_start: Array, n_rounds: int) -> Solutions:
+        """Solve each set of captures, re-associating the ring ends between rounds.
+
+        Args:
+            selection: (B, F).
+            T_start: (4, 4) T_cam_lidar for the first association.
+            n_rounds: of association and solution.
+        """
+        R = np.repeat(T_start[None, :3, :3], len(selection), axis=0)
+        linear = np.zeros((len(selection), 3 + self.n_shift))
+        linear[:, :3] = T_start[:3, 3]
+        for _ in range(n_rounds):
+            x = with_one(np.concatenate([vec_rotation(R), linear], axis=1))
+            edge_ids = self.associate(x)
+            Q, L = eliminate_linear(self.moments(selection, edge_ids))
+            R, certificates = solve_globally(Q, R)
+            linear = linear_unknowns(L, R)
+        return Solutions(R, linear, edge_ids, certificates)
+
+    def quadratics(
+        self,
+        x: Array,
+        edge_ids: NDArray[np.int8],
+        placement: NDArray[np.intp] | None = None,
+        weights: Weights | None = None,
+    ) -> Quadratics:
+        """Expand each capture's cost in the tangent (translation m, rotation rad, edge shift m).
+
+        Args:
+            x: (m,) solution [vec R; t; d; 1].
+            edge_ids: (n,) its association.
+            placement: (F,) numbers of the board placements; each capture's own by default.
+            weights: other weights than the problem's.
+        """
+        w = weights or self.weights
+        M = self.moments(
+            np.eye(self.n_captures),
+            np.repeat(edge_ids[None], self.n_captures, axis=0),
+            Weights(w.plane, w.edge, None if w.shift_prior is None else 0.0),
+        )
+        J = tangent_basis(x[:9].reshape(3, 3).T, self.n_shift)
+        prior = np.zeros((6 + self.n_shift, 6 + self.n_shift))
+        if w.shift_prior is not None:
+            prior[6, 6] = w.shift_prior
+        prior_gradient = prior[:, -1] * x[-2]
+        captures = np.arange(self.n_captures)
+        return Quadratics(
+            (M @ x) @ J, J.T @ M @ J, prior, prior_gradient, captures if placement is None else placement
+        )
+
+    def errors(self, x: Array) -> tuple[Array, Array]:
+        """Compute each capture's rms plane and edge residual in m, (B, F) each.
+
+        Args:
+            x: (B, m).
+        """
+        products = x[:, self._upper[0]] * x[:, self._upper[1]]
+        products[:, self._upper[0] != self._upper[1]] *= 2
+        plane = np.maximum(products @ self.plane.T, 0)
+        edge = np.zeros((len(x), self.n_captures))
+        ids = self.associate(x)
+        residuals = np.moveaxis(x @ np.swapaxes(self._edge_rows, 1, 2), 1, 0)
+        chosen = np.take_along_axis(residuals, ids[..., None], axis=2)[..., 0]
+        np.add.at(edge.T, self.edge_capture, (chosen**2 * self._edge_weight).T)
+        return np.sqrt(plane), np.sqrt(edge)
+
+
+def _board_coordinates(f: CaptureFeatures, size: int) -> Array:
+    """Write the board coordinates x, y of ring ends as rows (M, 2, m) that multiply [vec R; t; d; 1]."""
+    R, t = f.T_board_cam[:2, :3], f.T_board_cam[:2, 3]
+    rows = np.zeros((len(f.edge_points), 2, size))
+    rows[:, :, :9] = (f.edge_points[:, None, :, None] * R[None, :, None, :]).reshape(-1, 2, 9)
+    rows[:, :, 9:12] = R
+    rows[:, :, -1] = t
+    return rows

@@ -1,0 +1,180 @@
+"""How far the LiDAR's points and ring ends lie from the camera's board: two residuals and their derivatives.
+
+With T_cam_lidar = (R, t), a point p and a ring end q of the LiDAR's leave
+
+    plane     n . (g - R p - t)                                                                          (1)
+    ring end  m . (h - R q - t) + d                                                                      (2)
+
+where n is the board's normal and g its middle as the camera sees them, m the outward normal of the edge
+nearest to the ring end and h a point on that edge. Ring ends lie by the edge shift d beyond the print.
+
+Both are distances along a normal. `residual_rows` writes them linear in vec R and t, for moments of many
+points; `differentiate` gives their derivatives by the tangent of (R, t). Algorithm 1, the likelihood, the
+validation, the estimate of time offsets and the guidance take them from here.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, transform
+from lce_rig.residuals.features import CaptureFeatures
+
+PLANE_FREEDOMS = 3
+"""Two planes differ by an offset and two tilts, however many points the LiDAR's has."""
+# Errors of a board's plane and of its ring ends are at least as large as this.
+_PLANE_FLOOR_M, _END_FLOOR_M = 0.001, 0.002
+
+
+def residual_rows(normals: Array, anchors: Array, points: Array, nuisances: Array | None = None) -> Array:
+    """Write the residuals n . (g - R p - t) + c . s as rows a of a . x, x = [vec R; t; s; 1].
+
+    Args:
+        normals: (..., 3) unit n, target frame.
+        anchors: (..., 3) g on the plane or line, m, target frame.
+        points: (..., 3) p, m, source frame.
+        nuisances: (..., k) coefficients c; none by default.
+
+    Returns:
+        (..., 13 + k).
+    """
+    normals, anchors, points = np.broadcast_arrays(normals, anchors, points)
+    batch = points.shape[:-1]
+    lever = -(points[..., :, None] * normals[..., None, :]).reshape(*batch, 9)
+    offset = np.sum(normals * anchors, axis=-1, keepdims=True)
+    extra = (
+        np.zeros((*batch, 0))
+        if nuisances is None
+        else np.broadcast_to(nuisances, (*batch, nuisances.shape[-1]))
+    )
+    return np.concatenate([lever, -normals, extra, offset], axis=-1)
+
+
+def along_normals(normals: Array, anchors: Array, points: Array, T: Array) -> Array:
+    """Evaluate n . (g - R p - t) for normals and anchors (..., N, 3), points (N, 3) and T (..., 4, 4)."""
+    return np.asarray(np.sum((anchors - transform(T, points)) * normals, axis=-1))
+
+
+def differentiate(normals: Array, levers: Array) -> Array:
+    """Differentiate n . (g - R p - t) by the tangent of (R, t), translation before rotation.
+
+    Args:
+        normals: (..., 3) n.
+        levers: (..., 3) R p, the points turned but not moved.
+
+    Returns:
+        (..., 6).
+    """
+    normals, levers = np.broadcast_arrays(normals, levers)
+    return -np.concatenate([normals, np.cross(levers, normals)], axis=-1)
+
+
+def plane_residuals(f: CaptureFeatures, T_cam_lidar: Array, points: Array | None = None) -> Array:
+    """Evaluate (1) for the points (N, 3) of a capture, by default its plane points: (..., N).
+
+    Args:
+        f: of the capture.
+        T_cam_lidar: (..., 4, 4).
+        points: other points of the board, frame lidar.
+    """
+    return along_normals(f.normal, f.centre, f.plane_points if points is None else points, T_cam_lidar)
+
+
+def end_residuals(f: CaptureFeatures, T_cam_lidar: Array, board: Board) -> tuple[Array, NDArray[np.intp]]:
+    """Evaluate (2) without shift for a capture's ring ends and their nearest edges.
+
+    Args:
+        f: of the capture.
+        T_cam_lidar: (..., 4, 4).
+        board: its size.
+
+    Returns:
+        Distances inside the edge (..., M), and the edges' numbers.
+    """
+    ends = ends_on_board(f, T_cam_lidar)
+    edge = board.nearest_edge(ends)
+    return distance_inside(board, ends, edge), edge
+
+
+def distance_inside(board: Board, xy_m: Array, edge: NDArray[np.intp]) -> Array:
+    """Measure how far points (..., 2 or 3) of the board's plane lie inside edges (...) by number: (...)."""
+    anchors, normals = (of_edges[edge, :2] for of_edges in board.edges())
+    return np.asarray(np.sum((anchors - xy_m[..., :2]) * normals, axis=-1))
+
+
+def ends_on_board(f: CaptureFeatures, T_cam_lidar: Array) -> Array:
+    """Take a capture's ring ends to the frame of the board that the camera sees: (..., M, 3)."""
+    return transform(f.T_board_cam @ T_cam_lidar, f.edge_points)
+
+
+def plane_rows(f: CaptureFeatures, T_cam_lidar: Array, points: Array) -> tuple[Array, Array]:
+    """Linearise (1) for points (N, 3) of a capture.
+
+    Returns:
+        Values (N,), and derivatives (N, 7) by the tangent (6) and by s, which shrinks the camera's distances
+        to (1 - s) g.
+    """
+    by_scale = np.full((len(points), 1), -f.normal @ f.centre)
+    by_tangent = differentiate(f.normal, points @ T_cam_lidar[:3, :3].T)
+    return plane_residuals(f, T_cam_lidar, points), np.hstack([by_tangent, by_scale])
+
+
+def end_rows(f: CaptureFeatures, T_cam_lidar: Array, board: Board) -> tuple[Array, Array]:
+    """Linearise (2) for a capture's ring ends.
+
+    Returns:
+        Values (M,), and derivatives (M, 8) by the tangent (6), the shift d and the scale s.
+    """
+    inside_m, edge = end_residuals(f, T_cam_lidar, board)
+    normals = f.edge_normals[edge]
+    by_tangent = differentiate(normals, f.edge_points @ T_cam_lidar[:3, :3].T)
+    return inside_m, np.column_stack([by_tangent, np.ones(len(edge)), -normals @ f.centre])
+
+
+def freedoms_of_plane() -> Array:
+    """Differentiate the height of a board's points by the board's motion.
+
+    Returns:
+        K (3, 6): a point (x, y) of the board rises along its normal by (1, x, y) K times the tangent, in the
+        axes of the board and about its middle.
+    """
+    at = -differentiate(np.array([0.0, 0.0, 1.0]), np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]))
+    return np.asarray(at - np.array([[0.0], [1], [1]]) * at[0])
+
+
+@dataclass(frozen=True)
+class FeatureSigmas:
+    """Errors by which planes and ring ends are weighed: how far they lie from the camera's.
+
+    Attributes:
+        plane_m: of a capture's plane, rms over the board.
+        end_m: of a ring end.
+    """
+
+    plane_m: float
+    end_m: float
+
+
+def feature_sigmas(features: Sequence[CaptureFeatures], board: Board, T_cam_lidar: Array) -> FeatureSigmas:
+    """Take the typical errors of captures' planes and ring ends under an extrinsic (4, 4)."""
+    planes_m = [np.sqrt(np.mean(plane_residuals(f, T_cam_lidar) ** 2)) for f in features]
+    inside_m = np.concatenate([end_residuals(f, T_cam_lidar, board)[0] for f in features])
+    # Ring ends reach beyond the plate by the beam's width, which is no error.
+    end_m = 1.4826 * float(np.median(np.abs(inside_m - np.median(inside_m))))
+    return FeatureSigmas(max(float(np.median(planes_m)), _PLANE_FLOOR_M), max(end_m, _END_FLOOR_M))
+
+
+def capture_costs(f: CaptureFeatures, board: Board, T_cam_lidar: Array, sigmas: FeatureSigmas) -> Array:
+    """Sum the squares of a capture's residuals under extrinsics (B, 4, 4): (B,).
+
+    The mean square over the plane's points counts `PLANE_FREEDOMS` / sigma^2, each ring end 1 / sigma^2 after
+    their mean is subtracted: they reach beyond the plate by the beam's width, alike on all sides.
+    """
+    plane_m = plane_residuals(f, T_cam_lidar)
+    inside_m, _ = end_residuals(f, T_cam_lidar, board)
+    own_m = inside_m - inside_m.mean(axis=1, keepdims=True) if inside_m.shape[1] else inside_m
+    by_plane = PLANE_FREEDOMS * np.mean(plane_m**2, axis=1) / sigmas.plane_m**2
+    return np.asarray(by_plane + np.sum(own_m**2, axis=1) / sigmas.end_m**2)

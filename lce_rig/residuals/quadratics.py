@@ -1,0 +1,145 @@
+"""A cost to second order, capture by capture: what any share of the captures would have given.
+
+Half the gradient g_k and half the Hessian H_k of each capture's cost say for all shares w of the captures at
+once, with P the information of the priors and g_P half the gradient of theirs, where the optimum lies:
+
+    x(w) = -(P + sum_k w_k H_k)^-1 (g_P + sum_k w_k g_k)                                                 (1)
+
+Whatever weighs residuals (Algorithm 1, the likelihood, the validation's second opinion) ends here, and every
+covariance from the scatter between captures starts here. What errs independently are placements of the
+board, not captures that repeat one.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.geometry import Array
+from lce_rig.solvers.covariance import symmetric_inverse
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratics:
+    """F captures' costs about some values of p unknowns.
+
+    Attributes:
+        gradients: (F, p) g_k.
+        hessians: (F, p, p) H_k.
+        prior: (p, p) P.
+        prior_gradient: (p,) g_P.
+        placement: (F,) number of the board placement that a capture shows.
+    """
+
+    gradients: Array
+    hessians: Array
+    prior: Array
+    prior_gradient: Array
+    placement: NDArray[np.intp]
+
+    @cached_property
+    def groups(self) -> Array:
+        """(G, F): 1 where a capture shows a placement."""
+        numbers = np.arange(int(self.placement.max()) + 1)
+        return np.asarray(numbers[:, None] == self.placement, dtype=np.float64)
+
+    @cached_property
+    def information(self) -> Array:
+        """(p, p) of all captures and priors."""
+        return np.asarray(self.hessians.sum(axis=0) + self.prior)
+
+    def solve(self, shares: Array) -> Array:
+        """Compute (1) for B shares (B, F): unknowns (B, p)."""
+        H = np.tensordot(shares, self.hessians, axes=1) + self.prior
+        g = shares @ self.gradients + self.prior_gradient
+        return np.asarray(-(symmetric_inverse(H) @ g[..., None])[..., 0])
+
+    def optimum(self) -> Array:
+        """Compute (1) for all captures: (p,)."""
+        return np.asarray(self.solve(np.ones((1, len(self.gradients))))[0])
+
+    def without_each(self) -> Array:
+        """Compute (1) without each of the placements: (G, p).
+
+        The inverse of H - H_k and not of H corrects for the pull that each placement has on its own
+        residuals, which matters for few of them.
+        """
+        return self.solve(1 - self.groups)
+
+    def moves(self) -> Array:
+        """Compute by how much an estimate at the optimum moves without each placement: (G, p).
+
+            m_k = (P + sum_j H_j - H_k)^-1 g_k
+
+        with sums over a placement's captures for g_k and H_k. No other gradient enters: an estimate that
+        stopped short of its optimum shows in the scatter.
+        """
+        H = np.tensordot(1 - self.groups, self.hessians, axes=1) + self.prior
+        return np.asarray((symmetric_inverse(H) @ (self.groups @ self.gradients)[..., None])[..., 0])
+
+    def covariance(self) -> Array:
+        """Compute the covariance (p, p) of all captures' unknowns if every error is independent."""
+        return symmetric_inverse(self.information)
+
+    def jackknife_covariance(self) -> Array:
+        """Compute the covariance (p, p) of the optimum from what leaving placements out does to it.
+
+        No model of the noise enters, and errors within a placement may be correlated in any way; unlike
+        s^2 H^-1, which takes every residual for independent, it sees what a whole placement has in common.
+
+        The inverse of a covariance from few samples is too large: for normal errors in p unknowns it averages
+        (G - 1) / (G - p - 2) times the true inverse. Multiplied by that factor, the scatter gives normalised
+        errors e^T cov^-1 e of the right size; below p + 4 placements the factor is held at (G - 1) / 2.
+
+        References:
+            MacKinnon, White, "Some heteroskedasticity-consistent covariance matrix estimators", J.
+            Econometrics, 1985; Bell, McCaffrey, "Bias reduction in standard errors for linear regression with
+            multi-stage samples", Survey Methodology, 2002 (CR3).
+        """
+        n_groups, p = len(self.groups), len(self.prior)
+        correction = (n_groups - 1) / max(n_groups - p - 2, 2)
+        return np.asarray(correction * jackknife_scatter(self.moves()))
+
+    def hold(self, unknown: int) -> "Quadratics":
+        """Hold an unknown where it is: quadratics in the others."""
+        return self.of(np.delete(np.arange(len(self.prior)), unknown))
+
+    def of(self, unknowns: NDArray[np.intp]) -> "Quadratics":
+        """Hold all unknowns but these, by index, where they are."""
+        return replace(
+            self,
+            gradients=self.gradients[:, unknowns],
+            hessians=self.hessians[:, unknowns[:, None], unknowns],
+            prior=self.prior[unknowns[:, None], unknowns],
+            prior_gradient=self.prior_gradient[unknowns],
+        )
+
+    def settled(self) -> "Quadratics":
+        """Hold all unknowns but the first six at their estimate: quadratics in these, about their optimum."""
+        x = self.optimum()
+        return replace(
+            self,
+            gradients=(self.gradients + self.hessians @ x)[:, :6],
+            hessians=self.hessians[:, :6, :6],
+            prior=np.zeros((6, 6)),
+            prior_gradient=np.zeros(6),
+        )
+
+
+def without_prior(gradients: Array, hessians: Array, placement: NDArray[np.intp]) -> Quadratics:
+    """Build quadratics of costs of which nothing is believed beforehand."""
+    none = np.zeros_like(hessians[0])
+    return Quadratics(gradients, hessians, none, none[0], placement)
+
+
+def jackknife_scatter(moves: Array) -> Array:
+    """Estimate the covariance (p, p) of an estimate from how leaving out each of G placements moves it.
+
+        cov = (G - 1) / G sum_k m_k m_k^T
+
+    Args:
+        moves: (G, p) from the estimate with all of them, or from their mean.
+    """
+    n_groups = len(moves)
+    return np.asarray((n_groups - 1) / n_groups * moves.T @ moves)

@@ -1,0 +1,143 @@
+"""The relation of two clocks: offset and drift with their standard deviations, and time conversion."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.geometry import Array
+
+NS_PER_S = 1_000_000_000
+HOUR_NS = 3600 * NS_PER_S
+FOREVER_NS = 2**62
+# A crystal's drift changes by about a part in a million as it warms up; no data say so once they have ended.
+WANDER = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class ClockModel:
+    """A straight line from the time of one clock, the source, to that of another, the reference.
+
+        reference(t) = reference_ns + (1 + drift) (t - anchor_ns)                                          (1)
+
+    Unix time in ns has more digits than a float: both ends of the line are integers.
+
+    Attributes:
+        anchor_ns: time on the source's clock, in the middle of the data.
+        reference_ns: time on the reference's clock at that moment.
+        drift: by how much faster the reference runs, as a fraction: 40e-6 is 40 ppm.
+        cov: (2, 2) of the reference's time at the anchor in ns, and of `drift` in ns per ns.
+        bias_sigma_ns: error common to all readings (an answer that is always slower than its request); it
+            leaves no trace in their scatter.
+        rms_ns: scatter of the readings about the line.
+        first_ns, last_ns: from when to when on the source's clock there were readings.
+        n_used, n_left_out: readings the line was fitted to, and outliers.
+        origin: what the readings were, in words: "98 time requests".
+    """
+
+    anchor_ns: int
+    reference_ns: int
+    drift: float
+    cov: Array
+    bias_sigma_ns: float
+    rms_ns: float
+    first_ns: int
+    last_ns: int
+    n_used: int
+    n_left_out: int
+    origin: str
+
+    @staticmethod
+    def identity(sigma_ns: float, origin: str) -> "ClockModel":
+        """Build the model of a clock that shows the reference's time already.
+
+        Args:
+            sigma_ns: how well it does.
+            origin: why, in words: "PPS locked".
+        """
+        return ClockModel(0, 0, 0.0, np.zeros((2, 2)), sigma_ns, 0.0, -FOREVER_NS, FOREVER_NS, 0, 0, origin)
+
+    def convert(self, source_ns: int) -> int:
+        """Read the reference's clock at a moment of the source's (1)."""
+        elapsed_ns = source_ns - self.anchor_ns
+        return self.reference_ns + elapsed_ns + round(self.drift * elapsed_ns)
+
+    def convert_all(self, source_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Read the reference's clock at moments (N,) of the source's (1)."""
+        elapsed_ns = np.asarray(source_ns, dtype=np.int64) - self.anchor_ns
+        drifted_ns = np.rint(self.drift * elapsed_ns).astype(np.int64)
+        return np.asarray(self.reference_ns + elapsed_ns + drifted_ns)
+
+    def sigma_ns(self, source_ns: int) -> float:
+        """Give the standard deviation of `convert`, within the data or beyond them."""
+        return float(self.sigmas_ns(np.array([source_ns], dtype=np.int64))[0])
+
+    def sigmas_ns(self, source_ns: NDArray[np.int64]) -> Array:
+        """Give the standard deviations (N,) of `convert_all`.
+
+            sigma(t)^2 = c00 + 2 c01 dt + c11 dt^2 + bias^2 + (WANDER outside)^2
+
+        with dt from the anchor, and `outside` how far t lies before or after the data.
+        """
+        source_ns = np.asarray(source_ns, dtype=np.int64)
+        elapsed_ns = (source_ns - self.anchor_ns).astype(np.float64)
+        outside_ns = np.maximum(np.maximum(self.first_ns - source_ns, source_ns - self.last_ns), 0)
+        line = self.cov[0, 0] + 2 * self.cov[0, 1] * elapsed_ns + self.cov[1, 1] * elapsed_ns**2
+        return np.asarray(np.sqrt(line + self.bias_sigma_ns**2 + (WANDER * outside_ns) ** 2))
+
+    def inverse(self) -> "ClockModel":
+        """Build the model that reads the source's clock on the reference's."""
+        return ClockModel(
+            self.reference_ns,
+            self.anchor_ns,
+            -self.drift / (1 + self.drift),
+            self.cov,  # to first order in the drift
+            self.bias_sigma_ns,
+            self.rms_ns,
+            self.convert(self.first_ns),
+            self.convert(self.last_ns),
+            self.n_used,
+            self.n_left_out,
+            self.origin,
+        )
+
+    def then(self, other: "ClockModel") -> "ClockModel":
+        """Build the model from this source to another's reference, by way of the clock that both share.
+
+        Args:
+            other: its source is this model's reference; its errors are independent of this one's.
+        """
+        elapsed_ns = float(self.reference_ns - other.anchor_ns)
+        shift = np.array([[1.0, elapsed_ns], [0.0, 1.0]])
+        back = self.inverse()
+        return ClockModel(
+            self.anchor_ns,
+            other.convert(self.reference_ns),
+            (1 + self.drift) * (1 + other.drift) - 1,
+            self.cov + shift @ other.cov @ shift.T,
+            float(np.hypot(self.bias_sigma_ns, other.bias_sigma_ns)),
+            float(np.hypot(self.rms_ns, other.rms_ns)),
+            max(self.first_ns, back.convert(other.first_ns)),
+            min(self.last_ns, back.convert(other.last_ns)),
+            min(self.n_used, other.n_used),
+            self.n_left_out + other.n_left_out,
+            f"{self.origin}, then {other.origin}",
+        )
+
+    def __str__(self) -> str:
+        sigma_us = 1e-3 * self.sigma_ns(self.last_ns)
+        sigma = f"{sigma_us / 1000:.1f} ms" if sigma_us >= 1000 else f"{sigma_us:.3g} us"
+        return f"{self.origin}: drift {1e6 * self.drift:+.1f} ppm, known to {sigma}"
+
+
+def resolve_hour(past_hour_ns: int, near_ns: int) -> int:
+    """Complete a time that is known past the hour only.
+
+    Args:
+        past_hour_ns: time since the full hour; may exceed an hour where a counter has not wrapped yet.
+        near_ns: about the same moment on a clock that knows the hour, right within half an hour.
+
+    Returns:
+        The time that is `past_hour_ns` past some hour, and nearest to `near_ns`.
+    """
+    return past_hour_ns + HOUR_NS * ((near_ns - past_hour_ns + HOUR_NS // 2) // HOUR_NS)

@@ -1,0 +1,308 @@
+"""Clock models from readings: time requests and replies, edges timestamped by two clocks, arrivals."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.geometry import Array
+from lce_rig.timing.clock import NS_PER_S, ClockModel
+
+MIN_PAIRS = 4
+# A timestamp in whole microseconds cannot scatter by less than this says.
+RESOLUTION_NS = 1000.0
+# A USB frame lasts 1 ms: what comes by USB may be as late as that every time.
+ARRIVAL_BIAS_NS = 1_000_000.0
+
+_MAX_GROUP = 5
+_WANTED_GROUPS = 12
+_QUICK = 0.4
+
+Stamps = NDArray[np.int64]
+_SHARP = 0.1
+_OUTLIER_SIGMAS = 3.5
+_N_ROUNDS = 10
+_N_STRETCHES = 8
+_MIN_INLIERS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class TimePairs:
+    """Times, each read on two clocks.
+
+    Attributes:
+        source_ns: (N,) reading of the clock to be modelled; rising.
+        reference_ns: (N,) reading of the clock that it is modelled on.
+        bound_ns: (N,) by how much the two readings may lie apart in truth; 0 where they are of one edge.
+    """
+
+    source_ns: Stamps
+    reference_ns: Stamps
+    bound_ns: Array
+
+    @staticmethod
+    def from_edges(source_ns: Stamps, reference_ns: Stamps) -> "TimePairs":
+        """Take edges (N,) that both clocks timestamped."""
+        return TimePairs(source_ns, reference_ns, np.zeros(len(source_ns)))
+
+    @staticmethod
+    def from_exchanges(
+        sent_ns: Stamps, received_ns: Stamps, device_rx_ns: Stamps, device_tx_ns: Stamps
+    ) -> "TimePairs":
+        """Take time requests (N,) that a device answered; the device's clock is the source.
+
+        The middle between sending and receiving is the middle between the device's own two timestamps, to
+        within half of what the round trip took beyond the device's own delay, whatever the two ways had of
+        it.
+
+        Args:
+            sent_ns, received_ns: when the host sent the request and had the answer.
+            device_rx_ns, device_tx_ns: when the device had the request and sent the answer.
+
+        References:
+            RFC 5905, "Network Time Protocol Version 4", section 8.
+        """
+        round_trip_ns = (received_ns - sent_ns) - (device_tx_ns - device_rx_ns)
+        return TimePairs(
+            device_rx_ns + (device_tx_ns - device_rx_ns) // 2,
+            sent_ns + (received_ns - sent_ns) // 2,
+            np.maximum(round_trip_ns, 0) / 2,
+        )
+
+    def select(self, keep: NDArray[np.intp] | NDArray[np.bool_]) -> "TimePairs":
+        """Keep the pairs of a mask or an index."""
+        return TimePairs(self.source_ns[keep], self.reference_ns[keep], self.bound_ns[keep])
+
+    def __len__(self) -> int:
+        return len(self.source_ns)
+
+
+def fit_clock(pairs: TimePairs, what: str, resolution_ns: float = RESOLUTION_NS) -> ClockModel | None:
+    """Fit offset and drift to readings of two clocks.
+
+    The quickest two fifths of the readings count. What one of them took beyond the very quickest,
+    e_i = bound_i - min bound, put its middle wrong by up to +-e_i: by all of it where one way had it, by
+    nothing where both had half. Which it was, a third unknown tells that is common to all,
+
+        reference_i - source_i = offset + drift t_i + a e_i + noise_i,      a ~ 0 +- 1 / sqrt(3)
+
+    or else a machine that becomes slower to answer while it is asked would pass for a drift. The quickest
+    round trip itself may have been all on one way, in the same manner every time: that does not scatter, and
+    is stated as bias_sigma = min bound / sqrt(3).
+
+    Args:
+        pairs: the readings.
+        what: what they are, in words: "time requests".
+        resolution_ns: step of the coarser clock.
+
+    Returns:
+        The model; None from fewer than 4 readings, or where all are of the same time.
+    """
+    if len(pairs) < MIN_PAIRS:
+        return None
+    n_quick = max(MIN_PAIRS, int(np.ceil(_QUICK * len(pairs))))
+    quick = pairs.select(pairs.bound_ns <= np.sort(pairs.bound_ns)[n_quick - 1])
+    least_ns = float(quick.bound_ns.min())
+    origin = f"{len(pairs)} {what}"
+    return _model(quick, quick.bound_ns - least_ns, origin, resolution_ns, least_ns / np.sqrt(3))
+
+
+def fit_arrivals(
+    stamp_ns: Stamps, arrival_ns: Stamps, what: str, bias_sigma_ns: float = ARRIVAL_BIAS_NS
+) -> ClockModel | None:
+    """Fit offset and drift of a device that cannot be asked, to when its messages arrived.
+
+    Messages come late and never early: of every few successive ones the least late is kept. How late even
+    those are, nothing tells; hence the bias.
+
+    Args:
+        stamp_ns: (N,) on the device's clock; rising.
+        arrival_ns: (N,) on the host's clock.
+        what: what they are, in words.
+        bias_sigma_ns: how late the quickest may be.
+    """
+    if len(stamp_ns) < MIN_PAIRS:
+        return None
+    late_ns = ((arrival_ns - arrival_ns[0]) - (stamp_ns - stamp_ns[0])).astype(np.float64)
+    elapsed_s = (stamp_ns - stamp_ns[0]) / NS_PER_S
+    # Without its drift, the lateness of messages seconds apart can be compared.
+    late_ns = late_ns - median_slope(elapsed_s, late_ns) * elapsed_s
+    pairs = TimePairs.from_edges(stamp_ns, arrival_ns).select(_quickest(late_ns))
+    return _model(pairs, np.zeros(len(pairs)), f"{len(stamp_ns)} {what}", RESOLUTION_NS, bias_sigma_ns)
+
+
+def match_edges(
+    source_ns: Stamps, reference_ns: Stamps, coarse: ClockModel, tolerance_ns: float
+) -> TimePairs | None:
+    """Find which edges that one clock timestamped are which of another's, by a coarse model of the two.
+
+    Args:
+        source_ns: (N,) edges on the one clock; rising.
+        reference_ns: (M,) edges on the other; rising.
+        coarse: from the one clock to the other, right to within the tolerance.
+        tolerance_ns: how far off it may be.
+
+    Returns:
+        Edges that are nearest to each other both ways and within the tolerance; None where edges follow each
+        other so closely, within twice the tolerance, that a neighbour could be taken for the right one.
+    """
+    if not len(source_ns) or not len(reference_ns):
+        return TimePairs.from_edges(source_ns[:0], reference_ns[:0])
+    if len(reference_ns) > 1 and np.median(np.diff(reference_ns)) < 2 * tolerance_ns:
+        return None
+    predicted_ns = coarse.convert_all(source_ns)
+    nearest = _nearest(predicted_ns, reference_ns)
+    is_mutual = _nearest(reference_ns, predicted_ns)[nearest] == np.arange(len(source_ns))
+    is_near = np.abs(predicted_ns - reference_ns[nearest]) <= tolerance_ns
+    keep = is_mutual & is_near
+    return TimePairs.from_edges(source_ns[keep], reference_ns[nearest[keep]])
+
+
+def _nearest(these_ns: Stamps, those_ns: Stamps) -> NDArray[np.intp]:
+    """Find the index (N,) of the nearest of `those_ns` to each of `these_ns`; both rising."""
+    right = np.clip(np.searchsorted(those_ns, these_ns), 1, max(len(those_ns) - 1, 1))
+    left = right - 1
+    right = np.minimum(right, len(those_ns) - 1)
+    return np.where(these_ns - those_ns[left] <= those_ns[right] - these_ns, left, right)
+
+
+def _quickest(late: Array) -> NDArray[np.intp]:
+    """Find the least late (G,) of every few successive readings (N,)."""
+    size = int(np.clip(len(late) // _WANTED_GROUPS, 1, _MAX_GROUP))
+    whole = len(late) // size * size
+    groups = late[:whole].reshape(-1, size)
+    return np.asarray(np.arange(len(groups)) * size + groups.argmin(axis=1))
+
+
+def _model(
+    pairs: TimePairs, excess_ns: Array, origin: str, resolution_ns: float, bias_sigma_ns: float
+) -> ClockModel | None:
+    """Fit a line without outliers; where there is a bias, readings were delayed and err together."""
+    source_ns = pairs.source_ns
+    if len(pairs) < MIN_PAIRS or source_ns.min() == source_ns.max():
+        return None
+    origin_ns, reference_origin_ns = int(source_ns[0]), int(pairs.reference_ns[0])
+    y_ns = (pairs.reference_ns - reference_origin_ns) - (source_ns - origin_ns)
+    floor_ns = resolution_ns / np.sqrt(12)
+    fit = LineFit((source_ns - origin_ns) / NS_PER_S, y_ns.astype(np.float64), excess_ns, floor_ns)
+    keep = fit.inliers()
+    fit = fit.select(keep).centred()
+    line, residual = fit.solve()
+    scale = np.diag([1.0, 1.0 / NS_PER_S])
+    elapsed_ns = round(fit.origin_s * NS_PER_S)
+    return ClockModel(
+        anchor_ns=origin_ns + elapsed_ns,
+        reference_ns=reference_origin_ns + elapsed_ns + round(line[0]),
+        drift=float(line[1]) / NS_PER_S,
+        cov=scale @ fit.covariance(are_delayed=bias_sigma_ns > 0) @ scale,
+        bias_sigma_ns=float(bias_sigma_ns),
+        rms_ns=float(np.sqrt(residual @ residual / np.sum(fit.sigma_ns**-2.0))),
+        first_ns=int(source_ns[keep].min()),
+        last_ns=int(source_ns[keep].max()),
+        n_used=int(keep.sum()),
+        n_left_out=int((~keep).sum()),
+        origin=origin,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class LineFit:
+    """Readings in the order of time, and the line
+
+        y_i = offset + drift x_i + a e_i + noise_i,      a ~ 0 +- 1 / sqrt(3)                              (1)
+        sigma_i^2 = (e_0^2 + e_i^2) / 3,      e_0 the tenth part quantile of e                             (2)
+
+    with e_i the delay that could have put reading i wrong by up to +-e_i.
+
+    Attributes:
+        x_s: (N,) time on the source's clock.
+        y_ns: (N,) the reference's time minus the source's.
+        excess_ns: (N,) e_i; 0 for edges.
+        floor_ns: no reading is better than this.
+        origin_s: what was taken off x to centre it.
+    """
+
+    x_s: Array
+    y_ns: Array
+    excess_ns: Array
+    floor_ns: float
+    origin_s: float = 0.0
+
+    @property
+    def sigma_ns(self) -> Array:
+        """The readings' standard deviations (N,) before their scatter is known (2)."""
+        usual_ns = max(float(np.quantile(self.excess_ns, _SHARP)), np.sqrt(3) * self.floor_ns)
+        return np.asarray(np.sqrt((usual_ns**2 + self.excess_ns**2) / 3))
+
+    def select(self, keep: NDArray[np.bool_]) -> "LineFit":
+        """Keep the readings of a mask."""
+        return replace(self, x_s=self.x_s[keep], y_ns=self.y_ns[keep], excess_ns=self.excess_ns[keep])
+
+    def centred(self) -> "LineFit":
+        """Move the origin of x to the readings' weighted mean, where offset and drift are independent."""
+        mean_s = float(np.average(self.x_s, weights=self.sigma_ns**-2.0))
+        return replace(self, x_s=self.x_s - mean_s, origin_s=self.origin_s + mean_s)
+
+    def solve(self) -> tuple[Array, Array]:
+        """Find offset ns, drift ns/s and a, and the residuals (N,) in sigmas."""
+        design, value, information = self._normal()
+        line = np.linalg.solve(information, design.T @ value)
+        return line, value - design @ line
+
+    def covariance(self, are_delayed: bool) -> Array:
+        """Compute the covariance (2, 2) of offset and drift.
+
+        Edges err each by itself. Delays stay as they are for a while, and then are others: readings of one
+        stretch of time err together. How much that matters, the jackknife over stretches tells: where its
+        covariance is r > 1 times that of independent readings, that one is multiplied by r.
+
+        References:
+            `lce_rig.residuals.quadratics.Quadratics.jackknife_covariance`, which has the factor as well.
+        """
+        design, value, information = self._normal()
+        inverse = np.linalg.inv(information)
+        residual = value - design @ (inverse @ (design.T @ value))
+        n, p = len(value), 2
+        scatter = max(float(residual @ residual) / (n - p), (self.floor_ns / float(self.sigma_ns.min())) ** 2)
+        independent = scatter * inverse[:p, :p]
+        if not are_delayed or n < 3 * _N_STRETCHES:
+            return np.asarray(independent)
+        stretches = np.array_split(np.arange(n), _N_STRETCHES)
+        gradients = np.array([design[part].T @ residual[part] for part in stretches])
+        hessians = np.array([design[part].T @ design[part] for part in stretches])
+        steps = np.linalg.solve(information - hessians, gradients[..., None])[:, :p, 0]
+        jackknife = (_N_STRETCHES - 1) / (_N_STRETCHES - p - 2) * (steps.T @ steps)
+        ratio = float(np.trace(np.linalg.solve(independent, jackknife))) / p
+        return np.asarray(max(ratio, 1.0) * independent)
+
+    def inliers(self) -> NDArray[np.bool_]:
+        """Find the readings (N,) within 3.5 times the usual of the line through them, each by its sigma."""
+        sigma_ns = self.sigma_ns
+        residual = self.y_ns - median_slope(self.x_s, self.y_ns) * self.x_s
+        residual = (residual - np.median(residual)) / sigma_ns
+        keep = np.ones(len(residual), dtype=np.bool_)
+        for _ in range(_N_ROUNDS):
+            scale = max(1.4826 * float(np.median(np.abs(residual))), 1.0)
+            found = np.abs(residual) <= _OUTLIER_SIGMAS * scale
+            if found.sum() < _MIN_INLIERS or np.ptp(self.x_s[found]) == 0 or np.array_equal(found, keep):
+                break
+            keep = found
+            line, _ = self.select(keep).solve()
+            residual = (self.y_ns - line[0] - line[1] * self.x_s - line[2] * self.excess_ns) / sigma_ns
+        return keep
+
+    def _normal(self) -> tuple[Array, Array, Array]:
+        """Build the weighted design (N, 3), the values (N,), and the information (3, 3) with that on a."""
+        design = np.column_stack([np.ones(len(self.x_s)), self.x_s, self.excess_ns]) / self.sigma_ns[:, None]
+        return design, self.y_ns / self.sigma_ns, design.T @ design + np.diag([0.0, 0.0, 3.0])
+
+
+def median_slope(x: Array, y: Array) -> float:
+    """Compute the median slope between points half the data apart; bears a quarter of outliers.
+
+    References:
+        Theil, "A rank-invariant method of linear and polynomial regression analysis", 1950 (method I).
+    """
+    half = len(x) // 2
+    dx = x[half:] - x[: len(x) - half]
+    return float(np.median((y[half:] - y[: len(y) - half])[dx > 0] / dx[dx > 0])) if (dx > 0).any() else 0.0

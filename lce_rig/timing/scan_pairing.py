@@ -1,0 +1,173 @@
+"""Streams of several sensors cut into frames: one scan, and what the others saw at about that time."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from lce_rig.core.data import Events, Image, Sample, Scan
+from lce_rig.rig import Rig
+from lce_rig.timing.event_buffer import AFTER_NS, BEFORE_NS, EventBuffer, EventCut
+from lce_rig.timing.rig_time import rig_time_ns
+
+PATIENCE_NS = 1_000_000_000
+# Scans wait for others and come late in bags; what lies this far back no scan asks for any more.
+_KEPT_NS = BEFORE_NS + AFTER_NS + 3 * PATIENCE_NS
+_Buffers: TypeAlias = dict[tuple[str, str], deque[tuple[int, Image | Scan]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What the rig saw at one time.
+
+    Attributes:
+        time_ns: middle of the first LiDAR's sweep, rig time (stamps plus the profile's expected offsets).
+        images: the picture of each camera channel that has one within the tolerance.
+        scans: the scan of the first LiDAR, and of each other that has one within the tolerance.
+        events: of each event camera, 1.2 s before the first scan's first firing to 0.15 s after its last.
+    """
+
+    time_ns: int
+    images: tuple[Image, ...]
+    scans: tuple[Scan, ...]
+    events: tuple[EventCut, ...] = ()
+
+
+@dataclass
+class PairingCounts:
+    """How pairing went.
+
+    Attributes:
+        n_alone: scans with no picture within the tolerance.
+        nearest_ns: smallest difference in time of any picture to one of those; None where there was none.
+    """
+
+    n_alone: int = 0
+    nearest_ns: int | None = None
+
+
+def pair_by_time(samples: Iterable[Sample], rig: Rig, counts: PairingCounts) -> Iterator[Frame]:
+    """Give each scan of the first LiDAR heard the nearest picture of each camera channel, and its events.
+
+    Samples come in order of receipt: a scan waits until every other sensor has passed its time, or a second
+    has gone by. Where clocks are set back, what waits is given up.
+
+    Args:
+        samples: pictures, scans and packets of events; each sensor's stamps rise.
+        rig: its timestamps say what to add to stamps, and how far pairs may lie apart.
+        counts: filled as frames are made.
+    """
+    pairing = _Pairing(rig, counts)
+    for sample in samples:
+        pairing.take(sample)
+        yield from pairing.due_frames()
+    yield from pairing.remaining_frames()
+
+
+class _Pairing:
+    """Scans that wait, and what has come of the other sensors."""
+
+    def __init__(self, rig: Rig, counts: PairingCounts) -> None:
+        self._rig = rig
+        self._counts = counts
+        self._waiting: deque[tuple[int, int, Scan]] = deque()
+        self._buffers: _Buffers = {}
+        self._events = EventBuffer(rig)
+        self._anchor: str | None = None
+        # How far pictures and scans have come, and all of them.
+        self._newest_ns = self._position_ns = -(2**62)
+
+    def take(self, sample: Sample) -> None:
+        """Put a sample where it waits to be paired."""
+        time_ns = rig_time_ns(sample, self._rig)
+        if time_ns is None:
+            return
+        if isinstance(sample, Events):
+            self._events.add(sample)
+        else:
+            # Told once a scan: samples come hundreds of times as often.
+            half_ns = _half_sweep_ns(sample, self._rig) if isinstance(sample, Scan) else 0
+            time_ns += half_ns
+            self._take_frame_part(sample, time_ns, half_ns)
+        self._position_ns = max(self._position_ns, time_ns)
+        self._events.forget_before(self._position_ns - _KEPT_NS)
+
+    def due_frames(self) -> Iterator[Frame]:
+        """Yield the frames that nothing more can come for."""
+        while self._waiting and self._is_due(*self._waiting[0][:2]):
+            yield from self._frame(*self._waiting.popleft())
+
+    def remaining_frames(self) -> Iterator[Frame]:
+        """Yield what waits when the streams have ended."""
+        while self._waiting:
+            yield from self._frame(*self._waiting.popleft())
+
+    def _take_frame_part(self, sample: Image | Scan, time_ns: int, half_ns: int) -> None:
+        if time_ns < self._newest_ns - 2 * PATIENCE_NS:
+            self._waiting.clear()
+            self._buffers.clear()
+            self._events.clear()
+            self._newest_ns = self._position_ns = time_ns
+        self._newest_ns = max(self._newest_ns, time_ns)
+        if isinstance(sample, Scan) and sample.sensor == (self._anchor or sample.sensor):
+            self._anchor = sample.sensor
+            self._waiting.append((time_ns, half_ns, sample))
+        else:
+            key = (sample.sensor, sample.channel if isinstance(sample, Image) else "")
+            self._buffers.setdefault(key, deque()).append((time_ns, sample))
+
+    def _is_due(self, time_ns: int, half_ns: int) -> bool:
+        if self._position_ns > time_ns + PATIENCE_NS:
+            return True
+        have_passed = all(buffer and buffer[-1][0] >= time_ns for buffer in self._buffers.values())
+        return bool(self._buffers) and have_passed and self._events.has_passed(time_ns + half_ns + AFTER_NS)
+
+    def _frame(self, time_ns: int, half_ns: int, scan: Scan) -> Iterator[Frame]:
+        images: list[Image] = []
+        scans = [scan]
+        nearest_ns: int | None = None
+        for key in sorted(self._buffers):
+            buffer = self._buffers[key]
+            # What lies before the nearest sample cannot be nearest to any later scan.
+            while len(buffer) > 1 and abs(buffer[1][0] - time_ns) <= abs(buffer[0][0] - time_ns):
+                buffer.popleft()
+            if not buffer:
+                continue
+            apart_ns, sample = abs(buffer[0][0] - time_ns), buffer[0][1]
+            if isinstance(sample, Image):
+                nearest_ns = apart_ns if nearest_ns is None else min(apart_ns, nearest_ns)
+            if apart_ns > _tolerance_ns(sample, scan, self._rig):
+                continue
+            if isinstance(sample, Image):
+                images.append(sample)
+            else:
+                scans.append(sample)
+        if images:
+            events = self._events.cut(time_ns - half_ns - BEFORE_NS, time_ns + half_ns + AFTER_NS)
+            yield Frame(time_ns, tuple(images), tuple(scans), events)
+        else:
+            self._counts.n_alone += 1
+            known_ns = self._counts.nearest_ns
+            if nearest_ns is not None:
+                self._counts.nearest_ns = nearest_ns if known_ns is None else min(nearest_ns, known_ns)
+
+
+def middle_of_sweep_ns(scan: Scan, rig: Rig) -> int | None:
+    """Find the rig's time at the middle of a sweep; None where the scan carries no stamp."""
+    time_ns = rig_time_ns(scan, rig)
+    return None if time_ns is None else time_ns + _half_sweep_ns(scan, rig)
+
+
+def _half_sweep_ns(scan: Scan, rig: Rig) -> int:
+    if scan.offset_ns is None or not len(scan.offset_ns):
+        return round(0.5e9 / rig.lidars[scan.sensor].rate_hz)
+    return int(scan.offset_ns.max()) // 2
+
+
+def _tolerance_ns(sample: Image | Scan, scan: Scan, rig: Rig) -> float:
+    lidar = rig.lidars[scan.sensor].timestamps.tolerance_s
+    if isinstance(sample, Image):
+        other = rig.cameras[sample.sensor].channels[sample.channel].timestamps.tolerance_s
+    else:
+        other = rig.lidars[sample.sensor].timestamps.tolerance_s
+    return max(lidar, other) * 1e9

@@ -1,0 +1,351 @@
+"""Triggered pictures and the pulses that made them, matched by their running numbers.
+
+A camera numbers its frames, a sync board its pulses. The two numbers differ by a constant, which a few
+pictures at the start tell by their time; from then on the numbers alone decide, and neither a busy computer
+nor a lost line can mix them up. The camera's stamps still watch over the constant: a pulse that the camera
+missed, or a frame that its driver did not number, shifts every later picture by whole pulses.
+"""
+
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from statistics import median
+
+from lce_rig.core.data import Image, Pulse
+from lce_rig.core.findings import Finding
+from lce_rig.timing.clock import ClockModel
+
+# VersaVIS, too, asks for four in a row.
+N_AGREE = 4
+
+_N_WAITING = 64
+_N_DELAYS = 31
+# A camera that misses more pulses at once has been set up anew.
+_MAX_SLIP = 8
+# Of the time between two pulses: nearer than this, a picture belongs to the pulse and to no other.
+_NEAR = 0.3
+_N_SLIPS_DOUBTFUL = 3
+_SLIP_WINDOW = 200
+_N_PULSES = 1024
+_N_RECENT = 8
+_MAX_INTERPOLATED = 8
+
+
+@dataclass(frozen=True, eq=False)
+class TriggeredImage:
+    """A picture and the pulse that made it.
+
+    Attributes:
+        image: as the camera gave it.
+        pulse: running number of the pulse.
+        pulse_ns: its rising edge, board time.
+        stamp_ns: the moment the picture shows, board time: the pulse and the camera's usual delay.
+        is_interpolated: whether the pulse's line was lost, and its time is between its neighbours'.
+    """
+
+    image: Image
+    pulse: int
+    pulse_ns: int
+    stamp_ns: int
+    is_interpolated: bool
+
+
+@dataclass
+class TriggerCounts:
+    """How matching went.
+
+    Attributes:
+        n_matched: pictures matched.
+        n_unmatched: pictures that no pulse could be given to.
+        n_lost_frames: frames that the camera numbered and that never came.
+        n_lost_pulses: pulses whose lines never came, of pictures that did.
+        n_missed: pulses that the camera made no frame of; they shift its numbers.
+        n_repeated: pictures and pulses that came twice.
+        n_slips: how often the constant had to be corrected.
+        n_restarts: how often the camera or the board began to count anew.
+    """
+
+    n_matched: int = 0
+    n_unmatched: int = 0
+    n_lost_frames: int = 0
+    n_lost_pulses: int = 0
+    n_missed: int = 0
+    n_repeated: int = 0
+    n_slips: int = 0
+    n_restarts: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Waiting:
+    image: Image
+    number: int
+    board_ns: int
+
+
+class TriggerMatcher:
+    """Pulses and pictures of one camera in, matched pictures out, each stream in its own order.
+
+    Attributes:
+        counts: how matching went.
+        problem: why images are not matched now; None while they are.
+    """
+
+    def __init__(self, camera: str, max_delay_ns: int, min_delay_ns: int = 0) -> None:
+        """Prepare to find the constant.
+
+        Args:
+            camera: its name in the profile.
+            max_delay_ns: latest stamp of a picture after its pulse, on the board's clock.
+            min_delay_ns: earliest; below 0 where the two clocks are tied loosely.
+        """
+        self.counts = TriggerCounts()
+        self.problem: Finding | None = Finding("pulses.nothing_yet", "error", camera)
+        self._camera = camera
+        self._window_ns = (min_delay_ns, max_delay_ns)
+        self._clock: ClockModel | None = None
+        self._pulses = PulseLog()
+        self._waiting: deque[_Waiting] = deque()
+        self._agreeing: list[_Waiting] = []
+        self._constant: int | None = None
+        self._candidate: int | None = None
+        self._delays_ns: deque[int] = deque(maxlen=_N_DELAYS)
+        self._doubtful: list[_Waiting] = []
+        self._last: tuple[int, int] | None = None
+        self._slipped_at: deque[int] = deque(maxlen=_N_SLIPS_DOUBTFUL)
+
+    def set_clock(self, board_from_camera: ClockModel) -> None:
+        """Take the board's time on the camera's clock, by which the start is found."""
+        self._clock = board_from_camera
+
+    def take_pulse(self, pulse: Pulse) -> list[TriggeredImage]:
+        """Take a pulse, and give the pictures that waited for it."""
+        if len(self._pulses) and pulse.count <= self._pulses.last_count:
+            if pulse.stamp_ns <= self._pulses.last_ns and pulse.stamp_ns in self._pulses:
+                self.counts.n_repeated += 1
+                return []
+            self._begin_anew("pulses.board_restarted")
+            self._pulses.clear()
+        self._pulses.add(pulse.count, pulse.stamp_ns)
+        return list(self._proceed())
+
+    def take_image(self, image: Image) -> list[TriggeredImage]:
+        """Take a picture, and give those whose pulses are now known."""
+        if image.count is None or image.stamp_ns is None or self._clock is None:
+            self.counts.n_unmatched += 1
+            code = "pulses.images_not_numbered" if image.count is None else "pulses.clock_not_tied"
+            self.problem = Finding(code, "error", self._camera)
+            return []
+        if self._last is not None and image.count <= self._last[0]:
+            if image.stamp_ns <= self._last[1]:
+                self.counts.n_repeated += 1
+                return []
+            self._begin_anew("pulses.camera_restarted")
+        elif self._last is not None:
+            self.counts.n_lost_frames += image.count - self._last[0] - 1
+        self._last = image.count, image.stamp_ns
+        if len(self._waiting) == _N_WAITING:
+            self._waiting.popleft()
+            self.counts.n_unmatched += 1
+            self.problem = Finding("pulses.none", "error", self._camera)
+        self._waiting.append(_Waiting(image, image.count, self._clock.convert(image.stamp_ns)))
+        return list(self._proceed())
+
+    def _proceed(self) -> Iterator[TriggeredImage]:
+        while self._waiting and len(self._pulses):
+            frame = self._waiting[0]
+            if self._constant is None:
+                # Only when the pulses have come past a picture's time are all that could be its own known.
+                if self._pulses.last_ns <= frame.board_ns - self._window_ns[0]:
+                    return
+                yield from self._seek(self._waiting.popleft())
+            elif frame.number - self._constant > self._pulses.last_count:
+                return
+            else:
+                yield from self._follow(self._waiting.popleft())
+
+    def _seek(self, frame: _Waiting) -> Iterator[TriggeredImage]:
+        """Look for the constant: the same for several pictures in a row, each with one possible pulse."""
+        least_ns, most_ns = self._window_ns
+        possible = self._pulses.within(frame.board_ns - most_ns, frame.board_ns - least_ns)
+        # A pulse lost on the way is missing among the possible, and makes another look like the only one.
+        is_ambiguous = len(possible) > 1 or self._pulses.least_period_ns() < most_ns - least_ns
+        constant = frame.number - possible[0] if len(possible) == 1 and not is_ambiguous else None
+        if is_ambiguous:
+            window = {"window_ms": (most_ns - least_ns) / 1e6}
+            self.problem = Finding("pulses.ambiguous", "error", self._camera, window)
+        elif not possible:
+            self.problem = Finding("pulses.images_without", "error", self._camera)
+        if constant is None or constant != self._candidate:
+            self._drop(self._agreeing)
+            self._candidate = constant
+        if constant is None:
+            self.counts.n_unmatched += 1
+            return
+        self._agreeing = [*self._agreeing, frame]
+        if len(self._agreeing) == N_AGREE:
+            self._constant, self.problem = constant, None
+            agreeing, self._agreeing = self._agreeing, []
+            for known in agreeing:
+                found = self._pulses.time_of(known.number - constant)
+                assert found is not None
+                self._delays_ns.append(known.board_ns - found[0])
+            for known in agreeing:
+                yield from self._emit(known)
+
+    def _follow(self, frame: _Waiting) -> Iterator[TriggeredImage]:
+        """Match by number, and keep an eye on the time."""
+        assert self._constant is not None
+        if self._pulses.time_of(frame.number - self._constant) is None:
+            self.counts.n_unmatched += 1
+            return
+        shift = self._shift(frame)
+        if shift == 0:
+            # What looked like a slip was a picture with a late stamp.
+            doubtful, self._doubtful = self._doubtful, []
+            for known in (*doubtful, frame):
+                yield from self._emit(known)
+            found = self._pulses.time_of(frame.number - self._constant)
+            if found is not None:
+                self._delays_ns.append(frame.board_ns - found[0])
+            return
+        self._doubtful.append(frame)
+        if len(self._doubtful) == N_AGREE:
+            doubtful, self._doubtful = self._doubtful, []
+            yield from self._settle(doubtful)
+
+    def _settle(self, doubtful: list[_Waiting]) -> Iterator[TriggeredImage]:
+        """Decide on several pictures in a row that are at odds with their pulses' times."""
+        shifts = {self._shift(frame) for frame in doubtful}
+        shift = shifts.pop()
+        if shifts or shift is None or self._is_slipping(doubtful[-1].number):
+            self._drop(doubtful)
+            self._begin_anew("pulses.not_followed")
+            return
+        assert self._constant is not None
+        self._constant -= shift
+        self.counts.n_slips += 1
+        self.counts.n_missed += max(shift, 0)
+        self._slipped_at.append(doubtful[-1].number)
+        for frame in doubtful:
+            yield from self._emit(frame)
+
+    def _is_slipping(self, number: int) -> bool:
+        is_full = len(self._slipped_at) == _N_SLIPS_DOUBTFUL
+        return is_full and number - self._slipped_at[0] < _SLIP_WINDOW
+
+    def _shift(self, frame: _Waiting) -> int | None:
+        """Tell by how many pulses a picture's time is off its number's; None where it is between pulses."""
+        assert self._constant is not None
+        number = frame.number - self._constant
+        made_ns = frame.board_ns - round(median(self._delays_ns))
+        found = self._pulses.time_of(number)
+        if found is None:
+            return 0
+        off = (made_ns - found[0]) / self._pulses.period_ns(number)
+        return round(off) if abs(off - round(off)) < _NEAR and abs(off) < _MAX_SLIP else None
+
+    def _emit(self, frame: _Waiting) -> Iterator[TriggeredImage]:
+        assert self._constant is not None
+        number = frame.number - self._constant
+        found = self._pulses.time_of(number)
+        if found is None:
+            self.counts.n_unmatched += 1
+            return
+        time_ns, is_interpolated = found
+        self.counts.n_lost_pulses += is_interpolated
+        self.counts.n_matched += 1
+        stamp_ns = time_ns + round(median(self._delays_ns))
+        yield TriggeredImage(frame.image, number, time_ns, stamp_ns, is_interpolated)
+
+    def _begin_anew(self, code: str) -> None:
+        self.problem = Finding(code, "error", self._camera)
+        self.counts.n_restarts += 1
+        for frames in (self._waiting, self._agreeing, self._doubtful):
+            self._drop(frames)
+        self._constant = self._candidate = self._last = None
+        self._delays_ns.clear()
+        self._slipped_at.clear()
+
+    def _drop(self, frames: list[_Waiting] | deque[_Waiting]) -> None:
+        self.counts.n_unmatched += len(frames)
+        frames.clear()
+
+
+class PulseLog:
+    """The last thousand pulses of one line, numbers and board times rising."""
+
+    def __init__(self) -> None:
+        self._counts: list[int] = []
+        self._times_ns: list[int] = []
+
+    def __len__(self) -> int:
+        return len(self._counts)
+
+    def __contains__(self, time_ns: int) -> bool:
+        at = bisect_left(self._times_ns, time_ns)
+        return at < len(self._times_ns) and self._times_ns[at] == time_ns
+
+    def add(self, count: int, time_ns: int) -> None:
+        """Append a pulse."""
+        self._counts.append(count)
+        self._times_ns.append(time_ns)
+        if len(self._counts) > 2 * _N_PULSES:
+            del self._counts[:_N_PULSES], self._times_ns[:_N_PULSES]
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._counts.clear()
+        self._times_ns.clear()
+
+    @property
+    def last_count(self) -> int:
+        """Number of the last pulse."""
+        return self._counts[-1]
+
+    @property
+    def last_ns(self) -> int:
+        """Time of the last pulse."""
+        return self._times_ns[-1]
+
+    def within(self, start_ns: float, end_ns: float) -> list[int]:
+        """List the numbers of the pulses from a time to another, both included."""
+        first = bisect_left(self._times_ns, start_ns)
+        return [
+            count
+            for count, time_ns in zip(self._counts[first:], self._times_ns[first:], strict=True)
+            if time_ns <= end_ns
+        ]
+
+    def time_of(self, count: int) -> tuple[int, bool] | None:
+        """Find the time of a pulse, and whether it is interpolated between neighbours.
+
+        Returns:
+            None where neither it nor neighbours within 8 numbers of each other are known.
+        """
+        after = bisect_left(self._counts, count)
+        if after < len(self._counts) and self._counts[after] == count:
+            return self._times_ns[after], False
+        if not 0 < after < len(self._counts):
+            return None
+        n_apart = self._counts[after] - self._counts[after - 1]
+        if n_apart > _MAX_INTERPOLATED:
+            return None
+        span_ns = self._times_ns[after] - self._times_ns[after - 1]
+        return self._times_ns[after - 1] + span_ns * (count - self._counts[after - 1]) // n_apart, True
+
+    def period_ns(self, count: int) -> float:
+        """Tell the time between two pulses about a number; infinite where there is but one pulse."""
+        if len(self._counts) < 2:
+            return float("inf")
+        after = min(max(bisect_left(self._counts, count), 1), len(self._counts) - 1)
+        return self._period_before(after)
+
+    def least_period_ns(self) -> float:
+        """Tell the shortest time between two pulses among the last few."""
+        recent = range(max(1, len(self._counts) - _N_RECENT), len(self._counts))
+        return min((self._period_before(after) for after in recent), default=float("inf"))
+
+    def _period_before(self, after: int) -> float:
+        n_apart = self._counts[after] - self._counts[after - 1]
+        return (self._times_ns[after] - self._times_ns[after - 1]) / n_apart

@@ -1,0 +1,205 @@
+"""Why an extrinsic is doubted: the reasons of a verdict, and its notes."""
+
+import math
+
+from lce_rig.core.findings import Finding
+from lce_rig.words.rendering import Phrase, Template
+
+_AXES = ("x right", "y down", "z forward")
+_RANGES = (
+    "measure the LiDAR's constant range errors, which alone exceed the target, correct them in its driver "
+    "and lower range_offset_sigma_m and laser_bias_sigma_m in the profile, or put more rings on the board"
+)
+_LENS = "check that the intrinsics belong to this lens and that the board is flat"
+_WAYS = {
+    "bootstrap": "bootstrap samples",
+    "left_out": "leave-one-out results",
+    "halves": "random halves of the captures",
+}
+_APART = "{rotation_deg:deg}, {translation_m:mm}"
+
+
+def _sigma(unit: str, scale: float) -> Template:
+    def text(finding: Finding) -> str:
+        what = "rotation" if unit == "deg" else "translation"
+        sigma, target = finding.figure(f"sigma_{_suffix(unit)}"), finding.figure(f"target_{_suffix(unit)}")
+        by_axis = finding.figures[f"by_axis_{_suffix(unit)}"]
+        assert isinstance(by_axis, tuple)
+        sizes = [scale * float(str(axis)) for axis in by_axis]
+        axes = ", ".join(f"{name} {size:.2g}" for name, size in zip(_AXES, sizes, strict=True))
+        reached = f"{scale * sigma:.2g} {unit}, target {scale * target:.2g} {unit}"
+        return f"{what} standard deviation {reached} ({axes})"
+
+    suffix = _suffix(unit)
+    text.__doc__ = f"Standard deviation {{sigma_{suffix}}}, target {{target_{suffix}}}, {{by_axis_{suffix}}}."
+    return text
+
+
+def _suffix(unit: str) -> str:
+    return "deg" if unit == "deg" else "m"
+
+
+def _intrinsics(finding: Finding) -> str:
+    """Intrinsics do not fit: {rms_px}, {possible_px}, {displacement_px}, {turn_deg}, {focal_ratio}."""
+    q = finding.figures
+    how = "do not fit" if finding.severity == "error" else "fit only roughly"
+    parts = ["corners fit, but only because the boards' poses are off"]
+    if q["is_visible"]:
+        rms_px, possible_px = finding.figure("rms_px"), finding.figure("possible_px")
+        parts = [f"reprojection error {rms_px:.2f} px, possible {possible_px:.2f} px"]
+    displacement_px = q["displacement_px"]
+    if not isinstance(displacement_px, float) or not math.isfinite(displacement_px):
+        parts.append("they project to no pixels where boards were seen")
+    elif q["is_bent"]:
+        parts.append(
+            f"pixels displaced by {displacement_px:.1f} +- {finding.figure('displacement_sigma_px'):.1f} px"
+        )
+    if q["is_turned"]:
+        turn = f"{finding.figure('turn_deg'):.2f} +- {finding.figure('turn_sigma_deg'):.2f} deg"
+        parts.append(f"that alone rotates the extrinsics by {turn}")
+    if q["is_focal_off"]:
+        percent = 100 * (finding.figure("focal_ratio") - 1)
+        larger = "larger" if percent > 0 else "smaller"
+        parts.append(
+            f"focal length {abs(percent):.1f} +- {100 * finding.figure('focal_sigma'):.1f} % {larger}"
+        )
+    return f"the profile's intrinsics {how}: {'; '.join(parts)}"
+
+
+def _scale(finding: Finding) -> str:
+    """Camera distances differ by {scale} +- {scale_sigma}: squares {square_m}, not {profile_square_m}."""
+    scale = finding.figure("scale")
+    longer = "longer" if scale > 0 else "shorter"
+    percent = f"{100 * abs(scale):.1f} +- {100 * finding.figure('scale_sigma'):.1f} %"
+    wanted_m = finding.figure("profile_square_m")
+    squares = f"{1000 * finding.figure('square_m'):.1f} mm instead of {1000 * wanted_m:.1f} mm"
+    return (
+        f"camera distances are {percent} {longer} than the LiDAR's: the squares measure {squares}, "
+        "or the intrinsics belong to another lens"
+    )
+
+
+def _widened(finding: Finding) -> str:
+    """Standard deviations are {ratio} times the method's, as {spread} vary."""
+    way = _WAYS[str(finding.figures["spread"])]
+    return f"standard deviations widened {finding.figure('ratio'):.1f} times: {way} vary that much"
+
+
+def _plate(finding: Finding) -> str:
+    """The plate's {side} is {measured_m} in the scans, {profile_m} in the profile."""
+    measured_m, profile_m = finding.figure("measured_m"), finding.figure("profile_m")
+    percent, size = 100 * abs(measured_m / profile_m - 1), "larger" if measured_m > profile_m else "smaller"
+    return (
+        f"plate {finding.figures['side']} {measured_m:.3f} m in the scans, {profile_m:.3f} m in the profile: "
+        f"{percent:.1f} % {size}"
+    )
+
+
+PHRASES: dict[str, Phrase] = {
+    "verdict.text": Phrase("{text}"),
+    "verdict.no_certificate": Phrase(
+        "not certified: method {method} has no certificate", "use --method paper"
+    ),
+    "verdict.not_certified": Phrase(
+        "not certified as the global minimum (gap {gap:.1e})", "collect more captures"
+    ),
+    "verdict.rotation_uncertain": Phrase(
+        _sigma("deg", 1.0),
+        "collect more captures; least determined: {weakest}",
+        {"measure_ranges": _RANGES + "; least determined: {weakest}"},
+    ),
+    "verdict.translation_uncertain": Phrase(
+        _sigma("mm", 1000.0),
+        "collect more captures; least determined: {weakest}",
+        {"measure_ranges": _RANGES + "; least determined: {weakest}"},
+    ),
+    "verdict.plane_residual": Phrase(
+        "LiDAR points {mean_m:mm} on average from the camera's board planes (limit {limit_m:mm})",
+        "hold the board still, check board size and intrinsics",
+    ),
+    "verdict.edge_residual": Phrase(
+        "ring ends {mean_m:mm} on average from the board's edges (limit {limit_m:mm})",
+        "hold the board still, check board size and intrinsics",
+    ),
+    "verdict.held_out": Phrase(
+        "held-out captures fit worse ({held_out_m:1mm}) than captures used ({fitted_m:1mm})",
+        "collect more captures",
+    ),
+    "verdict.planes_apart": Phrase(
+        "camera and LiDAR board planes differ by {rms_m:mm} rms (still boards: under 10 mm)",
+        "hold the board still and check the image-scan matching",
+        {"compensated": "move the board more slowly and evenly, about 10 cm/s"},
+    ),
+    "verdict.channels_differ": Phrase(
+        "{first} and {second} of one camera differ by " + _APART + ", beyond their uncertainty",
+        "calibrate each alone (--channels) and see which captures contradict it",
+    ),
+    "verdict.sensors_disagree": Phrase(
+        "the sensors disagree in {n_refused} of {n_captures} captures ({captures})",
+        "look for a moving board, a second board, or wrong matching",
+    ),
+    "verdict.few_used": Phrase(
+        "{n_used} of {n_captures} captures could be used", "see the causes with `lce-rig check`"
+    ),
+    "verdict.few_placements": Phrase(
+        "{n_used} captures show {n_placements} different placements (minimum {n_needed})",
+        "move the board between captures",
+    ),
+    "verdict.far_from_nominal": Phrase(
+        "{rotation_deg:1deg}, {translation_m:mm} from the nominal extrinsics "
+        "(tolerance {tolerance_deg:g} deg, {tolerance_m:mm})",
+        "check nominal_extrinsics and the frames in the profile, and that these sensors were used",
+    ),
+    "verdict.plate_size": Phrase(_plate, "measure the plate"),
+    "verdict.intrinsics": Phrase(
+        _intrinsics,
+        "check whether lens or resolution were changed, run `lce-rig intrinsics` and put its numbers "
+        "into the profile",
+        {
+            "refocused": "check whether the lens was refocused, run `lce-rig intrinsics` and put its numbers "
+            "into the profile"
+        },
+    ),
+    "verdict.changed": Phrase(
+        "extrinsics change significantly at capture {capture}, by " + _APART,
+        "fasten the sensors, one may have moved, and collect again",
+    ),
+    "verdict.shares_differ": Phrase(
+        "{first} and {second} boards differ significantly, by " + _APART,
+        _LENS,
+        {"near": "check the squares' size and the focal length, and that the board is flat"},
+    ),
+    "verdict.control": Phrase(
+        "control failed: moved by " + _APART + " ({direction}), the result fits held-out captures no worse",
+        "collect more captures; if this persists, re-measure the board",
+    ),
+    "verdict.scale": Phrase(_scale, "measure the squares"),
+    "verdict.edge_shift": Phrase(
+        "ring ends {shift_m:mm} beyond the plate's edges (limit {limit_m:mm}, the beam's width)",
+        "measure the plate",
+    ),
+    "verdict.laser_offset": Phrase(
+        "ranges of laser ring {ring} {offset_m:mm} too long (limit {limit_m:mm}, from the profile)",
+        "correct them in the LiDAR's driver",
+    ),
+    "verdict.camera_changed": Phrase(
+        "{subject}, by their images alone, change significantly at capture {capture}, by " + _APART,
+        "fasten the cameras, one may have moved, and collect again",
+    ),
+    "verdict.camera_shares_differ": Phrase(
+        "{subject}, by their images alone: {first} and {second} boards differ significantly, by " + _APART,
+        _LENS,
+        {"near": "check the squares' size and the focal length, and that the board is flat"},
+    ),
+    "verdict.cameras_scatter": Phrase(
+        "{subject}: images put the same board {rms_m:mm} apart, rms, wherever the cameras sit "
+        "({scatter:.1f} times the typical value)",
+        "hold the board still between the images and check the intrinsics",
+    ),
+    "verdict.cameras_differ": Phrase(
+        "{subject}: the same board {rms_m:mm} apart ({images_rms_m:mm} by the images alone), "
+        "extrinsics and images differ by " + _APART,
+        "check whether a camera has moved, and the intrinsics",
+    ),
+    "verdict.widened": Phrase(_widened),
+}

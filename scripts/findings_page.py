@@ -1,0 +1,78 @@
+#!/usr/bin/env python3
+"""Write docs/findings.md: every code that `--json` and result.json may hold, with its figures and words."""
+
+import string
+import sys
+from importlib import import_module
+from pathlib import Path
+
+from lce_rig.words.rendering import FAMILIES, Phrase, Template
+
+PAGE = Path(__file__).parents[1] / "docs" / "findings.md"
+HEAD = """# Findings
+What lce-rig finds is a fact: a code, a severity, the figures and, where several actions are possible, an
+action code. `--json`, result.json and intrinsics.json hold these facts. Codes, figure names, units and action
+codes are stable; texts may change in any release.
+
+| field | content |
+|---|---|
+| `code` | what was found, "family.name" |
+| `severity` | `note`: changes nothing; `warning`: usable, less well; `error`: must not be used |
+| `subject` | what it is about: a sensor, a capture, a profile key or a file; "" where it is plain |
+| `figures` | by name with units: `_m`, `_deg`, `_s`, `_px`, `_mps`; null where a figure is not known |
+| `action_code` | which of several actions applies; "" for the usual one |
+| `text`, `action` | the same in words, for people |
+
+Refused captures have `stage` and `cause` in place of `severity` and `text`; the code begins with the stage:
+`read`, `image`, `lidar`, `pair` (camera and LiDAR disagree) or `calibrate`. Codes that end in `.text` come
+from results of earlier versions, which held words only.
+
+`scripts/findings_page.py` writes this page from the tables in `lce_rig/words/`.
+"""
+
+
+def page() -> str:
+    """Build the page."""
+    parts = [HEAD]
+    for family in FAMILIES:
+        module = import_module(f"lce_rig.words.{family}")
+        title = (module.__doc__ or family).splitlines()[0].rstrip(".")
+        parts.append(f"## {title}\n| code | figures | text | action |\n|---|---|---|---|")
+        parts.extend(_row(code, phrase) for code, phrase in sorted(module.PHRASES.items()))
+        parts.append("")
+    return "\n".join(parts)
+
+
+def _row(code: str, phrase: Phrase) -> str:
+    actions = [
+        _said(phrase.action),
+        *(f"`{name}`: {_said(each)}" for name, each in (phrase.actions or {}).items()),
+    ]
+    templates = [phrase.text, phrase.action, *(phrase.actions or {}).values()]
+    names = dict.fromkeys(name for template in templates for name in _figures(template))
+    cells = (
+        f"`{code}`",
+        ", ".join(names),
+        _said(phrase.text),
+        "<br>".join(action for action in actions if action),
+    )
+    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
+
+
+def _figures(template: Template) -> list[str]:
+    """Name the figures of a template; those of a function stand in its docstring, as {name}."""
+    text = template if isinstance(template, str) else template.__doc__ or ""
+    return [name for _, name, _, _ in string.Formatter().parse(text) if name and name != "subject"]
+
+
+def _said(template: Template) -> str:
+    """Show a template with the names of its figures in place of their values."""
+    text = template if isinstance(template, str) else (template.__doc__ or "").splitlines()[0].rstrip(".")
+    return "".join(
+        before + (f"*{name}*" if name else "") for before, name, _, _ in string.Formatter().parse(text)
+    )
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
+    sys.stdout.write(f"{PAGE}\n")

@@ -1,0 +1,82 @@
+"""An object in another process: its answers, its errors, and what happens when its process ends."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from lce_rig.collect.live import worker
+from lce_rig.collect.live.worker import Worker
+from lce_rig.core.errors import ProfileError, SourceError
+
+
+class Adder:
+    """Sums what it is given, and remembers it."""
+
+    def __init__(self, first: int) -> None:
+        self.total = first
+        self.kept: np.ndarray | None = None
+
+    def add(self, values: np.ndarray) -> int:
+        self.total += int(values.sum())
+        self.kept = values if self.kept is None else self.kept
+        return self.total
+
+    def keep(self) -> np.ndarray | None:
+        return self.kept
+
+    def process(self) -> int:
+        return os.getpid()
+
+    def threads(self) -> str | None:
+        return os.environ.get("OPENBLAS_NUM_THREADS")
+
+    def refuse(self) -> None:
+        raise ProfileError("what", "hint")
+
+    def fail(self) -> None:
+        raise ZeroDivisionError
+
+    def die(self) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.fixture(scope="module")
+def adder():
+    with Worker("add", Adder, 5) as opened:
+        yield opened
+
+
+def test_arrays_arrive_whole_and_are_not_overwritten_by_the_next(adder):
+    first = np.arange(300_000, dtype=np.uint16).reshape(300, 1000)
+    assert adder.call("add", first) == 5 + int(first.sum())
+    adder.call("add", np.zeros_like(first))
+    assert np.array_equal(adder.call("keep"), first)
+
+
+def test_what_does_not_fit_into_shared_memory_arrives_all_the_same(adder):
+    large = np.ones(worker._SHARED_BYTES + 8, dtype=np.uint8)
+    assert adder.call("add", large) - adder.call("add", np.zeros(1)) == 0
+    assert adder.call("add", large[::2]) > len(large)
+
+
+def test_it_runs_in_another_process_that_computes_in_one_thread(adder):
+    assert adder.call("process") != os.getpid()
+    assert adder.call("threads") == "1" and "OPENBLAS_NUM_THREADS" not in os.environ
+
+
+def test_errors_of_the_user_arrive_as_they_are_and_bugs_as_bugs(adder):
+    with pytest.raises(ProfileError) as caught:
+        adder.call("refuse")
+    assert (caught.value.what, caught.value.hint) == ("what", "hint")
+    with pytest.raises(RuntimeError, match="ZeroDivisionError"):
+        adder.call("fail")
+
+
+def test_a_process_that_was_killed_is_started_again_and_one_that_always_dies_is_an_error():
+    with Worker("add", Adder, 7) as opened:
+        os.kill(opened.call("process"), signal.SIGKILL)
+        assert opened.call("add", np.ones(3)) == 10
+        with pytest.raises(SourceError):
+            opened.call("die")

@@ -1,0 +1,54 @@
+"""The jackknife covariance against sampling, and its steps against estimates made without a group."""
+
+import numpy as np
+
+from lce_rig.residuals.quadratics import jackknife_scatter, without_prior
+
+
+def sample_regressions(n_groups, n_trials, seed=0):
+    """Fit lines of 3 coefficients to groups whose residuals share one error: errors and covariances."""
+    rng = np.random.default_rng(seed)
+    design = rng.normal(size=(n_groups, 10, 3))
+    errors, covariances = [], []
+    for _ in range(n_trials):
+        noise = rng.normal(size=(n_groups, 1)) + 0.1 * rng.normal(size=(n_groups, 10))
+        hessians = design.swapaxes(1, 2) @ design
+        right = (design.swapaxes(1, 2) @ noise[..., None])[..., 0]
+        estimate = np.linalg.solve(hessians.sum(axis=0), right.sum(axis=0))
+        gradients = (design.swapaxes(1, 2) @ (design @ estimate - noise)[..., None])[..., 0]
+        errors.append(estimate)
+        cost = without_prior(gradients, hessians, np.arange(n_groups))
+        covariances.append(cost.jackknife_covariance())
+    return np.array(errors), np.array(covariances)
+
+
+def test_normalised_errors_have_the_right_size_although_residuals_of_a_group_share_their_error():
+    errors, covariances = sample_regressions(n_groups=25, n_trials=800)
+    nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    assert 2.3 < nees.mean() < 3.5  # 3 expected
+
+
+def test_few_groups_are_not_trusted_too_far():
+    errors, covariances = sample_regressions(n_groups=7, n_trials=800)
+    nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    assert np.median(nees) < 2.37  # the median of chi square with 3 degrees
+
+
+def test_moves_are_those_of_estimates_made_anew_without_each_group():
+    rng = np.random.default_rng(1)
+    group = np.array([0, 0, 1, 2, 2, 2, 3])
+    A, b = rng.normal(size=(7, 5, 3)), rng.normal(size=(7, 5))
+
+    def fit(is_used):
+        return np.linalg.lstsq(A[is_used].reshape(-1, 3), b[is_used].ravel())[0]
+
+    estimate = fit(group >= 0)
+    gradients = np.einsum("fni,fn->fi", A, A @ estimate - b)
+    hessians = np.swapaxes(A, 1, 2) @ A
+    cost = without_prior(gradients, hessians, group)
+    moves = cost.moves()
+    np.testing.assert_allclose(moves, cost.without_each(), atol=1e-12)
+    anew = np.array([fit(group != k) for k in range(4)])
+    np.testing.assert_allclose(estimate + moves, anew, atol=1e-12)
+    expected = 3 / 4 * (anew - estimate).T @ (anew - estimate)
+    np.testing.assert_allclose(jackknife_scatter(moves), expected, atol=1e-12)

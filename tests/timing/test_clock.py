@@ -1,0 +1,247 @@
+"""Offset and drift of clocks: the truth lies within the stated sigmas, jumps are seen, hours completed."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lce_rig.timing.clock import HOUR_NS, ClockModel, resolve_hour
+from lce_rig.timing.clock_fit import TimePairs, fit_arrivals, fit_clock, match_edges
+from lce_rig.timing.clock_tracker import ClockTracker
+
+START_NS = 1_753_000_000_123_456_789
+S = 1_000_000_000
+
+
+class Device:
+    """A device whose clock began at a moment of the host's, and goes faster than it by `drift`."""
+
+    def __init__(self, drift, offset_ns=5 * S):
+        self.drift, self.offset_ns = drift, offset_ns
+
+    def stamp_ns(self, elapsed_ns):
+        """Read it, in whole microseconds, at times since START_NS."""
+        elapsed_ns = np.asarray(elapsed_ns)
+        return np.int64(elapsed_ns * (1 + self.drift) + self.offset_ns) // 1000 * 1000
+
+    def host_ns(self, stamp_ns):
+        """The exact host time of a device time."""
+        return START_NS + round((stamp_ns - self.offset_ns) / (1 + self.drift))
+
+    def error_sigmas(self, model, stamp_ns):
+        return (model.convert(stamp_ns) - self.host_ns(stamp_ns)) / model.sigma_ns(stamp_ns)
+
+
+def exchanges(rng, device, n=100, span_s=10.0, way_ns=73_000.0, jitter_ns=100_000.0):
+    """Requests over a shared machine: ways of unequal length, usual jitter, a few that waited for long."""
+    sent = np.sort(rng.uniform(0, span_s, n)) * S
+    share = rng.uniform()
+    there = 2 * way_ns * share + rng.exponential(jitter_ns, n) * np.where(rng.uniform(size=n) < 0.05, 20, 1)
+    back = 2 * way_ns * (1 - share) + rng.exponential(jitter_ns, n)
+    back *= np.where(rng.uniform(size=n) < 0.03, 200, 1)
+    received = sent + there + 20_000 + back
+    return TimePairs.from_exchanges(
+        START_NS + np.int64(sent),
+        START_NS + np.int64(received),
+        device.stamp_ns(sent + there),
+        device.stamp_ns(sent + there + 20_000),
+    )
+
+
+def edges(rng, device, n=60, period_s=0.5, noise_ns=20_000.0):
+    times = np.arange(n) * period_s * S
+    seen = START_NS + np.int64(times + rng.normal(scale=noise_ns, size=n))
+    return TimePairs.from_edges(device.stamp_ns(times), seen)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def test_ten_seconds_of_requests_tell_the_drift_to_a_part_in_a_million():
+    errors, sigmas = [], []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        device = Device(drift=40e-6)
+        model = fit_clock(exchanges(rng, device), "time requests")
+        errors.append(model.drift - (1 / 1.00004 - 1))
+        sigmas.append(errors[-1] / np.sqrt(model.cov[1, 1]))
+    assert rms(errors) < 1.5e-6
+    assert 0.7 < rms(sigmas) < 1.3
+
+
+@pytest.mark.parametrize("where_s", [0.0, 5.0, 10.0, 40.0])
+def test_the_time_from_requests_is_off_by_no_more_than_its_sigma_says(where_s):
+    sigmas = []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        device = Device(drift=rng.normal(scale=40e-6))
+        model = fit_clock(exchanges(rng, device), "time requests")
+        sigmas.append(device.error_sigmas(model, int(device.stamp_ns(where_s * S))))
+    # Ways that differ by all of their length are rarer than the model allows for.
+    assert 0.5 < rms(sigmas) < 1.2
+
+
+@pytest.mark.parametrize("where_s", [0.0, 15.0, 29.5])
+def test_the_time_from_edges_is_off_by_as_much_as_its_sigma_says(where_s):
+    sigmas = []
+    for seed in range(300):
+        device = Device(drift=-25e-6)
+        model = fit_clock(edges(np.random.default_rng(seed), device), "edges")
+        sigmas.append(device.error_sigmas(model, int(device.stamp_ns(where_s * S))))
+    assert 0.85 < rms(sigmas) < 1.2
+
+
+def test_a_drift_that_changes_after_the_data_is_allowed_for():
+    device = Device(drift=40e-6)
+    model = fit_clock(edges(np.random.default_rng(0), device), "edges")
+    later = model.last_ns + 600 * S
+    warmer = device.host_ns(model.last_ns) + round(600 * S / (1 + 41e-6))
+    assert abs(model.convert(later) - warmer) < 2 * model.sigma_ns(later)
+    assert model.sigma_ns(later) > 10 * model.sigma_ns(model.last_ns)
+
+
+def test_a_fifth_of_false_edges_does_not_move_the_line():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        device = Device(drift=40e-6)
+        pairs = edges(rng, device, n=100)
+        wrong = rng.choice(100, 20, replace=False)
+        pairs.reference_ns[wrong] += np.int64(rng.uniform(5e6, 500e6, 20))
+        model = fit_clock(pairs, "edges")
+        assert model.n_left_out >= 20
+        assert abs(device.error_sigmas(model, model.anchor_ns)) < 4
+
+
+def test_exact_readings_are_known_no_better_than_their_resolution():
+    stamps = np.arange(10, dtype=np.int64) * S
+    model = fit_clock(TimePairs.from_edges(stamps, stamps + START_NS), "edges")
+    assert model.convert(int(stamps[3])) == START_NS + 3 * S
+    assert model.sigma_ns(model.anchor_ns) == pytest.approx(1000 / np.sqrt(12) / np.sqrt(10))
+
+
+def test_too_few_readings_make_no_model():
+    pairs = edges(np.random.default_rng(0), Device(0.0), n=3)
+    assert fit_clock(pairs, "edges") is None
+    assert fit_clock(pairs.select(np.zeros(3, dtype=bool)), "edges") is None
+    assert fit_arrivals(pairs.source_ns, pairs.reference_ns, "pulses") is None
+    same = TimePairs.from_edges(np.full(9, S), np.full(9, START_NS))
+    assert fit_clock(same, "edges") is None
+
+
+def test_arrivals_give_the_drift_and_own_up_to_a_millisecond():
+    drifts = []
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        device = Device(drift=40e-6)
+        times = np.arange(600) * 0.05 * S
+        late = 160_000 + rng.exponential(500_000, 600)
+        model = fit_arrivals(device.stamp_ns(times), START_NS + np.int64(times + late), "pulses")
+        drifts.append(model.drift - (1 / 1.00004 - 1))
+        assert abs(device.error_sigmas(model, model.anchor_ns)) < 1
+    assert rms(drifts) < 4e-6
+
+
+def test_there_and_back_is_where_it_began():
+    model = fit_clock(edges(np.random.default_rng(1), Device(300e-6)), "edges")
+    for stamp_ns in (0, model.anchor_ns, model.last_ns + 3600 * S):
+        assert abs(model.inverse().convert(model.convert(stamp_ns)) - stamp_ns) <= 2
+        assert model.inverse().sigma_ns(model.convert(stamp_ns)) == pytest.approx(
+            model.sigma_ns(stamp_ns), rel=1e-3
+        )
+
+
+def test_models_in_a_row_convert_like_one_after_the_other_and_add_their_errors():
+    camera, board = Device(40e-6, 7 * S), Device(-90e-6, 2 * S)
+    sigmas = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        times = np.arange(80) * 0.3 * S
+        noisy = camera.stamp_ns(times + rng.normal(scale=30_000, size=80))
+        to_board = fit_clock(TimePairs.from_edges(noisy, board.stamp_ns(times)), "edges")
+        through = to_board.then(fit_clock(edges(rng, board), "edges"))
+        stamp_ns = int(camera.stamp_ns(20 * S))
+        sigmas.append(camera.error_sigmas(through, stamp_ns))
+    assert 0.85 < rms(sigmas) < 1.2
+    assert through.origin == "80 edges, then 60 edges"
+
+
+def test_one_array_is_converted_like_its_elements():
+    model = fit_clock(edges(np.random.default_rng(2), Device(40e-6)), "edges")
+    stamps = np.arange(20, dtype=np.int64) * 7 * S + START_NS
+    assert model.convert_all(stamps).tolist() == [model.convert(int(stamp)) for stamp in stamps]
+    assert model.sigmas_ns(stamps).tolist() == [model.sigma_ns(int(stamp)) for stamp in stamps]
+
+
+def test_edges_find_their_partners_in_spite_of_losses_and_bounces():
+    rng = np.random.default_rng(3)
+    device = Device(40e-6)
+    times = np.arange(200) * 0.05 * S
+    coarse = ClockModel(0, START_NS - 5 * S + 4_000_000, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, 0, 0, "start")
+    seen = rng.uniform(size=200) < 0.8
+    bounced = np.sort(np.concatenate([times[seen], times[seen][::7] + 3000]))
+    made = rng.uniform(size=200) < 0.9
+    pairs = match_edges(device.stamp_ns(bounced), START_NS + np.int64(times[made]), coarse, 10e6)
+    assert len(pairs) == (seen & made).sum()
+    model = fit_clock(pairs, "edges")
+    assert abs(model.drift - (1 / 1.00004 - 1)) < 0.2e-6
+
+
+def test_edges_closer_than_the_coarse_model_can_tell_apart_are_not_matched():
+    stamps = np.arange(50, dtype=np.int64) * 15_000_000
+    coarse = ClockModel(0, 0, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, 0, 0, "start")
+    assert match_edges(stamps, stamps, coarse, 10e6) is None
+    assert len(match_edges(stamps, stamps, coarse, 5e6)) == 50
+    assert len(match_edges(stamps[:0], stamps, coarse, 5e6)) == 0
+    assert len(match_edges(stamps[:1], stamps[:1], coarse, 5e6)) == 1
+
+
+def followed(rng, jump_ns, at_s, what="host"):
+    tracker, device, steps = ClockTracker("time requests"), Device(40e-6), []
+    pairs = exchanges(rng, device, n=300, span_s=30.0)
+    for source, reference, bound in zip(
+        pairs.source_ns.tolist(), pairs.reference_ns.tolist(), pairs.bound_ns.tolist(), strict=True
+    ):
+        after = reference - START_NS > at_s * S
+        moved = (
+            (source, reference + jump_ns * after) if what == "host" else (source - jump_ns * after, reference)
+        )
+        step = tracker.add(*moved, bound)
+        steps += [step] if step else []
+    return tracker, device, steps
+
+
+@pytest.mark.parametrize("jump_ns", [3 * S, -3 * S, 20_000_000, -2_000_000])
+def test_a_host_clock_that_is_set_is_noticed_once_and_followed(jump_ns):
+    for seed in range(5):
+        tracker, device, steps = followed(np.random.default_rng(seed), jump_ns, at_s=20)
+        assert len(steps) == 1 and tracker.steps == steps
+        assert steps[0].size_ns == pytest.approx(jump_ns, abs=1_000_000)
+        stamp_ns = int(device.stamp_ns(30 * S))
+        error_ns = tracker.model.convert(stamp_ns) - device.host_ns(stamp_ns) - jump_ns
+        assert abs(error_ns) < 4 * tracker.model.sigma_ns(stamp_ns)
+
+
+def test_a_device_that_begins_anew_is_noticed_at_its_first_reading():
+    tracker, _, steps = followed(np.random.default_rng(0), 15 * S, at_s=15, what="device")
+    assert [round(step.size_ns / S) for step in steps] == [15]
+    assert tracker.model.n_used < 200
+
+
+def test_steady_clocks_never_jump():
+    for seed in range(10):
+        _, _, steps = followed(np.random.default_rng(seed), 0, at_s=20)
+        assert steps == []
+
+
+def test_a_tracker_forgets_what_is_older_than_its_window():
+    tracker = ClockTracker("edges", window_s=10)
+    for k in range(2_000):
+        tracker.add(k * S // 10, START_NS + k * S // 10)
+    assert tracker.model.n_used <= 101
+    assert tracker.model.first_ns >= 189 * S
+
+
+@given(st.integers(0, 3 * 10**18), st.integers(-HOUR_NS // 2 + 1, HOUR_NS // 2 - 1))
+def test_the_hour_comes_from_a_clock_that_is_right_within_half_an_hour(true_ns, error_ns):
+    assert resolve_hour(true_ns % HOUR_NS, true_ns + error_ns) == true_ns

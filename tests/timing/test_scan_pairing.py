@@ -1,0 +1,75 @@
+"""Streams of several sensors become frames."""
+
+import numpy as np
+
+from lce_rig.core.data import Image, Scan
+from lce_rig.timing.scan_pairing import PATIENCE_NS, PairingCounts, pair_by_time
+
+MS = 1_000_000
+
+
+def image(time_ms, channel="frames"):
+    return Image("cam", channel, round(time_ms * MS), np.zeros((2, 2), np.uint8))
+
+
+def scan(time_ms, has_times=True):
+    """A sweep of 100 ms whose middle is at `time_ms`."""
+    offset_ns = np.array([0, 100 * MS]) if has_times else None
+    points, zeros = np.ones((2, 3), np.float32), np.zeros(2)
+    return Scan(
+        "lidar", round((time_ms - 50) * MS), points, zeros.astype("f4"), zeros.astype("i2"), offset_ns
+    )
+
+
+def pairs(samples, rig):
+    counts = PairingCounts()
+    frames = list(pair_by_time(samples, rig, counts))
+    return [(f.time_ns // MS, [i.stamp_ns // MS for i in f.images]) for f in frames], counts
+
+
+def test_each_scan_gets_the_picture_nearest_to_its_middle(rig):
+    pictures = [image(t) for t in (970, 1003, 1036, 1069, 1102, 1135)]
+    samples = sorted([scan(1000), scan(1100), *pictures], key=lambda s: s.stamp_ns)
+    assert pairs(samples, rig)[0] == [(1000, [1003]), (1100, [1102])]
+
+
+def test_scans_without_times_last_as_long_as_the_profile_says(rig):
+    assert pairs([scan(1000, has_times=False), image(1000)], rig)[0] == [(1000, [1000])]
+
+
+def test_pictures_that_come_much_later_than_their_scan_still_find_it(rig):
+    samples = [scan(1000), scan(1100), scan(1200), image(1000), image(1100), image(1200)]
+    assert [images for _, images in pairs(samples, rig)[0]] == [[1000], [1100], [1200]]
+
+
+def test_what_lies_outside_the_tolerance_is_left_alone_and_measured(rig):
+    found, counts = pairs([image(900), scan(1000), image(1080)], rig)
+    assert found == [] and counts.n_alone == 1 and counts.nearest_ns == 80 * MS
+
+
+def test_a_camera_that_falls_silent_does_not_hold_up_the_rest(rig):
+    samples = [image(1000), *(scan(1000 + 100 * k) for k in range(30))]
+    counts = PairingCounts()
+    frames = pair_by_time(samples, rig, counts)
+    assert next(frames).time_ns == 1000 * MS
+    assert list(frames) == [] and counts.n_alone == 29
+    assert PATIENCE_NS < 29 * 100 * MS
+
+
+def test_a_clock_set_back_does_not_mix_before_and_after(rig):
+    before = [s for k in range(5) for s in (scan(10**7 + 100 * k), image(10**7 + 100 * k))]
+    after = [s for k in range(5) for s in (scan(1000 + 100 * k), image(1000 + 100 * k))]
+    found, _ = pairs(before + after, rig)
+    assert all(images == [time] for time, images in found) and len(found) >= 9
+
+
+def test_samples_without_a_stamp_are_passed_over(rig):
+    timeless = Image("cam", "frames", None, np.zeros((2, 2), np.uint8))
+    assert pairs([timeless, scan(1000), image(1000)], rig)[0] == [(1000, [1000])]
+
+
+def test_the_nearest_picture_is_told_of_scans_that_found_none(rig):
+    samples = sorted([image(1000), scan(1000), scan(1100), scan(1200)], key=lambda s: s.stamp_ns)
+    found, counts = pairs(samples, rig)
+    assert found == [(1000, [1000])]
+    assert (counts.n_alone, counts.nearest_ns) == (2, 100 * MS)
