@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+import numpy as np
 
 from lce_rig.cli import show
-from lce_rig.cli.cameras import camera_lines, lacking_extrinsics, together_lines
 from lce_rig.cli.options import (
     cameras_option,
     event_image_option,
@@ -17,10 +17,118 @@ from lce_rig.cli.options import (
     session_argument,
     split_names,
 )
-from lce_rig.cli.uncertainty import uncertainty_lines
-from lce_rig.core.results import Calibration
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.geometry import Array, sigma_sizes
+from lce_rig.core.results import Calibration, OtherCamera
 from lce_rig.detect.detection import Pair
 from lce_rig.words import sentence
+
+# How the report of a calibration states what is uncertain: by axis, and for points at several distances.
+
+_AXES = ("x right", "y down", "z forward")
+
+
+def uncertainty_lines(calibration: Calibration) -> list[str]:
+    """State an extrinsic's standard deviations and its least certain motion, in lines of 80 columns."""
+    c = calibration
+    sigmas = np.sqrt(np.diag(c.cov))
+    return [
+        f"  known to     {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
+        f"               about {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
+        f"               along {_by_axis(1000 * sigmas[:3], '.1f')} mm",
+        f"  weakest: {c.weak_direction}",
+        *_at_distances(c),
+    ]
+
+
+def _by_axis(values: Array, digits: str) -> str:
+    return ", ".join(f"{axis} {value:{digits}}" for axis, value in zip(_AXES, values, strict=True))
+
+
+def _at_distances(c: Calibration) -> list[str]:
+    if not c.uncertainty:
+        return []
+    columns = [f"{each.distance_m:g} m away" for each in c.uncertainty]
+    centre = [f"{each.centre_px:.1f} px, {100 * each.centre_m:.1f} cm" for each in c.uncertainty]
+    corner = [f"{each.corner_px:.1f} px, {100 * each.corner_m:.1f} cm" for each in c.uncertainty]
+    return [
+        f"  {title:<13}" + "".join(f"{cell:<20}" for cell in cells).rstrip()
+        for title, cells in (("a point", columns), ("  in centre", centre), ("  in corner", corner))
+    ]
+
+
+# How a calibration is reported of several cameras: how they sit to each other, which one has no result.
+
+
+def together_lines(calibration: Calibration) -> list[str]:
+    """Say with which cameras an extrinsic was estimated, and how well it is known without them."""
+    if not calibration.estimated_with:
+        return []
+    figures = calibration.diagnostics
+    alone = ""
+    if "alone_sigma_rotation_deg" in figures:
+        sigma_mm = 1000 * figures["alone_sigma_translation_m"]
+        alone = f"; alone it is known to {figures['alone_sigma_rotation_deg']:.3f} deg, {sigma_mm:.1f} mm"
+    return [f"  together     with {', '.join(calibration.estimated_with)}{alone}"]
+
+
+def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) -> list[str]:
+    """State where cameras earlier in the result sit to this one; each two cameras are stated once."""
+    c = calibration
+    others = {other.camera: other for other in c.other_cameras}
+    lines: list[str] = []
+    for earlier in calibrations[: calibrations.index(c)]:
+        if earlier.lidar == c.lidar and earlier.camera in others:
+            lines += _camera_lines(c.camera, others[earlier.camera])
+        elif earlier.lidar == c.lidar:
+            lines.append(
+                f"[bold]{earlier.camera} and {c.camera}[/]: no board held still before both: "
+                "neither is held against the other"
+            )
+    return lines
+
+
+def lacking_extrinsics(
+    wanted: Sequence[str], seen: Collection[str], calibrations: Sequence[Calibration]
+) -> NotEnoughDataError | None:
+    """Say which cameras have no extrinsic, None where all have: half a rig must not pass for the whole.
+
+    Args:
+        wanted: cameras that should have one.
+        seen: cameras of which the session holds captures.
+        calibrations: what there is, at least one.
+    """
+    calibrated = {calibration.camera for calibration in calibrations}
+    missing = [camera for camera in wanted if camera not in calibrated]
+    if not missing:
+        return None
+    causes = [f"No capture holds a picture of {name} and a scan." for name in missing if name not in seen]
+    others = " ".join(f"--camera {name}" for name in wanted if name in calibrated)
+    return NotEnoughDataError(
+        f"no extrinsic of camera {', '.join(missing)}",
+        "\n".join([*causes, f"Collect more captures; to do without: {others}"]),
+    )
+
+
+def _camera_lines(camera: str, other: OtherCamera) -> list[str]:
+    name = other.camera
+    lines = [
+        f"[bold]{name} and {camera}[/], by {other.n_captures} captures of both",
+        f"  T_{camera}_{name} (p_{camera} = R p_{name} + t)",
+        *("    " + "  ".join(f"{value: .6f}" for value in row) for row in other.T_cam_other[:3]),
+    ]
+    if other.cov is not None:
+        sigma_deg, sigma_m = sigma_sizes(other.cov)
+        lines.append(f"  known to     {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm (1 sigma)")
+    if other.apart_rotation_deg is not None and other.apart_translation_m is not None:
+        by_itself = ", each camera by itself" if other.cov is not None else ""
+        lines.append(
+            f"  pictures     differ by {other.apart_rotation_deg:.3f} deg, "
+            f"{1000 * other.apart_translation_m:.1f} mm{by_itself}"
+        )
+    lines.append(f"  boards       {1000 * other.board_rms_m:.1f} mm apart")
+    return lines
+
 
 if TYPE_CHECKING:
     from lce_rig.pipeline.result_files import WrittenResults

@@ -7,15 +7,28 @@ from functools import partial
 from pathlib import Path
 
 from lce_rig.collect.health import Check
-from lce_rig.collect.health.clocks import check_clock, check_edges, check_offsets, check_sync
+from lce_rig.collect.health.clocks import (
+    check_clock,
+    check_edges,
+    check_frames_of_pulses,
+    check_offsets,
+    check_pulses_sent,
+    check_sync,
+)
 from lce_rig.collect.health.computer import COMPUTER_CHECKS
-from lce_rig.collect.health.devices import check_device, check_stream
+from lce_rig.collect.health.devices import (
+    check_board,
+    check_device,
+    check_events,
+    check_picture,
+    check_pulse,
+    check_settings,
+    check_stream,
+    read_web,
+)
 from lce_rig.collect.health.examination import Examination
 from lce_rig.collect.health.observing import Observation, observe
-from lce_rig.collect.health.pictures import check_board, check_events, check_picture
-from lce_rig.collect.health.pulses import check_frames_of_pulses, check_pulses_sent
 from lce_rig.collect.health.sensors import driver_of, sensors, source_of
-from lce_rig.collect.health.velodyne import check_pulse, check_settings, read_web
 from lce_rig.core.data import Image
 from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.core.findings import Finding

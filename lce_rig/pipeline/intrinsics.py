@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate.intrinsics import MIN_CAPTURES, estimate_intrinsics
+from lce_rig.calibrate.intrinsics import MIN_CAPTURES, Choice, choose_model, estimate_intrinsics
 from lce_rig.calibrate.intrinsics_check import IntrinsicsCheck, compare_with_given
-from lce_rig.calibrate.intrinsics_choice import Choice, choose_model
 from lce_rig.calibrate.intrinsics_coverage import find_weaknesses
 from lce_rig.calibrate.intrinsics_difference import LensCertainty, LensDifference, certainty_of
 from lce_rig.calibrate.intrinsics_estimate import IntrinsicsEstimate, View

@@ -1,18 +1,154 @@
 """Profiles from and to YAML, found by name or by path."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, get_args
 
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
-from lce_rig.rig.document import Document, read_document
-from lce_rig.rig.explaining import explain
+from lce_rig.rig.document import Document, KeyPath, read_document
 from lce_rig.rig.profile import Rig
+from lce_rig.rig.settings import PATTERNS
+
+# Validation errors as sentences that name file, line, key and the nearest valid key.
+
+# To look for the key that was meant takes a millisecond each; nobody reads as many.
+_MOST_SHOWN = 100
+
+
+@dataclass(frozen=True)
+class _Problem:
+    path: KeyPath
+    what: str
+    # The key that was probably meant by an unknown one: it need not be reported missing as well.
+    meant: KeyPath | None = None
+
+
+def explain(error: ValidationError, document: Document) -> ProfileError:
+    """Build the error for the user: each problem once, in the order of the file's lines."""
+    details = error.errors()
+    problems = {
+        problem.path: problem for problem in reversed([_problem(detail) for detail in details[:_MOST_SHOWN]])
+    }
+    meant = {problem.meant for problem in problems.values()}
+    lines = [
+        (document.line(path), f"{'.'.join(map(str, path))}: {problem.what}" if path else problem.what)
+        for path, problem in problems.items()
+        if path not in meant
+    ]
+    sentences = [f"{document.source}:{line}: {text}" for line, text in sorted(lines)]
+    if len(sentences) == 1:
+        return ProfileError(sentences[0])
+    n_more = max(len(details) - _MOST_SHOWN, 0)
+    what = f"{document.source}: {len(sentences) + n_more} problems"
+    return ProfileError(what, "\n".join([*sentences, *([f"and {n_more} more"] if n_more else [])]))
+
+
+def _problem(detail: ErrorDetails) -> _Problem:
+    path = tuple(part for part in detail["loc"] if part != "[key]")
+    kind, given, context = detail["type"], detail["input"], detail.get("ctx", {})
+    if kind == "extra_forbidden":
+        return _unknown_key(path)
+    if kind == "missing" and isinstance(path[-1], int):
+        return _Problem(path[:-1], f"{_shown(given)} has too few values")
+    if kind == "missing":
+        return _Problem(path, "is missing")
+    if kind == "profile":
+        return _Problem((*path, *_parts(context["key"])), context["what"])
+    if kind == "string_pattern_mismatch":
+        return _Problem(path, f"{_shown(given)}: {PATTERNS[context['pattern']]}")
+    if "controls" in path[:-2]:
+        # The last part names a member of the union that the value was tried as.
+        return _Problem(path[:-1], "must be a text, a number, true or false")
+    what = detail["msg"].replace("Input should", "must").replace("Tuple should", "must")
+    what = (
+        what.replace("a valid i", "an i")
+        .replace("a valid ", "a ")
+        .replace("List should", "must")
+        .replace(" after validation", "")
+    )
+    return _Problem(path, f"{what}; {_shown(given)} given")
+
+
+def _parts(key: str) -> KeyPath:
+    return tuple(int(part) if part.isdigit() else part for part in key.split(".") if part)
+
+
+def _shown(value: Any) -> str:
+    text = "nothing" if value is None else repr(value)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def _unknown_key(path: KeyPath) -> _Problem:
+    key = str(path[-1])
+    valid = valid_keys(path[:-1])
+    # A forgotten unit is the likeliest slip: for difflib, fx is as close to fy_px as to fx_px.
+    nearest = [name for name in valid if name.startswith(f"{key}_")]
+    nearest = nearest or difflib.get_close_matches(key, valid, n=1)
+    if nearest:
+        return _Problem(path, f"unknown key; did you mean {nearest[0]}?", (*path[:-1], nearest[0]))
+    elsewhere = [block for block, name in all_keys() if name == key]
+    if elsewhere:
+        return _Problem(path, f"unknown key here; it belongs into {elsewhere[0] or 'the top level'}")
+    return _Problem(path, f"unknown key; known are {', '.join(valid)}")
+
+
+def valid_keys(path: KeyPath) -> list[str]:
+    """List the keys that a block may have.
+
+    Args:
+        path: the block's path; () for the whole profile.
+    """
+    model: type[BaseModel] | None = Rig
+    parts = list(path)
+    while parts and model is not None:
+        key = str(parts.pop(0))
+        annotation = model.model_fields[key].annotation if key in model.model_fields else None
+        model = _model_within(annotation)
+        # The names of sensors and the places in lists lie between a block and its settings.
+        if parts and not _is_block(annotation):
+            parts.pop(0)
+    return list(model.model_fields) if model is not None else []
+
+
+def _is_model(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _is_block(annotation: Any) -> bool:
+    """Return a block of settings, optional or not, from many by name or in a list."""
+    return _is_model(annotation) or any(_is_model(argument) for argument in _members(annotation))
+
+
+def _members(annotation: Any) -> tuple[Any, ...]:
+    return get_args(annotation) if isinstance(annotation, UnionType) else ()
+
+
+def _model_within(annotation: Any) -> type[BaseModel] | None:
+    """Find the settings class in an annotation such as dict[Name, CameraSettings]."""
+    if _is_model(annotation):
+        found: type[BaseModel] = annotation
+        return found
+    inner = (_model_within(argument) for argument in get_args(annotation))
+    return next((model for model in inner if model is not None), None)
+
+
+def all_keys(model: type[BaseModel] = Rig, block: str = "") -> Iterator[tuple[str, str]]:
+    """List every key of the schema as (block, key), names of sensors and places in lists shown as *."""
+    for key, field in model.model_fields.items():
+        yield block, key
+        inner = _model_within(field.annotation)
+        if inner is not None:
+            name = "" if _is_block(field.annotation) else ".*"
+            yield from all_keys(inner, f"{block}.{key}{name}".removeprefix("."))
+
 
 _SUFFIXES = (".yaml", ".yml")
 

@@ -20,16 +20,46 @@ from numpy.typing import NDArray
 
 from lce_rig import __version__
 from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.documents import parse_json
 from lce_rig.core.errors import LceRigError, SessionError
+from lce_rig.core.limits import MAX_DOCUMENT_BYTES, MAX_FILE_BYTES, open_regular
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import cache
 from lce_rig.session.capture import SAFE_NAME, Capture
 from lce_rig.session.durable import WriterLock, append_line, flush_folder, own_path, replace_file
 from lce_rig.session.identity import MARKER, check_marker, differing_keys, marker_of, read_marker
-from lce_rig.session.journal import read_entries
 from lce_rig.session.membership import check_samples, event_channel
 from lce_rig.session.replacing import recover, replacing
 from lce_rig.session.writing import content_hash, write_capture
+
+# A session's journal, one event per line.
+
+
+def read_entries(path: Path) -> list[dict[str, Any]]:
+    """List the entries of a journal; lines that are none, such as one torn by a crash, are skipped.
+
+    Args:
+        path: its file; one that is not there has no entries.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is not a regular file.
+    """
+    entries: list[dict[str, Any]] = []
+    if not path.exists():
+        return entries
+    with open_regular(path) as file:
+        n_left = MAX_FILE_BYTES
+        while n_left > 0 and (line := file.readline(min(n_left, MAX_DOCUMENT_BYTES))):
+            n_left -= len(line)
+            try:
+                entry = parse_json(line)
+            except ValueError:
+                continue
+            if isinstance(entry, dict):
+                entries.append(entry)
+    return entries
+
 
 PROFILE, JOURNAL, LOCK = "rig.yaml", "journal.jsonl", ".lock"
 CAPTURES, DETECTIONS, DRAFT_PREFIX = "captures", "detections", ".new-"

@@ -1,18 +1,205 @@
 """A bag written as samples arrive, on the topics of the rig's profile."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
+
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.rig import Rig
-from lce_rig.sources.bag_messages import CLOUD_TYPE, IMAGE_TYPE, encode_image, encode_scan, typestore
-from lce_rig.sources.events.bag_writer import MESSAGE_TYPE, add_event_topic, event_messages, open_bag_writer
+from lce_rig.rig import LidarSettings, Rig
+from lce_rig.sources.events.event_array import encode_event_array
 from lce_rig.timing.rig_time import event_channel
+
+# Writing events into ROS bags as dvs_msgs/EventArray.
+#
+# References:
+#     https://github.com/uzh-rpg/rpg_dvs_ros/tree/master/dvs_msgs/msg
+
+MESSAGE_TYPE = "dvs_msgs/msg/EventArray"
+# The drivers' own rate.
+_MESSAGE_NS = 33_000_000
+_HEADER = "std_msgs/Header header\nuint32 height\nuint32 width\ndvs_msgs/Event[] events\n"
+_EVENT = {
+    True: "uint16 x\nuint16 y\ntime ts\nbool polarity\n",
+    False: "uint16 x\nuint16 y\nbuiltin_interfaces/Time ts\nbool polarity\n",
+}
+
+
+def write_event_bag(
+    path: Path, stretches: Iterable[Events], topic: str = "/dvs/events", frame_id: str = "event_camera"
+) -> None:
+    """Write a recording of events: as a ROS 1 bag where the path ends in .bag, else as a ROS 2 folder (mcap).
+
+    Raises:
+        FileExistsError: something is there already.
+    """
+    if path.exists():
+        raise FileExistsError(f"{path} exists already")
+    is_ros1 = path.suffix == ".bag"
+    with open_bag_writer(path) as writer:
+        connection = add_event_topic(writer, topic, is_ros1)
+        number = 0
+        for stretch in stretches:
+            for received_ns, message in event_messages(stretch, frame_id, is_ros1, number):
+                writer.write(connection, received_ns, message)
+                number += 1
+
+
+def open_bag_writer(path: Path) -> Any:
+    """Begin a bag: ROS 1 where the path ends in .bag, else ROS 2's mcap; a context manager of rosbags'."""
+    if path.suffix == ".bag":
+        from rosbags.rosbag1 import Writer as Ros1Writer
+
+        return Ros1Writer(path)
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Ros2Writer
+
+    return Ros2Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+
+
+def add_event_topic(writer: Any, topic: str, is_ros1: bool) -> Any:
+    """Announce a topic of events in a bag that may hold others as well."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(_EVENT[is_ros1], "dvs_msgs/msg/Event"))
+    store.register(get_types_from_msg(_HEADER, MESSAGE_TYPE))
+    return writer.add_connection(topic, MESSAGE_TYPE, typestore=store)
+
+
+def event_messages(
+    events: Events, frame_id: str, is_ros1: bool, first_number: int = 0
+) -> Iterator[tuple[int, bytes]]:
+    """Cut events into messages of 33 ms.
+
+    Yields:
+        Time of receipt in ns, that of the last event where the host's clock is not known, and the message.
+    """
+    if not len(events):
+        return
+    first_ns, last_ns = int(events.t_ns[0]), int(events.t_ns[-1])
+    edges_ns = np.arange(first_ns, last_ns + _MESSAGE_NS + 1, _MESSAGE_NS)
+    encoding = "ros1" if is_ros1 else "cdr"
+    number = first_number
+    for start_ns in edges_ns[:-1]:
+        part = events.between(int(start_ns), int(start_ns) + _MESSAGE_NS)
+        if len(part):
+            received_ns = int(part.t_ns[-1])
+            if events.host_ns is not None:
+                received_ns = events.host_ns + int(part.t_ns[0]) - first_ns
+            yield received_ns, encode_event_array(part, frame_id, encoding, number)
+            number += 1
+
+
+# Images and scans as ROS messages, with the fields and conventions that other programs expect.
+#
+# References:
+#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/Image.html
+#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/PointCloud2.html
+#     https://github.com/ros-drivers/velodyne (the layout of its point clouds)
+
+IMAGE_TYPE = "sensor_msgs/msg/Image"
+CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
+_NS_PER_S = 10**9
+_UINT16, _FLOAT32 = 4, 7
+# velodyne_pointcloud's: times are seconds after the header's timestamp, which float32 holds to 4 ns.
+_POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2")])
+_TIMED_POINT = np.dtype([*_POINT.descr, ("time", "<f4")])
+
+
+@cache
+def typestore(is_ros1: bool) -> Any:
+    """Load the message definitions of ROS 1 or ROS 2."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+
+
+def encode_image(image: Image, frame_id: str, is_ros1: bool, number: int) -> memoryview:
+    """Encode an image as sensor_msgs/Image, mono8 or bgr8.
+
+    Args:
+        image: the image; one without a timestamp gets 0, which readers take for none.
+        frame_id: of the header.
+        is_ros1: whether for ROS 1.
+        number: of the message in its topic; ROS 1 headers carry it.
+    """
+    height_px, width_px = image.pixels.shape[:2]
+    data = np.ascontiguousarray(image.pixels).reshape(-1)
+    message = typestore(is_ros1).types[IMAGE_TYPE](
+        header=_header(image.stamp_ns or 0, frame_id, is_ros1, number),
+        height=height_px,
+        width=width_px,
+        encoding="mono8" if image.pixels.ndim == 2 else "bgr8",
+        is_bigendian=0,
+        step=len(data) // height_px,
+        data=data,
+    )
+    return _serialize(message, IMAGE_TYPE, is_ros1)
+
+
+def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool, number: int) -> memoryview:
+    """Encode a scan as sensor_msgs/PointCloud2 with x, y, z, intensity, ring and, where known, time.
+
+    Args:
+        scan: the scan; one without a timestamp gets 0, which readers take for none.
+        settings: the LiDAR's frame, and which firing its timestamps mark.
+        is_ros1: whether for ROS 1.
+        number: of the message in its topic; ROS 1 headers carry it.
+    """
+    stamp_ns = _cloud_stamp_ns(scan, settings)
+    points = np.empty(len(scan.points), _POINT if scan.offset_ns is None else _TIMED_POINT)
+    for axis, name in enumerate("xyz"):
+        points[name] = scan.points[:, axis]
+    points["intensity"], points["ring"] = scan.intensity, scan.ring
+    if scan.offset_ns is not None:
+        points["time"] = 1e-9 * (scan.offset_ns + ((scan.stamp_ns or 0) - stamp_ns))
+    types = typestore(is_ros1).types
+    field = types["sensor_msgs/msg/PointField"]
+    message = types[CLOUD_TYPE](
+        header=_header(stamp_ns, settings.frame, is_ros1, number),
+        height=1,
+        width=len(points),
+        fields=[
+            field(name=name, offset=place, datatype=_UINT16 if kind == "<u2" else _FLOAT32, count=1)
+            for name, (kind, place, *_) in (points.dtype.fields or {}).items()
+        ],
+        is_bigendian=False,
+        point_step=points.dtype.itemsize,
+        row_step=points.nbytes,
+        data=points.view(np.uint8),
+        is_dense=True,
+    )
+    return _serialize(message, CLOUD_TYPE, is_ros1)
+
+
+def _cloud_stamp_ns(scan: Scan, settings: LidarSettings) -> int:
+    """Say what the LiDAR's driver would have timestamped: the first firing, or the last one."""
+    if scan.stamp_ns is None or settings.timestamps.reference == "first_firing":
+        return scan.stamp_ns or 0
+    if scan.offset_ns is None or not len(scan.offset_ns):
+        return scan.stamp_ns + round(_NS_PER_S / settings.rate_hz)
+    return scan.stamp_ns + int(scan.offset_ns.max())
+
+
+def _header(stamp_ns: int, frame_id: str, is_ros1: bool, number: int) -> Any:
+    types = typestore(is_ros1).types
+    seconds, nanoseconds = divmod(stamp_ns, _NS_PER_S)
+    stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
+    sequence = {"seq": number} if is_ros1 else {}
+    return types["std_msgs/msg/Header"](**sequence, stamp=stamp, frame_id=frame_id)
+
+
+def _serialize(message: Any, msgtype: str, is_ros1: bool) -> memoryview:
+    store = typestore(is_ros1)
+    data: memoryview = (store.serialize_ros1 if is_ros1 else store.serialize_cdr)(message, msgtype)
+    return data
 
 
 class BagRecorder:

@@ -9,6 +9,10 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core import limits
 from lce_rig.core.data import Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
@@ -18,13 +22,169 @@ from lce_rig.sources.base import SourceOptions, Span
 from lce_rig.sources.cloud import to_scan
 from lce_rig.sources.events.bag import BagEvents
 from lce_rig.sources.events.camera import CameraEvents
+from lce_rig.sources.events.message import MessageReader, read_header
 from lce_rig.sources.events.recording import EventRecording
 from lce_rig.sources.events.stream import NoEventsError
+from lce_rig.sources.image_file import decode_image, to_8_bit
 from lce_rig.sources.merging import merge_by_time
 from lce_rig.sources.overlap import check_overlap
-from lce_rig.sources.pointcloud2 import check_field_count, decode_pointcloud2
-from lce_rig.sources.ros_image import decode_ros_compressed_image, decode_ros_image
 from lce_rig.sources.topics import CLOUD_TYPES, Target, choose_topics
+
+# sensor_msgs/Image and CompressedImage as grey or BGR images.
+#
+# References:
+#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/image__encodings_8h_source.html
+
+# Encoding: bytes of one channel, channels, name of OpenCV's conversion to BGR ("" where none is needed).
+_ENCODINGS = {
+    "mono8": (1, 1, ""),
+    "8uc1": (1, 1, ""),
+    "mono16": (2, 1, ""),
+    "16uc1": (2, 1, ""),
+    "bgr8": (1, 3, ""),
+    "8uc3": (1, 3, ""),
+    "bgr16": (2, 3, ""),
+    "rgb8": (1, 3, "COLOR_RGB2BGR"),
+    "rgb16": (2, 3, "COLOR_RGB2BGR"),
+    "bgra8": (1, 4, "COLOR_BGRA2BGR"),
+    "8uc4": (1, 4, "COLOR_BGRA2BGR"),
+    "rgba8": (1, 4, "COLOR_RGBA2BGR"),
+    "yuv422": (1, 2, "COLOR_YUV2BGR_UYVY"),
+    "uyvy": (1, 2, "COLOR_YUV2BGR_UYVY"),
+    "yuv422_yuy2": (1, 2, "COLOR_YUV2BGR_YUY2"),
+    "yuyv": (1, 2, "COLOR_YUV2BGR_YUY2"),
+    **{f"bayer_{m}8": (1, 1, f"COLOR_Bayer{m.upper()}2BGR") for m in ("rggb", "bggr", "gbrg", "grbg")},
+    **{f"bayer_{m}16": (2, 1, f"COLOR_Bayer{m.upper()}2BGR") for m in ("rggb", "bggr", "gbrg", "grbg")},
+}
+
+
+def decode_ros_image(message: Any) -> NDArray[np.uint8]:
+    """Decode sensor_msgs/Image.
+
+    Returns:
+        (H, W) grey or (H, W, 3) BGR.
+
+    Raises:
+        ValueError: an unknown encoding, or sizes that contradict each other.
+    """
+    encoding = str(message.encoding).lower()
+    if encoding not in _ENCODINGS:
+        raise ValueError(f"its encoding {message.encoding!r} is not known; known are {', '.join(_ENCODINGS)}")
+    n_bytes, n_channels, conversion = _ENCODINGS[encoding]
+    width, height = int(message.width), int(message.height)
+    if width * height > limits.MAX_PIXELS:
+        raise ValueError(f"it declares {width}x{height} pixels, at most {limits.MAX_PIXELS} are read")
+    n_row = width * n_channels * n_bytes
+    step = int(message.step) or n_row
+    data = np.ascontiguousarray(message.data, dtype=np.uint8)
+    if width * height == 0 or step < n_row or len(data) < (height - 1) * step + n_row:
+        raise ValueError(
+            f"{len(data)} bytes are no {width}x{height} picture in {encoding} with rows of {step} bytes"
+        )
+    kind = np.dtype(f"{'>' if message.is_bigendian else '<'}u{n_bytes}")
+    rows = np.ndarray((height, width, n_channels), kind, data.data, 0, (step, n_channels * n_bytes, n_bytes))
+    pixels = rows[:, :, 0] if n_channels == 1 else rows
+    return _convert(to_8_bit(pixels.astype(kind.newbyteorder("="))), conversion)
+
+
+def decode_ros_compressed_image(message: Any) -> NDArray[np.uint8]:
+    """Decode sensor_msgs/CompressedImage.
+
+    Returns:
+        (H, W) grey or (H, W, 3) BGR.
+
+    Raises:
+        ValueError: it is damaged, or no image.
+    """
+    form = str(message.format).lower()
+    if "compresseddepth" in form:
+        raise ValueError("it is a depth image, not a picture")
+    pixels = decode_image(bytes(message.data))
+    mosaic = form.split(";")[0].strip()
+    # A camera's raw mosaic may have been compressed as if it were grey.
+    if mosaic.startswith("bayer_") and mosaic in _ENCODINGS and pixels.ndim == 2:
+        return _convert(pixels, _ENCODINGS[mosaic][2])
+    return pixels
+
+
+def _convert(pixels: NDArray[np.uint8], conversion: str) -> NDArray[np.uint8]:
+    if not conversion:
+        return pixels
+    import cv2
+
+    return np.asarray(cv2.cvtColor(pixels, getattr(cv2, conversion)), dtype=np.uint8)
+
+
+# sensor_msgs/PointCloud2 of any layout as a structured array.
+#
+# References:
+#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/PointCloud2.html
+
+_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+def check_field_count(data: bytes, encoding: str) -> None:
+    """Make sure that a message does not declare more fields than points have, before it is deserialised.
+
+    Args:
+        data: sensor_msgs/PointCloud2 as it lies in the bag.
+        encoding: "ros1" or "cdr".
+
+    Raises:
+        ValueError: it does, or it is damaged.
+    """
+    reader = MessageReader(data, encoding)
+    read_header(reader)  # Height and width stand behind the header as they do in messages of events.
+    n_fields = reader.number("I")
+    if n_fields > limits.MAX_FIELDS:
+        raise ValueError(f"it declares {n_fields} fields a point, at most {limits.MAX_FIELDS} are read")
+
+
+def decode_pointcloud2(message: Any) -> NDArray[Any]:
+    """View a message's points by their names, row by row.
+
+    Field offsets, gaps between fields, gaps behind rows and byte order are as the message says.
+
+    Args:
+        message: sensor_msgs/PointCloud2 of ROS 1 or 2.
+
+    Returns:
+        Structured (height * width,); fields with a count of c > 1 have shape (c,).
+
+    Raises:
+        ValueError: what in the message contradicts itself.
+    """
+    order = ">" if message.is_bigendian else "<"
+    names: list[str] = []
+    formats: list[Any] = []
+    offsets: list[int] = []
+    for entry in message.fields:
+        if entry.datatype not in _KINDS:
+            raise ValueError(f"field {entry.name!r} has the unknown datatype {entry.datatype}")
+        kind, count = np.dtype(order + _KINDS[entry.datatype]), max(int(entry.count), 1)
+        if entry.offset + kind.itemsize * count > message.point_step:
+            raise ValueError(f"field {entry.name!r} does not fit into point_step {message.point_step}")
+        if entry.name and entry.name not in names:
+            names.append(entry.name)
+            formats.append(kind if count == 1 else (kind, (count,)))
+            offsets.append(int(entry.offset))
+    width, height, step = int(message.width), int(message.height), int(message.point_step)
+    if width * height > limits.MAX_POINTS:
+        raise ValueError(f"it declares {width * height} points, at most {limits.MAX_POINTS} are read")
+    # Some drivers leave row_step at zero in point clouds of one row.
+    row_step = int(message.row_step) or width * step
+    if row_step < width * step:
+        raise ValueError(f"row_step {row_step} is less than {width} points of {step} bytes")
+    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    if width * height == 0:
+        return np.empty(0, dtype=dtype)
+    data = np.ascontiguousarray(message.data, dtype=np.uint8)
+    n_needed = (height - 1) * row_step + width * step
+    if len(data) < n_needed:
+        raise ValueError(f"{len(data)} of {n_needed} bytes of its points are there")
+    rows: NDArray[Any] = np.ndarray((height, width), dtype, data.data, 0, (row_step, step))
+    return rows.reshape(-1)
+
 
 # A timestamp this much earlier than the one before is a clock that was set, not a message that came late.
 CLOCK_JUMP_NS = 1_000_000_000

@@ -37,8 +37,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate import CalibrationEstimate, EstimateSettings
+from lce_rig.calibrate.algorithm_1 import solve_planes
 from lce_rig.calibrate.calibrate import METHODS
-from lce_rig.calibrate.initial import solve_planes
 from lce_rig.calibrate.observability import require_observable
 from lce_rig.calibrate.options import Estimator
 from lce_rig.calibrate.report import report_estimate

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from lce_rig.calibrate.intrinsics import estimate_intrinsics
+from lce_rig.calibrate.intrinsics import choose_model, estimate_intrinsics
 from lce_rig.calibrate.intrinsics_check import check_intrinsics, compare_with_given, explain
-from lce_rig.calibrate.intrinsics_choice import choose_model
 from lce_rig.calibrate.intrinsics_coverage import find_weaknesses, reach, tilts_deg
 from lce_rig.calibrate.intrinsics_difference import certainty_of, compare_lenses
 from lce_rig.calibrate.intrinsics_estimate import View

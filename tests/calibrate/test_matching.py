@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.calibrate.matching import match_candidates
 from lce_rig.core.geometry import perturb
+from lce_rig.verify.session_check import match_candidates
 from tests.calibrate.boards import BOARD, T_FORWARD, simulate
 
 

@@ -11,10 +11,10 @@ from lce_rig.calibrate import CaptureCandidates, EstimateSettings, error_to_refe
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.pcd import decode_pcd
 from lce_rig.core.results import Refusal
-from lce_rig.core.rings import rings_from_elevation
 from lce_rig.detect.image_board import find_image_board
 from lce_rig.detect.lidar_board import find_lidar_boards
 from lce_rig.rig import Rig, load_rig
+from lce_rig.sources.cloud import rings_from_elevation
 
 pytestmark = pytest.mark.dataset
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from lce_rig.cli.braille import draw_outlines
-from lce_rig.cli.live_view import PlainView, ScreenView, render
+from lce_rig.cli.live_view import PlainView, ScreenView, draw_outlines, render
 from lce_rig.collect.guidance import Coverage
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, StreamState
 

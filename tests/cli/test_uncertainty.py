@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.cli.uncertainty import uncertainty_lines
+from lce_rig.cli.calibrate import uncertainty_lines
 from lce_rig.core.results import Calibration, Certificate, Metrics, PointUncertainty
 
 WEAK = "translation along the camera's z axis (line of sight), sigma 104.9 mm"

@@ -8,7 +8,7 @@ import pytest
 
 from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
-from lce_rig.cli.cameras import camera_lines, together_lines
+from lce_rig.cli.calibrate import camera_lines, together_lines
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import difference, invert
 from lce_rig.core.results import Refusal

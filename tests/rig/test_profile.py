@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import exp_so3
 from lce_rig.rig import CalibrationSettings, QualitySettings, Rig, find_profile, load_rig, parse_rig
-from lce_rig.rig.explaining import all_keys
+from lce_rig.rig.loading import all_keys
 from lce_rig.rig.sensors import LidarSettings
 
 RLFS = find_profile("rlfs").read_text(encoding="utf-8")

@@ -6,7 +6,7 @@ import pytest
 
 from lce_rig.core.errors import ProfileError
 from lce_rig.rig import Rig, dump_rig, find_profile, load_rig, parse_rig
-from lce_rig.rig.explaining import all_keys, valid_keys
+from lce_rig.rig.loading import all_keys, valid_keys
 
 RLES = find_profile("rles").read_text(encoding="utf-8")
 KIND = "        kind: events\n"

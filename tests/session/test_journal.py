@@ -2,7 +2,7 @@ import os
 
 import pytest
 
-from lce_rig.session.journal import read_entries
+from lce_rig.session.session import read_entries
 
 
 def test_lines_that_are_no_entries_are_skipped(tmp_path):

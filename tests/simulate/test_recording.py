@@ -11,9 +11,9 @@ from lce_rig.core.geometry import invert, transform
 from lce_rig.rig import Rig
 from lce_rig.simulate import HandMotion, SimulatedRecording, SimulationOptions, simulate_recording
 from lce_rig.simulate.recording import stamp_of
+from lce_rig.sources.bag_recorder import write_event_bag
 from lce_rig.sources.events import open_events
 from lce_rig.sources.events.aedat4_writer import write_aedat4
-from lce_rig.sources.events.bag_writer import write_event_bag
 
 from .test_moving_captures import found_corners, moving_rig
 

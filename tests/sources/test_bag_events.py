@@ -11,8 +11,8 @@ from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig, load_rig
 from lce_rig.sources import SourceOptions, open_recording
+from lce_rig.sources.bag_recorder import open_bag_writer
 from lce_rig.sources.base import ContinuousRecording
-from lce_rig.sources.events.bag_writer import open_bag_writer
 from lce_rig.timing.rig_time import rig_time_ns
 from tests.sources.events import encoders
 from tests.sources.events.bags import write_packet_bag
@@ -120,8 +120,7 @@ def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_pat
 
 
 def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path: Path, rig: Rig) -> None:
-    from lce_rig.sources.bag_messages import encode_image, encode_scan, typestore
-    from lce_rig.sources.events.bag_writer import add_event_topic
+    from lce_rig.sources.bag_recorder import add_event_topic, encode_image, encode_scan, typestore
 
     def write(path: Path, has_pictures: bool) -> Path:
         with open_bag_writer(path) as writer:

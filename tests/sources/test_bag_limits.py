@@ -22,8 +22,7 @@ from lce_rig.rig import Rig
 from lce_rig.sources import open_recording
 from lce_rig.sources.bag_file import BagFile
 from lce_rig.sources.base import ContinuousRecording
-from lce_rig.sources.events.bag import BagEvents
-from lce_rig.sources.events.event_packet import PacketDecoder, parse_packet
+from lce_rig.sources.events.bag import BagEvents, PacketDecoder, parse_packet
 from lce_rig.sources.events.stream import Findings, join
 from lce_rig.sources.events.word_codec import EVT3, WordDecoder
 

@@ -8,9 +8,8 @@ import pytest
 
 from lce_rig.core.errors import SourceError
 from lce_rig.core.pcd import encode_pcd
-from lce_rig.sources.cloud_file import read_cloud
+from lce_rig.sources.cloud_file import decode_ply, read_cloud
 from lce_rig.sources.image_file import read_image, to_8_bit
-from lce_rig.sources.ply import decode_ply
 
 POINTS = np.array(
     [(1.5, -2, 3, 7), (4, 5, 6, 9)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f8"), ("ring", "u2")]

@@ -15,9 +15,8 @@ from lce_rig.simulate.vlp16_packets import SensorPacket
 from lce_rig.sources import open_recording
 from lce_rig.sources.base import ContinuousRecording, SourceOptions
 from lce_rig.sources.datagrams import Datagram, build_frame
-from lce_rig.sources.pcap import PcapRecording
-from lce_rig.sources.pcap_file import PcapFile
-from lce_rig.sources.pcap_writer import PcapWriter
+from lce_rig.sources.live.vlp16_recorder import PcapWriter
+from lce_rig.sources.pcap import PcapFile, PcapRecording
 
 from .vlp16_room import NETWORK_NS, T0_NS, packets_of, room_scans
 

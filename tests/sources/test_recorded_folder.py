@@ -13,7 +13,7 @@ from lce_rig.sources.base import ContinuousRecording, SourceOptions
 from lce_rig.sources.datagrams import Datagram
 from lce_rig.sources.folder_recorder import FolderRecorder
 from lce_rig.sources.joining import JoinedRecording, join_recordings
-from lce_rig.sources.pcap_writer import PcapWriter
+from lce_rig.sources.live.vlp16_recorder import PcapWriter
 from lce_rig.sources.recorded_folder import list_parts
 
 from .rig_samples import KINDS, T0_NS, one_second

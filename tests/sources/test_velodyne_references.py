@@ -12,8 +12,7 @@ from lce_rig.simulate.vlp16_packets import STREAMED_VLP16
 from lce_rig.sources import open_recording
 from lce_rig.sources.base import SourceOptions
 from lce_rig.sources.cloud_file import read_cloud
-from lce_rig.sources.pcap import PcapRecording
-from lce_rig.sources.pcap_file import PcapFile
+from lce_rig.sources.pcap import PcapFile, PcapRecording
 from lce_rig.sources.velodyne_points import Vlp16Decoder, keep_brighter
 
 from .vlp16_room import (

@@ -5,7 +5,7 @@ import pytest
 
 from lce_rig.core.data import Pulse
 from lce_rig.timing.clock import ClockModel
-from lce_rig.timing.edge_clock import EdgeClock
+from lce_rig.timing.rig_clock import EdgeClock
 
 MS, S = 1_000_000, 1_000_000_000
 HOST_NS = 1_753_000_000 * S

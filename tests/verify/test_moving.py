@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import Clocks
-from lce_rig.calibrate.matching import match_candidates
 from lce_rig.calibrate.metrics import capture_residual
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import Calibration, Certificate, ChannelResult, Metrics, Observation
-from lce_rig.verify.moving import bring_together
+from lce_rig.verify.session_check import bring_together, match_candidates
 from tests.calibrate.boards import BOARD, T_FORWARD
 from tests.calibrate.moving_boards import Moving, simulate_moving
 

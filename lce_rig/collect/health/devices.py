@@ -1,12 +1,128 @@
 """Each sensor: whether it answers and what it is, and whether its stream comes whole and at its rate."""
 
+from dataclasses import replace
+
+import numpy as np
+
 from lce_rig.collect.health.check import Check, problems_of
 from lce_rig.collect.health.examination import Examination
 from lce_rig.collect.health.observing import Observation
 from lce_rig.collect.health.sensors import driver_of
+from lce_rig.core import velodyne
+from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Figure, Finding, Severity
+from lce_rig.core.results import Refusal
+from lce_rig.detect.event_gate import events_problem
+from lce_rig.detect.image_quality import strongest_edge_px
 from lce_rig.rig import Rig
-from lce_rig.sources.live.velodyne_web import WebReport
+from lce_rig.sources.live.velodyne_web import VelodyneWeb, WebReport, find_problems
+from lce_rig.timing.event_buffer import join_events
+
+# A VLP-16: how its web page says that it is set, and whether pulses and sentences give it UTC.
+
+_WEB_TIMEOUT_S = 1.0
+
+
+def read_web(rig: Rig, lidar: str, port: int = 80) -> WebReport | SourceError:
+    """Ask the web page of a VLP-16; why it says nothing where it does not."""
+    address = rig.lidars[lidar].driver.address or velodyne.FACTORY_ADDRESS
+    try:
+        return VelodyneWeb(address, port, _WEB_TIMEOUT_S).read()
+    except SourceError as error:
+        return error
+
+
+def check_settings(exam: Examination, sensor: str) -> Check | None:
+    """Compare what the web page says with the profile."""
+    report = exam.web.get(sensor)
+    if report is None:
+        return None
+    if isinstance(report, SourceError):
+        # A sensor that sends nothing has a line already, with all there is to check.
+        if not exam.seen[sensor].has_opened:
+            return None
+        unknown = Finding("settings.unknown", "warning", figures={"what": report.what})
+        return Check.of(sensor, "settings", unknown)
+    problems = find_problems(report, exam.rig.lidars[sensor])
+    # The pulse has a line of its own.
+    others = [problem for problem in problems if problem.code != "settings.pps"]
+    figures: dict[str, Figure] = {
+        "rotor_hz": report.rotor_hz,
+        "returns": report.returns,
+        "fov_deg": report.fov_deg,
+        "host": report.host,
+        "data_port": report.data_port,
+    }
+    return Check.of(sensor, "settings", Finding("settings.read", "note", figures=figures), *others)
+
+
+def check_pulse(exam: Examination, sensor: str) -> Check | None:
+    """Say whether the sensor is locked to pulses and knows UTC, and whose time its scans are stamped with."""
+    seen, report, lidar = exam.seen[sensor], exam.web.get(sensor), exam.rig.lidars[sensor]
+    if seen.status is None or seen.status.clock is None:
+        return None
+    clock = seen.status.clock
+    told = report.pps if isinstance(report, WebReport) and report.pps else None
+    figures: dict[str, Figure] = {"pps": told, "has_position": "pps" in clock.finding.figures}
+    pulse = Finding("clock.pulse", "note", figures=figures | dict(clock.finding.figures))
+    if clock.is_utc or lidar.timestamps.clock != "utc":
+        return Check.of(sensor, "PPS", pulse, replace(clock.finding, severity="note"))
+    severity: Severity = "error" if lidar.timestamps.sync == "hardware" else "warning"
+    way_out = Finding("clock.without_pulses", "note")
+    return Check.of(sensor, "PPS", pulse, replace(clock.finding, severity=severity), way_out)
+
+
+# What a camera's pictures and events are like, and the board in them and in a LiDAR's scans.
+
+_BLACK, _WHITE = 5, 250
+_MAX_WHITE, _MAX_BLACK = 0.2, 0.6
+_DARK_GREY, _FLAT_GREY = 50.0, 3.0
+# As the finder of boards has it: edges that are wider are blurred.
+_MAX_EDGE_PX = 6.0
+
+
+def check_picture(exam: Examination, sensor: str) -> Check | None:
+    """Judge the exposure and sharpness of the last image."""
+    images = exam.seen[sensor].images
+    if not images:
+        return None
+    grey = next(iter(images.values())).grey
+    low, high = (float(value) for value in np.percentile(grey, (1, 99)))
+    white, black = float(np.mean(grey >= _WHITE)), float(np.mean(grey <= _BLACK))
+    edge_px = strongest_edge_px(grey, high - low)
+    figures = {"grey_1": low, "grey_99": high, "white_share": white, "black_share": black, "edge_px": edge_px}
+    wrong = None
+    if high - low < _FLAT_GREY:
+        wrong = Finding("exposure.nothing_visible")
+    elif high < _DARK_GREY or black > _MAX_BLACK:
+        wrong = Finding("exposure.dark", "warning", figures={"black_share": black})
+    elif white > _MAX_WHITE:
+        wrong = Finding("exposure.bright", "warning", figures={"white_share": white})
+    elif edge_px > _MAX_EDGE_PX:
+        wrong = Finding("exposure.blurred", "warning", figures={"limit_px": _MAX_EDGE_PX})
+    return Check.of(sensor, "picture", Finding("exposure.grey", "note", figures=figures), wrong)
+
+
+def check_events(exam: Examination, sensor: str) -> Check | None:
+    """Judge the last second of events: lamps that flicker, hot pixels, too few."""
+    seen = exam.seen[sensor]
+    if not seen.events:
+        return None
+    events = join_events(list(seen.events))
+    problem = events_problem(events, int(events.t_ns[-1]) + 1, exam.rig.quality)
+    found = Finding("exposure.events", "note") if problem is None else replace(problem, severity="warning")
+    return Check.of(sensor, "events", found)
+
+
+def check_board(exam: Examination, sensor: str) -> Check | None:
+    """Say whether the sensor sees the board now."""
+    found = [board for (name, _), board in exam.boards.items() if name == sensor]
+    if not found:
+        return None
+    # Where any channel sees it, it is there.
+    seen = next((board for board in found if not isinstance(board, Refusal)), None)
+    return Check.of(sensor, "board", seen or replace(found[0], severity="warning"))
+
 
 # A rotor holds its speed within some tenths of a percent, cameras theirs within a few percent.
 _MAX_OFF_RATE = 0.05

@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,168 @@ from lce_rig.core.data import Events, Image
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.results import Refusal
 from lce_rig.detect.reconstruct.filters import NoiseFilter
-from lce_rig.detect.reconstruct.imagers import EventImager, MapImager, NetworkImager
-from lce_rig.detect.reconstruct.model import States
-from lce_rig.detect.reconstruct.refusals import still_cold, too_early, too_late
-from lce_rig.detect.reconstruct.voxels import FloatArray
+from lce_rig.detect.reconstruct.model import ReconstructionModel, States
+from lce_rig.detect.reconstruct.voxels import FloatArray, event_map, normalise_voxels, voxel_grid
 from lce_rig.detect.reconstruct.windows import WindowOptions, WindowRule, active_share, window_rule
+
+# Why there is no picture at a stamp.
+
+
+def still_cold(n_steps: int, n_warm_up: int, seen_ns: int) -> Refusal:
+    """Too little of the stream precedes the stamp for the network's state to have settled."""
+    figures = {"n_steps": n_steps, "n_warm_up": n_warm_up, "seen_s": 1e-9 * seen_ns}
+    return Refusal("read.network_settling", figures=figures)
+
+
+def too_early(stamp_ns: int, first_ns: int) -> Refusal:
+    """The stamp lies before the stream."""
+    return Refusal("read.before_events", figures={"gap_s": 1e-9 * (first_ns - stamp_ns)})
+
+
+def too_late(stamp_ns: int, last_ns: int | None) -> Refusal:
+    """The stamp lies after the stream, or there is no stream."""
+    if last_ns is None:
+        return Refusal("read.no_events")
+    return Refusal("read.after_events", figures={"gap_s": 1e-9 * (stamp_ns - last_ns)})
+
+
+# Two ways from a window of events to a picture: the recurrent network and the event map.
+
+# From arbitrary scales to 8 bits, without flicker: intensities of the network, sums of polarities.
+
+_PERCENTILES = (1.0, 99.0)
+# Smallest spread that is stretched to the full range: below it there is noise, not contrast.
+_MIN_SPREAD = 0.05
+
+
+class GreyScale(Protocol):
+    """What maps the pictures of a stream to 8 bits."""
+
+    def follow(self, picture: FloatArray) -> None:
+        """Take the next picture of the stream into account, (H, W)."""
+        ...
+
+    def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
+        """Map (H, W) to uint8."""
+        ...
+
+
+class SignedScale:
+    """Nothing is grey 128, sums of polarities brighter and darker alike, but for the largest twentieth."""
+
+    def follow(self, picture: FloatArray) -> None:
+        """Every map stands for itself."""
+
+    def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
+        """Map (H, W) to uint8."""
+        sums = np.abs(picture[picture != 0])
+        largest = float(np.percentile(sums, 95)) if len(sums) else 1.0
+        return np.asarray(np.clip(np.rint(128 + 127 * picture / largest), 0, 255), dtype=np.uint8)
+
+
+class IntensityScale:
+    """Robust minimum and maximum, smoothed over pictures.
+
+    Args:
+        memory: weight of the past, per picture, in [0, 1).
+    """
+
+    def __init__(self, memory: float = 0.8) -> None:
+        self._memory = memory
+        self._smooth: NDArray[np.float64] | None = None
+
+    def follow(self, picture: FloatArray) -> None:
+        """Take the next picture of the stream into account, (H, W)."""
+        bounds = _bounds(picture)
+        if self._smooth is not None:
+            bounds = self._memory * self._smooth + (1 - self._memory) * bounds
+        self._smooth = bounds
+
+    def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
+        """Map (H, W) to uint8."""
+        bounds = _bounds(picture) if self._smooth is None else self._smooth
+        spread = max(float(bounds[1] - bounds[0]), _MIN_SPREAD)
+        darkest = float(bounds.mean()) - spread / 2
+        scaled = (picture - darkest) * (255.0 / spread)
+        return np.asarray(np.clip(np.rint(scaled), 0, 255), dtype=np.uint8)
+
+
+def _bounds(picture: FloatArray) -> NDArray[np.float64]:
+    # Every fourth pixel in each direction tells the percentiles well enough.
+    return np.asarray(np.percentile(picture[::4, ::4], _PERCENTILES), dtype=np.float64)
+
+
+class EventImager(Protocol):
+    """What turns windows of events into pictures, one step a window."""
+
+    @property
+    def n_warm_up(self) -> int:
+        """Steps before pictures can be trusted."""
+        ...
+
+    def initial_states(self, height_px: int, width_px: int) -> States:
+        """Make the states before the first window."""
+        ...
+
+    def grey_scale(self) -> GreyScale:
+        """Make what maps the pictures of one stream to 8 bits."""
+        ...
+
+    def picture(
+        self, events: Events, start_ns: int, end_ns: int, states: States
+    ) -> tuple[FloatArray, States]:
+        """Make the picture (H, W) at end_ns from the window [start_ns, end_ns) and the states before it."""
+        ...
+
+
+class NetworkImager:
+    """The recurrent network.
+
+    Args:
+        model: ONNX file; None takes the shipped one.
+        n_warm_up: steps until the states have settled; 12 on a real DAVIS346 recording.
+        n_threads: threads of onnxruntime.
+    """
+
+    def __init__(self, model: Path | None, n_warm_up: int, n_threads: int) -> None:
+        self.model = ReconstructionModel(model, n_threads)
+        self.n_warm_up = n_warm_up
+
+    def initial_states(self, height_px: int, width_px: int) -> States:
+        """Make zero states."""
+        return self.model.initial_states(height_px, width_px)
+
+    def grey_scale(self) -> GreyScale:
+        """Follow the intensities' bounds."""
+        return IntensityScale()
+
+    def picture(
+        self, events: Events, start_ns: int, end_ns: int, states: States
+    ) -> tuple[FloatArray, States]:
+        """Take one step of the network."""
+        voxels = normalise_voxels(voxel_grid(events, self.model.n_bins, start_ns, end_ns))
+        return self.model.step(voxels, states)
+
+
+class MapImager:
+    """The event map: polarity sums of the window alone, nothing carried over."""
+
+    n_warm_up = 0
+
+    def initial_states(self, height_px: int, width_px: int) -> States:
+        """Nothing is carried over."""
+        return ()
+
+    def grey_scale(self) -> GreyScale:
+        """Draw no events as grey."""
+        return SignedScale()
+
+    def picture(
+        self, events: Events, start_ns: int, end_ns: int, states: States
+    ) -> tuple[FloatArray, States]:
+        """Sum the polarities."""
+        return event_map(events), ()
+
 
 # A window emptier than this is judged together with the one before it: too few events make noise, not edges.
 _MIN_FILL = 0.5

@@ -1,22 +1,204 @@
 """Events in ROS 1 and ROS 2 bags."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core import limits
 from lce_rig.core.errors import SourceError
 from lce_rig.sources.bag_file import BagFile, list_topics
 from lce_rig.sources.bag_storage import RawMessage
 from lce_rig.sources.events.event_array import decode_event_array
-from lce_rig.sources.events.event_packet import (
-    EventPacket,
-    PacketDecoder,
-    Triggers,
-    decode_triggers,
-    parse_packet,
-)
-from lce_rig.sources.events.message import EventHeader
-from lce_rig.sources.events.stream import EventColumns, Findings, seconds_in
+from lce_rig.sources.events.message import EventHeader, MessageReader, read_header
+from lce_rig.sources.events.stream import NS_PER_US, EventColumns, Findings, seconds_in
+from lce_rig.sources.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
+
+# event_camera_msgs/EventPacket: the sensor's own encodings inside a ROS message.
+#
+# References:
+#     https://github.com/ros-event-camera/event_camera_msgs
+#     https://github.com/ros-event-camera/event_camera_codecs
+
+ENCODINGS = ("evt3", "libcaer", "libcaer_cmp", "mono", "trigger")
+_BATCH_BYTES = 1 << 17
+# A word of two bytes may hold twelve events.
+_WORDS_AT_ONCE = 1 << 17
+_LIBCAER_WRAP_US = 1 << 31
+
+
+@dataclass(frozen=True, eq=False)
+class EventPacket:
+    """One message, undecoded.
+
+    Attributes:
+        number: of the message, as the driver counted them.
+        time_base_ns: what the timestamps inside count from; 0 where they count from the sensor's start.
+        encoding: one of `ENCODINGS`.
+        is_big_endian: byte order of the payload.
+        payload: (N,) bytes.
+    """
+
+    header: EventHeader
+    number: int
+    time_base_ns: int
+    encoding: str
+    is_big_endian: bool
+    payload: NDArray[np.uint8]
+
+    def words(self, kind: str) -> NDArray[np.void]:
+        """View the payload as words of one kind: "u2", "u8".
+
+        Raises:
+            ValueError: it does not hold a whole number of them.
+        """
+        dtype = np.dtype(f"{'>' if self.is_big_endian else '<'}{kind}")
+        if len(self.payload) % dtype.itemsize:
+            raise ValueError(f"{len(self.payload)} bytes are no whole number of {dtype.itemsize}-byte words")
+        return self.payload.view(dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class Triggers:
+    """Edges on the camera's trigger input.
+
+    Attributes:
+        t_ns: (N,) int64 device time.
+        is_rising: (N,) bool.
+        source: (N,) int16 number of the input.
+    """
+
+    t_ns: NDArray[np.int64]
+    is_rising: NDArray[np.bool_]
+    source: NDArray[np.int16]
+
+
+def parse_packet(data: bytes, encoding: str) -> EventPacket:
+    """Read a message up to its payload.
+
+    Args:
+        data: the message as it lies in the bag.
+        encoding: "ros1" or "cdr".
+
+    Raises:
+        ValueError: it is damaged.
+    """
+    reader = MessageReader(data, encoding)
+    header = read_header(reader)
+    number, time_base_ns = reader.number("Q"), reader.number("Q")
+    if time_base_ns > limits.MAX_TIME_NS:
+        raise ValueError(f"its time base, {time_base_ns} ns, is beyond any clock")
+    name = reader.text()
+    is_big_endian = bool(reader.number("B"))
+    n_bytes = limits.check_size(reader.number("I"), "a packet", limits.MAX_PACKET_BYTES)
+    payload = reader.block(n_bytes)
+    return EventPacket(header, number, time_base_ns, name, is_big_endian, payload)
+
+
+class PacketDecoder:
+    """Decodes the packets of one topic in turn; EVT3 continues from one to the next."""
+
+    def __init__(self) -> None:
+        self._evt3 = WordDecoder(EVT3)
+        self._compressed = WordDecoder(LIBCAER_CMP)
+        self._waiting: list[EventPacket] = []
+        self._n_waiting_bytes = 0
+        self._n_trigger_packets = 0
+
+    def decode(self, packet: EventPacket) -> Iterator[EventColumns]:
+        """Yield what is decoded by now: small EVT3 packets are decoded together, later.
+
+        Raises:
+            ValueError: the packet is damaged or of no known encoding.
+        """
+        if packet.encoding == "evt3":
+            packet.words("u2")
+            self._waiting.append(packet)
+            self._n_waiting_bytes += len(packet.payload)
+            if self._n_waiting_bytes >= _BATCH_BYTES:
+                yield from self.finish()
+            return
+        yield from self.finish()
+        if packet.encoding == "mono":
+            yield _decode_mono(packet)
+        elif packet.encoding == "libcaer":
+            yield _decode_libcaer(packet)
+        elif packet.encoding == "libcaer_cmp":
+            self._compressed.start_packet()
+            for words in _pieces(packet.words("u2").astype(np.uint16)):
+                yield _shift(self._compressed.decode(words), packet)
+        elif packet.encoding == "trigger":
+            self._n_trigger_packets += 1
+        else:
+            raise ValueError(f"encoding {packet.encoding!r} is none of {', '.join(ENCODINGS)}")
+
+    def finish(self) -> Iterator[EventColumns]:
+        """Yield what waits."""
+        if self._waiting:
+            words = [packet.words("u2").astype(np.uint16) for packet in self._waiting]
+            host_ns: int | None = self._waiting[0].header.stamp_ns
+            self._waiting, self._n_waiting_bytes = [], 0
+            for piece in _pieces(np.concatenate(words)):
+                events = self._evt3.decode(piece)
+                yield EventColumns(events.t_ns, events.x, events.y, events.polarity, host_ns)
+                host_ns = None
+
+    def account(self, findings: Findings) -> None:
+        """Say what was passed over, and what could not be decoded inside packets."""
+        findings.add("packets of triggers passed over", n=self._n_trigger_packets)
+        findings.add("events before the first stamp left out", n=self._evt3.n_untimed)
+        n_repaired = self._evt3.n_repaired + self._compressed.n_repaired
+        findings.add("time words that did not fit repaired", n=n_repaired)
+        findings.add(
+            "words of no known code passed over", n=self._evt3.n_unknown + self._compressed.n_unknown
+        )
+
+
+def _pieces(words: NDArray[np.uint16]) -> Iterator[NDArray[np.uint16]]:
+    return (words[at : at + _WORDS_AT_ONCE] for at in range(0, len(words), _WORDS_AT_ONCE))
+
+
+def _shift(events: EventColumns, packet: EventPacket) -> EventColumns:
+    # The driver's time base has nanoseconds of its own start; the codec drops them, and so do we.
+    base_ns = packet.time_base_ns // NS_PER_US * NS_PER_US
+    return EventColumns(events.t_ns + base_ns, events.x, events.y, events.polarity, packet.header.stamp_ns)
+
+
+def _decode_mono(packet: EventPacket) -> EventColumns:
+    """Decode polarity 1 | y 15 | x 16 | ns after the time base 32 bits."""
+    t_ns, upper, is_set = _split_mono(packet)
+    x, y = (upper & 0xFFFF).astype(np.uint16), ((upper >> 16) & 0x7FFF).astype(np.uint16)
+    return EventColumns(t_ns, x, y, is_set, packet.header.stamp_ns)
+
+
+def decode_triggers(packets: list[EventPacket]) -> Triggers:
+    """Decode packets of encoding "trigger": mono's layout, with the input's number in place of y."""
+    parts = [_split_mono(packet) for packet in packets]
+    empty = (np.empty(0, np.int64), np.empty(0, np.uint32), np.empty(0, bool))
+    t_ns, upper, is_set = (np.concatenate(column) for column in zip(*([empty] + parts), strict=True))
+    return Triggers(t_ns, is_set, ((upper >> 16) & 0x7FFF).astype(np.int16))
+
+
+def _split_mono(packet: EventPacket) -> tuple[NDArray[np.int64], NDArray[np.uint32], NDArray[np.bool_]]:
+    words = packet.words("u8").astype(np.uint64)
+    upper = (words >> np.uint64(32)).astype(np.uint32)
+    t_ns = packet.time_base_ns + (words & np.uint64(0xFFFFFFFF)).astype(np.int64)
+    return t_ns, upper, (upper >> 31).astype(bool)
+
+
+def _decode_libcaer(packet: EventPacket) -> EventColumns:
+    """Decode x 15 | y 15 | polarity 1 | valid 1 bits, then 31 bits of us, which may wrap inside a packet."""
+    pairs = packet.words("u4").astype(np.uint32)
+    if len(pairs) % 2:
+        raise ValueError(f"{len(packet.payload)} bytes are no whole number of 8-byte events")
+    where, t_us = pairs[0::2], pairs[1::2].astype(np.int64)
+    wraps = np.cumsum(np.diff(t_us, prepend=t_us[:1]) < -_LIBCAER_WRAP_US // 2)
+    t_ns = packet.time_base_ns + (t_us + wraps * _LIBCAER_WRAP_US) * NS_PER_US
+    x, y = (where >> 17).astype(np.uint16), ((where >> 2) & 0x7FFF).astype(np.uint16)
+    return EventColumns(t_ns, x, y, (where >> 1 & 1).astype(bool), packet.header.stamp_ns)
+
 
 ARRAY_TYPES = frozenset({"dvs_msgs/EventArray", "prophesee_event_msgs/EventArray"})
 # event_array_msgs is what event_camera_msgs was called before; the layout is the same.

@@ -10,10 +10,9 @@ from lce_rig.rig import CameraSettings
 from lce_rig.sources.live.base import ClockState, SourceStatus
 from lce_rig.sources.live.pixel_formats import FORMATS, PixelDecoder, find_format
 from lce_rig.sources.live.reading import LiveSource
-from lce_rig.sources.live.v4l2_clock import StampClock
+from lce_rig.sources.live.v4l2_clock import FrameTiming, Mark, StampClock, frame_timing, stamped_moment
 from lce_rig.sources.live.v4l2_controls import apply_controls, list_controls, read_exposure_us
 from lce_rig.sources.live.v4l2_device import RawFrame, VideoDevice, video_devices
-from lce_rig.sources.live.v4l2_timing import FrameTiming, Mark, frame_timing, stamped_moment
 
 # Two buffers drop pictures as soon as the computer stalls for one; eight ride out a quarter of a second.
 N_BUFFERS = 8

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lce_rig.collect.guidance.rings import cross_board
+from lce_rig.collect.guidance.evidence import cross_board
 from lce_rig.core.geometry import invert, transform
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, scan_board
 from tests.collect.guidance.boards import model, placements

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+from lce_rig.collect.health.devices import check_board, check_events, check_picture
 from lce_rig.collect.health.examination import Examination
-from lce_rig.collect.health.pictures import check_board, check_events, check_picture
 from lce_rig.core.data import Events, Image
 from lce_rig.core.findings import Finding
 from lce_rig.core.results import Refusal

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from lce_rig.collect.health.pulses import check_frames_of_pulses, check_pulses_sent
+from lce_rig.collect.health.clocks import check_frames_of_pulses, check_pulses_sent
 from lce_rig.rig import Rig
 
 from .observed import camera, codes, examination, make_rig, sync_board

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from lce_rig.collect.health.velodyne import check_pulse, check_settings
+from lce_rig.collect.health.devices import check_pulse, check_settings
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.rig import Rig

@@ -2,7 +2,7 @@
 
 import pytest
 
-from lce_rig.collect.live.simulated_pace import LEAST_S, SimulatedPace
+from lce_rig.collect.live.simulated import LEAST_S, SimulatedPace
 
 
 class Clock:

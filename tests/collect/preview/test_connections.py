@@ -8,9 +8,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from lce_rig.collect.preview import Preview, connections, viewer
+from lce_rig.collect.preview import Preview, connections
+from lce_rig.collect.preview import preview as viewer
 from lce_rig.collect.preview.connections import MAX_CONNECTIONS, MAX_OF_ONE_PEER
-from lce_rig.collect.preview.server import Server
+from lce_rig.collect.preview.preview import Server
 
 from .conftest import state
 from .watcher import Watcher

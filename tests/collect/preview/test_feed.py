@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.live.state import Drawing
-from lce_rig.collect.preview import Preview, server
+from lce_rig.collect.preview import Preview
+from lce_rig.collect.preview import preview as server
 from lce_rig.collect.preview.message import MAX_WIDTH_PX, encode_picture
-from lce_rig.collect.preview.viewer import MAX_UNDER_WAY
+from lce_rig.collect.preview.preview import MAX_UNDER_WAY
 
 from .conftest import PRESENT_PX, picture, state
 from .watcher import Watcher

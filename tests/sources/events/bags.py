@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from lce_rig.sources.events.bag_writer import open_bag_writer
+from lce_rig.sources.bag_recorder import open_bag_writer
 
 _PACKET = (
     "std_msgs/Header header\nuint32 height\nuint32 width\nuint64 seq\nuint64 time_base\n"

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lce_rig.sources.event_camera_file import Aedat4Frames, Frame, decode_frame
 from lce_rig.sources.events.aedat4_file import Aedat4File
-from lce_rig.sources.events.aedat4_frames import Aedat4Frames, Frame, decode_frame
 from lce_rig.sources.events.stream import Findings
 from tests.sources.events.aedat4_files import RawFrame, flatbuffer, write_davis
 from tests.sources.events.encoders import random_events

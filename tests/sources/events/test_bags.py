@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from lce_rig.core.errors import SourceError
+from lce_rig.sources.bag_recorder import add_event_topic, event_messages, write_event_bag
 from lce_rig.sources.events import EventRecording, open_events
 from lce_rig.sources.events.bag import read_triggers
-from lce_rig.sources.events.bag_writer import add_event_topic, event_messages, write_event_bag
 from tests.sources.events import encoders
 from tests.sources.events.bags import write_packet_bag
 from tests.sources.events.encoders import Event, listed, random_events

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.data import Events
+from lce_rig.sources.events.bag import PacketDecoder, decode_triggers, parse_packet
 from lce_rig.sources.events.event_array import decode_event_array, encode_event_array
-from lce_rig.sources.events.event_packet import PacketDecoder, decode_triggers, parse_packet
-from lce_rig.sources.events.evt2 import Evt2Decoder
+from lce_rig.sources.events.prophesee_raw import Evt2Decoder
 from lce_rig.sources.events.stream import EventColumns, join
 from lce_rig.sources.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
 from tests.sources.events import encoders
@@ -165,7 +165,7 @@ def test_event_arrays_come_back(encoding: str, n: int, seed: int, frame_id: str)
 def test_event_arrays_are_what_ros_itself_reads(is_ros1: bool) -> None:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    from lce_rig.sources.events import bag_writer
+    from lce_rig.sources import bag_recorder as bag_writer
 
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(bag_writer._EVENT[is_ros1], "dvs_msgs/msg/Event"))

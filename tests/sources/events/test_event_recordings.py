@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.sources.bag_file import BagFile
 from lce_rig.sources.events import open_events
-from lce_rig.sources.events.event_packet import parse_packet
+from lce_rig.sources.events.bag import parse_packet
 
 pytestmark = pytest.mark.dataset
 

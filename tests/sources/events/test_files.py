@@ -12,9 +12,9 @@ import pytest
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SourceError
 from lce_rig.core.event_file import encode_events
+from lce_rig.sources.bag_recorder import write_event_bag
 from lce_rig.sources.events import EventRecording, open_events
 from lce_rig.sources.events.aedat4_writer import Aedat4Writer, write_aedat4
-from lce_rig.sources.events.bag_writer import write_event_bag
 from tests.sources.events import encoders
 from tests.sources.events.encoders import listed, random_events
 

@@ -15,8 +15,8 @@ import pytest
 
 from lce_rig.core.errors import SourceError
 from lce_rig.core.event_file import encode_events
+from lce_rig.sources.event_camera_file import decode_frame
 from lce_rig.sources.events import open_events
-from lce_rig.sources.events.aedat4_frames import decode_frame
 from lce_rig.sources.events.stream import EventColumns, Findings, parse_size, to_ns
 from lce_rig.sources.events.text import TextEvents
 from tests.sources.events import encoders
@@ -366,7 +366,7 @@ def test_a_clock_that_wraps_at_every_event_is_refused() -> None:
 
 
 def test_more_events_than_a_camera_sends_that_stay_mixed_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lce_rig.sources.events.order._MAX_HELD_EVENTS", 2**16)
+    monkeypatch.setattr("lce_rig.sources.events.recording._MAX_HELD_EVENTS", 2**16)
     rng = np.random.default_rng(0)
     mixed = [columns(rng.integers(0, 19_000, 40_000)) for _ in range(50)]
     with pytest.raises(SourceError, match="80000 events within 20 ms, out of order"):

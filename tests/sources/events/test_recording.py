@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.errors import SourceError
-from lce_rig.sources.events.order import REORDER_NS
-from lce_rig.sources.events.recording import EventRecording
+from lce_rig.sources.events.recording import REORDER_NS, EventRecording
 from lce_rig.sources.events.stream import EventColumns, Findings
 from tests.sources.events.encoders import random_events
 

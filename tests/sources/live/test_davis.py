@@ -21,9 +21,8 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.rig import CameraSettings, load_rig
 from lce_rig.sources.live import davis_device
-from lce_rig.sources.live.davis import DavisSource
+from lce_rig.sources.live.davis import DavisSamples, DavisSource
 from lce_rig.sources.live.davis_device import OpenedCamera, bias_of, number_of
-from lce_rig.sources.live.davis_samples import DavisSamples
 
 dv = pytest.importorskip("dv_processing")
 START_US = 1_763_733_600_000_000

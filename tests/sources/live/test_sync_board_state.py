@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.sources.live.sync_board_plausibility import RunningNumber, Verdict
 from lce_rig.sources.live.sync_board_report import BoardView, clock_state, figures, problems
-from lce_rig.sources.live.sync_board_state import Arrival, BoardState
+from lce_rig.sources.live.sync_board_state import Arrival, BoardState, RunningNumber, Verdict
 from lce_rig.sources.live.sync_lines import LineReader
 from lce_rig.sources.live.sync_lines.lce1 import Lce1
 from lce_rig.sources.live.sync_lines.messages import (

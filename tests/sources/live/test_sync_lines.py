@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.sources.live.sync_lines import DIALECTS, LineReader
-from lce_rig.sources.live.sync_lines.framing import MAX_LINE, LineSplitter
+from lce_rig.sources.live.sync_lines.dialect import MAX_LINE, LineSplitter
 from lce_rig.sources.live.sync_lines.lce1 import READERS, Lce1
 from lce_rig.sources.live.sync_lines.messages import (
     MAX_COUNT,

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.rig import DriverSettings, FrameTimingSettings
-from lce_rig.sources.live.v4l2_timing import FrameTiming, frame_timing, stamped_moment
+from lce_rig.sources.live.v4l2_clock import FrameTiming, frame_timing, stamped_moment
 
 ROWS = st.integers(2, 1080)
 TIMES = st.integers(0, 40_000)

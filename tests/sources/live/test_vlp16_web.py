@@ -13,7 +13,7 @@ import pytest
 from lce_rig.core.errors import SourceError
 from lce_rig.rig.sensors import DriverSettings
 from lce_rig.sources.live.velodyne_web import VelodyneWeb, find_problems
-from lce_rig.sources.live.vlp16_silence import explain_silence
+from lce_rig.sources.live.vlp16 import explain_silence
 from lce_rig.sources.live.vlp16_status import Reception
 from lce_rig.sources.velodyne_stream import Vlp16Stream
 from tests.sources.vlp16_room import settings
