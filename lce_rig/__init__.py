@@ -18,7 +18,6 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lce_rig.calibrate import CalibrateOptions
     from lce_rig.collect import CollectOptions
     from lce_rig.core.data import Events, Image, Scan
     from lce_rig.core.errors import (
@@ -36,15 +35,16 @@ if TYPE_CHECKING:
     from lce_rig.export import export
     from lce_rig.export.reference import Reference, read_reference
     from lce_rig.export.result import SavedResult, read_result
+    from lce_rig.extrinsics import CalibrateOptions
     from lce_rig.pipeline.calibration import calibrate
     from lce_rig.pipeline.collection import collect_from
-    from lce_rig.pipeline.detection import detect
-    from lce_rig.pipeline.repeat import Repeat, repeat
+    from lce_rig.pipeline.comparison import Repeat, repeat
+    from lce_rig.pipeline.detect_session import detect
     from lce_rig.pipeline.result_files import Result
     from lce_rig.pipeline.verification import Verification, verify
+    from lce_rig.recordings.protocol import SourceOptions
     from lce_rig.rig import Rig, load_rig
     from lce_rig.session import Session
-    from lce_rig.sources.base import SourceOptions
     from lce_rig.words import describe, recommend
 
 __all__ = [
@@ -93,7 +93,7 @@ __version__ = "0.1.0"
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))
 
 _HOMES = {
-    "lce_rig.calibrate": ("CalibrateOptions",),
+    "lce_rig.extrinsics": ("CalibrateOptions",),
     "lce_rig.collect": ("CollectOptions",),
     "lce_rig.core.data": ("Events", "Image", "Scan"),
     "lce_rig.core.errors": tuple(name for name in __all__ if name.endswith("Error")),
@@ -105,13 +105,13 @@ _HOMES = {
     "lce_rig.export.result": ("SavedResult", "read_result"),
     "lce_rig.pipeline.calibration": ("calibrate",),
     "lce_rig.pipeline.collection": ("collect_from",),
-    "lce_rig.pipeline.detection": ("detect",),
-    "lce_rig.pipeline.repeat": ("Repeat", "repeat"),
+    "lce_rig.pipeline.detect_session": ("detect",),
+    "lce_rig.pipeline.comparison": ("Repeat", "repeat"),
     "lce_rig.pipeline.result_files": ("Result",),
     "lce_rig.pipeline.verification": ("Verification", "verify"),
     "lce_rig.rig": ("Rig", "load_rig"),
     "lce_rig.session": ("Session",),
-    "lce_rig.sources.base": ("SourceOptions",),
+    "lce_rig.recordings.protocol": ("SourceOptions",),
     "lce_rig.words": ("describe", "recommend"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}

@@ -141,10 +141,10 @@ def collect(
     from lce_rig.collect import CollectOptions
     from lce_rig.core.errors import NotEnoughDataError
     from lce_rig.pipeline.collection import fill_session
+    from lce_rig.recordings import open_recordings
+    from lce_rig.recordings.protocol import PairedRecording, SourceOptions
     from lce_rig.rig import load_rig
     from lce_rig.session import Session
-    from lce_rig.sources import open_recordings
-    from lce_rig.sources.base import PairedRecording, SourceOptions
 
     rig = load_rig(rig_name)
     require_kind(session, None)

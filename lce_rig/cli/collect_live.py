@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.keys import Controls, controls
 from lce_rig.cli.simulate import TRUTH, require_kind, write_truth
 from lce_rig.core.errors import LceRigError
+from lce_rig.screen.keys import Controls, controls
 
 if TYPE_CHECKING:
     from lce_rig.collect.live.options import LiveReport
     from lce_rig.collect.live.recorder import SampleRecorder
     from lce_rig.collect.live.simulated import SimulatedRig
     from lce_rig.collect.live.state import LiveState
-    from lce_rig.collect.preview import Preview
+    from lce_rig.devices.reading import LiveSource
+    from lce_rig.page import Preview
     from lce_rig.rig import Rig
     from lce_rig.session import Session
-    from lce_rig.sources.live.reading import LiveSource
 
 #: A run that nobody looks after ends after so long without a capture. The simulated person never rests;
 #: before a rig without a terminal somebody may have gone to fetch something.
@@ -59,11 +59,11 @@ class LiveArguments:
 
 def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
     """Collect live into a session, and say how it went."""
-    from lce_rig.cli.live_view import open_view
     from lce_rig.collect.live.collection import collect_live
     from lce_rig.collect.live.options import HOLD_S, LiveOptions
     from lce_rig.core.errors import UsageError
     from lce_rig.rig import load_rig
+    from lce_rig.screen.live_view import open_view
 
     if given.seed is not None and not given.simulated:
         raise UsageError("--seed belongs to --simulated", "leave it out")
@@ -141,7 +141,7 @@ def _open_rig(
 ) -> "tuple[list[LiveSource], SimulatedRig | None]":
     """Build the sources: attached ones, or simulated ones, whose truth goes into the session's folder."""
     if not given.simulated:
-        from lce_rig.sources.live.opening import open_live
+        from lce_rig.devices.opening import open_live
 
         return open_live(rig, given.record), None
     from lce_rig.collect.live.simulated import SimulatedRig
@@ -160,7 +160,7 @@ def _open_preview(
     """Serve the page where it is wanted, say where, and give its links."""
     if given.preview is None:
         return [], ()
-    from lce_rig.collect.preview import Preview, parse_address
+    from lce_rig.page import Preview, parse_address
 
     host, port = parse_address(given.preview)
     preview = Preview(host, port)

@@ -12,8 +12,8 @@ from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, json_option, rig_option
 
 if TYPE_CHECKING:
-    from lce_rig.collect.health import Check
     from lce_rig.core.findings import Severity
+    from lce_rig.doctor import Check
 
 _MARKS = {"note": "[green]ok[/]", "warning": "[yellow]warn[/]", "error": "[bold red]FAIL[/]"}
 _EXIT_ERROR = 5
@@ -51,9 +51,9 @@ def doctor(rig_name: str, as_json: bool, duration: float, folder: Path) -> int:
 
     Exits with 5 where a line says FAIL, else with 0.
     """
-    from lce_rig.collect.health.sensors import sensors
     from lce_rig.core.findings import worst
-    from lce_rig.pipeline.doctor import DoctorOptions, examine
+    from lce_rig.doctor.examine import DoctorOptions, examine
+    from lce_rig.doctor.sensor_sources import sensors
     from lce_rig.rig import load_rig
 
     rig = load_rig(rig_name)

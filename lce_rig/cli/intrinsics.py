@@ -10,7 +10,7 @@ from lce_rig.cli.options import cameras_option, require_sensors, session_argumen
 from lce_rig.words import sentence
 
 if TYPE_CHECKING:
-    from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
+    from lce_rig.pipeline.lens import MeasuredIntrinsics
 
 _MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")
 
@@ -51,9 +51,9 @@ def intrinsics(
     camera. The profile itself is not touched. Exits with 6 where the captures do not do.
     """
     from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
-    from lce_rig.pipeline.intrinsics import measure_intrinsics
     from lce_rig.pipeline.intrinsics_files import document, write_intrinsics
     from lce_rig.pipeline.intrinsics_files import save_profile as write_profile
+    from lce_rig.pipeline.lens import measure_intrinsics
     from lce_rig.session import Session
 
     opened = Session.open(session)
@@ -138,7 +138,7 @@ def _table(measured: "MeasuredIntrinsics") -> Any:
 
 
 def _findings(measured: "MeasuredIntrinsics") -> list[str]:
-    from lce_rig.calibrate.intrinsics_check import describe, explain
+    from lce_rig.validation.intrinsics_check import describe, explain
 
     lines = []
     if measured.check is None:

@@ -12,7 +12,7 @@ from lce_rig.words import describe
 
 if TYPE_CHECKING:
     from lce_rig.core.data import Events
-    from lce_rig.sources.events.recording import EventRecording
+    from lce_rig.recordings.events.event_recording import EventRecording
 
 STAMPS = "stamps.csv"
 # Fourteen hours at the default period; one wild stamp makes a recording centuries long.
@@ -91,8 +91,8 @@ def reconstruct(
     The first pictures, from before the network has seen enough, are left out, and their number is told.
     """
     from lce_rig.core.errors import SourceError, UsageError
-    from lce_rig.detect.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
-    from lce_rig.sources.events import open_events
+    from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
+    from lce_rig.recordings.events import open_events
 
     if window_s is not None and window_events is not None:
         raise UsageError("--window-s and --window-events exclude each other")
@@ -120,7 +120,7 @@ def reconstruct(
 
 
 def _warn_of_flicker(recording: Path, events: "EventRecording") -> None:
-    from lce_rig.detect.flicker import measure_flicker
+    from lce_rig.detect.events.flicker import measure_flicker
 
     flicker = measure_flicker(events.read(events.start_ns, events.start_ns + 1_000_000_000))
     if flicker.is_storm:
@@ -162,7 +162,7 @@ def _write(
 ) -> tuple[list[Path], list[str]]:
     """Write the pictures and the list of their stamps; return the files, and causes of those left out."""
     from lce_rig.core.results import Refusal
-    from lce_rig.verify.writing import write_picture
+    from lce_rig.verify.overlay_files import write_picture
 
     lines = ["picture,stamp_ns"]
     files: list[Path] = []

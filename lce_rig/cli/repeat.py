@@ -9,7 +9,7 @@ from lce_rig.cli import show
 from lce_rig.cli.options import json_option
 
 if TYPE_CHECKING:
-    from lce_rig.calibrate.repeatability import Repeatability
+    from lce_rig.validation.repeatability import Repeatability
 
 
 @click.command()
@@ -26,7 +26,7 @@ def repeat(sessions: tuple[Path, ...], as_json: bool) -> None:
     calibrations disagree, or one of them failed by itself.
     """
     from lce_rig.core.errors import ResultRefusedError
-    from lce_rig.pipeline.repeat import repeat as compare
+    from lce_rig.pipeline.comparison import repeat as compare
 
     with show.progress_bar("reading") as progress:
         compared = compare(sessions, progress=progress)

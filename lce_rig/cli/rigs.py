@@ -157,7 +157,7 @@ def _limit_table(rig: "Rig") -> Any:
 def check_profile(file: str, as_json: bool) -> None:
     """Check a profile; every problem is named with its line. Exits with 3 where there is one."""
     from lce_rig.core.errors import ProfileError
-    from lce_rig.pipeline.detection import check_networks
+    from lce_rig.pipeline.detect_session import check_networks
     from lce_rig.rig import find_profile, load_rig
 
     try:

@@ -201,9 +201,9 @@ def _simulate_session(
 def _simulate_recording(
     folder: Path, rig: "Rig", duration_s: float, seed: int, options: "SimulationOptions", ros: int
 ) -> None:
+    from lce_rig.recordings.folder.folder_recorder import FolderRecorder
     from lce_rig.simulate import recording_truth, rig_truth, simulate_recording
-    from lce_rig.simulate.recording import stamp_of
-    from lce_rig.sources.folder_recorder import FolderRecorder
+    from lce_rig.simulate.simulated_recording import stamp_of
 
     recording = simulate_recording(rig, duration_s=duration_s, seed=seed, options=options)
     with FolderRecorder(folder, rig, ros) as recorder, show.progress_bar("simulating, s") as progress:

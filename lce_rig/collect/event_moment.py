@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.collect.watching import ImageKey, Moment, Sighting
+from lce_rig.collect.board_tracker import ImageKey, Moment, Sighting
 from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
-from lce_rig.detect.event_figures import MEMORY_NS, event_figures, outline_px
-from lce_rig.detect.event_gate import explain_missing_board, look_for_flicker, too_fast
+from lce_rig.detect.events.event_limits import explain_missing_board, look_for_flicker, too_fast
+from lce_rig.detect.events.figures import MEMORY_NS, event_figures, outline_px
 from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.rig_time import rig_time_ns

@@ -3,10 +3,10 @@
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 
-from lce_rig.collect.tally import Tally
+from lce_rig.collect.refusal_counts import Tally
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.results import Refusal
-from lce_rig.detect.event_board import reconstructor_for
+from lce_rig.detect.events.search import reconstructor_for
 from lce_rig.rig import Rig
 from lce_rig.timing.rig_time import event_channel, rig_offset_ns, rig_time_ns
 from lce_rig.timing.scan_pairing import PATIENCE_NS, middle_of_sweep_ns

@@ -7,10 +7,10 @@ import numpy as np
 
 from lce_rig.core.geometry import Array, invert, pose
 from lce_rig.core.results import Calibration
+from lce_rig.export.files import header, number, quoted, reads_back, write_atomically
 from lce_rig.export.frames import T_BODY_OPTICAL, FrameTree, build_trees, choose_channels
 from lce_rig.export.probes import check_pose
 from lce_rig.export.rotations import rotation_from_rpy, rpy
-from lce_rig.export.writing import header, number, quoted, reads_back, write_atomically
 from lce_rig.rig import Rig
 
 FILE_NAME = "sensor_kit_calibration.yaml"

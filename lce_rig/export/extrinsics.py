@@ -9,9 +9,7 @@ import numpy as np
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, pose, transform
 from lce_rig.core.results import Calibration
-from lce_rig.export.probes import TOLERANCE, check_pose
-from lce_rig.export.rotations import quaternion_wxyz, rotation_from_quaternion
-from lce_rig.export.writing import (
+from lce_rig.export.files import (
     MADE_BY,
     header,
     number,
@@ -22,6 +20,8 @@ from lce_rig.export.writing import (
     texts,
     write_atomically,
 )
+from lce_rig.export.probes import TOLERANCE, check_pose
+from lce_rig.export.rotations import quaternion_wxyz, rotation_from_quaternion
 from lce_rig.rig import Rig
 
 FILE_NAME = "extrinsics.yaml"

@@ -15,7 +15,7 @@ from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import FARTHEST_M, Array
 from lce_rig.core.limits import describe
 from lce_rig.core.results import Calibration, ChannelResult, OtherCamera, PointUncertainty, Refusal
-from lce_rig.export.writing import MADE_BY, write_atomically
+from lce_rig.export.files import MADE_BY, write_atomically
 from lce_rig.words import as_json, is_renderable, refusal_as_json
 
 # The schema of result.json, strict where it is read.

@@ -10,7 +10,13 @@ from itertools import combinations
 
 import numpy as np
 
-from lce_rig.calibrate import (
+from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
+from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
+from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal
+from lce_rig.detect.detection import Detections, Pair
+from lce_rig.export.reference import Reference
+from lce_rig.extrinsics import (
     CalibrateOptions,
     CalibrationEstimate,
     CaptureCandidates,
@@ -18,26 +24,20 @@ from lce_rig.calibrate import (
     EstimateSettings,
     calibrate_channels,
 )
-from lce_rig.calibrate.camera_pairs import CameraPair, doubt_cameras, relate
-from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.examination import Examination, examine
-from lce_rig.calibrate.intrinsics_estimate import View
-from lce_rig.calibrate.likelihood.calibrate_together import TogetherEstimate, calibrate_together
-from lce_rig.calibrate.metrics import error_to_reference
-from lce_rig.calibrate.reach import point_uncertainties
-from lce_rig.calibrate.relative_pose import relative_pose
-from lce_rig.calibrate.shared_scans import take_apart
-from lce_rig.calibrate.verdict import judge
-from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
-from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
-from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal
-from lce_rig.detect.detection import Detections, Pair
-from lce_rig.export.reference import Reference
-from lce_rig.pipeline.detection import Progress, detect, silent
+from lce_rig.extrinsics.consensus import find_consensus
+from lce_rig.extrinsics.likelihood.calibrate_together import TogetherEstimate, calibrate_together
+from lce_rig.extrinsics.metrics import error_to_reference
+from lce_rig.extrinsics.relative_pose import relative_pose
+from lce_rig.extrinsics.shared_scans import take_apart
+from lce_rig.lens.lens_estimate import View
+from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.result_files import Result
 from lce_rig.rig import Rig
 from lce_rig.session import Session
+from lce_rig.validation.camera_pairs import CameraPair, doubt_cameras, relate
+from lce_rig.validation.reach import point_uncertainties
+from lce_rig.validation.validate import Examination, examine
+from lce_rig.validation.verdict import judge
 from lce_rig.words import sentence
 
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from lce_rig.collect import CollectOptions, CollectReport, collect
-from lce_rig.collect.tally import Tally
+from lce_rig.collect.refusal_counts import Tally
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.pipeline.detection import Progress, silent
+from lce_rig.pipeline.detect_session import Progress, silent
+from lce_rig.recordings import open_recordings
+from lce_rig.recordings.protocol import Recording, SourceOptions
 from lce_rig.rig import Rig
 from lce_rig.session import Session
-from lce_rig.sources import open_recordings
-from lce_rig.sources.base import Recording, SourceOptions
 from lce_rig.words import describe
 
 Source = Path | str | Recording

@@ -13,8 +13,8 @@ from lce_rig.core.documents import read_json
 from lce_rig.core.errors import LceRigError, UsageError
 from lce_rig.core.results import Refusal
 from lce_rig.export.camera_info import camera_info_text, read_camera_info, ros_distortion
-from lce_rig.export.writing import MADE_BY, number, numbers, write_atomically
-from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
+from lce_rig.export.files import MADE_BY, number, numbers, write_atomically
+from lce_rig.pipeline.lens import MeasuredIntrinsics
 from lce_rig.pipeline.result_files import keep_earlier
 from lce_rig.rig import (
     Rig,
@@ -69,7 +69,7 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
 def _write_camera(folder: Path, rig: Rig, one: MeasuredIntrinsics) -> tuple[str, ...]:
     """Write the files of one camera and give their names."""
     from lce_rig.verify.intrinsics_plot import draw_intrinsics
-    from lce_rig.verify.writing import write_picture
+    from lce_rig.verify.overlay_files import write_picture
 
     names = _file_names(one.camera)
     block, info, page = (folder / name for name in names)

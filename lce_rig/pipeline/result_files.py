@@ -11,9 +11,9 @@ from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError
 from lce_rig.core.limits import read_file
 from lce_rig.core.results import Calibration
 from lce_rig.session import Session
+from lce_rig.session.capture_files import MANIFEST
 from lce_rig.session.replacing import check_folder, copy_over
 from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE
-from lce_rig.session.writing import MANIFEST
 
 RESULT, OVERLAYS, PREVIOUS = "result.json", "overlays", "previous"
 

@@ -8,17 +8,17 @@ from pathlib import Path
 from lce_rig.core.errors import SessionError
 from lce_rig.core.results import Calibration, Refusal
 from lce_rig.detect.detection import Detections, Pair
-from lce_rig.detect.event_board import EventImage
+from lce_rig.detect.events.search import EventImage
 from lce_rig.export.result import SavedResult, read_result
 from lce_rig.pipeline.calibration import clocks_of
-from lce_rig.pipeline.detection import Progress, detect, event_channels, event_picture, silent
+from lce_rig.pipeline.detect_session import Progress, detect, event_channels, event_picture, silent
 from lce_rig.pipeline.result_files import OVERLAYS, RESULT, Result, keep_foreign, result_content
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.session.session import CALIBRATION, DEBUG
 from lce_rig.verify.event_picture import CameraView
+from lce_rig.verify.overlay_files import is_overlay
 from lce_rig.verify.session_check import SessionCheck, check_session, draw_check
-from lce_rig.verify.writing import is_overlay
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +190,7 @@ def write_debug_images(
         The folder of the pictures.
     """
     from lce_rig.verify.debug_image import draw_debug
-    from lce_rig.verify.writing import write_picture
+    from lce_rig.verify.overlay_files import write_picture
 
     base = folder or session.own(DEBUG)
     jobs = [(pair, name) for pair in detections.pairs for name in detections.captures(pair)]

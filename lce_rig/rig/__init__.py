@@ -1,9 +1,9 @@
 """The profile of a rig: its sensors, its board, and the limits and targets of a calibration."""
 
-from lce_rig.rig.board import BoardSettings
+from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.editing import derive_text, set_value
-from lce_rig.rig.extrinsics import NominalExtrinsic
 from lce_rig.rig.loading import dump_rig, find_profile, load_rig, parse_rig, read_profile, shipped_profiles
+from lce_rig.rig.nominal import NominalExtrinsic
 from lce_rig.rig.profile import Rig
 from lce_rig.rig.reconstruction import ReconstructionSettings
 from lce_rig.rig.sensors import (
@@ -15,7 +15,7 @@ from lce_rig.rig.sensors import (
     LidarSettings,
     TimestampSettings,
 )
-from lce_rig.rig.sync import SyncSettings, TriggerSettings
+from lce_rig.rig.sync_settings import SyncSettings, TriggerSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
 __all__ = [

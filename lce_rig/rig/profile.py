@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from lce_rig.rig.board import BoardSettings
-from lce_rig.rig.extrinsics import NominalExtrinsic
+from lce_rig.rig.board_settings import BoardSettings
+from lce_rig.rig.nominal import NominalExtrinsic
 from lce_rig.rig.sensors import CameraSettings, LidarSettings
 from lce_rig.rig.settings import FrameName, Name, RigName, Settings, Text, problem
-from lce_rig.rig.sync import SyncSettings
+from lce_rig.rig.sync_settings import SyncSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
 _MOST_SENSORS = 64

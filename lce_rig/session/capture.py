@@ -21,7 +21,7 @@ from lce_rig.core.image_codec import decode_pixels
 from lce_rig.core.limits import MAX_DOCUMENT_BYTES, MAX_FILE_BYTES, MAX_TIME_NS, describe, read_file
 from lce_rig.core.pcd import decode_pcd
 from lce_rig.rig.settings import Name
-from lce_rig.session.writing import EVENTS_VERSION, MANIFEST, check_events, stamps_of
+from lce_rig.session.capture_files import EVENTS_VERSION, MANIFEST, check_events, stamps_of
 
 # The schema of a capture's manifest; reading is strict, as a session may come from elsewhere.
 

@@ -26,11 +26,11 @@ from lce_rig.core.limits import MAX_DOCUMENT_BYTES, MAX_FILE_BYTES, open_regular
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import cache
 from lce_rig.session.capture import SAFE_NAME, Capture
+from lce_rig.session.capture_files import content_hash, write_capture
 from lce_rig.session.durable import WriterLock, append_line, flush_folder, own_path, replace_file
 from lce_rig.session.identity import MARKER, check_marker, differing_keys, marker_of, read_marker
 from lce_rig.session.membership import check_samples, event_channel
 from lce_rig.session.replacing import recover, replacing
-from lce_rig.session.writing import content_hash, write_capture
 
 # A session's journal, one event per line.
 

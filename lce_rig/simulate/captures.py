@@ -10,12 +10,12 @@ from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, invert
 from lce_rig.rig import Rig
 from lce_rig.simulate.carriers import build_carrier
-from lce_rig.simulate.motion import Trajectory, hold_board, sway_board
 from lce_rig.simulate.options import SimulationOptions
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import CARRIER, HAND, PHASE, PLACEMENT, Stage, set_stage
 from lce_rig.simulate.subframes import film
 from lce_rig.simulate.takes import MovingBoard, take_image, take_scan
+from lce_rig.simulate.trajectory import Trajectory, hold_board, sway_board
 
 _FIRST_STAMP_NS = 1_700_000_000_000_000_000
 _CAPTURE_EVERY_NS = 4_000_000_000

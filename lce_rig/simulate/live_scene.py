@@ -13,7 +13,7 @@ from lce_rig.simulate.camera import SUBPIXELS, develop, focus, render_radiance, 
 from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.lidar import Sweep, measure_sweep, sweep_again, sweep_scene
 from lce_rig.simulate.options import SimulationOptions
-from lce_rig.simulate.placements import can_be_held, count_rings
+from lce_rig.simulate.poses import can_be_held, count_rings
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import CARRIER, OF_SESSION, set_stage
 

@@ -14,7 +14,7 @@ from lce_rig.simulate.backdrop import Backdrop, build_backdrop
 from lce_rig.simulate.event_camera import EventPixels, draw_pixels
 from lce_rig.simulate.lidar import VLP16, LidarModel
 from lce_rig.simulate.options import SimulationOptions
-from lce_rig.simulate.placements import View, place_board
+from lce_rig.simulate.poses import View, place_board
 from lce_rig.simulate.room import Room, build_room
 
 LIDAR_MODELS = {"vlp16": VLP16}

@@ -17,9 +17,9 @@ from lce_rig.simulate.backdrop import Backdrop, pixel_rays
 from lce_rig.simulate.camera import sensor_gain
 from lce_rig.simulate.event_camera import EventCamera
 from lce_rig.simulate.light import irradiance, reached
-from lce_rig.simulate.motion import Trajectory
 from lce_rig.simulate.options import CameraNoise
 from lce_rig.simulate.scene import PLATE, PLATE_BACK, PRINT_ALBEDO, Hits, Raycaster, Scene
+from lce_rig.simulate.trajectory import Trajectory
 
 # The board's carrier for event cameras: rendered at intervals, shifted and blended in between.
 

@@ -12,10 +12,10 @@ from lce_rig.simulate.camera import expose, render_radiance
 from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.event_camera import EventCamera
 from lce_rig.simulate.lidar import simulate_scan
-from lce_rig.simulate.motion import Trajectory
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import EVENTS, IMAGE, SCAN, Stage
 from lce_rig.simulate.subframes import MovingView, speed_px_s
+from lce_rig.simulate.trajectory import Trajectory
 
 # While the shutter is open the board is drawn at moments that lie this far apart in the image at most.
 _SMEAR_STEP_PX = 0.35

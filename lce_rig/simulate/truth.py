@@ -9,7 +9,7 @@ from lce_rig.core.geometry import invert, transform
 from lce_rig.rig import Rig
 from lce_rig.simulate.captures import SimulatedCapture
 from lce_rig.simulate.options import SimulationOptions
-from lce_rig.simulate.recording import SimulatedRecording
+from lce_rig.simulate.simulated_recording import SimulatedRecording
 from lce_rig.simulate.stage import truth_extrinsics
 
 _TRACK_EVERY_NS = 10_000_000

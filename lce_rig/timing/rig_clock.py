@@ -14,7 +14,7 @@ import numpy as np
 from lce_rig.core.data import Image, LiveSample, Pulse, Sample
 from lce_rig.core.findings import Finding
 from lce_rig.rig import Rig
-from lce_rig.rig.sync import BOARD, PPS_LINE, TriggerSettings
+from lce_rig.rig.sync_settings import BOARD, PPS_LINE, TriggerSettings
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 from lce_rig.timing.clock_fit import MIN_PAIRS, RESOLUTION_NS, Stamps, fit_clock, match_edges
 from lce_rig.timing.sync import CommonClock, SyncVerdict, judge_sync

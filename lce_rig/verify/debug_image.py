@@ -9,7 +9,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
-from lce_rig.detect.event_figures import outline_px
+from lce_rig.detect.events.figures import outline_px
 from lce_rig.verify import canvas
 from lce_rig.verify.canvas import BLACK, BLUE, FAINT, INK, MAGENTA, ORANGE, WHITE, Picture
 from lce_rig.verify.event_picture import draw_event_key, draw_events

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from lce_rig.calibrate.intrinsics_difference import LensCertainty, LensDifference
-from lce_rig.calibrate.intrinsics_estimate import IntrinsicsEstimate
 from lce_rig.core.geometry import Array
+from lce_rig.lens.difference import LensCertainty, LensDifference
+from lce_rig.lens.lens_estimate import IntrinsicsEstimate
 from lce_rig.verify.canvas import Picture
 
 _INK, _GREY, _FAINT, _SHADE = "#22262b", "#5b636b", "#9aa3ad", "#e9ecef"

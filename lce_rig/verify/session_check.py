@@ -8,25 +8,25 @@ from typing import Any
 
 import numpy as np
 
-from lce_rig.calibrate import Clocks
-from lce_rig.calibrate.metrics import capture_residual, summarise
-from lce_rig.calibrate.motion import fit_motions
-from lce_rig.calibrate.options import CaptureCandidates
-from lce_rig.calibrate.shared_scans import SharedScan, sample_scans
-from lce_rig.calibrate.time_offsets import at_sweep_time, deskew_points
-from lce_rig.calibrate.verdict import residuals_beyond
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import Calibration, CaptureResidual, ImageBoard, LidarBoard, Metrics, Observation
 from lce_rig.detect.detection import Detections, Pair
+from lce_rig.extrinsics import Clocks
+from lce_rig.extrinsics.board_motion import fit_motions
+from lce_rig.extrinsics.metrics import capture_residual, summarise
+from lce_rig.extrinsics.options import CaptureCandidates
+from lce_rig.extrinsics.shared_scans import SharedScan, sample_scans
+from lce_rig.extrinsics.time_offsets import at_sweep_time, deskew_points
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
+from lce_rig.validation.verdict import residuals_beyond
 from lce_rig.verify.canvas import Picture
 from lce_rig.verify.event_picture import CameraView
 from lce_rig.verify.overlay import camera_part, draw_overlay
-from lce_rig.verify.writing import write_overlays
+from lce_rig.verify.overlay_files import write_overlays
 from lce_rig.words import describe
 
 # Boards that moved between picture and sweep, brought together as the calibration brought them.

@@ -12,7 +12,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, exp_so3, fit_plane, invert, perturb, pose, transform
 from lce_rig.core.results import LidarBoard, Refusal
 from lce_rig.detect.detection import ImageDetection, LidarDetection
-from lce_rig.detect.image_board import board_from_pose
+from lce_rig.detect.image.search import board_from_pose
 from lce_rig.rig import Rig
 from lce_rig.solvers.pnp import solve_planar_pose
 

@@ -20,7 +20,7 @@ from lce_rig.detect.detection import LidarDetection, from_arrays, to_arrays
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
-from lce_rig.simulate.placements import can_be_held, count_rings, seen_share
+from lce_rig.simulate.poses import can_be_held, count_rings, seen_share
 from lce_rig.simulate.stage import PLACEMENT, Stage, set_stage, truth_extrinsics
 
 N_CAPTURES, N_PARALLEL = 15, 12

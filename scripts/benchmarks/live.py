@@ -25,14 +25,14 @@ from lce_rig.collect.live.collection import collect_live
 from lce_rig.collect.live.options import Key, LiveOptions, LiveReport
 from lce_rig.collect.live.state import LiveState
 from lce_rig.core.geometry import Array
+from lce_rig.devices.davis.driver import DavisSource
+from lce_rig.devices.davis.opened import OpenedCamera
+from lce_rig.devices.opening import open_live
+from lce_rig.devices.protocol import SourceStatus
+from lce_rig.devices.reading import LiveSource
 from lce_rig.rig import Rig, load_rig
-from lce_rig.rig.sync import SyncSettings
+from lce_rig.rig.sync_settings import SyncSettings
 from lce_rig.session import Session
-from lce_rig.sources.live.base import SourceStatus
-from lce_rig.sources.live.davis import DavisSource
-from lce_rig.sources.live.davis_device import OpenedCamera
-from lce_rig.sources.live.opening import open_live
-from lce_rig.sources.live.reading import LiveSource
 
 LOOPS_PER_HOLD = 10
 N_PLACEMENTS = 20

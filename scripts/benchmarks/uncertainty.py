@@ -10,13 +10,13 @@ from scipy.stats import chi2
 
 from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
-from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
-from lce_rig.calibrate.likelihood.picture_terms import stack_pictures
-from lce_rig.calibrate.likelihood.refine import to_extrinsic
-from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, Terms, assemble, density, linearise
-from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.geometry import Array, difference, invert
+from lce_rig.extrinsics import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
+from lce_rig.extrinsics.likelihood.levels import MOST_LOST, Levels, Priors
+from lce_rig.extrinsics.likelihood.picture_terms import stack_pictures
+from lce_rig.extrinsics.likelihood.refine import to_extrinsic
+from lce_rig.extrinsics.likelihood.system import PER_CAMERA, State, Terms, assemble, density, linearise
+from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.residuals.along_rays import N_FIELDS, N_SHIFTS, SHIFTS, EdgeRows, interior, stack_scans
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import LidarNoise, SimulationOptions

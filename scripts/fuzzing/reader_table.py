@@ -49,8 +49,8 @@ class Reader:
 
 
 def _cloud(folder: Path) -> None:
-    from lce_rig.sources.cloud import to_scan
-    from lce_rig.sources.cloud_file import read_cloud
+    from lce_rig.recordings.folder.cloud import to_scan
+    from lce_rig.recordings.folder.cloud_file import read_cloud
 
     path = next(folder.iterdir())
     reading = to_scan(read_cloud(path), "lidar", small_rig().lidars["lidar"], str(path))
@@ -58,13 +58,13 @@ def _cloud(folder: Path) -> None:
 
 
 def _image(folder: Path) -> None:
-    from lce_rig.sources.image_file import read_image
+    from lce_rig.recordings.folder.image_file import read_image
 
     sanity.check_pixels(read_image(next(folder.iterdir())))
 
 
 def _image_stream(folder: Path) -> None:
-    from lce_rig.sources.live.image_streams import find_stream
+    from lce_rig.devices.pipe.image_streams import find_stream
 
     data = next(folder.iterdir()).read_bytes()
     stream = find_stream(data[:64])
@@ -79,8 +79,8 @@ def _drain(samples: Iterator[Any]) -> None:
 
 
 def _recording(folder: Path) -> None:
-    from lce_rig.sources import open_recordings
-    from lce_rig.sources.base import PairedRecording, SourceOptions
+    from lce_rig.recordings import open_recordings
+    from lce_rig.recordings.protocol import PairedRecording, SourceOptions
 
     for recording in open_recordings([next(folder.iterdir())], small_rig(), SourceOptions(is_part=True)):
         if isinstance(recording, PairedRecording):
@@ -99,9 +99,9 @@ def _read_pairs(recording: Any) -> None:
 
 def _joined(folder: Path) -> None:
     """Read a folder of several recorders as `collect` does: all of its parts as one."""
-    from lce_rig.sources import open_recordings
-    from lce_rig.sources.base import SourceOptions
-    from lce_rig.sources.joining import join_recordings
+    from lce_rig.recordings import open_recordings
+    from lce_rig.recordings.joining import join_recordings
+    from lce_rig.recordings.protocol import SourceOptions
 
     parts = open_recordings([folder / "folder"], small_rig(), SourceOptions())
     for recording in join_recordings(parts, small_rig()):
@@ -109,7 +109,7 @@ def _joined(folder: Path) -> None:
 
 
 def _events(folder: Path) -> None:
-    from lce_rig.sources.events import open_events
+    from lce_rig.recordings.events import open_events
 
     path = next(folder.iterdir())
     events = open_events(path, sensor=CAMERA)
@@ -117,7 +117,7 @@ def _events(folder: Path) -> None:
 
 
 def _own_events(folder: Path) -> None:
-    from lce_rig.sources.events import open_events
+    from lce_rig.recordings.events import open_events
 
     _read_events(open_events(next(folder.iterdir()), sensor=CAMERA, resolution=SIZE))
 
@@ -132,8 +132,8 @@ def _read_events(events: Any) -> None:
 
 
 def _event_camera_file(folder: Path) -> None:
-    from lce_rig.sources.base import SourceOptions
-    from lce_rig.sources.event_camera_file import EventCameraFile
+    from lce_rig.recordings.events.camera_file import EventCameraFile
+    from lce_rig.recordings.protocol import SourceOptions
 
     recording = EventCameraFile(next(folder.iterdir()), small_rig(), SourceOptions())
     _drain(recording.samples())
@@ -141,8 +141,8 @@ def _event_camera_file(folder: Path) -> None:
 
 def _named_folder(folder: Path) -> None:
     """Read a folder of images and clouds under names that were damaged."""
-    from lce_rig.sources.base import SourceOptions
-    from lce_rig.sources.folder import FolderRecording
+    from lce_rig.recordings.folder.folder import FolderRecording
+    from lce_rig.recordings.protocol import SourceOptions
 
     base = folder / "recording"
     base.mkdir()
@@ -303,7 +303,7 @@ def _static_tf(folder: Path) -> None:
 
 
 def _network(folder: Path) -> None:
-    from lce_rig.detect.reconstruct.model import ReconstructionModel
+    from lce_rig.detect.events.reconstruct.model import ReconstructionModel
 
     model = ReconstructionModel(folder / "a.onnx")
     picture, _ = model.step(np.zeros((model.n_bins, 16, 16), np.float32), model.initial_states(16, 16))
@@ -313,7 +313,7 @@ def _network(folder: Path) -> None:
 def _web(folder: Path) -> None:
     import json
 
-    from lce_rig.sources.live.velodyne_web import to_report
+    from lce_rig.devices.vlp16.web import to_report
 
     try:
         pages = json.loads((folder / "pages.json").read_bytes())

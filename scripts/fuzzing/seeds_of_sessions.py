@@ -171,6 +171,6 @@ def exports(_samples: Samples) -> list[Files]:
 
 def network(_samples: Samples) -> list[Files]:
     """The shipped reconstruction network."""
-    from lce_rig.detect.reconstruct.model import model_bytes
+    from lce_rig.detect.events.reconstruct.model import model_bytes
 
     return [{"a.onnx": model_bytes(None)}]

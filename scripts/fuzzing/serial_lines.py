@@ -15,8 +15,8 @@ from datetime import datetime, timezone
 
 import numpy as np
 
-from lce_rig.sources.live.sync_lines import DIALECTS, LineReader
-from lce_rig.sources.live.sync_lines.messages import (
+from lce_rig.devices.sync_board.lines import DIALECTS, LineReader
+from lce_rig.devices.sync_board.lines.messages import (
     BoardError,
     BoardStatus,
     Exposure,

@@ -15,8 +15,8 @@ import numpy as np
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
+from lce_rig.recordings.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings
-from lce_rig.sources.velodyne_stream import Vlp16Stream
 
 Mutation = Callable[[bytearray, np.random.Generator], bytes]
 _N_PACKETS = 226

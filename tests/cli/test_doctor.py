@@ -20,8 +20,8 @@ from lce_rig.core.findings import Finding
 from lce_rig.rig import dump_rig
 from lce_rig.simulate.vlp16_packets import Vlp16Clock
 from lce_rig.words import Phrase, rendering, sentence
-from tests.collect.health.attached import Attached, attach, picture_of, scan_of
-from tests.collect.health.observed import make_rig
+from tests.doctor.attached import Attached, attach, picture_of, scan_of
+from tests.doctor.observed import make_rig
 
 
 @pytest.fixture

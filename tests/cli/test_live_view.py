@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from lce_rig.cli.live_view import PlainView, ScreenView, draw_outlines, render
 from lce_rig.collect.guidance import Coverage
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, StreamState
+from lce_rig.screen.live_view import PlainView, ScreenView, draw_outlines, render
 
 SQUARE = np.array([[300.0, 200.0], [700, 240], [660, 500], [280, 470], [300, 200]])
 STREAMS = (

@@ -11,12 +11,12 @@ import pytest
 from lce_rig.cli.main import run
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.recordings import open_recording
+from lce_rig.recordings.events import open_events
+from lce_rig.recordings.protocol import ContinuousRecording
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import Session
 from lce_rig.simulate import HandMotion, SimulatedCapture, SimulationOptions, simulate_captures
-from lce_rig.sources import open_recording
-from lce_rig.sources.base import ContinuousRecording
-from lce_rig.sources.events import open_events
 
 # The placement is 1.3 m away: squares are 9 px wide, even to a camera of half the resolution.
 SEED = 9

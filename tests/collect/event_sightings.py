@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lce_rig.collect.watching import Sighting
+from lce_rig.collect.board_tracker import Sighting
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.rig import Rig

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.event_pictures import with_event_pictures
-from lce_rig.collect.tally import Tally
+from lce_rig.collect.refusal_counts import Tally
 from lce_rig.core.data import Events, Image, Sample, Scan
-from lce_rig.detect.event_board import reconstructor_for
+from lce_rig.detect.events.search import reconstructor_for
+from lce_rig.recordings.merging import merge_by_time
 from lce_rig.rig import ReconstructionSettings, Rig, load_rig
-from lce_rig.sources.merging import merge_by_time
 
 from .event_sightings import T0_NS, event_stream
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lce_rig.collect import CollectOptions, collect
-from lce_rig.collect.stillness import StillnessOptions
+from lce_rig.collect.offline.stillness import StillnessOptions
+from lce_rig.recordings import open_recording
 from lce_rig.rig import dump_rig, parse_rig
 from lce_rig.session import Session
-from lce_rig.sources import open_recording
 
 
 @pytest.fixture(scope="module")

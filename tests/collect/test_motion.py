@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lce_rig.collect.board_tracker import Moment, Sighting
 from lce_rig.collect.event_moment import MotionOptions
-from lce_rig.collect.motion import _Neighbours, find_moving_moments
-from lce_rig.collect.novelty import Placements
-from lce_rig.collect.tally import Tally
-from lce_rig.collect.watching import Moment, Sighting
+from lce_rig.collect.offline.slow_motion import _Neighbours, find_moving_moments
+from lce_rig.collect.placement_dedupe import Placements
+from lce_rig.collect.refusal_counts import Tally
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig, load_rig
 from lce_rig.timing.scan_pairing import Frame

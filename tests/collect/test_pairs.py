@@ -13,9 +13,9 @@ import pytest
 from lce_rig.collect import CollectOptions, collect
 from lce_rig.core.errors import SourceError
 from lce_rig.core.pcd import encode_pcd
+from lce_rig.recordings import open_recording
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
-from lce_rig.sources import open_recording
 
 N_PAIRS = 5
 
@@ -115,7 +115,7 @@ import sys
 from lce_rig.collect import collect
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
-from lce_rig.sources import open_recording
+from lce_rig.recordings import open_recording
 rig = load_rig("rlfs")
 with Session.resume(sys.argv[1], rig) as session:
     recording = open_recording(sys.argv[2], rig)

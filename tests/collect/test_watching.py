@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.collect.stillness import StillnessOptions, find_still_moments
-from lce_rig.collect.watching import BoardWatcher, Moment, Sighting
+from lce_rig.collect.board_tracker import BoardWatcher, Moment, Sighting
+from lce_rig.collect.offline.stillness import StillnessOptions, find_still_moments
 from lce_rig.core.geometry import transform
 from lce_rig.core.results import Refusal
 from lce_rig.detect.finder import BoardFinder

@@ -9,7 +9,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import difference, perturb, pose, rotation_angle, transform
 from lce_rig.core.results import ImageBoard
-from lce_rig.detect.event_board import align_corner_order, nearest_pose
+from lce_rig.detect.events.search import align_corner_order, nearest_pose
 from lce_rig.solvers.pnp import mirror_tilt, solve_planar_pose
 
 DAVIS = Intrinsics(349.57, 349.18, 172.49, 126.24, 346, 260, "radtan", (-0.36, 0.18, 0.0, 0.0, 0.0))

@@ -16,8 +16,8 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array, difference, exp_so3, pose, rotation_angle, transform
 from lce_rig.core.results import ImageBoard, Refusal
-from lce_rig.detect.image_board import find_image_board, region_around
-from lce_rig.detect.image_saddle import fit_crossings
+from lce_rig.detect.image.saddle import fit_crossings
+from lce_rig.detect.image.search import find_image_board, region_around
 
 ASYMMETRIC = Board(cols=9, rows=6, square_m=0.068, width_m=0.8, height_m=0.6)
 SYMMETRIC = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)

@@ -21,8 +21,8 @@ from scans import (
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import exp_so3, invert, pose, transform
 from lce_rig.core.results import Refusal
-from lce_rig.detect.lidar_board import find_lidar_boards
-from lce_rig.detect.lidar_features import Beam
+from lce_rig.detect.lidar.measurement import Beam
+from lce_rig.detect.lidar.search import find_lidar_boards
 
 POINT_BEAM = Beam(0.0, 0.0)
 ROOM = room(13.0)

@@ -5,7 +5,7 @@ import pytest
 from scans import board_plate, cast, place, room
 
 from lce_rig.core.data import Scan
-from lce_rig.detect.lidar_segments import cut_segments, order_scan
+from lce_rig.detect.lidar.segments import cut_segments, order_scan
 
 
 @pytest.mark.parametrize("sigma_m", [0.01, 0.03, 0.1])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.errors import ProfileError
-from lce_rig.detect.reconstruct import ReconstructionModel, model_process
+from lce_rig.detect.events.reconstruct import ReconstructionModel, model_process
 
 from .onnx_file import (
     endless_network,
@@ -215,7 +215,7 @@ ENDS_IN_A_STEP = """
 import os, sys, threading, time
 from pathlib import Path
 import numpy as np
-from lce_rig.detect.reconstruct import ReconstructionModel
+from lce_rig.detect.events.reconstruct import ReconstructionModel
 model = ReconstructionModel(Path(sys.argv[1]))
 step = lambda: model.step(np.ones((5, 8, 8), np.float32), model.initial_states(8, 8))
 threading.Thread(target=step, daemon=True).start()

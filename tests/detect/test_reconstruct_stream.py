@@ -10,7 +10,7 @@ from moving_board import COLS, ROWS, Motion, board_events, cut, events_of, inner
 from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.results import Refusal
-from lce_rig.detect.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
+from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
 
 MS = 1_000_000
 DURATION_S = 1.6

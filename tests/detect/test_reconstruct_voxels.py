@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from moving_board import Motion, board_events, events_of
 
-from lce_rig.detect.reconstruct import event_map, normalise_voxels, voxel_grid
-from lce_rig.detect.reconstruct.filters import hot_pixels, without_background_activity, without_pixels
+from lce_rig.detect.events.reconstruct import event_map, normalise_voxels, voxel_grid
+from lce_rig.detect.events.reconstruct.filters import hot_pixels, without_background_activity, without_pixels
 
 
 def random_events(n, seed, width_px=12, height_px=9, duration_ns=50_000_000):

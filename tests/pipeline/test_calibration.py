@@ -1,10 +1,10 @@
 """The calibration of a session takes from the rig what the algorithm cannot know."""
 
 from lce_rig import pipeline
-from lce_rig.calibrate import CalibrateOptions
 from lce_rig.detect.detection import Detections
+from lce_rig.extrinsics import CalibrateOptions
 from lce_rig.rig import find_profile, parse_rig
-from tests.calibrate.boards import simulate
+from tests.extrinsics.boards import simulate
 
 RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 

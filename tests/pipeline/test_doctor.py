@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from lce_rig.collect.health import Check
-from lce_rig.collect.health.observing import Observation
 from lce_rig.core.findings import worst
-from lce_rig.pipeline.doctor import DoctorOptions, examine, look_for_boards
+from lce_rig.doctor import Check
+from lce_rig.doctor.examine import DoctorOptions, examine, look_for_boards
+from lce_rig.doctor.observing import Observation
 from lce_rig.rig import Rig
 from lce_rig.simulate.vlp16_packets import Vlp16Clock
 from lce_rig.words import recommend
-from tests.collect.health.attached import Attached, attach, picture_of, scan_of
-from tests.collect.health.observed import codes, make_rig
 from tests.detect.moving_board import CENTRE_PX, HEIGHT_PX, WIDTH_PX, Motion, board_events
+from tests.doctor.attached import Attached, attach, picture_of, scan_of
+from tests.doctor.observed import codes, make_rig
 
 Lines = dict[tuple[str, str], Check]
 

@@ -58,7 +58,7 @@ def test_what_cannot_be_meant_is_refused_with_its_key(old, new, said):
 
 
 def test_one_line_cannot_trigger_two_cameras():
-    from lce_rig.rig.sync import SyncSettings
+    from lce_rig.rig.sync_settings import SyncSettings
 
     triggers = {name: {"channel": 3, "rate_hz": 10.0} for name in ("left", "right")}
     with pytest.raises(ValueError, match="line 3 triggers left already"):

@@ -3,7 +3,7 @@
 import pytest
 from fuzzing.serial_lines import fuzz_lines
 
-from lce_rig.sources.live.sync_lines.messages import LineFault
+from lce_rig.devices.sync_board.lines.messages import LineFault
 
 
 def test_damaged_lines_make_no_message_that_their_sum_denies():

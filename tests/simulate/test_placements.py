@@ -6,7 +6,7 @@ import pytest
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, pose
 from lce_rig.simulate.lidar import VLP16
-from lce_rig.simulate.placements import View, count_rings, seen_share
+from lce_rig.simulate.poses import View, count_rings, seen_share
 
 from .conftest import LENSES, board_before_lidar
 

@@ -9,15 +9,23 @@ from lce_rig.core import velodyne
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array
+from lce_rig.recordings.velodyne.packet import read_data_packet, read_position_packet
+from lce_rig.recordings.velodyne.stream import Vlp16Stream
 from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.lidar import simulate_scan
 from lce_rig.simulate.options import LidarNoise
 from lce_rig.simulate.room import Room
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets, gprmc
-from lce_rig.sources.velodyne_packet import read_data_packet, read_position_packet
-from lce_rig.sources.velodyne_stream import Vlp16Stream
-from tests.sources.vlp16_room import T0_NS, largest_errors, packets_of, push, room_scan, room_scans, settings
+from tests.recordings.vlp16_room import (
+    T0_NS,
+    largest_errors,
+    packets_of,
+    push,
+    room_scan,
+    room_scans,
+    settings,
+)
 
 from .conftest import board_before_lidar
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import Clocks
-from lce_rig.calibrate.metrics import capture_residual
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import Calibration, Certificate, ChannelResult, Metrics, Observation
+from lce_rig.extrinsics import Clocks
+from lce_rig.extrinsics.metrics import capture_residual
 from lce_rig.verify.session_check import bring_together, match_candidates
-from tests.calibrate.boards import BOARD, T_FORWARD
-from tests.calibrate.moving_boards import Moving, simulate_moving
+from tests.extrinsics.boards import BOARD, T_FORWARD
+from tests.extrinsics.moving_boards import Moving, simulate_moving
 
 CLOCKS = Clocks(tolerance_s={"frames": 0.1, "events": 0.1})
 MOVING = Moving(speed_mps=0.3, tracked=("events",))

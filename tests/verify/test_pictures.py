@@ -16,7 +16,7 @@ from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.verify.canvas import MAGENTA, ORANGE, PANEL, Picture, round_ticks, text_width_px, wrapped
 from lce_rig.verify.debug_image import draw_debug
 from lce_rig.verify.overlay import draw_overlay
-from lce_rig.verify.writing import contact_sheet, write_overlays, write_picture
+from lce_rig.verify.overlay_files import contact_sheet, write_overlays, write_picture
 
 BOARD = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)
 FOLDING = Intrinsics(300.0, 300.0, 172.5, 129.5, 346, 260, "radtan", (-0.4, 0.0, 0.0, 0.0, 0.0))

@@ -3,12 +3,7 @@
 from lce_rig.collect.guidance.candidates import View, is_reachable, spread_candidates
 from lce_rig.collect.guidance.coverage import Coverage, measure_coverage
 from lce_rig.collect.guidance.evidence import Evidence, weigh_placements
-from lce_rig.collect.guidance.outline import outline_px
-from lce_rig.collect.guidance.person import Person
-from lce_rig.collect.guidance.planner import Guidance, Novelty, Planner
-from lce_rig.collect.guidance.precision import Precision, combine, predict_covariance, sigmas
-from lce_rig.collect.guidance.sensors import ErrorModel, SensorModel, model_sensors
-from lce_rig.collect.guidance.words import (
+from lce_rig.collect.guidance.instructions import (
     HeldPose,
     Instruction,
     build_pose,
@@ -17,6 +12,11 @@ from lce_rig.collect.guidance.words import (
     is_there,
     say,
 )
+from lce_rig.collect.guidance.outline import outline_px
+from lce_rig.collect.guidance.person import Person
+from lce_rig.collect.guidance.planner import Guidance, Novelty, Planner
+from lce_rig.collect.guidance.precision import Precision, combine, predict_covariance, sigmas
+from lce_rig.collect.guidance.sensor_noise import ErrorModel, SensorModel, model_sensors
 
 __all__ = [
     "Coverage",

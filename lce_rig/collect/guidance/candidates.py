@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.collect.guidance.sensors import SensorModel
+from lce_rig.collect.guidance.sensor_noise import SensorModel
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
 
 NEAREST_M = 1.2

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lce_rig.collect.guidance.candidates import DIAMOND_DEG, View
-from lce_rig.collect.guidance.words import describe_pose
+from lce_rig.collect.guidance.instructions import describe_pose
 from lce_rig.core.geometry import Array
 
 #: A bar is full where captures span this share of what reachable placements span.

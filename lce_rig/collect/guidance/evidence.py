@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.collect.guidance.sensors import SensorModel
+from lce_rig.collect.guidance.sensor_noise import SensorModel
 from lce_rig.core.geometry import Array, invert, skew
 from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS, differentiate, freedoms_of_plane
 from lce_rig.solvers.covariance import symmetric_inverse

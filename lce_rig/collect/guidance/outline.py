@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lce_rig.collect.guidance.sensors import SensorModel
+from lce_rig.collect.guidance.sensor_noise import SensorModel
 from lce_rig.core.geometry import Array, transform
 
 

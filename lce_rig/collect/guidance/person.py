@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lce_rig.collect.guidance.candidates import View
-from lce_rig.collect.guidance.words import HeldPose, build_pose, describe_pose, instruct
+from lce_rig.collect.guidance.instructions import HeldPose, build_pose, describe_pose, instruct
 from lce_rig.core.geometry import Array, exp_so3, pose
 
 _FIGURE = {

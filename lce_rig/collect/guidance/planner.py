@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from lce_rig.collect.guidance.candidates import View, spread_candidates
 from lce_rig.collect.guidance.evidence import Evidence, weigh_placements
+from lce_rig.collect.guidance.instructions import instruct, is_there, say
 from lce_rig.collect.guidance.precision import Precision, combine, combine_with_each, shortfall, sigmas
-from lce_rig.collect.guidance.words import instruct, is_there, say
 from lce_rig.core.geometry import Array, rotation_angle
 from lce_rig.core.results import Refusal
 

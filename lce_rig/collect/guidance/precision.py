@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lce_rig.collect.guidance.evidence import N_UNKNOWNS, Evidence, weigh_placements
-from lce_rig.collect.guidance.sensors import ErrorModel, SensorModel
+from lce_rig.collect.guidance.sensor_noise import ErrorModel, SensorModel
 from lce_rig.core.geometry import Array
 from lce_rig.solvers.covariance import symmetric_inverse, systematic_covariances
 

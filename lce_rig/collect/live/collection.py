@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
+from lce_rig.collect.board_tracker import BoardWatcher, Moment, Sighting
+from lce_rig.collect.live.capture_triggers import LiveGate, SlowBoards, StillBoards
+from lce_rig.collect.live.capture_writer import Keeper, Task
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
-from lce_rig.collect.live.gates import LiveGate, SlowBoards, StillBoards
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
-from lce_rig.collect.live.keeper import Keeper, Task
 from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.live.monitor import Monitor
 from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_unseen
@@ -22,14 +23,13 @@ from lce_rig.collect.live.options import Ending, Key, LiveOptions, LiveReport
 from lce_rig.collect.live.recorder import SampleRecorder
 from lce_rig.collect.live.state import LiveState
 from lce_rig.collect.live.worker import Worker
-from lce_rig.collect.novelty import Placements, capture_poses
-from lce_rig.collect.watching import BoardWatcher, Moment, Sighting
+from lce_rig.collect.placement_dedupe import Placements, capture_poses
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.results import Refusal
+from lce_rig.devices.opening import edge_cameras
+from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
-from lce_rig.sources.live.opening import edge_cameras
-from lce_rig.sources.live.reading import AttachedSensors, LiveSource
 from lce_rig.timing.rig_clock import RigClock
 from lce_rig.timing.scan_pairing import Frame
 from lce_rig.timing.sync import pair_times

@@ -7,12 +7,12 @@ from types import TracebackType
 from typing import Protocol, runtime_checkable
 
 from lce_rig.collect.event_pictures import with_event_pictures
-from lce_rig.collect.tally import Tally
+from lce_rig.collect.refusal_counts import Tally
 from lce_rig.core.data import Sample
 from lce_rig.core.errors import LceRigError, SourceError
+from lce_rig.devices.protocol import Mailbox
+from lce_rig.devices.reading import AttachedSensors
 from lce_rig.rig import Rig
-from lce_rig.sources.live.base import Mailbox
-from lce_rig.sources.live.reading import AttachedSensors
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.rig_clock import SLOW_TRIGGERS_HZ, RigClock
 from lce_rig.timing.rig_time import event_channel

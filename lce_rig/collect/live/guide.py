@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lce_rig.collect.board_tracker import ImageKey, Sighting
 from lce_rig.collect.guidance import (
     Coverage,
     Guidance,
@@ -17,7 +18,6 @@ from lce_rig.collect.guidance import (
     model_sensors,
     outline_px,
 )
-from lce_rig.collect.watching import ImageKey, Sighting
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal

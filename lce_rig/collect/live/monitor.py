@@ -5,16 +5,16 @@ from collections import deque
 
 import numpy as np
 
+from lce_rig.collect.board_tracker import Sighting
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.narration import Narration, image_figures, scan_figures, stream_name
 from lce_rig.collect.live.options import LiveOptions
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, Phase, Sound, StreamState
-from lce_rig.collect.watching import Sighting
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
+from lce_rig.devices.protocol import SourceStatus
+from lce_rig.devices.reading import AttachedSensors
 from lce_rig.session import Session
-from lce_rig.sources.live.base import SourceStatus
-from lce_rig.sources.live.reading import AttachedSensors
 from lce_rig.timing.rig_clock import RigClock
 from lce_rig.words import enumerated, sentence
 

@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
+from lce_rig.collect.board_tracker import ImageKey, Moment, Sighting
 from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.guidance import say
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.state import Phase
-from lce_rig.collect.watching import ImageKey, Moment, Sighting
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.words import describe, recommend, sentence

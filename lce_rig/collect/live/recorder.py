@@ -8,9 +8,9 @@ import numpy as np
 
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SourceError
+from lce_rig.devices.protocol import Mailbox
+from lce_rig.recordings.folder.folder_recorder import FolderRecorder
 from lce_rig.rig import Rig
-from lce_rig.sources.folder_recorder import FolderRecorder
-from lce_rig.sources.live.base import Mailbox
 
 #: What may wait for the disk.
 MOST_WAITING_BYTES = 512 * 2**20

@@ -23,11 +23,11 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError, ProfileError, SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert
+from lce_rig.devices.protocol import ClockState, Mailbox, SourceStatus
+from lce_rig.devices.reading import LiveSource
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene, between
-from lce_rig.sources.live.base import ClockState, Mailbox, SourceStatus
-from lce_rig.sources.live.reading import LiveSource
 
 # Whether this computer simulates as fast as sensors sense: where it does not, low rates are its doing.
 

@@ -14,9 +14,9 @@ from wire.timing import LOOP_NS, PACKET_NS, placement_at
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
+from lce_rig.recordings.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings
 from lce_rig.session import Capture, Session
-from lce_rig.sources.velodyne_stream import Vlp16Stream
 from tests.collect.live.conftest import LOOPS_PER_HOLD
 
 

@@ -5,9 +5,9 @@ from functools import cache
 
 import numpy as np
 
-from lce_rig.collect.live.gates import StillBoards
+from lce_rig.collect.board_tracker import Sighting
+from lce_rig.collect.live.capture_triggers import StillBoards
 from lce_rig.collect.live.guide import make_guides
-from lce_rig.collect.watching import Sighting
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder

@@ -15,8 +15,8 @@ from wire.rig import WireRig
 from lce_rig.collect.live.collection import collect_live
 from lce_rig.collect.live.options import LiveOptions
 from lce_rig.collect.live.state import LiveState
+from lce_rig.devices.opening import open_live
 from lce_rig.session import Session
-from lce_rig.sources.live.opening import open_live
 from tests.collect.live.sent import check_sent, check_stamps, check_whole, errors, journal_of, read_sent
 
 Start = Callable[..., WireRig]
@@ -24,7 +24,7 @@ Start = Callable[..., WireRig]
 # stamps of arrivals left out, which no process can set.
 SET_CLOCK = """
 import os, time
-from lce_rig.sources.live import vlp16_socket
+from lce_rig.devices import vlp16_socket
 vlp16_socket._SO_TIMESTAMPNS = -1
 real_ns = time.time_ns
 time.time_ns = lambda: real_ns() + ({set_ns} if os.path.exists({file!r}) else 0)

@@ -1,0 +1,181 @@
+"""The board followed from frame to frame, in every picture and scan."""
+
+from dataclasses import dataclass, field, replace
+
+from lce_rig.collect.refusal_counts import Tally
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.detect.finder import BoardFinder, ImageSearch
+from lce_rig.detect.image.search import NOT_SEEN_AT_ONCE
+from lce_rig.rig import Rig
+from lce_rig.timing.scan_pairing import Frame
+
+ImageKey = tuple[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """The board in one frame.
+
+    Attributes:
+        images: by (camera, channel), where it was found.
+        lidars: candidates that the profile's limits admit, by LiDAR; things of the board's size may be among
+            them.
+        unseen: why it was not found, by (camera, channel), where it was looked for.
+        unscanned: why there is no such candidate, by LiDAR, where it was looked for.
+        unfit: why the profile's limits refuse a board of `images`, by (camera, channel).
+    """
+
+    frame: Frame
+    images: dict[ImageKey, ImageBoard]
+    lidars: dict[str, list[LidarBoard]]
+    unseen: dict[ImageKey, Refusal] = field(default_factory=dict)
+    unscanned: dict[str, Refusal] = field(default_factory=dict)
+    unfit: dict[ImageKey, Refusal] = field(default_factory=dict)
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether a camera and a LiDAR see the board as the profile's limits want it."""
+        return bool(self.images.keys() - self.unfit.keys() and self.lidars)
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A sighting worth a capture.
+
+    Attributes:
+        figures: how still or how fast the board was, by name; kept with the capture.
+    """
+
+    sighting: Sighting
+    figures: dict[str, float]
+
+
+@dataclass
+class BoardWatcher:
+    """Finds the board frame by frame, near where it was, so that a long recording is searched quickly.
+
+    Attributes:
+        rig: the profile.
+        search_interval_s: how often a whole picture is searched while no board is in sight.
+        refusals: frames in which it was not found, and boards that were found and cannot be used.
+        thorough_interval_s: how often such a search is thorough, which takes most of a second; 0 for always.
+        rescan_interval_s: how often a whole scan is searched while all candidates are followed; 0 for as
+            often as while one is lost.
+    """
+
+    rig: Rig
+    search_interval_s: float
+    refusals: Tally = field(default_factory=Tally)
+    thorough_interval_s: float = 0.0
+    rescan_interval_s: float = 0.0
+    _seen: dict[ImageKey, ImageBoard] = field(default_factory=dict)
+    _candidates: dict[str, list[LidarBoard]] = field(default_factory=dict)
+    _n_candidates: dict[str, int] = field(default_factory=dict)
+    _searched_ns: dict[ImageKey | str, int] = field(default_factory=dict)
+    _thorough_ns: dict[ImageKey | str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.finder = BoardFinder(self.rig)
+
+    def sight(self, frame: Frame) -> Sighting:
+        """Find the board in every picture and scan of a frame."""
+        images: dict[ImageKey, ImageBoard] = {}
+        unseen: dict[ImageKey, Refusal] = {}
+        unfit: dict[ImageKey, Refusal] = {}
+        for image in frame.images:
+            key = (image.sensor, image.channel)
+            found = self._find_in_image(image, key, frame.time_ns)
+            if found is None:
+                continue
+            if isinstance(found.board, Refusal):
+                unseen[key] = found.board
+                continue
+            images[key] = found.board
+            if isinstance(found.usable, Refusal):
+                unfit[key] = found.usable
+                self.refusals.add(found.usable)
+        lidars: dict[str, list[LidarBoard]] = {}
+        unscanned: dict[str, Refusal] = {}
+        # Nothing is gained from scans while no camera sees the board.
+        for scan in frame.scans if images else ():
+            candidates = self._find_in_scan(scan, frame.time_ns)
+            if isinstance(candidates, Refusal):
+                unscanned[scan.sensor] = candidates
+            else:
+                lidars[scan.sensor] = candidates
+        if not images:
+            self._n_candidates.clear()  # A board that comes back is searched for at once.
+            self.refusals.add(Refusal("image.none"))
+        elif not lidars:
+            self.refusals.add(Refusal("lidar.none"))
+        return Sighting(frame, images, lidars, unseen, unscanned, unfit)
+
+    def confirm(self, moment: Moment) -> Moment | Refusal:
+        """Search the frame of a moment without a prior, as `check` does: what is captured can be used later.
+
+        Returns:
+            The moment with what was found; or why it cannot be used.
+        """
+        sighting = moment.sighting
+        keys = sighting.images.keys()
+        images = {
+            (image.sensor, image.channel): self.finder.image(image)
+            for image in sighting.frame.images
+            if (image.sensor, image.channel) in keys
+        }
+        scans = {scan.sensor: self.finder.scan(scan) for scan in sighting.frame.scans}
+        usable = {key: board for key, board in images.items() if isinstance(board, ImageBoard)}
+        lidars = {name: boards for name, boards in scans.items() if isinstance(boards, list)}
+        for found, refused in ((usable, images), (lidars, scans)):
+            if not found:
+                return next(why for why in refused.values() if isinstance(why, Refusal))
+        return replace(moment, sighting=Sighting(sighting.frame, usable, lidars))
+
+    def _find_in_image(self, image: Image, key: ImageKey, time_ns: int) -> ImageSearch | None:
+        last = self._seen.pop(key, None)
+        if last is None and not self._is_search_due(key, time_ns):
+            return None
+        is_thorough = self._is_thorough_due(key, time_ns, was_seen=last is not None)
+        found = self.finder.search_image(image, last, is_thorough=is_thorough)
+        if found.board is NOT_SEEN_AT_ONCE:
+            return None
+        if isinstance(found.board, ImageBoard):
+            self._seen[key] = found.board
+        return found
+
+    def _find_in_scan(self, scan: Scan, time_ns: int) -> list[LidarBoard] | Refusal:
+        known = self._candidates.get(scan.sensor, [])
+        followed = self.finder.follow_scan(scan, known) if known else None
+        n_found = len(followed.boards) if followed is not None and isinstance(followed.boards, list) else 0
+        are_all_there = n_found == self._n_candidates.get(scan.sensor)
+        interval_s = max(self.search_interval_s, self.rescan_interval_s if are_all_there else 0.0)
+        is_due = _is_due(self._searched_ns, scan.sensor, time_ns, interval_s)
+        search = followed
+        if search is None or not n_found or is_due:
+            search = self.finder.search_scan(scan)
+        self._candidates[scan.sensor] = search.boards if isinstance(search.boards, list) else []
+        if search is not followed:
+            self._n_candidates[scan.sensor] = len(self._candidates[scan.sensor])
+        if isinstance(search.boards, list) and isinstance(search.usable, Refusal):
+            self.refusals.add(search.usable)
+        return search.usable
+
+    def _is_search_due(self, key: ImageKey | str, time_ns: int) -> bool:
+        return _is_due(self._searched_ns, key, time_ns, self.search_interval_s)
+
+    def _is_thorough_due(self, key: ImageKey, time_ns: int, *, was_seen: bool) -> bool:
+        """Tell whether it is time for a thorough search; a board just lost is soon seen again without."""
+        if was_seen and self.thorough_interval_s > 0:
+            self._thorough_ns[key] = time_ns
+            return False
+        return _is_due(self._thorough_ns, key, time_ns, self.thorough_interval_s)
+
+
+def _is_due(last_ns: dict[ImageKey | str, int], key: ImageKey | str, time_ns: int, interval_s: float) -> bool:
+    """Tell whether an interval has gone by since something was done last, and note that it is done now."""
+    before_ns = last_ns.get(key)
+    if before_ns is not None and 0 <= time_ns - before_ns < interval_s * 1e9:
+        return False
+    last_ns[key] = time_ns
+    return True

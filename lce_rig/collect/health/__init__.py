@@ -1,5 +1,0 @@
-"""Whether a computer and its sensors are fit to collect: a function a check, each line with its findings."""
-
-from lce_rig.collect.health.check import Check
-
-__all__ = ["Check"]

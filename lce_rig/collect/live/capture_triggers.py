@@ -1,0 +1,95 @@
+"""When a live board is captured: standing still, or moving slowly where events are wanted."""
+
+from typing import Protocol
+
+from lce_rig.collect.board_tracker import Moment, Sighting
+from lce_rig.collect.event_moment import MotionOptions
+from lce_rig.collect.live.guide import Guide
+from lce_rig.collect.live.narration import Narration, narrate_moving, narrate_still
+from lce_rig.collect.offline.slow_motion import MotionGate
+from lce_rig.collect.offline.stillness import StillnessGate, StillnessOptions
+from lce_rig.collect.placement_dedupe import Placements
+from lce_rig.collect.refusal_counts import Tally
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Refusal
+from lce_rig.rig import Rig
+from lce_rig.timing.event_buffer import EventCut
+
+#: A live moment waits for a better one of its place no longer than this.
+LIVE_PATIENCE_S = 0.7
+
+
+class LiveGate(Protocol):
+    """Decides on moments as sightings come."""
+
+    def take(self, sighting: Sighting) -> list[Moment]:
+        """Take the next sighting, and give the moments that are worth a capture by how the board moves."""
+        ...
+
+    def narrate(self, guide: Guide, present: Array) -> Narration:
+        """Say what to do with a board that is seen at (4, 4)."""
+        ...
+
+    def events_of(self, moment: Moment) -> tuple[EventCut, ...]:
+        """Give the events of a moment that its capture keeps."""
+        ...
+
+
+class StillBoards:
+    """Captures boards that stand still for `hold_s`; see `LiveGate`."""
+
+    def __init__(self, rig: Rig, hold_s: float) -> None:
+        self._hold_s = hold_s
+        self._max_motion_m = rig.quality.max_motion_m
+        # The first window of stillness has passed when the hold begins.
+        options = StillnessOptions(max_motion_m=self._max_motion_m, dwell_s=hold_s)
+        self._gate = StillnessGate(rig.board.to_board(), options)
+        self._is_judged = self._is_decided = False
+        self._refusal: Refusal | None = None
+
+    def take(self, sighting: Sighting) -> list[Moment]:
+        """Take the next sighting; a board that is moved on before its time is not captured."""
+        moment = self._gate.take(sighting)
+        if self._gate.motion_m > self._max_motion_m:
+            self._is_judged = self._is_decided = False
+            return []
+        if moment is None or self._is_decided:
+            return []
+        self._is_decided = True
+        return [moment]
+
+    def narrate(self, guide: Guide, present: Array) -> Narration:
+        """Say what to do with a board that is seen at (4, 4)."""
+        held_s = self._gate.held_s
+        # Weighing a placement takes long: once a stretch of stillness is enough.
+        if held_s is not None and not self._is_judged:
+            self._is_judged, self._refusal = True, guide.adds_nothing(present)
+            if self._refusal is not None:
+                guide.note_refusal(present)
+        if self._is_decided:
+            return narrate_still(guide, present, None, self._hold_s, None)
+        return narrate_still(guide, present, held_s, self._hold_s, self._refusal)
+
+    def events_of(self, moment: Moment) -> tuple[EventCut, ...]:
+        """Give none: a board that stands still makes no events of use."""
+        return ()
+
+
+class SlowBoards:
+    """Captures boards that move slowly before a camera of events; see `LiveGate`."""
+
+    def __init__(self, rig: Rig, novelty: Placements) -> None:
+        self._options = MotionOptions(patience_s=LIVE_PATIENCE_S)
+        self._gate = MotionGate(rig, self._options, novelty, Tally())
+
+    def take(self, sighting: Sighting) -> list[Moment]:
+        """Take the next sighting."""
+        return self._gate.take(sighting)
+
+    def narrate(self, guide: Guide, present: Array) -> Narration:
+        """Say what to do with a board that is seen at (4, 4)."""
+        return narrate_moving(guide, present, self._gate.judged, self._options)
+
+    def events_of(self, moment: Moment) -> tuple[EventCut, ...]:
+        """Give all of them."""
+        return moment.sighting.frame.events

@@ -1,0 +1,396 @@
+"""Build a session from recordings, unattended: what is new becomes a capture, the rest is counted."""
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+from lce_rig.collect.board_tracker import BoardWatcher, ImageKey, Moment
+from lce_rig.collect.event_moment import MotionOptions
+from lce_rig.collect.event_pictures import with_event_pictures
+from lce_rig.collect.offline.slow_motion import find_moving_moments
+from lce_rig.collect.offline.stillness import StillnessOptions, find_still_moments
+from lce_rig.collect.offline.stored_events import StoredEvents
+from lce_rig.collect.placement_dedupe import Placements, board_figures, known_placements
+from lce_rig.collect.refusal_counts import Tally
+from lce_rig.core.data import Events, Image, Sample, Scan, Stream
+from lce_rig.core.errors import SessionError, SourceError
+from lce_rig.core.results import Refusal
+from lce_rig.recordings.joining import join_recordings, require_sensors
+from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording, PairFiles, Recording
+from lce_rig.rig import Rig
+from lce_rig.session import Session
+from lce_rig.timing.scan_pairing import PairingCounts, pair_by_time
+from lce_rig.words import describe
+
+# The moments of a recording that are worth a capture.
+
+# How often an image without a board is searched thoroughly, which takes most of a second.
+_THOROUGH_S = 1.0
+
+
+@dataclass
+class MomentSearch:
+    """Finds moments in a stream of samples: by stillness or, where there are events, by motion.
+
+    A camera that sends events and no pictures is watched in pictures reconstructed as the stream runs.
+
+    Attributes:
+        rig: the profile.
+        streams: what the recording holds.
+        stillness: when a board stands still; None takes the profile's `quality.max_motion_m`.
+        motion: how a moving board is judged.
+        min_move_m, min_turn_deg: how far placements of a moving board must be apart.
+    """
+
+    rig: Rig
+    streams: Collection[Stream]
+    stillness: StillnessOptions | None
+    motion: MotionOptions
+    min_move_m: float
+    min_turn_deg: float
+    _pairing: PairingCounts = field(default_factory=PairingCounts)
+    _tally: Tally = field(default_factory=Tally)
+
+    @property
+    def has_events(self) -> bool:
+        """Whether events are kept with captures, so that the board has to move."""
+        return any(stream.kind == "events" for stream in self.streams)
+
+    @property
+    def reconstructed(self) -> frozenset[ImageKey]:
+        """(camera, channel) of the pictures that are made of events to watch the board."""
+        with_pictures = {stream.sensor for stream in self.streams if stream.kind == "pictures"}
+        return frozenset(
+            (stream.sensor, stream.channel)
+            for stream in self.streams
+            if stream.kind == "events" and stream.sensor not in with_pictures
+        )
+
+    def moments(self, samples: Iterable[Sample]) -> Iterator[Moment]:
+        """Yield the moments of a stream, as `find_still_moments` or `find_moving_moments` define them.
+
+        Raises:
+            ProfileError: the profile's network cannot be used.
+            SourceError: as the samples do.
+        """
+        cameras = {camera for camera, _ in self.reconstructed}
+        if cameras:
+            samples = with_event_pictures(samples, self.rig, cameras, self._tally)
+        stillness = self.stillness or StillnessOptions(max_motion_m=self.rig.quality.max_motion_m)
+        interval_s = self.motion.search_interval_s if self.has_events else stillness.search_interval_s
+        watcher = BoardWatcher(self.rig, interval_s, self._tally, _THOROUGH_S)
+        frames = pair_by_time(samples, self.rig, self._pairing)
+        sightings = (watcher.sight(frame) for frame in frames)
+        if self.has_events:
+            taken = Placements(self.min_move_m, self.min_turn_deg)
+            moments = find_moving_moments(sightings, self.rig, self.motion, taken, self._tally)
+        else:
+            moments = find_still_moments(sightings, self.rig.board.to_board(), stillness)
+        for moment in moments:
+            confirmed = watcher.confirm(moment)
+            if isinstance(confirmed, Refusal):
+                self._tally.add(confirmed)
+            else:
+                yield confirmed
+
+    def kept_images(self, moment: Moment) -> list[Image]:
+        """List the pictures of a moment that its capture keeps: all but those that its events give again."""
+        images = moment.sighting.frame.images
+        return [image for image in images if (image.sensor, image.channel) not in self.reconstructed]
+
+    def counts(self) -> Tally:
+        """Count what became no moment so far."""
+        # Why a picture could not be made of events is in the tally.
+        n_alone = 0 if self.reconstructed else self._pairing.n_alone
+        total = Tally()
+        total.add(Refusal("read.no_image_at_scan"), n_alone)
+        total.update(self._tally)
+        return total
+
+    def notes(self) -> list[str]:
+        """Say how scans and pictures came together."""
+        if self._pairing.n_alone == 0 or self.reconstructed:
+            return []
+        if self._pairing.nearest_ns is None:
+            return ["no picture could be compared with a scan: one of the two has none"]
+        apart_s = self._pairing.nearest_ns * 1e-9
+        return [f"{self._pairing.n_alone} scans without a picture; the nearest was {apart_s:.3f} s away"]
+
+
+Progress = Callable[[int, int, str], None]
+"""Told (samples done, samples in all, what happened)."""
+
+
+@dataclass(frozen=True)
+class CollectOptions:
+    """What becomes a capture.
+
+    Attributes:
+        max_captures: the session is never filled beyond this; None for no limit.
+        target: number of captures wanted: recordings are read until the session has as many.
+        min_move_m, min_turn_deg: a board differs from one captured before when it moved or turned as far; for
+            continuous recordings only.
+        stillness: when a board stands still; None takes the profile's `quality.max_motion_m`.
+        motion: how a moving board is judged, where events are recorded.
+    """
+
+    max_captures: int | None = None
+    target: int | None = None
+    min_move_m: float = 0.15
+    min_turn_deg: float = 10.0
+    stillness: StillnessOptions | None = None
+    motion: MotionOptions = field(default_factory=MotionOptions)
+
+
+@dataclass
+class CollectReport:
+    """What became of everything that was read.
+
+    Attributes:
+        captured: names of the new captures.
+        n_resumed: pairs and moments that an earlier run had captured already.
+        duplicates: capture that holds the same data, by label.
+        refused: why something became no capture, by label.
+        counts: what kept moments of a continuous recording from becoming captures.
+        notes: what was chosen, assumed or left out, in words.
+        errors: recordings that could not be read to their end; what was captured before is kept.
+        n_missing: captures short of the target.
+        has_events: whether any recording held events, which make the board's motion wanted.
+    """
+
+    captured: list[str] = field(default_factory=list)
+    n_resumed: int = 0
+    duplicates: dict[str, str] = field(default_factory=dict)
+    refused: dict[str, Refusal] = field(default_factory=dict)
+    counts: Tally = field(default_factory=Tally)
+    notes: list[str] = field(default_factory=list)
+    errors: list[SourceError] = field(default_factory=list)
+    n_missing: int = 0
+    has_events: bool = False
+
+
+def collect(
+    session: Session,
+    recordings: Sequence[Recording],
+    options: CollectOptions | None = None,
+    progress: Progress | None = None,
+) -> CollectReport:
+    """Fill a session from recordings.
+
+    A folder's pairs become captures as they are. A continuous recording is cut where the board stands still
+    in every sensor that sees it, and differs from what the session holds; where it holds events, at the best
+    moment of every place that the board passes slowly, and the raw events about it are kept. Recordings of
+    the same moment by several recorders are read as one. What an earlier run captured is not captured again.
+
+    Raises:
+        SourceError: nothing could be read at all; it names the first file and the cause.
+        SessionError: the session cannot be written; what was captured before is safe.
+    """
+    collector = _Collector(session, options or CollectOptions(), progress or _silent)
+    for recording in join_recordings(recordings, session.rig):
+        collector.note(recording.notes)
+        try:
+            if isinstance(recording, PairedRecording):
+                collector.take_pairs(recording)
+            elif isinstance(recording, ContinuousRecording):
+                collector.take_moments(recording)
+        except SourceError as error:
+            collector.report.errors.append(error)
+        finally:
+            collector.note(recording.notes)
+    return collector.finish()
+
+
+def _silent(_done: int, _total: int, _message: str) -> None:
+    return
+
+
+class _Collector:
+    def __init__(self, session: Session, options: CollectOptions, progress: Progress) -> None:
+        self.report = CollectReport()
+        self._session = session
+        self._options = options
+        self._progress = progress
+        self._stored = StoredEvents()
+        self._names_by_key = _known_keys(session)
+        self._n_captures = len(session.captures)
+
+    def take_pairs(self, recording: PairedRecording) -> None:
+        """Capture every pair of a folder.
+
+        Raises:
+            SourceError: not one pair could be read; its cause is that of the first.
+        """
+        failures: list[SourceError] = []
+        n_left_out = 0
+        for done, files in enumerate(recording.pairs):
+            message = files.label
+            if self._is_enough():
+                n_left_out += 1
+                continue
+            try:
+                message = self._take_pair(files)
+            except SourceError as error:
+                failures.append(error)
+                self.report.refused[files.label] = Refusal.of_error("read", error, "record")
+                message = f"{files.label} refused: {error.what}"
+            self._progress(done + 1, len(recording.pairs), message)
+        if n_left_out:
+            self.note(
+                [f"{n_left_out} pairs left out: the session holds {self._n_captures} captures, as wanted"]
+            )
+        if failures and len(failures) == len(recording.pairs):
+            raise failures[0]
+
+    def take_moments(self, recording: ContinuousRecording) -> None:
+        """Capture the moments of a continuous recording that are worth it.
+
+        Raises:
+            SourceError: it lacks a LiDAR or a camera, or their clocks do not overlap; or it is torn: what
+                came before has been captured.
+        """
+        require_sensors(recording)
+        rig, options = self._session.rig, self._options
+        known = known_placements(self._session, options.min_move_m, options.min_turn_deg)
+        search = MomentSearch(
+            rig,
+            frozenset(recording.streams),
+            options.stillness,
+            options.motion,
+            options.min_move_m,
+            options.min_turn_deg,
+        )
+        self.report.has_events |= search.has_events
+        torn: list[SourceError] = []
+        samples = self._counted(_until_torn(recording.samples(), torn), recording.n_samples)
+        for moment in search.moments(samples):
+            if self._is_enough():
+                self.note(["stopped early: the session has as many captures as wanted"])
+                break
+            self._take_moment(recording.key, moment, search.kept_images(moment), known)
+        self.report.counts.update(search.counts())
+        self.note(search.notes())
+        if torn:
+            raise torn[0]
+
+    def note(self, notes: Iterable[str]) -> None:
+        """Keep notes, each once."""
+        self.report.notes.extend(note for note in notes if note not in self.report.notes)
+
+    def finish(self) -> CollectReport:
+        """Close the books.
+
+        Raises:
+            SourceError: nothing could be read and the session is empty.
+        """
+        report = self.report
+        self.note(self._stored.notes())
+        if self._options.target is not None:
+            report.n_missing = max(0, self._options.target - self._n_captures)
+        self._session.journal(
+            "collected",
+            captured=len(report.captured),
+            resumed=report.n_resumed,
+            duplicates=report.duplicates,
+            refused={label: describe(refusal) for label, refusal in report.refused.items()},
+            counts=report.counts.by_code(),
+            errors=[error.what for error in report.errors],
+        )
+        if report.errors and self._n_captures == 0:
+            raise report.errors[0]
+        return report
+
+    def _take_pair(self, files: PairFiles) -> str:
+        key = files.key()
+        if key in self._names_by_key:
+            self.report.n_resumed += 1
+            return f"{files.label} is capture {self._names_by_key[key]} already"
+        pair = files.read()
+        self.note(pair.notes)
+        self._note_sizes(pair.images)
+        return self._store(key, files.label, pair.images, pair.scans, {})
+
+    def _take_moment(
+        self, recording_key: str, moment: Moment, images: Sequence[Image], known: Placements
+    ) -> None:
+        frame, boards = moment.sighting.frame, moment.sighting.images
+        stamps = [scan.stamp_ns for scan in frame.scans] + [image.stamp_ns for image in images]
+        key = f"{recording_key}:{'/'.join(str(stamp) for stamp in stamps)}"
+        label = f"at {stamps[0]} ns"
+        if key in self._names_by_key:
+            self.report.n_resumed += 1
+            return
+        if known.find_like(boards) is not None:
+            self.report.counts.add(Refusal("calibrate.same_placement"))
+            return
+        self._note_sizes(images)
+        self._stored.note(frame.events)
+        events = [cut.events for cut in frame.events]
+        figures = {**moment.figures, **board_figures(boards)}
+        self._store(key, label, images, frame.scans, figures, events)
+        known.add(self._names_by_key.get(key, label), boards)
+
+    def _store(
+        self,
+        key: str,
+        label: str,
+        images: Sequence[Image],
+        scans: Sequence[Scan],
+        figures: dict[str, object],
+        events: Sequence[Events] = (),
+    ) -> str:
+        duplicate = self._session.find_duplicate(images, scans, events)
+        if duplicate is not None:
+            self.report.duplicates[label] = duplicate
+            return f"{label} is a duplicate of {duplicate}"
+        meta = {"source": {"key": key, "label": label}, **figures}
+        name = self._session.add_capture(images, scans, meta, events)
+        self._names_by_key[key] = name
+        self._n_captures += 1
+        self.report.captured.append(name)
+        return f"{label} captured as {name}"
+
+    def _is_full(self) -> bool:
+        limit = self._options.max_captures
+        return limit is not None and self._n_captures >= limit
+
+    def _is_enough(self) -> bool:
+        target = self._options.target
+        return self._is_full() or (target is not None and self._n_captures >= target)
+
+    def _counted(self, samples: Iterable[Sample], n_samples: int) -> Iterator[Sample]:
+        done = 0
+        for sample in samples:
+            yield sample
+            if not isinstance(sample, Events):
+                done += 1
+                self._progress(done, n_samples, f"{len(self.report.captured)} captured")
+
+    def _note_sizes(self, images: Iterable[Image]) -> None:
+        for image in images:
+            height, width = image.pixels.shape[:2]
+            wanted = self._session.rig.cameras[image.sensor].resolution_px
+            if (width, height) != wanted:
+                size = f"{wanted[0]}x{wanted[1]}"
+                self.note(
+                    [f"camera {image.sensor}: pictures of {width}x{height} where the profile says {size}"]
+                )
+
+
+def _until_torn(samples: Iterable[Sample], torn: list[SourceError]) -> Iterator[Sample]:
+    """Pass samples on, and end where the recording is torn: moments found so far must still be captured."""
+    try:
+        yield from samples
+    except SourceError as error:
+        torn.append(error)
+
+
+def _known_keys(session: Session) -> dict[str, str]:
+    keys = {}
+    for capture in session.captures:
+        try:
+            source = capture.meta.get("source", {})
+        except SessionError:
+            continue  # A damaged capture is named when it is used.
+        if isinstance(source, dict) and isinstance(source.get("key"), str):
+            keys[source["key"]] = capture.name
+    return keys

@@ -1,0 +1,157 @@
+"""The best moment of every place that a moving board passes.
+
+Of the moments that will do for an event camera, follow each other within seconds and lie within a placement's
+reach of each other, the one is taken whose events are whole, and whose speed is nearest to 10 cm/s and most
+steady.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from lce_rig.collect.board_tracker import Moment, Sighting
+from lce_rig.collect.event_moment import MotionOptions, judge_sighting
+from lce_rig.collect.placement_dedupe import Placements
+from lce_rig.collect.refusal_counts import Tally
+from lce_rig.core.results import Refusal
+from lce_rig.rig import Rig
+
+# A way that strays from a straight one by this counts as much as a speed e times too high or low.
+_UNSTEADY_M = 0.01
+
+
+def find_moving_moments(
+    sightings: Iterable[Sighting], rig: Rig, options: MotionOptions, taken: Placements, tally: Tally
+) -> Iterator[Moment]:
+    """Yield the best moment of every place that the board passes, each place once.
+
+    Which they are depends on the recording alone, so that a second run finds the same.
+
+    Args:
+        sightings: in order of time.
+        rig: the profile.
+        options: how a moving board is judged.
+        taken: no placements yet; it says how far apart they must be.
+        tally: receives why other sightings are no moments.
+    """
+    gate = MotionGate(rig, options, taken, tally)
+    for sighting in sightings:
+        yield from gate.take(sighting)
+    yield from gate.finish()
+
+
+class MotionGate:
+    """Takes sightings in order of time, and gives the best moment of every place that the board passes.
+
+    Attributes:
+        judged: the last sighting that could be judged: a moment that will do, or why it does not; None where
+            no camera of events saw the board.
+    """
+
+    def __init__(self, rig: Rig, options: MotionOptions, taken: Placements, tally: Tally) -> None:
+        """Begin without sightings; for the arguments see `find_moving_moments`."""
+        self.judged: Moment | Refusal | None = None
+        self._rig = rig
+        self._options = options
+        self._tally = tally
+        self._neighbours = _Neighbours(options.window_s)
+        self._chooser = _Chooser(options, taken)
+
+    def take(self, sighting: Sighting) -> list[Moment]:
+        """Take the next sighting, and give the moments that nothing better can follow."""
+        return self._judge(self._neighbours.take(sighting))
+
+    def finish(self) -> list[Moment]:
+        """Give what is left when nothing more comes."""
+        return [*self._judge(self._neighbours.finish()), *self._chooser.finish()]
+
+    def _judge(self, sightings: Iterable[tuple[Sighting, list[Sighting]]]) -> list[Moment]:
+        moments: list[Moment] = []
+        for sighting, around in sightings:
+            self.judged = judge_sighting(sighting, around, self._rig, self._options)
+            if isinstance(self.judged, Refusal):
+                self._tally.add(self.judged)
+            moment = self.judged if isinstance(self.judged, Moment) else None
+            moments.extend(self._chooser.take(sighting.frame.time_ns, moment))
+        return moments
+
+
+class _Chooser:
+    """Holds moments back until it is known whether a better one of the same place follows shortly."""
+
+    def __init__(self, options: MotionOptions, taken: Placements) -> None:
+        self._options = options
+        self._taken = taken
+        self._pending: deque[Moment] = deque()
+
+    def take(self, now_ns: int, moment: Moment | None) -> Iterator[Moment]:
+        """Take the moment at a time, where there is one, and yield those that nothing better came after."""
+        while self._pending and not self._is_young(self._pending[0], now_ns):
+            yield from self._decide_oldest()
+        if moment is not None and self._taken.find_like(moment.sighting.images) is None:
+            self._pending.append(moment)
+
+    def finish(self) -> Iterator[Moment]:
+        """Yield what is left when the recording has ended."""
+        while self._pending:
+            yield from self._decide_oldest()
+
+    def _decide_oldest(self) -> Iterator[Moment]:
+        """Give up the oldest moment, unless it stands when the best of all are taken first, one a place."""
+        oldest = self._pending.popleft()
+        if self._taken.find_like(oldest.sighting.images) is not None:
+            return
+        kept: list[Moment] = []
+        for moment in sorted((oldest, *self._pending), key=self._badness):
+            boards = moment.sighting.images
+            if any(self._taken.are_alike(boards, other.sighting.images) for other in kept):
+                continue
+            if moment is oldest:
+                self._taken.add(str(oldest.sighting.frame.time_ns), boards)
+                yield oldest
+                return
+            kept.append(moment)
+
+    def _is_young(self, moment: Moment, now_ns: int) -> bool:
+        return 0 <= now_ns - moment.sighting.frame.time_ns < self._options.patience_s * 1e9
+
+    def _badness(self, moment: Moment) -> tuple[bool, float]:
+        is_short = any(cut.missing_ns > 0 for cut in moment.sighting.frame.events)
+        speed_ratio = max(moment.figures["speed_mps"], 1e-3) / self._options.best_speed_mps
+        return is_short, abs(float(np.log(speed_ratio))) + moment.figures["unsteady_m"] / _UNSTEADY_M
+
+
+class _Neighbours:
+    """Gives each sighting with all within half a window of it, itself among them, once they have come."""
+
+    def __init__(self, window_s: float) -> None:
+        self._half_ns = round(window_s * 0.5e9)
+        self._near: deque[Sighting] = deque()
+        self._n_waiting = 0
+
+    def take(self, sighting: Sighting) -> Iterator[tuple[Sighting, list[Sighting]]]:
+        """Take the next sighting, and give those whose neighbours are complete."""
+        near, now_ns = self._near, sighting.frame.time_ns
+        if near and now_ns <= near[-1].frame.time_ns:
+            # The clocks were set back.
+            yield from self.finish()
+        near.append(sighting)
+        self._n_waiting += 1
+        while now_ns - near[-self._n_waiting].frame.time_ns >= self._half_ns:
+            oldest = near[-self._n_waiting]
+            yield oldest, self._around(oldest)
+            self._n_waiting -= 1
+        while near[-max(self._n_waiting, 1)].frame.time_ns - near[0].frame.time_ns > self._half_ns:
+            near.popleft()
+
+    def finish(self) -> Iterator[tuple[Sighting, list[Sighting]]]:
+        """Give those that still wait, and forget all."""
+        for place in range(len(self._near) - self._n_waiting, len(self._near)):
+            yield self._near[place], self._around(self._near[place])
+        self._near.clear()
+        self._n_waiting = 0
+
+    def _around(self, sighting: Sighting) -> list[Sighting]:
+        time_ns = sighting.frame.time_ns
+        return [other for other in self._near if abs(other.frame.time_ns - time_ns) <= self._half_ns]

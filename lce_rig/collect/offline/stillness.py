@@ -1,0 +1,155 @@
+"""Moments at which the board stands still in every sensor that sees it."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from lce_rig.collect.board_tracker import Moment, Sighting
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import LidarBoard
+
+
+@dataclass(frozen=True)
+class StillnessOptions:
+    """When a board counts as standing still.
+
+    Attributes:
+        window_s: for how long it has to.
+        max_motion_m: how far it may move meanwhile; a hand never holds it quite still.
+        dwell_s: after this long a capture is taken without waiting for the board to be moved on.
+        search_interval_s: how often a whole picture is searched while no board is in sight.
+    """
+
+    window_s: float = 0.5
+    max_motion_m: float = 0.01
+    dwell_s: float = 2.0
+    search_interval_s: float = 0.3
+
+
+def find_still_moments(
+    sightings: Iterable[Sighting], board: Board, options: StillnessOptions
+) -> Iterator[Moment]:
+    """Yield the stillest moment of every stretch in which the board stands still."""
+    gate = StillnessGate(board, options)
+    for sighting in sightings:
+        moment = gate.take(sighting)
+        if moment is not None:
+            yield moment
+    moment = gate.finish()
+    if moment is not None:
+        yield moment
+
+
+class StillnessGate:
+    """Takes sightings in order of time, and gives the stillest moment of every stretch of stillness.
+
+    It is the middle of a window in which nothing moved more than its figure `motion_m`. A stretch ends when
+    the board moves, is lost, or has stood for `dwell_s`; it is then reported once.
+
+    Attributes:
+        motion_m: how far the board moved in the last window; infinite where there is no whole one.
+        held_s: for how long the present stretch has lasted, since its first whole window; None out of one.
+    """
+
+    def __init__(self, board: Board, options: StillnessOptions) -> None:
+        self.motion_m = np.inf
+        self.held_s: float | None = None
+        self._board = board
+        self._options = options
+        self._window: deque[Sighting] = deque()
+        self._best: Moment | None = None
+        self._best_m = np.inf
+        self._since_ns = 0
+
+    def take(self, sighting: Sighting) -> Moment | None:
+        """Take the next sighting, and give the moment of a stretch that has ended with it."""
+        options, now_ns = self._options, sighting.frame.time_ns
+        self.motion_m = self._measure(sighting)
+        is_still = self.motion_m <= options.max_motion_m
+        if is_still:
+            self._since_ns = now_ns if self._best is None else self._since_ns
+            if self._best is None or self.motion_m < self._best_m:
+                middle = self._window[len(self._window) // 2]
+                self._best = Moment(middle, {"motion_m": round(self.motion_m, 6)})
+                self._best_m = self.motion_m
+        self.held_s = (now_ns - self._since_ns) * 1e-9 if is_still else None
+        if self._best is not None and (not is_still or now_ns - self._since_ns > options.dwell_s * 1e9):
+            return self.finish()
+        return None
+
+    def finish(self) -> Moment | None:
+        """Give the moment of the stretch that lasts, where there is one, and end it."""
+        best, self._best, self.held_s = self._best, None, None
+        return best
+
+    def _measure(self, sighting: Sighting) -> float:
+        """Put a sighting into the window and measure how far the board moved in it."""
+        window, options = self._window, self._options
+        is_seen = sighting.is_usable
+        if not is_seen or _is_gap(window, sighting, options):
+            window.clear()
+        if is_seen:
+            window.append(sighting)
+        while len(window) > 2 and _span_s(window) - _step_s(window) >= options.window_s:
+            window.popleft()
+        is_full = len(window) > 2 and _span_s(window) >= options.window_s * 0.999
+        return _motion_m(window, self._board, options.max_motion_m) if is_full else np.inf
+
+
+def _is_gap(window: deque[Sighting], sighting: Sighting, options: StillnessOptions) -> bool:
+    return bool(window) and not 0 < sighting.frame.time_ns - window[-1].frame.time_ns < options.window_s * 1e9
+
+
+def _span_s(window: deque[Sighting]) -> float:
+    return (window[-1].frame.time_ns - window[0].frame.time_ns) * 1e-9
+
+
+def _step_s(window: deque[Sighting]) -> float:
+    return (window[1].frame.time_ns - window[0].frame.time_ns) * 1e-9
+
+
+def _motion_m(window: deque[Sighting], board: Board, max_motion_m: float) -> float:
+    """Measure how far the board moved within a window.
+
+    Corners tell of motion across the line of sight much better than poses do; planes tell of motion along it.
+    """
+    middle = window[len(window) // 2]
+    motions: list[float] = []
+    for key, reference in middle.images.items():
+        others = [s.images[key].corners_px for s in window if key in s.images]
+        motions.append(max(_corner_motion_m(corners, reference.corners_px, board) for corners in others))
+    lidar_motions = [
+        max(_plane_motion_m(candidate, sighting.lidars.get(lidar, []), max_motion_m) for sighting in window)
+        for lidar, candidates in middle.lidars.items()
+        for candidate in candidates
+    ]
+    # Walls and tables always stand still: the cameras, which know the board by its print, must agree.
+    return max(max(motions), min(lidar_motions))
+
+
+def _corner_motion_m(corners_px: Array, reference_px: Array, board: Board) -> float:
+    grid = reference_px.reshape(board.rows, board.cols, 2)
+    square_px = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=-1)))
+    # The order may start at the other end of the print where the pattern does not say which is up.
+    shift_px = min(_rms(corners_px - reference_px), _rms(corners_px[::-1] - reference_px))
+    return shift_px * board.square_m / max(square_px, 1e-6)
+
+
+def _rms(difference: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(difference**2, axis=-1))))
+
+
+def _plane_motion_m(reference: LidarBoard, candidates: list[LidarBoard], max_motion_m: float) -> float:
+    """Measure by how much the plane of the nearest candidate passes by the reference's centre.
+
+    The centre itself is known along the board to a few centimetres only, and serves to tell plates apart.
+    """
+    centre = reference.T_lidar_board[:3, 3]
+    distances = [float(np.linalg.norm(c.T_lidar_board[:3, 3] - centre)) for c in candidates]
+    if not distances or min(distances) > 0.1 + max_motion_m:
+        return float("inf")
+    plane = candidates[int(np.argmin(distances))].plane
+    return float(abs(plane[:3] @ centre + plane[3]))

@@ -1,0 +1,1 @@
+"""The board in event streams: limits, flicker, figures."""

@@ -1,0 +1,102 @@
+"""The profile's limits on boards seen through events, and why none was seen, with what to do about it."""
+
+import numpy as np
+
+from lce_rig.core.data import Events
+from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.detect.events.figures import MEMORY_NS, busiest_events
+from lce_rig.detect.events.flicker import measure_flicker
+from lce_rig.detect.events.reconstruct.filters import hot_pixels
+from lce_rig.rig import QualitySettings
+
+_MAX_HOT_SHARE = 0.5
+# One event in a hundred pixels in a second is none.
+_MIN_EVENTS_PX = 0.01
+# Boards at 2 to 5 cm/s make 2 to 4 events a pixel in a second: with fewer one that is missing was too slow.
+_SLOW_EVENTS_PX = 4.0
+
+
+def gate_event_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:
+    """Hold a board seen through events against the profile's limits on events and motion.
+
+    A figure that could not be measured, as of pictures that others reconstructed, is not judged; speeds count
+    from where two standard deviations leave no doubt.
+
+    Args:
+        found: with the figures of its quality record.
+        limits: `quality` of the rig profile.
+    """
+    q = found.quality
+    events_px = q.get("events_px")
+    if events_px is not None and events_px < limits.min_events_px:
+        figures = {"events_px": events_px, "min_events_px": limits.min_events_px}
+        return Refusal("image.hardly_moved", figures=figures)
+    speed_mps = q.get("speed_mps", 0.0)
+    if speed_mps - 2 * q.get("speed_sigma_mps", 0.0) > limits.max_board_speed_mps:
+        return too_fast(speed_mps, limits)
+    turn_deg_s = q.get("turn_deg_s", 0.0)
+    if turn_deg_s - 2 * q.get("turn_sigma_deg_s", 0.0) > limits.max_turn_deg_s:
+        figures = {"turn_deg_s": turn_deg_s, "max_turn_deg_s": limits.max_turn_deg_s}
+        return Refusal("image.turning", figures=figures)
+    smear_m = q.get("smear_m", 0.0)
+    if smear_m > limits.max_smear_m:
+        return Refusal("image.smeared", figures={"smear_m": smear_m, "max_smear_m": limits.max_smear_m})
+    return found
+
+
+def too_fast(speed_mps: float, limits: QualitySettings) -> Refusal:
+    """Refuse a board that moves faster than the profile allows."""
+    figures = {"speed_mps": speed_mps, "max_speed_mps": limits.max_board_speed_mps}
+    return Refusal("image.too_fast", figures=figures)
+
+
+def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: QualitySettings) -> Refusal:
+    """Say what about the events keeps the board from being found; what was seen where they are not to blame.
+
+    Args:
+        events: about the picture.
+        stamp_ns: of the picture.
+        seen: why there is no picture, or no board in it.
+        limits: `quality` of the rig profile.
+    """
+    if len(events) and seen.stage == "read":
+        return seen
+    return events_problem(events, stamp_ns, limits) or seen
+
+
+def events_problem(events: Events, stamp_ns: int, limits: QualitySettings) -> Refusal | None:
+    """Say what about the events before a stamp keeps a board from being found; None where nothing does."""
+    if not len(events):
+        return Refusal("image.no_events")
+    recent = events.between(stamp_ns - MEMORY_NS, stamp_ns)
+    n_pixels = events.width_px * events.height_px
+    if len(recent) < _MIN_EVENTS_PX * n_pixels:
+        return Refusal("image.few_events", figures={"n_events": len(recent)})
+    lamps = look_for_flicker(recent)
+    if lamps is not None:
+        return lamps
+    n_hot, hot_share = _hot(recent)
+    if hot_share > _MAX_HOT_SHARE:
+        return Refusal("image.hot_pixels", figures={"n_hot": n_hot, "share": hot_share})
+    events_px, needed_px = busiest_events(events, stamp_ns), max(_SLOW_EVENTS_PX, limits.min_events_px)
+    if events_px < needed_px:
+        figures = {"events_px": events_px, "min_events_px": needed_px}
+        return Refusal("image.still_scene", figures=figures)
+    return None
+
+
+def look_for_flicker(events: Events) -> Refusal | None:
+    """Name the lamps that make most of the events of about a second; None where none do."""
+    flicker = measure_flicker(events)
+    if not flicker.is_storm:
+        return None
+    return Refusal("image.flicker", figures={"frequency_hz": flicker.frequency_hz})
+
+
+def _hot(events: Events) -> tuple[int, float]:
+    """Count hot pixels and measure their share of the events."""
+    shape = events.height_px, events.width_px
+    index = events.y.astype(np.intp) * events.width_px + events.x
+    counts = np.bincount(index, minlength=shape[0] * shape[1]).reshape(shape)
+    is_hot = hot_pixels(np.minimum(counts, 65535).astype(np.uint16))
+    return int(is_hot.sum()), float(counts[is_hot].sum() / max(counts.sum(), 1))

@@ -1,0 +1,17 @@
+"""Pictures from events: voxel grids, the recurrent network, the event map, and pictures at any stamp."""
+
+from lce_rig.detect.events.reconstruct.model import ReconstructionModel, model_bytes
+from lce_rig.detect.events.reconstruct.reconstructor import ReconstructionOptions, Reconstructor
+from lce_rig.detect.events.reconstruct.voxels import event_map, normalise_voxels, voxel_grid
+from lce_rig.detect.events.reconstruct.windows import WindowOptions
+
+__all__ = [
+    "ReconstructionModel",
+    "ReconstructionOptions",
+    "Reconstructor",
+    "WindowOptions",
+    "event_map",
+    "model_bytes",
+    "normalise_voxels",
+    "voxel_grid",
+]

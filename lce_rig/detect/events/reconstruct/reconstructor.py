@@ -1,0 +1,430 @@
+"""Pictures from an event stream, at any time asked for."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.data import Events, Image
+from lce_rig.core.errors import SourceError, UsageError
+from lce_rig.core.results import Refusal
+from lce_rig.detect.events.reconstruct.filters import NoiseFilter
+from lce_rig.detect.events.reconstruct.model import ReconstructionModel, States
+from lce_rig.detect.events.reconstruct.voxels import FloatArray, event_map, normalise_voxels, voxel_grid
+from lce_rig.detect.events.reconstruct.windows import WindowOptions, WindowRule, active_share, window_rule
+
+# Why there is no picture at a stamp.
+
+
+def still_cold(n_steps: int, n_warm_up: int, seen_ns: int) -> Refusal:
+    """Too little of the stream precedes the stamp for the network's state to have settled."""
+    figures = {"n_steps": n_steps, "n_warm_up": n_warm_up, "seen_s": 1e-9 * seen_ns}
+    return Refusal("read.network_settling", figures=figures)
+
+
+def too_early(stamp_ns: int, first_ns: int) -> Refusal:
+    """The stamp lies before the stream."""
+    return Refusal("read.before_events", figures={"gap_s": 1e-9 * (first_ns - stamp_ns)})
+
+
+def too_late(stamp_ns: int, last_ns: int | None) -> Refusal:
+    """The stamp lies after the stream, or there is no stream."""
+    if last_ns is None:
+        return Refusal("read.no_events")
+    return Refusal("read.after_events", figures={"gap_s": 1e-9 * (stamp_ns - last_ns)})
+
+
+# Two ways from a window of events to a picture: the recurrent network and the event map.
+
+# From arbitrary scales to 8 bits, without flicker: intensities of the network, sums of polarities.
+
+_PERCENTILES = (1.0, 99.0)
+# Smallest spread that is stretched to the full range: below it there is noise, not contrast.
+_MIN_SPREAD = 0.05
+
+
+class GreyScale(Protocol):
+    """What maps the pictures of a stream to 8 bits."""
+
+    def follow(self, picture: FloatArray) -> None:
+        """Take the next picture of the stream into account, (H, W)."""
+        ...
+
+    def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
+        """Map (H, W) to uint8."""
+        ...
+
+
+class SignedScale:
+    """Nothing is grey 128, sums of polarities brighter and darker alike, but for the largest twentieth."""
+
+    def follow(self, picture: FloatArray) -> None:
+        """Every map stands for itself."""
+
+    def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
+        """Map (H, W) to uint8."""
+        sums = np.abs(picture[picture != 0])
+        largest = float(np.percentile(sums, 95)) if len(sums) else 1.0
+        return np.asarray(np.clip(np.rint(128 + 127 * picture / largest), 0, 255), dtype=np.uint8)
+
+
+class IntensityScale:
+    """Robust minimum and maximum, smoothed over pictures.
+
+    Args:
+        memory: weight of the past, per picture, in [0, 1).
+    """
+
+    def __init__(self, memory: float = 0.8) -> None:
+        self._memory = memory
+        self._smooth: NDArray[np.float64] | None = None
+
+    def follow(self, picture: FloatArray) -> None:
+        """Take the next picture of the stream into account, (H, W)."""
+        bounds = _bounds(picture)
+        if self._smooth is not None:
+            bounds = self._memory * self._smooth + (1 - self._memory) * bounds
+        self._smooth = bounds
+
+    def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
+        """Map (H, W) to uint8."""
+        bounds = _bounds(picture) if self._smooth is None else self._smooth
+        spread = max(float(bounds[1] - bounds[0]), _MIN_SPREAD)
+        darkest = float(bounds.mean()) - spread / 2
+        scaled = (picture - darkest) * (255.0 / spread)
+        return np.asarray(np.clip(np.rint(scaled), 0, 255), dtype=np.uint8)
+
+
+def _bounds(picture: FloatArray) -> NDArray[np.float64]:
+    # Every fourth pixel in each direction tells the percentiles well enough.
+    return np.asarray(np.percentile(picture[::4, ::4], _PERCENTILES), dtype=np.float64)
+
+
+class EventImager(Protocol):
+    """What turns windows of events into pictures, one step a window."""
+
+    @property
+    def n_warm_up(self) -> int:
+        """Steps before pictures can be trusted."""
+        ...
+
+    def initial_states(self, height_px: int, width_px: int) -> States:
+        """Make the states before the first window."""
+        ...
+
+    def grey_scale(self) -> GreyScale:
+        """Make what maps the pictures of one stream to 8 bits."""
+        ...
+
+    def picture(
+        self, events: Events, start_ns: int, end_ns: int, states: States
+    ) -> tuple[FloatArray, States]:
+        """Make the picture (H, W) at end_ns from the window [start_ns, end_ns) and the states before it."""
+        ...
+
+
+class NetworkImager:
+    """The recurrent network.
+
+    Args:
+        model: ONNX file; None takes the shipped one.
+        n_warm_up: steps until the states have settled; 12 on a real DAVIS346 recording.
+        n_threads: threads of onnxruntime.
+    """
+
+    def __init__(self, model: Path | None, n_warm_up: int, n_threads: int) -> None:
+        self.model = ReconstructionModel(model, n_threads)
+        self.n_warm_up = n_warm_up
+
+    def initial_states(self, height_px: int, width_px: int) -> States:
+        """Make zero states."""
+        return self.model.initial_states(height_px, width_px)
+
+    def grey_scale(self) -> GreyScale:
+        """Follow the intensities' bounds."""
+        return IntensityScale()
+
+    def picture(
+        self, events: Events, start_ns: int, end_ns: int, states: States
+    ) -> tuple[FloatArray, States]:
+        """Take one step of the network."""
+        voxels = normalise_voxels(voxel_grid(events, self.model.n_bins, start_ns, end_ns))
+        return self.model.step(voxels, states)
+
+
+class MapImager:
+    """The event map: polarity sums of the window alone, nothing carried over."""
+
+    n_warm_up = 0
+
+    def initial_states(self, height_px: int, width_px: int) -> States:
+        """Nothing is carried over."""
+        return ()
+
+    def grey_scale(self) -> GreyScale:
+        """Draw no events as grey."""
+        return SignedScale()
+
+    def picture(
+        self, events: Events, start_ns: int, end_ns: int, states: States
+    ) -> tuple[FloatArray, States]:
+        """Sum the polarities."""
+        return event_map(events), ()
+
+
+# A window emptier than this is judged together with the one before it: too few events make noise, not edges.
+_MIN_FILL = 0.5
+# Nothing happens in a longer silence: it is passed over in one stride, states kept.
+_LONGEST_SILENCE_NS = 2_000_000_000
+# A stream cut off at the stamp ends with its last event, a little before.
+_MAX_AFTER_END_NS = 100_000_000
+_SHARE_MEMORY = 0.8
+
+
+@dataclass(frozen=True)
+class ReconstructionOptions:
+    """How events become pictures.
+
+    Attributes:
+        method: "network" (recurrent reconstruction) or "map" (polarity sums, for comparison).
+        windows: how the stream is cut.
+        n_warm_up: windows of the network before its pictures count.
+        is_filtered: leave out hot pixels and background activity.
+        channel: the channel that pictures are said to come from.
+        n_threads: threads of onnxruntime.
+    """
+
+    method: Literal["network", "map"] = "network"
+    windows: WindowOptions = field(default_factory=WindowOptions)
+    n_warm_up: int = 12
+    is_filtered: bool = True
+    channel: str = "events"
+    n_threads: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """A stretch of the stream and the states before it."""
+
+    start_ns: int
+    events: Events
+    states: States
+
+
+class Reconstructor:
+    """Runs over one event stream; its recurrent state spans the whole stream.
+
+    Windows are cut by the events alone, so that neither the batches in which events arrive nor the stamps
+    asked for change what the network has seen: a picture at a stamp is a side step from the running state
+    with the events up to the stamp.
+
+    Args:
+        model: ONNX file; None takes the one shipped with the package.
+        options: method, windows, filters.
+
+    Raises:
+        ProfileError: the model cannot be used.
+        SourceError: onnxruntime is not installed.
+    """
+
+    def __init__(
+        self, model: Path | None = None, options: ReconstructionOptions = ReconstructionOptions()
+    ) -> None:
+        self.options = options
+        self._imager: EventImager = (
+            MapImager()
+            if options.method == "map"
+            else NetworkImager(model, options.n_warm_up, options.n_threads)
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the stream."""
+        self.n_steps = 0
+        self._scale = self._imager.grey_scale()
+        self._share = 1.0
+        self._first_ns: int | None = None
+        self._fed_ns: int | None = None
+        self._previous: _Window | None = None
+        self._current: _Window | None = None
+        self._noise = NoiseFilter()
+
+    @property
+    def is_warm(self) -> bool:
+        """Whether enough of the stream has been seen for pictures to count."""
+        return self.n_steps >= self._imager.n_warm_up
+
+    def step(self, events: Events, start_ns: int | None = None, end_ns: int | None = None) -> FloatArray:
+        """Advance by a window of the caller's choice and give its picture, (H, W), arbitrary scale.
+
+        Args:
+            events: the window's events; following windows must follow in time.
+            start_ns, end_ns: its bounds; None takes the first and the last event's stamp.
+        """
+        if start_ns is None:
+            start_ns = int(events.t_ns[0]) if len(events) else 0
+        if end_ns is None:
+            end_ns = int(events.t_ns[-1]) + 1 if len(events) else start_ns
+        if self._current is None:
+            self._begin(events)
+        assert self._current is not None
+        self._current = _Window(start_ns, events, self._current.states)
+        return self._commit(end_ns)
+
+    def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
+        """Map a picture of `step` to uint8, (H, W), with percentiles smoothed over the steps so far."""
+        return self._scale.to_grey(picture)
+
+    def reconstruct(
+        self, batches: Iterable[Events], stamps_ns: Sequence[int] | None = None, every_ns: int | None = None
+    ) -> Iterator[Image | Refusal]:
+        """Give one picture, or the reason for none, for every stamp, in the order of the stamps.
+
+        Args:
+            batches: the stream from its beginning, in time order, cut anywhere.
+            stamps_ns: when pictures are wanted, never decreasing, the events' clock.
+            every_ns: in place of stamps: one picture every so many ns from the first event on.
+
+        Raises:
+            SourceError: the batches are of different sensors or go back in time.
+            UsageError: neither or both of stamps_ns and every_ns, or stamps out of order.
+        """
+        _check_request(stamps_ns, every_ns)
+        self.reset()
+        wanted = deque(stamps_ns or ())
+        last_ns: int | None = None
+        for batch in batches:
+            if not len(batch):
+                continue
+            self._take(batch, last_ns)
+            first_ns, before_ns, last_ns = self._first_ns, last_ns, int(batch.t_ns[-1])
+            assert first_ns is not None
+            if every_ns is not None:
+                n_passed = 0 if before_ns is None else (before_ns - first_ns) // every_ns
+                wanted.extend(range(first_ns + (n_passed + 1) * every_ns, last_ns + 1, every_ns))
+            while wanted and wanted[0] <= last_ns:
+                yield self._picture_at(wanted.popleft())
+            self._advance(last_ns)
+        for stamp_ns in wanted:
+            is_covered = last_ns is not None and stamp_ns - last_ns <= _MAX_AFTER_END_NS
+            yield self._picture_at(stamp_ns) if is_covered else too_late(stamp_ns, last_ns)
+
+    def feed(self, events: Events) -> None:
+        """Take the next events of a stream that runs on; `picture_at` gives its pictures.
+
+        Args:
+            events: up to the next stamp that a picture will be asked for, or shorter.
+
+        Raises:
+            SourceError: they are of another sensor or go back in time.
+        """
+        if len(events):
+            self._take(events, self._fed_ns)
+            self._fed_ns = int(events.t_ns[-1])
+            self._advance(self._fed_ns)
+
+    def picture_at(self, stamp_ns: int) -> Image | Refusal:
+        """Give the picture at a stamp up to which the stream was fed, or the reason for none."""
+        return too_late(stamp_ns, None) if self._first_ns is None else self._picture_at(stamp_ns)
+
+    def _begin(self, events: Events) -> None:
+        self._first_ns = int(events.t_ns[0]) if len(events) else 0
+        states = self._imager.initial_states(events.height_px, events.width_px)
+        self._current = _Window(self._first_ns, events, states)
+
+    def _take(self, batch: Events, last_ns: int | None) -> None:
+        """Append a batch to the current window."""
+        if self._current is None:
+            self._begin(batch)
+            return
+        pending = self._current.events
+        size, expected = (batch.width_px, batch.height_px), (pending.width_px, pending.height_px)
+        if size != expected:
+            raise SourceError(
+                f"{batch.sensor}: events of {size} px follow events of {expected} px",
+                "name one sensor's stream",
+            )
+        if last_ns is not None and int(batch.t_ns[0]) < last_ns:
+            back_s = (last_ns - int(batch.t_ns[0])) / 1e9
+            raise SourceError(
+                f"{batch.sensor}: events go back in time by {back_s:.6f} s", "sort the recording"
+            )
+        self._current = replace(self._current, events=_joined(pending, batch))
+
+    def _rule(self) -> WindowRule:
+        assert self._current is not None
+        events = self._current.events
+        return window_rule(self.options.windows, events.height_px, events.width_px, self._share)
+
+    def _advance(self, until_ns: int) -> None:
+        """Take every step whose window is complete by then."""
+        while self._current is not None:
+            events = self._current.events
+            if len(events) and int(events.t_ns[0]) - self._current.start_ns > _LONGEST_SILENCE_NS:
+                self._current = replace(self._current, start_ns=int(events.t_ns[0]))
+            end_ns = self._rule().end(events, self._current.start_ns)
+            if end_ns is None or end_ns > until_ns:
+                return
+            self._commit(end_ns)
+
+    def _commit(self, end_ns: int) -> FloatArray:
+        """Close the current window and step; what is left of its events begins the next."""
+        assert self._current is not None
+        window = self._current
+        events = window.events.between(window.start_ns, end_ns)
+        self._noise.learn(events)
+        events = self._cleaned(events)
+        picture, states = self._imager.picture(events, window.start_ns, end_ns, window.states)
+        self._scale.follow(picture)
+        memory = _SHARE_MEMORY if self.n_steps else 0.0
+        self._share = memory * self._share + (1 - memory) * active_share(events)
+        self._previous = replace(window, events=events)
+        last_ns = int(window.events.t_ns[-1]) + 1 if len(window.events) else end_ns
+        self._current = _Window(end_ns, window.events.between(end_ns, max(last_ns, end_ns)), states)
+        self.n_steps += 1
+        return picture
+
+    def _cleaned(self, events: Events) -> Events:
+        return self._noise.clean(events) if self.options.is_filtered else events
+
+    def _picture_at(self, stamp_ns: int) -> Image | Refusal:
+        assert self._first_ns is not None
+        if stamp_ns <= self._first_ns:
+            return too_early(stamp_ns, self._first_ns)
+        self._advance(stamp_ns)
+        if not self.is_warm:
+            return still_cold(self.n_steps, self._imager.n_warm_up, stamp_ns - self._first_ns)
+        window = self._current
+        assert window is not None
+        events = self._cleaned(window.events.between(window.start_ns, stamp_ns))
+        is_thin = self._rule().fill(len(events), stamp_ns - window.start_ns) < _MIN_FILL
+        if is_thin and self._previous is not None:
+            events = _joined(self._previous.events, events)
+            window = self._previous
+        picture, _ = self._imager.picture(events, window.start_ns, stamp_ns, window.states)
+        return Image(events.sensor, self.options.channel, stamp_ns, self._scale.to_grey(picture))
+
+
+def _joined(first: Events, second: Events) -> Events:
+    if not len(first) or not len(second):
+        return second if not len(first) else first
+    return replace(
+        first,
+        t_ns=np.concatenate([first.t_ns, second.t_ns]),
+        x=np.concatenate([first.x, second.x]),
+        y=np.concatenate([first.y, second.y]),
+        polarity=np.concatenate([first.polarity, second.polarity]),
+    )
+
+
+def _check_request(stamps_ns: Sequence[int] | None, every_ns: int | None) -> None:
+    if (stamps_ns is None) == (every_ns is None):
+        raise UsageError("either stamps_ns or every_ns says when pictures are wanted")
+    if stamps_ns is not None and np.any(np.diff(np.asarray(stamps_ns, dtype=np.int64)) < 0):
+        raise UsageError("stamps at which pictures are wanted must not decrease")
+    if every_ns is not None and every_ns <= 0:
+        raise UsageError(f"a picture every {every_ns} ns makes no sense")

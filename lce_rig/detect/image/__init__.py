@@ -1,0 +1,1 @@
+"""The board in images: corners to a fraction of a pixel, both poses, image quality."""

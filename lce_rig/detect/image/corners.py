@@ -1,0 +1,329 @@
+"""Inner corners of a checkerboard in a grey picture, in the order of `Board.corners()`."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.detect.image.saddle import Crossings, fit_crossings, sample
+
+Grey = NDArray[np.uint8]
+
+# Pictures wider than this are first searched at half their size, narrower ones at twice: the finders want
+# squares of 10 to 60 px.
+_WIDE_PX = 700
+_SEARCH_PX = 640
+# Of squares of a known size, pictures are searched in which they are so large: time goes with area.
+_SQUARE_PX = 12.0
+_MOST_SCALE = 1.5
+# A grid of another size with this share of the wanted corners is another board, not a part of the board.
+_OTHER_BOARD = 0.6
+# Saddle points that are looked at, and about how far edges reach around them, in the image that is searched.
+_MOST_SADDLES = 220
+_SADDLE_SIGMA_PX = 1.2
+# Cosine of the angle between a corner's edge and the way to its neighbour, at least.
+_ALONG = 0.94
+# Neighbours are alike: in the strength of their saddles, and in how far apart they are along a row.
+_MOST_STRONGER = 2.5
+_MOST_LONGER = 1.7
+_WAYS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+_SB_THOROUGH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+_CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+
+
+def find_grid(
+    grey: Grey, board: Board, *, is_thorough: bool = True, square_px: float | None = None
+) -> Crossings | None:
+    """Find the inner corners, cheapest attempt first, and fit them to sub-pixel accuracy.
+
+    Args:
+        grey: (H, W).
+        board: tells the number of inner corners.
+        is_thorough: whether to go on after the quick attempts, which take a tenth of the time of all.
+        square_px: about how large its squares are, where that is known: only such are looked for.
+
+    Returns:
+        The crossings, `grid_px` in the order of `Board.corners()`; None where no attempt finds that many.
+    """
+    width = grey.shape[1]
+    lattice_scale = _SEARCH_PX / width if width > _WIDE_PX else 1.0
+    if square_px is not None:
+        lattice_scale = min(_SQUARE_PX / square_px, 1.0)
+    lattice = crossing_lattice(grey, (board.cols, board.rows), lattice_scale)
+    if lattice is not None:
+        ordered = order_corners(grey, lattice, board)
+        crossings = fit_crossings(grey, ordered.reshape(board.rows, board.cols, 2))
+        if crossings.is_fitted.all():
+            return crossings
+    seen = seen_grid(grey, None if square_px is None else min(_SQUARE_PX / square_px, _MOST_SCALE))
+    if seen is not None and seen.shape[:2] == (board.cols, board.rows):
+        seen = seen.swapaxes(0, 1)
+    if seen is not None and seen.shape[:2] == (board.rows, board.cols):
+        attempts: Iterator[Array | None] = iter([seen.reshape(-1, 2)])
+    elif square_px is not None:
+        return None
+    else:
+        n_seen = 0 if seen is None else seen.shape[0] * seen.shape[1]
+        is_other_seen = n_seen >= _OTHER_BOARD * board.rows * board.cols
+        attempts = _attempts(grey, (board.cols, board.rows), is_other_seen, is_thorough)
+    for found in attempts:
+        if found is not None:
+            return fit_crossings(grey, order_corners(grey, found, board).reshape(board.rows, board.cols, 2))
+    return None
+
+
+def seen_grid(grey: Grey, scale: float | None = None) -> Array | None:
+    """Find a checkerboard of any size of at least 5x4 inner corners, in about 30 ms.
+
+    Args:
+        grey: (H, W).
+        scale: of the picture that is searched; None for what suits pictures of this width.
+
+    Returns:
+        (rows, cols, 2) px; which of the two is called rows means nothing. None where nothing is found.
+    """
+    width = grey.shape[1]
+    if scale is None:
+        scale = _SEARCH_PX / width if width > _WIDE_PX else _MOST_SCALE
+    level = level_contrast(_resize(grey, scale))
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+    is_found, corners, meta = cv2.findChessboardCornersSBWithMeta(level, (5, 4), flags)
+    full = _to_full_scale(corners, scale) if is_found else None
+    return None if full is None else full.reshape(*meta.shape[:2], 2)
+
+
+def order_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
+    """Sort a grid of corners as `Board.corners()` does, row by row from the print's top left.
+
+    A finder may start at any of the grid's ends. A camera looks at the front of the print, so the order that
+    turns from rows to columns clockwise in the picture (v points down) is the one that is not mirrored. Where
+    the pattern is not symmetric under 180 deg, the outer square at the top left is black by convention; where
+    it is, the order with its top row up in the picture is taken.
+
+    Args:
+        grey: (H, W) the picture, whose squares tell black from white.
+        corners_px: (rows * cols, 2) row by row in any direction.
+        board: the board.
+    """
+    grid = corners_px.reshape(board.rows, board.cols, 2)
+    along_row = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0)
+    along_column = grid[-1].mean(axis=0) - grid[0].mean(axis=0)
+    if along_row[0] * along_column[1] - along_row[1] * along_column[0] < 0:
+        grid = grid[:, ::-1]
+    turns = (0, 1, 2, 3) if board.rows == board.cols else (0, 2)
+    candidates = [np.rot90(grid, turn) for turn in turns]
+    if not board.is_symmetric or len(turns) == 4:
+        dark = [candidate for candidate in candidates if black_top_left(grey, candidate) > 0]
+        candidates = dark or candidates
+    best = min(candidates, key=lambda candidate: candidate[0, :, 1].mean() - candidate[-1, :, 1].mean())
+    return np.ascontiguousarray(best.reshape(-1, 2))
+
+
+def black_top_left(grey: Grey, grid_px: Array) -> float:
+    """Tell by how many grey values the squares of the top left one's colour are darker than the others.
+
+    Args:
+        grey: (H, W).
+        grid_px: (rows, cols, 2).
+    """
+    values = square_values(grey, grid_px)
+    is_even = np.indices(values.shape).sum(axis=0) % 2 == 0
+    return float(np.mean(values[~is_even]) - np.mean(values[is_even]))
+
+
+def square_values(grey: Grey, grid_px: Array) -> Array:
+    """Sample the grey value at the centre of each square between four corners, (rows - 1, cols - 1)."""
+    centres = (grid_px[:-1, :-1] + grid_px[1:, :-1] + grid_px[:-1, 1:] + grid_px[1:, 1:]) / 4
+    return sample(grey, centres)
+
+
+def _attempts(
+    grey: Grey, size: tuple[int, int], is_other_seen: bool, is_thorough: bool
+) -> Iterator[Array | None]:
+    """Run the finders one after the other, cheapest first; the caller stops at the first success.
+
+    The list is fixed, not timed, so that the same picture gives the same answer on any machine. The classic
+    finder takes seconds to fit one size into the squares of another: it is left out where another was seen.
+    """
+    width = grey.shape[1]
+    if width <= _WIDE_PX:
+        # A far board in a small picture, of which `seen_grid` sees a part.
+        yield _sector_based(grey, size, 2.0, cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if not is_thorough:
+        return
+    if width > _WIDE_PX:
+        scale = _SEARCH_PX / width
+        if not is_other_seen:
+            yield _classic(grey, size, min(1.0, 1280 / width))
+        level = level_contrast(_resize(grey, scale))
+        yield _to_full_scale(_sector_based(level, size, 1.0, _SB_THOROUGH), scale)
+        # Squares of 10 px, as of a board 5 m away, are too small at half the size.
+        yield _sector_based(grey, size, min(1.0, 1280 / width), _SB_THOROUGH)
+        return
+    level = level_contrast(grey)
+    if not is_other_seen:
+        yield _classic(grey, size, 2.0)
+        yield _classic(level, size, 2.0)
+    yield _sector_based(level, size, 1.5, _SB_THOROUGH)
+    # Squares of 4 px in a picture of full contrast, as those made from events are.
+    yield _sector_based(grey, size, 2.0, _SB_THOROUGH)
+
+
+def level_contrast(grey: Grey) -> Grey:
+    """Bring every neighbourhood of a low-contrast picture to the same mean and spread."""
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
+    mean = cv2.GaussianBlur(smooth, (0, 0), 8.0)
+    spread = np.sqrt(cv2.GaussianBlur((smooth - mean) ** 2, (0, 0), 8.0)) + 4.0
+    return np.asarray(np.clip(128 + 50 * (smooth - mean) / spread, 0, 255), dtype=np.uint8)
+
+
+def _sector_based(grey: Grey, size: tuple[int, int], scale: float, flags: int) -> Array | None:
+    """Run `cv2.findChessboardCornersSB` (A. Duda, U. Frese, BMVC 2018) at a scale of the picture."""
+    is_found, corners = cv2.findChessboardCornersSB(_resize(grey, scale), size, flags=flags)
+    return _to_full_scale(corners, scale) if is_found else None
+
+
+def _classic(grey: Grey, size: tuple[int, int], scale: float) -> Array | None:
+    is_found, corners = cv2.findChessboardCorners(_resize(grey, scale), size, flags=_CLASSIC)
+    return _to_full_scale(corners, scale) if is_found else None
+
+
+def _resize(grey: Grey, scale: float) -> Grey:
+    if scale == 1.0:
+        return grey
+    how = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
+    return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=how), dtype=np.uint8)
+
+
+def _to_full_scale(corners: NDArray[Any] | None, scale: float) -> Array | None:
+    if corners is None:
+        return None
+    # Pixel centres are integers: the centre of the first pixel lies half a pixel inside the picture.
+    return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
+
+
+def crossing_lattice(grey: Grey, size: tuple[int, int], scale: float) -> Array | None:
+    """Find a grid of just so many crossings by linking saddle points of the grey values.
+
+    Each saddle point's two edges point at its neighbours, whose colours are the other way round. Points that
+    find each other so are linked, and the links are followed over the grid. It gives up, and the finders
+    take over, where a corner is missing, or one is linked that does not belong there.
+
+    Args:
+        grey: (H, W).
+        size: (cols, rows); either may be the rows.
+        scale: of the image that is searched.
+
+    Returns:
+        (rows * cols, 2) px, row by row, to about half a pixel; None where no such grid is found.
+    """
+    points, edges, strengths = _saddle_points(_resize(grey, scale))
+    if len(points) < size[0] * size[1]:
+        return None
+    places = _follow_links(_link(points, edges, strengths), size[0] * size[1])
+    if places is None:
+        return None
+    cells = np.array(list(places.values()))
+    cells -= cells.min(axis=0)
+    n_columns, n_rows = (int(n) for n in cells.max(axis=0) + 1)
+    if {(n_columns, n_rows), (n_rows, n_columns)}.isdisjoint({size}) or len(cells) != size[0] * size[1]:
+        return None
+    grid = np.empty((n_rows, n_columns, 2))
+    grid[cells[:, 1], cells[:, 0]] = points[list(places)]
+    grid = grid if (n_columns, n_rows) == size else grid.swapaxes(0, 1)
+    return _to_full_scale(grid, scale)
+
+
+def _saddle_points(grey: Grey) -> tuple[Array, Array, Array]:
+    """Find the strongest saddle points, (N, 2) px, directions (N, 2, 2) of the two edges, and strengths (N,).
+
+    The quarter counter-clockwise of the first edge, as (u, v) are, is bright.
+    """
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _SADDLE_SIGMA_PX)
+    duu, dvv = cv2.Sobel(smooth, cv2.CV_32F, 2, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 2)
+    duv = cv2.Sobel(smooth, cv2.CV_32F, 1, 1)
+    response = duv * duv - duu * dvv
+    is_peak = (response >= cv2.dilate(response, np.ones((3, 3), np.uint8))) & (response > 1.0)
+    is_peak[:2], is_peak[-2:], is_peak[:, :2], is_peak[:, -2:] = False, False, False, False
+    v, u = np.nonzero(is_peak)
+    order = np.argsort(-response[v, u], kind="stable")[:_MOST_SADDLES]
+    v, u = v[order], u[order]
+    H = np.empty((len(u), 2, 2))
+    H[:, 0, 0], H[:, 1, 1], H[:, 0, 1] = duu[v, u], dvv[v, u], duv[v, u]
+    H[:, 1, 0] = H[:, 0, 1]
+    values, vectors = np.linalg.eigh(H)
+    # From the pixel to where the slope vanishes; Sobel's second derivatives are four times as large.
+    slope = np.stack([smooth[v, u + 1] - smooth[v, u - 1], smooth[v + 1, u] - smooth[v - 1, u]], axis=1) / 2
+    shift = np.clip(-4.0 * np.linalg.solve(H, slope[..., None])[..., 0], -1.0, 1.0)
+    # Along the edges the second derivative vanishes: between the eigenvectors, in the ratio of their values.
+    half = np.arctan(np.sqrt(np.maximum(values[:, 1], 1e-9) / np.maximum(-values[:, 0], 1e-9)))
+    middle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+    angles = np.stack([middle - half, middle + half], axis=1)
+    points = np.stack([u, v], axis=1) + shift
+    return points, np.stack([np.cos(angles), np.sin(angles)], axis=-1), response[v, u]
+
+
+def _link(points: Array, edges: Array, strengths: Array) -> dict[int, dict[int, tuple[int, int]]]:
+    """Link points that are each other's nearest along their edges, by point and side: (neighbour, its side).
+
+    Sides 0 to 3 are the first edge, the second, and both backwards.
+    """
+    apart = points[None] - points[:, None]
+    distance = np.linalg.norm(apart, axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    along = np.einsum("ijc,iac->aij", apart, edges) / np.maximum(distance, 1e-9)
+    ratio = strengths[None] / strengths[:, None]
+    is_alike = (ratio < _MOST_STRONGER) & (ratio > 1 / _MOST_STRONGER)
+    nearest = np.empty((4, len(points)), dtype=np.int64)
+    lengths = np.empty((4, len(points)))
+    for edge in (0, 1):
+        # Colours change from corner to corner, so that the first edge of one is the second of the next.
+        is_back = (np.abs(along[1 - edge].T) > _ALONG) & is_alike
+        for side, cosine in ((edge, along[edge]), (edge + 2, -along[edge])):
+            allowed = np.where(is_back & (cosine > _ALONG), distance, np.inf)
+            nearest[side], lengths[side] = allowed.argmin(axis=1), allowed.min(axis=1)
+    is_near = np.isfinite(lengths) & (lengths <= _MOST_LONGER * lengths[[2, 3, 0, 1]])
+    links: dict[int, dict[int, tuple[int, int]]] = {}
+    for side, i in zip(*np.nonzero(is_near), strict=True):
+        j = int(nearest[side, i])
+        back = 1 - side % 2
+        back += 2 if along[back, j, i] < 0 else 0
+        if is_near[back, j] and nearest[back, j] == i:
+            links.setdefault(int(i), {})[int(side)] = (j, int(back))
+    return links
+
+
+def _follow_links(
+    links: dict[int, dict[int, tuple[int, int]]], n_wanted: int
+) -> dict[int, tuple[int, int]] | None:
+    """Give the points of one connected grid of at least so many (column, row); None where links disagree.
+
+    Corners of a grid have two neighbours at least: what has fewer hangs on to it by chance.
+    """
+    while loose := [i for i, sides in links.items() if len(sides) < 2]:
+        for i in loose:
+            for j, back in links.pop(i).values():
+                links.get(j, {}).pop(back, None)
+    left = set(links)
+    while len(left) >= n_wanted:
+        first = left.pop()
+        places, turns, due = {first: (0, 0)}, {first: 0}, [first]
+        while due:
+            i = due.pop()
+            for side, (j, back) in links[i].items():
+                way = (side + turns[i]) % 4
+                place = (places[i][0] + _WAYS[way][0], places[i][1] + _WAYS[way][1])
+                turn = (way - back - 2) % 4
+                if j not in places:
+                    places[j], turns[j] = place, turn
+                    due.append(j)
+                elif (places[j], turns[j]) != (place, turn):
+                    return None
+        left -= places.keys()
+        if len(places) >= n_wanted:
+            return places if len(set(places.values())) == len(places) else None
+    return None

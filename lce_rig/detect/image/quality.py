@@ -1,0 +1,183 @@
+"""What a picture shows of the board in numbers, and why where it shows too little."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Refusal
+from lce_rig.detect.image.corners import seen_grid, square_values
+from lce_rig.detect.image.saddle import Crossings
+
+# 10 to 90 % of an edge blurred by a Gaussian span 2.56 sigma.
+_EDGE_WIDTH_PER_SIGMA = 2.56
+
+
+def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> dict[str, float]:
+    """Measure the corners' surroundings.
+
+    Returns:
+        mean_grey; contrast (grey values, white minus black); noise (grey values); square_px (shortest side);
+        edge_width_px (10-90 %); sharpness (edge widths in a square: 1 is unreadable, above 5 is crisp);
+        border_px (outermost corner to the border of the picture); n_corners (fitted).
+    """
+    grid = crossings.grid_px
+    height, width = grey.shape
+    sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1) for axis in (0, 1)]
+    square_px = float(min(side.min() for side in sides))
+    edge_width_px = _EDGE_WIDTH_PER_SIGMA * float(np.median(crossings.edge_sigma_px[crossings.is_fitted]))
+    alternating = crossings.contrast * (-1.0) ** np.indices(crossings.contrast.shape).sum(axis=0)
+    alternating *= -1.0 if np.median(alternating) < 0 else 1.0
+    contrast = float(np.median(alternating))
+    to_border = np.minimum(grid, [width - 1, height - 1] - grid).min()
+    return {
+        "mean_grey": float(grey.mean()),
+        "contrast": contrast,
+        "noise": crossings.noise,
+        "square_px": square_px,
+        "edge_width_px": edge_width_px,
+        "sharpness": square_px / edge_width_px if edge_width_px > 0 else 0.0,
+        "border_px": float(to_border),
+        "n_corners": float(crossings.is_fitted.sum()),
+    }
+
+
+def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
+    """Check that the pattern ends where the grid of corners says.
+
+    The squares outside the outermost corners must alternate as those inside do, the next ones must not.
+
+    Args:
+        grid_px: (rows, cols, 2).
+
+    Returns:
+        Contrast of the weakest side of outer squares over that of the inner squares, 1 on a clean board, and
+        whether the squares go on beyond them on some side, so that only a part of a larger board was taken.
+    """
+    wide = _widened(_widened(grid_px))
+    height, width = grey.shape
+    # Pixels beyond the border repeat its value, which alternates with nothing.
+    values = square_values(grey, np.clip(wide, 0, [width - 1, height - 1]))
+    signs = (-1.0) ** np.indices(values.shape).sum(axis=0)
+    inner = _alternation(values[2:-2, 2:-2], signs[2:-2, 2:-2])
+    if inner == 0:
+        return 0.0, False
+    signs, inner = signs * np.sign(inner), abs(inner)
+    sides = [(np.rot90(values, turn), np.rot90(signs, turn)) for turn in range(4)]
+    outer = [_alternation(value[1, 1:-1], sign[1, 1:-1]) / inner for value, sign in sides]
+    beyond = [_alternation(value[0, 1:-1], sign[0, 1:-1]) / inner for value, sign in sides]
+    steps = [np.diff(value[0, 1:-1]) * sign[0, 2:-1] for value, sign in sides]
+    is_beyond = any(ratio > 0.5 and bool(np.all(step > 0)) for ratio, step in zip(beyond, steps, strict=True))
+    return min(outer), is_beyond
+
+
+def _widened(grid_px: Array) -> Array:
+    """Extrapolate one more line of corners on every side."""
+    wide = np.concatenate(
+        [2 * grid_px[:, :1] - grid_px[:, 1:2], grid_px, 2 * grid_px[:, -1:] - grid_px[:, -2:-1]], axis=1
+    )
+    return np.concatenate([2 * wide[:1] - wide[1:2], wide, 2 * wide[-1:] - wide[-2:-1]])
+
+
+def _alternation(values: Array, signs: Array) -> float:
+    """Measure by how much the values of positive sign exceed the others."""
+    return float(values[signs > 0].mean() - values[signs < 0].mean())
+
+
+def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool = False) -> Refusal:
+    """Say why the board was not found, from the grey values and from what checkerboard is there instead."""
+    low, dark, bright = (float(value) for value in np.percentile(grey, (1, 50, 99)))
+    if bright < 50:
+        return Refusal("image.too_dark", figures={"grey_99": bright})
+    white_share = float(np.mean(grey >= 250))
+    if white_share > 0.5:
+        return Refusal("image.overexposed", figures={"white_share": white_share})
+    seen = seen_grid(grey)
+    if seen is not None:
+        return explain_other_grid(grey, board, seen, is_from_events)
+    wanted = {"n_cols": board.cols, "n_rows": board.rows}
+    action = _action(is_from_events)
+    if bright - low < 50:
+        return Refusal("image.flat", figures={**wanted, "grey_1": low, "grey_99": bright}, action=action)
+    width_px = strongest_edge_px(grey, bright - low)
+    if width_px > 6:
+        return Refusal("image.blurred", figures={**wanted, "edge_px": width_px}, action=action)
+    return Refusal("image.no_board", figures={**wanted, "grey_50": dark}, action=action)
+
+
+def explain_other_grid(
+    grey: NDArray[np.uint8], board: Board, seen_px: Array, is_from_events: bool = False
+) -> Refusal:
+    """Say that another grid of corners is in the picture than the profile's.
+
+    Args:
+        seen_px: (rows, cols, 2).
+    """
+    wanted, seen = _sizes(board, seen_px)
+    figures = {"n_cols": wanted[0], "n_rows": wanted[1], "n_cols_seen": seen[0], "n_rows_seen": seen[1]}
+    action = _action(is_from_events)
+    if seen == wanted:
+        return Refusal("image.unclear", figures=figures, action=action)
+    is_part = seen[0] <= wanted[0] and seen[1] <= wanted[1]
+    side = _side_beyond(grey, seen_px)
+    if is_part and side:
+        return Refusal("image.cut_off", figures={**figures, "side": side})
+    if is_part:
+        return Refusal("image.part", figures=figures, action=action)
+    return Refusal("image.other_board", figures=figures)
+
+
+def quality_problem(
+    quality: Mapping[str, float], min_contrast: float, min_sharpness: float, is_from_events: bool = False
+) -> Refusal | None:
+    """Judge the figures of a grid that was found; None where they will do."""
+    action = _action(is_from_events)
+    if quality["contrast"] < min_contrast:
+        figures = {"contrast": quality["contrast"], "min_contrast": min_contrast}
+        return Refusal("image.low_contrast", figures=figures, action=action)
+    if quality["sharpness"] < min_sharpness:
+        figures = {
+            "edge_px": quality["edge_width_px"],
+            "square_px": quality["square_px"],
+            "sharpness": quality["sharpness"],
+            "min_sharpness": min_sharpness,
+        }
+        return Refusal("image.not_sharp", figures=figures, action=action)
+    return None
+
+
+def _action(is_from_events: bool) -> str:
+    """Name the kind of advice: events need motion where a camera wants stillness."""
+    return "events" if is_from_events else ""
+
+
+def _sizes(board: Board, seen_px: Array) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Name wanted and seen size (cols, rows), the seen one turned the way that is nearer to the wanted."""
+    rows, cols = seen_px.shape[:2]
+    wanted = (board.cols, board.rows)
+    either = ((cols, rows), (rows, cols))
+    seen = min(either, key=lambda size: abs(size[0] - wanted[0]) + abs(size[1] - wanted[1]))
+    return wanted, seen
+
+
+def _side_beyond(grey: NDArray[np.uint8], grid_px: Array) -> str:
+    """Name the border within 1.5 squares of the grid; empty where there is none."""
+    height, width = grey.shape
+    square = max(float(np.linalg.norm(np.diff(grid_px, axis=axis), axis=-1).max()) for axis in (0, 1))
+    low, high = grid_px.min(axis=(0, 1)), grid_px.max(axis=(0, 1))
+    room = {
+        "left": low[0],
+        "upper": low[1],
+        "right": width - 1 - high[0],
+        "lower": height - 1 - high[1],
+    }
+    side = min(room, key=lambda name: float(room[name]))
+    return side if room[side] < 1.5 * square else ""
+
+
+def strongest_edge_px(grey: NDArray[np.uint8], spread: float) -> float:
+    """Measure the width of the strongest edges: grey spread over the 99.9 percentile of the gradient."""
+    dv, du = np.gradient(grey.astype(np.float32))
+    return spread / max(float(np.percentile(np.hypot(du, dv), 99.9)), 1e-3)

@@ -1,0 +1,299 @@
+"""The board in a picture: corners, both poses and figures, or why there is none."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image
+from lce_rig.core.errors import ProfileError
+from lce_rig.core.geometry import Array, transform
+from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.detect.image.corners import find_grid, order_corners, seen_grid
+from lce_rig.detect.image.quality import (
+    explain_absence,
+    explain_other_grid,
+    extent,
+    grid_quality,
+    quality_problem,
+)
+from lce_rig.detect.image.saddle import Crossings, fit_crossings
+from lce_rig.solvers.pnp import PlanarPose, solve_planar_pose
+
+Region = tuple[int, int, int, int]
+NOT_SEEN_AT_ONCE = Refusal("image.not_at_first_sight")
+"""Of a search that was not thorough."""
+
+# The alternative pose is as good as the first where the difference of the costs could be noise (3 sigma).
+_AMBIGUOUS_CHI2 = 9.0
+# A part of the picture may be missing at its end (a cut-off readout); a larger difference is another mode.
+_CUT_FRACTION = 0.02
+# A canvas is larger than the sensor by as much at most; to look at more than that takes memory.
+_CANVAS_FRACTION = 3.0
+# Corners that the finder misplaced, or that an artefact covers, at most.
+_MAX_MISPLACED = 0.08
+# A quarter of a full fit's time; corners are then known to 0.03 px, plenty for stillness and guidance.
+_FOLLOWED_SAMPLES = 13
+# A board whose corners have moved by less is where it was.
+_RESTING_PX = 0.5
+# A grid of corners of which fewer can be measured is none.
+_MIN_FITTED = 0.5
+# The outer squares of a line that is not on the board are all alike.
+_MIN_OUTER_CONTRAST = 0.35
+
+
+def find_image_board(
+    image: Image,
+    board: Board,
+    intrinsics: Intrinsics,
+    *,
+    region: Region | None = None,
+    last: ImageBoard | None = None,
+    max_reprojection_px: float = 1.0,
+    min_contrast: float = 12.0,
+    min_sharpness: float = 1.5,
+    is_from_events: bool = False,
+    is_thorough: bool = True,
+) -> ImageBoard | Refusal:
+    """Find the board's inner corners in one picture and T_cam_board in both its minima.
+
+    Corners are ordered as `Board.corners()` says. A pattern that is not symmetric under 180 deg is read with
+    the outer square at its top left black; a symmetric one with its top row up in the picture.
+
+    Args:
+        image: the picture.
+        board: the board as the profile describes it.
+        intrinsics: of the camera, at the picture's resolution.
+        region: (u0, v0, u1, v1) px to search first, from `region_around` the board in the last live picture;
+            the whole picture follows where it is not there.
+        last: the board in the last live picture: where it is there still, or within a third of a square,
+            nothing is searched.
+        max_reprojection_px: refuse where the corners' rms distance from the board's picture is larger.
+        min_contrast: refuse where black and white differ by fewer grey values.
+        min_sharpness: refuse where fewer edge widths fit into a square.
+        is_from_events: whether the picture was made from events: what is to be done is another thing.
+        is_thorough: whether a board that is not found at once is searched for at other scales, and its
+            absence explained, which takes most of a second.
+
+    Raises:
+        ProfileError: the intrinsics belong to pictures of another size.
+    """
+    grey = crop_to_intrinsics(image, intrinsics)
+    followed = _follow(grey, board, last)
+    crossings = (
+        followed
+        or _find_in_region(grey, board, region, last, is_thorough=is_thorough)
+        or find_grid(grey, board, is_thorough=is_thorough)
+    )
+    if crossings is None and not is_thorough:
+        return NOT_SEEN_AT_ONCE
+    if crossings is None or np.mean(crossings.is_fitted) < _MIN_FITTED:
+        return explain_absence(grey, board, is_from_events)
+    quality = grid_quality(grey, crossings)
+    outer_contrast, goes_on = extent(grey, crossings.grid_px)
+    if outer_contrast < _MIN_OUTER_CONTRAST or goes_on:
+        seen = seen_grid(grey)
+        return explain_other_grid(grey, board, crossings.grid_px if seen is None else seen, is_from_events)
+    problem = quality_problem(quality, min_contrast, min_sharpness, is_from_events)
+    if problem is not None:
+        return problem
+
+    solved, crossings = _solve(
+        grey, crossings, board, intrinsics, _starts(None if followed is None else last)
+    )
+    if solved is None or solved.reprojection_px > max_reprojection_px:
+        return _misfit(solved, intrinsics, max_reprojection_px)
+    quality |= {"n_corners": float(crossings.is_fitted.sum()), "corner_rms_px": solved.reprojection_px}
+    return board_from_pose(crossings.grid_px.reshape(-1, 2), solved, quality)
+
+
+def board_from_pose(
+    corners_px: Array, solved: PlanarPose, quality: Mapping[str, float] | None = None
+) -> ImageBoard:
+    """Put together what a picture shows of the board, once its pose is solved for.
+
+    Args:
+        corners_px: (rows * cols, 2) in the order of `Board.corners()`.
+        solved: both poses that they admit.
+        quality: figures of the picture; those of the pose are added.
+    """
+    return ImageBoard(
+        corners_px=corners_px,
+        T_cam_board=solved.T_cam_board,
+        cov=solved.cov,
+        T_cam_board_alternative=solved.T_cam_board_alternative,
+        chi2_gap=solved.chi2_gap,
+        is_ambiguous=solved.chi2_gap < _AMBIGUOUS_CHI2,
+        reprojection_px=solved.reprojection_px,
+        sigma_px=solved.sigma_px,
+        quality={**(quality or {}), **_pose_quality(solved.T_cam_board)},
+    )
+
+
+def region_around(found: ImageBoard, image: Image, margin: float = 0.5) -> Region:
+    """Name the part of the next picture to search: the corners' box, larger by `margin` of its size.
+
+    Returns:
+        (u0, v0, u1, v1) px, within the picture.
+    """
+    height, width = image.pixels.shape[:2]
+    low, high = found.corners_px.min(axis=0), found.corners_px.max(axis=0)
+    reach = margin * (high - low).max() + 8
+    u0, v0 = np.maximum(np.floor(low - reach), 0).astype(int)
+    u1, v1 = np.minimum(np.ceil(high + reach) + 1, [width, height]).astype(int)
+    return int(u0), int(v0), int(u1), int(v1)
+
+
+def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:
+    """Return the grey picture at the size the intrinsics belong to.
+
+    Two harmless differences occur in recordings: a readout that ends a few lines early, and a canvas larger
+    than the sensor, blank beyond it (pictures reconstructed from events).
+
+    Raises:
+        ProfileError: any other size, naming both.
+    """
+    height, width = image.pixels.shape[:2]
+    wanted_width, wanted_height = intrinsics.width_px, intrinsics.height_px
+    if (width, height) == (wanted_width, wanted_height):
+        return image.grey
+    missing_u, missing_v = 1 - width / wanted_width, 1 - height / wanted_height
+    if 0 <= missing_u <= _CUT_FRACTION and 0 <= missing_v <= _CUT_FRACTION:
+        return image.grey
+    if -_CANVAS_FRACTION <= missing_u <= 0 and -_CANVAS_FRACTION <= missing_v <= 0:
+        grey = image.grey
+        if _is_blank_beyond(grey, wanted_width, wanted_height):
+            return grey[:wanted_height, :wanted_width]
+    hint = "use the intrinsics of this mode, or record in the mode the intrinsics were calibrated in"
+    if abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width:
+        hint += f"; if the picture is only scaled, multiply fx, fy, cx, cy by {width / wanted_width:.4g}"
+    raise ProfileError(
+        f"camera {image.sensor}, channel {image.channel}: the picture is {width}x{height} px, the profile's "
+        f"intrinsics belong to {wanted_width}x{wanted_height} px",
+        hint,
+    )
+
+
+def _is_blank_beyond(grey: NDArray[np.uint8], width_px: int, height_px: int) -> bool:
+    """Tell whether nothing but a smooth background lies right of and below the sensor's size."""
+    steps = np.abs(np.diff(grey.astype(np.int16), axis=1))
+    inside = np.percentile(steps[:height_px, : width_px - 1], 99)
+    beyond = np.concatenate([steps[height_px:].ravel(), steps[:height_px, width_px + 8 :].ravel()])
+    if not len(beyond):
+        return False  # Columns next to the sensor's are not judged, and there are no others.
+    return bool(np.percentile(beyond, 99) <= max(0.3 * inside, 2.0))
+
+
+def _follow(grey: NDArray[np.uint8], board: Board, last: ImageBoard | None) -> Crossings | None:
+    """Fit the corners from where they were; None where the board is not all there.
+
+    A board that moved by a whole square is not taken for itself: on one side squares are missing then.
+    """
+    if last is None:
+        return None
+    start_px = last.corners_px.reshape(board.rows, board.cols, 2)
+    crossings = fit_crossings(grey, start_px, _FOLLOWED_SAMPLES)
+    if np.abs(crossings.grid_px - start_px).max() > _RESTING_PX:
+        # Patches that lie aside of their corners pull at them.
+        crossings = fit_crossings(grey, crossings.grid_px, _FOLLOWED_SAMPLES)
+    if not crossings.is_fitted.all():
+        return None
+    fitted_px = crossings.grid_px.reshape(-1, 2)
+    is_in_order = np.array_equal(order_corners(grey, fitted_px, board), fitted_px)
+    outer_contrast, goes_on = extent(grey, crossings.grid_px)
+    return crossings if is_in_order and outer_contrast >= _MIN_OUTER_CONTRAST and not goes_on else None
+
+
+def _find_in_region(
+    grey: NDArray[np.uint8],
+    board: Board,
+    region: Region | None,
+    last: ImageBoard | None,
+    *,
+    is_thorough: bool,
+) -> Crossings | None:
+    """Search about where the board was; a quick search looks for squares of the size they had there only."""
+    if region is None:
+        return None
+    u0, v0, u1, v1 = region
+    part = grey[max(v0, 0) : v1, max(u0, 0) : u1]
+    if min(part.shape) < 16:
+        return None
+    square_px = None if is_thorough or last is None else _square_px(last, board)
+    found = find_grid(np.ascontiguousarray(part), board, is_thorough=is_thorough, square_px=square_px)
+    return None if found is None else replace(found, grid_px=found.grid_px + [max(u0, 0), max(v0, 0)])
+
+
+def _starts(last: ImageBoard | None) -> list[Array]:
+    """List where a board that was followed has its poses, about: they jump no farther than it did."""
+    poses = [] if last is None else [last.T_cam_board, last.T_cam_board_alternative]
+    return [T_cam_board for T_cam_board in poses if T_cam_board is not None]
+
+
+def _square_px(found: ImageBoard, board: Board) -> float:
+    grid_px = found.corners_px.reshape(board.rows, board.cols, 2)
+    return float(np.median(np.linalg.norm(np.diff(grid_px, axis=1), axis=-1)))
+
+
+def _solve(
+    grey: NDArray[np.uint8],
+    crossings: Crossings,
+    board: Board,
+    intrinsics: Intrinsics,
+    near: Sequence[Array] = (),
+) -> tuple[PlanarPose | None, Crossings]:
+    """Solve for the pose; corners far from the board's picture are looked for again where they should be.
+
+    A finder puts single corners onto an artefact now and then. Few of them are fitted again from where the
+    others put them; what cannot be fitted there takes that place and no longer counts in `n_corners`.
+    """
+    corners_board = board.corners()
+    solved = solve_planar_pose(crossings.grid_px.reshape(-1, 2), corners_board, intrinsics, near)
+    if solved is None:
+        return None, crossings
+    error_px = _errors(solved.T_cam_board, crossings, corners_board, intrinsics)
+    is_far = error_px > max(6.0 * float(np.median(error_px)), 0.5)
+    is_far |= ~crossings.is_fitted.ravel()
+    if not is_far.any() or is_far.mean() > _MAX_MISPLACED:
+        return solved, crossings
+
+    good = ~is_far
+    rest = solve_planar_pose(crossings.grid_px.reshape(-1, 2)[good], corners_board[good], intrinsics)
+    if rest is None:
+        return solved, crossings
+    predicted, _ = intrinsics.project(transform(rest.T_cam_board, corners_board))
+    starts = np.where(is_far[:, None], predicted, crossings.grid_px.reshape(-1, 2))
+    again = fit_crossings(grey, starts.reshape(crossings.grid_px.shape))
+    still_far = _errors(rest.T_cam_board, again, corners_board, intrinsics) > 6.0 * rest.reprojection_px
+    is_lost = (is_far & (still_far | ~again.is_fitted.ravel())).reshape(again.is_fitted.shape)
+    repaired = Crossings(
+        grid_px=np.where(is_lost[..., None], predicted.reshape(again.grid_px.shape), again.grid_px),
+        is_fitted=~is_lost,
+        contrast=again.contrast,
+        edge_sigma_px=again.edge_sigma_px,
+        noise=again.noise,
+    )
+    return solve_planar_pose(repaired.grid_px.reshape(-1, 2), corners_board, intrinsics), repaired
+
+
+def _errors(T_cam_board: Array, crossings: Crossings, corners_board: Array, intrinsics: Intrinsics) -> Array:
+    predicted, _ = intrinsics.project(transform(T_cam_board, corners_board))
+    return np.asarray(np.linalg.norm(predicted - crossings.grid_px.reshape(-1, 2), axis=1))
+
+
+def _pose_quality(T_cam_board: Array) -> dict[str, float]:
+    """Measure tilt_deg (print's normal against the line of sight) and distance_m."""
+    distance_m = float(np.linalg.norm(T_cam_board[:3, 3]))
+    cosine = abs(float(T_cam_board[:3, 2] @ T_cam_board[:3, 3])) / distance_m
+    return {"tilt_deg": float(np.degrees(np.arccos(min(cosine, 1.0)))), "distance_m": distance_m}
+
+
+def _misfit(solved: PlanarPose | None, intrinsics: Intrinsics, max_reprojection_px: float) -> Refusal:
+    lens = {"model": intrinsics.model, "width_px": intrinsics.width_px, "height_px": intrinsics.height_px}
+    if solved is None:
+        return Refusal("image.no_pose", figures=lens)
+    errors = {"rms_px": solved.reprojection_px, "max_rms_px": max_reprojection_px}
+    return Refusal("image.misfit", figures={**lens, **errors})

@@ -1,0 +1,1 @@
+"""The board in LiDAR scans: plates, their outline, ring ends, tracking."""

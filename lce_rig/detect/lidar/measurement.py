@@ -1,0 +1,378 @@
+"""What the calibration needs from a registered board: plane, points, ring ends and measured size."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.data import Scan
+from lce_rig.core.geometry import Array, pose
+from lce_rig.core.results import LidarBoard
+from lce_rig.detect.lidar.segments import MAX_STEPS, Indices, OrderedScan
+from lce_rig.detect.lidar.template import (
+    Placement,
+    PlaneView,
+    beams_about,
+    plane_axes,
+    rate,
+    register,
+    view_plane,
+)
+
+# Where the rings end on a board, whether that is the board's border, and the size they show.
+
+SIZE_PRIOR_M = 0.10
+SLACK_M = 0.05  # by how much a board's border may lie off the nominal one to be measured
+
+
+@dataclass(frozen=True, eq=False)
+class RingEnds:
+    """First and last return of each ring on the board, E of them.
+
+    Attributes:
+        beam: (E,) index in the plane view.
+        side: (E,) -1 or +1.
+        gap: (E, 2) from one beam to the next along the ring at that end, outwards, in the plane view, m.
+        beyond: (E,) index in the scan of the next return outwards.
+        behind_m: (E,) how far behind the plane it lies, inf where there is none.
+        is_border: (E,) whether the surface itself ends there: no occluder before it, no plane behind it.
+    """
+
+    beam: Indices
+    side: NDArray[np.int8]
+    gap: Array
+    beyond: Indices
+    behind_m: Array
+    is_border: NDArray[np.bool_]
+
+
+def median(values: Array) -> float:
+    """Take the median: on a few hundred values several times faster than `numpy.median`."""
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    ordered = np.sort(values)
+    return float(ordered[low] + ordered[high]) / 2
+
+
+def find_ring_ends(scan: OrderedScan, view: PlaneView, is_board: NDArray[np.bool_]) -> RingEnds:
+    """Take the first and last board return of each ring and look at the beams beyond them.
+
+    Args:
+        scan: all returns.
+        view: beams about the board.
+        is_board: (M,) which of them return from it.
+    """
+    board = np.flatnonzero(is_board)
+    ring = scan.ring[view.member[board]]
+    is_first = np.diff(ring, prepend=-1) != 0
+    is_last = np.append(is_first[1:], True)
+    n_on_ring = np.flatnonzero(is_last) - np.flatnonzero(is_first) + 1
+    is_long = n_on_ring >= 3
+    first, last = np.flatnonzero(is_first)[is_long], np.flatnonzero(is_last)[is_long]
+    beam = np.concatenate([board[first], board[last]])
+    inner = np.concatenate([board[first + 2], board[last - 2]])
+    n_steps = np.mod(np.abs(scan.azimuth[view.member[beam]] - scan.azimuth[view.member[inner]]), 2 * np.pi)
+    n_steps = np.maximum(np.minimum(n_steps, 2 * np.pi - n_steps) / max(scan.step_rad, 1e-6), 1.0)
+    side = np.repeat(np.array([-1, 1], dtype=np.int8), len(first))
+    gap = (view.uv[beam] - view.uv[inner]) / n_steps[:, None]
+    beyond, beyond_exists = _outwards(scan, view.member[beam], side, 1)
+    further, further_exists = _outwards(scan, view.member[beam], side, 2)
+    height_1 = scan.points[beyond] @ view.plane[:3] + view.plane[3]
+    height_2 = scan.points[further] @ view.plane[:3] + view.plane[3]
+    is_occluded = beyond_exists & (height_1 > view.tolerance_m)
+    goes_on = beyond_exists & (np.abs(height_1) <= view.tolerance_m)
+    goes_on &= further_exists & (np.abs(height_2) <= view.tolerance_m)
+    behind_m = np.where(beyond_exists, -height_1, np.inf)
+    return RingEnds(beam, side, gap, beyond, behind_m, ~(is_occluded | goes_on))
+
+
+def _outwards(
+    scan: OrderedScan, member: Indices, side: NDArray[np.int8], n: int
+) -> tuple[Indices, NDArray[np.bool_]]:
+    """Find the n-th return beyond each ring end, all the way round, and whether it is a few firings off."""
+    ring = scan.ring[member]
+    start, end = np.searchsorted(scan.ring, ring), np.searchsorted(scan.ring, ring, side="right")
+    other = start + np.mod(member - start + n * side.astype(np.intp), end - start)
+    turn = np.abs(np.mod(scan.azimuth[other] - scan.azimuth[member] + np.pi, 2 * np.pi) - np.pi)
+    return other, (turn < (n + MAX_STEPS) * scan.step_rad) & (other != member)
+
+
+def measure_size(
+    ends: RingEnds, uv: Array, placement: Placement, beyond_m: float
+) -> tuple[Placement, Array, Array, Array]:
+    """Fit a rectangle of free size to the ring ends: least squares of their distance from the nearest edge.
+
+    An end lies half a step of the ring inside the edge on average, and half a light spot outside
+    (`beyond_m`); both along the edge's normal. A weak prior holds a side that no end shows.
+
+    Args:
+        ends: ring ends.
+        uv: (M, 2) of the plane view, m.
+        placement: of the rectangle with the nominal size.
+        beyond_m: how far the light spot reaches over an edge.
+
+    Returns:
+        The fitted rectangle, the standard deviation of its width and height (2,), the residuals (E,) in m,
+        positive outwards, and the step along the edge's normal (E,) in m.
+    """
+    local = placement.local(uv[ends.beam])
+    over = np.abs(local) - placement.half_m
+    axis = over.argmax(axis=1)
+    rows = np.arange(len(axis))
+    sign = np.where(local[rows, axis] < 0, -1.0, 1.0)
+    gap_local = placement.local(ends.gap + [placement.u_m, placement.v_m])
+    step_m = np.abs(gap_local[rows, axis])
+    half = np.asarray(placement.half_m)
+    # Unknowns: shift along x and y, angle, half width, half height.
+    jacobian = np.zeros((len(axis), 5))
+    jacobian[rows, axis] = sign
+    jacobian[:, 2] = sign * np.where(axis == 0, -local[:, 1], local[:, 0])
+    jacobian[rows, 3 + axis] = 1.0
+    target = np.abs(local[rows, axis]) - half[axis] - (beyond_m - step_m / 2)
+    sigma_m = np.sqrt(step_m**2 / 12 + 0.003**2)
+    usable = ends.is_border
+    prior = np.diag([0.0, 0.0, 0.0, 4.0, 4.0]) / SIZE_PRIOR_M**2 + 1e-3 * np.eye(5)
+    x = np.zeros(5)
+    for _ in range(6):
+        residual = target - jacobian @ x
+        scale = max(median(np.abs(residual[usable])) * 1.4826, 0.003) if usable.any() else 0.01
+        weight = usable * np.maximum(1 - (residual / (4.7 * np.maximum(scale, sigma_m))) ** 2, 0.0) ** 2
+        information = (jacobian * (weight / sigma_m**2)[:, None]).T @ jacobian + prior
+        x = np.linalg.solve(information, jacobian.T @ (weight / sigma_m**2 * target))
+    residual = target - jacobian @ x
+    cov = np.linalg.inv(information)
+    freedom = max(1.0, float((weight > 0).sum()) - 5)
+    chi2 = float((weight * (residual / sigma_m) ** 2).sum()) / freedom
+    # Ends of rings at equal gaps share their phase: their steps do not average out.
+    common_m = median(step_m) / np.sqrt(12) if len(step_m) else 0.0
+    size_sigma_m = np.hypot(2 * np.sqrt(np.diag(cov)[3:] * max(1.0, chi2)), common_m)
+    if np.abs(x[:2]).max() > SLACK_M or np.abs(x[3:]).max() > SLACK_M:
+        # The ends contradict each other: they say nothing about the size.
+        return placement, np.full(2, SIZE_PRIOR_M), target, step_m
+    cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
+    fitted = Placement(
+        placement.u_m + float(cosine * x[0] - sine * x[1]),
+        placement.v_m + float(sine * x[0] + cosine * x[1]),
+        placement.angle_rad + float(x[2]),
+        (float(half[0] + x[3]), float(half[1] + x[4])),
+        placement.error_m,
+    )
+    return fitted, size_sigma_m, residual, step_m
+
+
+SURROUND_M = 0.20
+MIN_POINTS = 12
+EDGE_TOLERANCE_M = 0.012
+BORDER_M = 0.06  # how bright the board is near its outline is asked of returns so near to it
+SETTLED_M = 0.01  # an outline that moves less leaves the returns inside it, and so the plane, as they are
+
+
+@dataclass(frozen=True)
+class Beam:
+    """The light spot of a LiDAR: half of it reaches over an edge before the board's return is lost.
+
+    Attributes:
+        aperture_m: width of the beam where it leaves the sensor.
+        divergence_rad: full angle by which it widens.
+    """
+
+    aperture_m: float = 0.0127
+    divergence_rad: float = 0.003
+
+    def half_width_m(self, distance_m: float) -> float:
+        """Compute half the width of the spot at a distance."""
+        return (self.aperture_m + self.divergence_rad * distance_m) / 2
+
+
+def fit_plane_to_ranges(points: Array, start: Array, scale_m: float, n_rounds: int = 3) -> Array:
+    """Fit a plane to ranges: minimise sum rho_T(r_i - 1 / (m . u_i)) over m, n = -m / |m|, d = 1 / |m|.
+
+    The beams' directions u_i are exact and the noise lies along them. Orthogonal least squares would turn the
+    plane towards the sensor, by sigma^2 / spread^2 rad at 45 deg. rho_T is Tukey's biweight at 4.7 scales.
+
+    Args:
+        points: (N, 3) m, frame lidar.
+        start: (4,) plane as (n, d).
+        scale_m: noise of a range.
+        n_rounds: Gauss-Newton rounds.
+
+    Returns:
+        (4,) plane as (n, d), n towards the LiDAR.
+    """
+    range_m = np.linalg.norm(points, axis=1)
+    rays = points / range_m[:, None]
+    m = -start[:3] / start[3]
+    for _ in range(n_rounds):
+        predicted = 1.0 / (rays @ m)
+        residual = range_m - predicted
+        weight = np.maximum(1.0 - (residual / (4.7 * scale_m)) ** 2, 0.0) ** 2
+        jacobian = -rays * (predicted**2)[:, None]
+        hessian = (jacobian * weight[:, None]).T @ jacobian
+        m = m + np.linalg.solve(hessian + 1e-9 * np.eye(3), jacobian.T @ (weight * residual))
+    return np.asarray(np.append(-m, 1.0) / np.linalg.norm(m))
+
+
+def refine(
+    scan: OrderedScan,
+    plane: Array,
+    centre: Array,
+    placement: Placement,
+    limit_m: float,
+    max_beyond: float = np.inf,
+) -> tuple[PlaneView, Placement] | None:
+    """Fit the plane to the single returns inside the outline, and the outline to the beams about it.
+
+    Args:
+        scan: all returns.
+        plane: (4,) first guess.
+        centre: (3,) m, the point of the plane the placement is counted from.
+        placement: first guess of the outline.
+        limit_m: largest error of an outline; what is far worse is not improved further.
+        max_beyond: most returns in the plane beyond the outline, per return inside, to look closer.
+
+    Returns:
+        The beams about the plate and the outline among them, with its error; None where too few returns lie
+        on the plane inside the outline, or too many beyond it.
+    """
+    radius_m = float(np.hypot(*placement.half_m)) + SURROUND_M
+    tolerance_m = 4.0 * scan.sigma_m + 0.01
+    near = beams_about(scan, centre + plane_axes(plane[:3]) @ [placement.u_m, placement.v_m], 1.3 * radius_m)
+    for k in range(3):
+        centre = centre + plane_axes(plane[:3]) @ [placement.u_m, placement.v_m]
+        placement = replace(placement, u_m=0.0, v_m=0.0)
+        view = view_plane(scan, near, plane, centre, radius_m, tolerance_m)
+        if k == 0:
+            error_m = rate(scan, view, placement)
+            if error_m > 2.0 * limit_m:
+                return view, replace(placement, error_m=error_m)
+        away = placement.distance_m(view.uv[view.is_on])
+        on = view.member[view.is_on][away < 0.0]
+        if len(on) < 10 or (k == 0 and np.count_nonzero(away > SLACK_M) > max_beyond * len(on)):
+            return None
+        points = scan.points[on].astype(np.float64)
+        height = points @ plane[:3] + plane[3]
+        scale_m = 1.4826 * median(np.abs(height - median(height))) + 0.001
+        plane = fit_plane_to_ranges(points, plane, scale_m * float(np.linalg.norm(centre)) / plane[3])
+        height = points @ plane[:3] + plane[3]
+        tolerance_m = 3.5 * 1.4826 * median(np.abs(height)) + 0.004
+        view = view_plane(scan, near, plane, view.origin, radius_m, tolerance_m)
+        registered = register(scan, view, placement)
+        if registered is None:
+            return None
+        placement, centre = registered, view.origin
+        if placement.error_m > 1.5 * limit_m or np.hypot(placement.u_m, placement.v_m) < SETTLED_M:
+            break
+    return view, placement
+
+
+def build_board(
+    scan: OrderedScan, source: Scan, board: Board, view: PlaneView, placement: Placement, beam: Beam
+) -> LidarBoard | None:
+    """Collect the returns inside the outline, keep the ring ends that are the board's own, and sum up.
+
+    Args:
+        scan: all returns, ordered.
+        source: the scan they come from.
+        board: nominal size.
+        view: beams about the board.
+        placement: of the nominal rectangle.
+        beam: light spot of the LiDAR.
+
+    Returns:
+        The board, None where hardly a return lies inside the outline.
+    """
+    distance_m = float(np.linalg.norm(view.origin))
+    beyond_m = beam.half_width_m(distance_m)
+    away = placement.distance_m(view.uv)
+    # A plate somewhat larger than it should be is to be measured, not cut to size.
+    ends = find_ring_ends(scan, view, view.is_on & (away <= beyond_m + SLACK_M))
+    fitted, size_sigma_m, residual, step_m = measure_size(ends, view.uv, placement, beyond_m)
+    away = fitted.distance_m(view.uv)
+    is_board = view.is_on & (away <= beyond_m + EDGE_TOLERANCE_M)
+    if is_board.sum() < MIN_POINTS:
+        return None
+    limit_m = step_m / 2 + EDGE_TOLERANCE_M + 0.5 * beyond_m
+    is_good = ends.is_border & (np.abs(residual) <= limit_m)
+    order = np.lexsort((ends.side, scan.ring[view.member[ends.beam]]))
+    order = order[is_good[order]]
+    kept, edge = view.member[is_board], view.member[ends.beam[order]]
+    border = kept[away[is_board] > -BORDER_M]
+    points = scan.points[kept].astype(np.float64)
+    height = points @ view.plane[:3] + view.plane[3]
+    low_m, high_m = np.percentile(height, [2.5, 97.5])
+    rms_m = float(np.sqrt(np.mean(height**2)))
+    incidence = np.arccos(np.clip(view.plane[3] / distance_m, 0.0, 1.0))
+    # How much of the light spot counts is not known.
+    quality = _size_figures(2 * np.asarray(fitted.half_m), np.hypot(size_sigma_m, beyond_m), board) | {
+        "n_rings": float(1 + np.count_nonzero(np.diff(scan.ring[kept]))),
+        "n_points": float(len(kept)),
+        "n_ring_ends": float(len(edge)),
+        "n_ring_ends_dropped": float(len(ends.beam) - len(edge)),
+        "thickness_m": float(high_m - low_m),
+        "plane_rms_m": rms_m,
+        "edge_rms_m": float(np.sqrt(np.mean(residual[is_good] ** 2))) if is_good.any() else float("nan"),
+        "template_m": placement.error_m,
+        "beyond_share": float((view.is_on & (away > SLACK_M)).sum()) / max(1, len(kept)),
+        "distance_m": distance_m,
+        "incidence_deg": float(np.degrees(incidence)),
+        "range_noise_m": scan.sigma_m,
+    }
+    return LidarBoard(
+        points=points,
+        ring=scan.ring[kept],
+        edge_points=scan.points[edge].astype(np.float64),
+        edge_ring=scan.ring[edge],
+        edge_side=ends.side[order],
+        edge_behind_m=ends.behind_m[order],
+        edge_echo=_echo_shares(scan, source, ends, view, border)[order],
+        azimuth_step_rad=scan.step_rad,
+        plane=view.plane,
+        sigma_m=rms_m,
+        T_lidar_board=_pose_of(view, fitted),
+        offset_ns=None if source.offset_ns is None else source.offset_ns[scan.index[kept]],
+        quality=quality,
+    )
+
+
+def _size_figures(size_m: Array, sigma_m: Array, board: Board) -> dict[str, float]:
+    """State width and height (2,) with their sigmas (2,), and how large they are beside the nominal ones."""
+    weight = 1.0 / sigma_m**2
+    ratio = (weight * size_m / [board.width_m, board.height_m]).sum() / weight.sum()
+    return {
+        "width_m": float(size_m[0]),
+        "height_m": float(size_m[1]),
+        "width_sigma_m": float(sigma_m[0]),
+        "height_sigma_m": float(sigma_m[1]),
+        "size_ratio": float(ratio),
+    }
+
+
+def _echo_shares(scan: OrderedScan, source: Scan, ends: RingEnds, view: PlaneView, border: Indices) -> Array:
+    """Compute the share (E,) of the power that comes from behind where a beam meets it and the board alike.
+
+    Intensities are those of surfaces; what is received from them falls with the square of the range.
+
+    Args:
+        scan: all returns.
+        source: the scan they come from; where it has no intensities all surfaces count as alike.
+        ends: ring ends.
+        view: beams about the board.
+        border: returns from near the board's outline.
+    """
+    intensity = source.intensity[scan.index].astype(np.float64)
+    end = view.member[ends.beam]
+    of_board = float(np.median(intensity[border])) if len(border) else 0.0
+    brightness = intensity[ends.beyond] / of_board if of_board > 0 else np.ones(len(end))
+    echo = brightness * (scan.range_m[end] / scan.range_m[ends.beyond]) ** 2
+    return np.where(np.isfinite(ends.behind_m), echo / (1 + echo), 0.0)
+
+
+def _pose_of(view: PlaneView, placement: Placement) -> Array:
+    """Compute T_lidar_board of a placement, y upwards where the rectangle leaves the choice."""
+    direction = np.array([np.cos(placement.angle_rad), np.sin(placement.angle_rad)])
+    if direction[0] < 0:
+        direction = -direction
+    x = view.axes @ direction
+    normal = view.plane[:3]
+    R = np.stack([x, np.cross(normal, x), normal], axis=1)
+    return pose(R, view.origin + view.axes @ [placement.u_m, placement.v_m])

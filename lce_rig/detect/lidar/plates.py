@@ -1,0 +1,250 @@
+"""Plates of about the board's size: clusters of straight segments that lie in one plane."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.detect.lidar.segments import MAX_INCIDENCE_RAD, Indices, OrderedScan, Segments
+from lce_rig.detect.lidar.template import Placement, plane_axes, register_ends
+
+MAX_PAIRS = 600
+N_ROUNDS = 2
+MAX_JOINT = 4  # returns between two segments of one chord: noise, a hand's edge, a dropped firing
+
+
+@dataclass(frozen=True, eq=False)
+class Plates:
+    """K plates, the most promising first.
+
+    Attributes:
+        plane: (K, 4) as (n, d), n.p + d = 0, n towards the LiDAR.
+        centre: (K, 3) mean of the plate's returns, m.
+        n_rings: (K,).
+        size_m: (K, 2) long and short side of the rectangle with the same second moments.
+        thickness_m: (K,) rms distance of the returns from the plane.
+    """
+
+    plane: Array
+    centre: Array
+    n_rings: Indices
+    size_m: Array
+    thickness_m: Array
+
+    def select(self, keep: NDArray[np.bool_] | Indices) -> "Plates":
+        """Keep the plates of a mask or index."""
+        return Plates(*(getattr(self, field.name)[keep] for field in fields(self)))
+
+
+def propose_plates(
+    scan: OrderedScan, segments: Segments, board: Board, n_plates: int = 10, is_any_size: bool = False
+) -> tuple[Plates, Array]:
+    """Grow plates from pairs of neighbouring segments and keep different ones of plausible size.
+
+    Each pair of parallel segments on neighbouring rings spans a plane. A plane takes all segments in reach
+    that lie in it and is fitted again to their sums, a few times over, for all planes at once.
+
+    Args:
+        scan: gives the noise.
+        segments: straight segments of all lengths.
+        board: gives the reach.
+        n_plates: the most plates to return.
+        is_any_size: whether to keep plates that cannot be the board.
+
+    Returns:
+        The plates, and the first and last return of their segments (K, M, 3) in m; NaN fills the rows up.
+    """
+    diagonal_m = float(np.hypot(board.width_m, board.height_m))
+    tolerance_m = 2.0 * scan.sigma_m + 0.01
+    segments = segments.select(segments.lateral_m < tolerance_m)
+    first, second = _neighbours(segments, diagonal_m, is_any_size)
+    sums = _sums(segments)
+    plates = _fit(np.repeat(np.arange(len(first)), 2), np.stack([first, second], 1).ravel(), segments, sums)
+    is_kept = (plates.thickness_m < tolerance_m) & _faces_lidar(plates)
+    facing, is_blurred = _facing_planes(plates, segments, first, second, 3.0 * scan.sigma_m)
+    plates = replace(plates, plane=np.where(is_blurred[:, None], facing, plates.plane))
+    is_kept |= is_blurred
+    row = column = first
+    for _ in range(2 * N_ROUNDS if is_blurred.any() else N_ROUNDS):
+        row, column = _members(plates.select(is_kept), segments, 0.6 * diagonal_m, tolerance_m)
+        plates = _fit(row, column, segments, sums)
+        # The same members give the very same sums.
+        is_kept = np.zeros(len(plates.centre), dtype=np.bool_)
+        is_kept[np.unique(plates.centre[:, 0], return_index=True)[1]] = True
+        is_kept &= (plates.n_rings >= 2) & _faces_lidar(plates) & (plates.size_m[:, 0] < 2.0 * diagonal_m)
+    if not is_any_size:
+        is_kept &= _is_plausible(plates, board)
+    best = _different(plates, np.flatnonzero(is_kept), board, n_plates)
+    ends = [_ring_ends(scan, segments, column[row == k]) for k in best]
+    padded = np.full((len(best), max((len(e) for e in ends), default=1), 3), np.nan)
+    for k, e in enumerate(ends):
+        padded[k, : len(e)] = e
+    return plates.select(best), padded
+
+
+def _facing_planes(
+    plates: Plates, segments: Segments, first: Indices, second: Indices, blur_m: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Lay a plane (K, 4) through each pair's line, square to the beam, for pairs (K,) lost in noise.
+
+    Where the noise is as large as the distance between two rings, their plane is arbitrary; this one is near
+    enough to collect the rings beyond them.
+    """
+    direction = segments.direction[first]
+    away = segments.centre[second] - segments.centre[first]
+    away = away - np.einsum("ij,ij->i", away, direction)[:, None] * direction
+    is_blurred = np.linalg.norm(away, axis=1) < blur_m
+    along = np.einsum("ij,ij->i", plates.centre, direction)
+    normal = along[:, None] * direction - plates.centre
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-9)[:, None]
+    d = -np.einsum("ij,ij->i", normal, plates.centre)
+    return np.concatenate([normal, d[:, None]], axis=1), is_blurred
+
+
+def _ring_ends(scan: OrderedScan, segments: Segments, members: Indices) -> Array:
+    """List the ends (M, 3) of a plate's segments in m; segments a few returns apart count as one."""
+    start, end = segments.start[members], segments.end[members]
+    is_joint = (start[1:] - end[:-1] <= MAX_JOINT) & (np.diff(segments.ring[members]) == 0)
+    first = start[np.append(True, ~is_joint)]
+    last = end[np.append(~is_joint, True)] - 1
+    return np.asarray(scan.points[np.concatenate([first, last])], dtype=np.float64)
+
+
+def _neighbours(segments: Segments, diagonal_m: float, is_any_size: bool) -> tuple[Indices, Indices]:
+    """List the pairs of board-like segments that can lie side by side on one plate."""
+    max_length_m = (2.0 if is_any_size else 1.15) * diagonal_m
+    is_seed = (segments.length_m > 0.2 * diagonal_m) & (segments.length_m < max_length_m)
+    distance = np.linalg.norm(segments.centre, axis=1)
+    along_beam = np.einsum("ij,ij->i", segments.direction, segments.centre)
+    is_seed &= np.abs(along_beam) < np.sin(MAX_INCIDENCE_RAD) * distance
+    seed = np.flatnonzero(is_seed)
+    ring, centre, direction = segments.ring[seed], segments.centre[seed], segments.direction[seed]
+    ring_gap = ring[None] - ring[:, None]
+    # Few pairs are on neighbouring rings: everything else is computed for them only.
+    first, second = np.nonzero(ring_gap == 1)
+    away = centre[second] - centre[first]
+    reach = segments.length_m[seed]
+    is_near = np.einsum("ij,ij->i", away, away) < (0.6 * diagonal_m) ** 2
+    is_near &= np.abs(np.einsum("ij,ij->i", direction[first], direction[second])) > 0.95
+    is_near &= np.abs(np.einsum("ij,ij->i", direction[first], away)) < 0.4 * (reach[first] + reach[second])
+    first, second = seed[first[is_near]], seed[second[is_near]]
+    best = np.argsort(-segments.count[first] - segments.count[second], kind="stable")[:MAX_PAIRS]
+    return first[best], second[best]
+
+
+def _sums(segments: Segments) -> Array:
+    """Stack count, sum of p and sum of p p^T of each segment (S, 13)."""
+    outer = segments.centre[:, :, None] * segments.centre[:, None, :]
+    second = (segments.scatter + segments.count[:, None, None] * outer).reshape(-1, 9)
+    return np.concatenate(
+        [segments.count[:, None], segments.count[:, None] * segments.centre, second], axis=1
+    )
+
+
+def _fit(row: Indices, column: Indices, segments: Segments, sums: Array) -> Plates:
+    """Fit a plane to the sums of each plate's segments.
+
+    Args:
+        row: (L,) plate of each membership, rising.
+        column: (L,) segment of each membership, rising within a plate.
+        segments: S of them.
+        sums: (S, 13) of the segments.
+    """
+    start = np.flatnonzero(np.diff(row, prepend=-1))
+    if len(start) == 0:
+        none = np.zeros(0)
+        return Plates(np.zeros((0, 4)), np.zeros((0, 3)), start, np.zeros((0, 2)), none)
+    total = np.add.reduceat(sums[column], start)
+    count = total[:, 0]
+    centre = total[:, 1:4] / count[:, None]
+    spread = total[:, 4:].reshape(-1, 3, 3) / count[:, None, None] - centre[:, :, None] * centre[:, None, :]
+    eigenvalues, eigenvectors = np.linalg.eigh(spread)
+    eigenvalues = np.maximum(eigenvalues, 0.0)
+    normal = eigenvectors[:, :, 0]
+    d = -np.einsum("ij,ij->i", normal, centre)
+    plane = np.concatenate([normal, d[:, None]], axis=1) * np.where(d < 0, -1.0, 1.0)[:, None]
+    is_new_ring = (np.diff(row, prepend=-1) != 0) | (np.diff(segments.ring[column], prepend=-1) != 0)
+    n_rings = np.add.reduceat(is_new_ring.astype(np.intp), start)
+    return Plates(plane, centre, n_rings, np.sqrt(12.0 * eigenvalues[:, [2, 1]]), np.sqrt(eigenvalues[:, 0]))
+
+
+def _members(
+    plates: Plates, segments: Segments, reach_m: float, tolerance_m: float
+) -> tuple[Indices, Indices]:
+    """List which segments lie in which plane, within reach of its centre: (plate, segment), rising."""
+    row, column = _within_reach(plates.centre, segments.centre, reach_m)
+    normal = plates.plane[:, :3]
+    offset = np.einsum("ij,ij->i", normal[row], segments.centre[column]) + plates.plane[row, 3]
+    is_near = np.abs(offset) < tolerance_m
+    row, column, offset = row[is_near], column[is_near], offset[is_near]
+    outer = (normal[:, :, None] * normal[:, None, :]).reshape(-1, 9)
+    scatter = segments.scatter.reshape(-1, 9) / segments.count[:, None]
+    variance = np.einsum("ij,ij->i", outer[row], scatter[column])
+    is_member = offset * offset + variance < tolerance_m**2
+    row, column = row[is_member], column[is_member]
+    # Number the plates that still have members without gaps.
+    return np.cumsum(np.diff(row, prepend=row[:1]) != 0), column
+
+
+def _within_reach(centres: Array, others: Array, reach_m: float, block: int = 32) -> tuple[Indices, Indices]:
+    """List the pairs (row, column) of points closer than the reach, by blocks that fit the cache."""
+    half_squared = np.einsum("ij,ij->i", others, others) / 2
+    limit = (reach_m**2 - np.einsum("ij,ij->i", centres, centres)) / 2
+    rows, columns = [], []
+    for begin in range(0, len(centres), block):
+        dot = centres[begin : begin + block] @ others.T
+        is_near = half_squared - dot < limit[begin : begin + block, None]
+        row, column = np.divmod(np.flatnonzero(is_near), len(others))  # faster than nonzero in two dimensions
+        rows.append(row + begin)
+        columns.append(column)
+    return np.concatenate(rows or [np.zeros(0, np.intp)]), np.concatenate(columns or [np.zeros(0, np.intp)])
+
+
+def _faces_lidar(plates: Plates) -> NDArray[np.bool_]:
+    """Find which planes (K,) the beams meet at less than the largest incidence; d = distance of the plane."""
+    distance = np.linalg.norm(plates.centre, axis=1)
+    return np.asarray(plates.plane[:, 3] > np.cos(MAX_INCIDENCE_RAD) * distance)
+
+
+def _is_plausible(plates: Plates, board: Board) -> NDArray[np.bool_]:
+    """Find which plates (K,) can be the board, part of which may be hidden or outside the rings."""
+    long_m, short_m = max(board.width_m, board.height_m), min(board.width_m, board.height_m)
+    ratio = plates.size_m / [long_m, short_m]
+    return np.asarray((ratio[:, 0] > 0.5) & (ratio[:, 0] < 1.5) & (ratio[:, 1] > 0.25) & (ratio[:, 1] < 1.5))
+
+
+def _different(plates: Plates, candidates: Indices, board: Board, n_plates: int) -> Indices:
+    """Choose the most board-like plate of each place and orientation, the best first."""
+    long_m, short_m = max(board.width_m, board.height_m), min(board.width_m, board.height_m)
+    misfit = np.abs(np.log(np.maximum(plates.size_m[candidates], 1e-3) / [long_m, short_m])).sum(axis=1)
+    # Few rings say little about a size; many returns on a wrong size say no.
+    rank = candidates[np.argsort(misfit - 0.1 * np.minimum(plates.n_rings[candidates], 8), kind="stable")]
+    rank = rank[: 20 * n_plates]
+    centre, normal = plates.centre[rank], plates.plane[rank, :3]
+    apart = np.linalg.norm(centre[:, None] - centre, axis=2)
+    offset = np.abs(centre @ normal.T + plates.plane[rank, 3])
+    is_same = (apart <= 0.3 * np.hypot(long_m, short_m)) & (normal @ normal.T >= 0.95) & (offset <= 0.05)
+    is_open = np.ones(len(rank), dtype=np.bool_)
+    chosen: list[int] = []
+    while is_open.any() and len(chosen) < n_plates:
+        best = int(np.argmax(is_open))
+        chosen.append(int(rank[best]))
+        is_open &= ~is_same[best]
+        is_open[best] = False
+    return np.array(chosen, dtype=np.intp)
+
+
+def screen_plates(
+    plates: Plates, ends: Array, board: Board, limit_m: float
+) -> list[tuple[Array, Array, Placement]]:
+    """Register the outline with the ends of each plate's segments and keep the plates it fits, best first."""
+    if len(plates.centre) == 0:
+        return []
+    relative = ends - plates.centre[:, None]
+    placements = register_ends(relative @ plane_axes(plates.plane[:, :3]), board)
+    rank = sorted(range(len(placements)), key=lambda k: placements[k].error_m)
+    return [
+        (plates.plane[k], plates.centre[k], placements[k]) for k in rank if placements[k].error_m < limit_m
+    ]

@@ -1,0 +1,297 @@
+"""Find the board in a full LiDAR scan, without a prior."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.data import Scan
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import LidarBoard, Refusal
+from lce_rig.detect.lidar.measurement import Beam, build_board, refine
+from lce_rig.detect.lidar.plates import propose_plates, screen_plates
+from lce_rig.detect.lidar.segments import OrderedScan, cut_segments, order_scan
+from lce_rig.detect.lidar.template import Placement, PlaneView, beams_about, view_plane
+
+# Why no board was found in a scan: the nearest miss, with its figures.
+
+# Share of returns beyond the outline, in the board's plane, from which something touches the board.
+TOUCHING_SHARE = 0.10
+SCATTER_M = 0.02  # by how much more than the LiDAR's noise a moving board's returns may scatter to be named
+MAX_SIZE_MISFIT = (
+    0.75  # sum of |log| of the ratios of long and short side up to which a plate is worth naming
+)
+LAYER_M = 0.06  # half the depth in which returns may belong to one warped or moving sheet
+
+
+def no_returns(n_points: int, min_range_m: float) -> Refusal:
+    """Refuse a scan without usable returns."""
+    return Refusal("lidar.no_returns", figures={"n_points": n_points, "min_range_m": min_range_m})
+
+
+def too_few_rings(found: LidarBoard, min_rings: int) -> Refusal:
+    """Refuse a board on which too few rings lie; their number goes with 1 / distance."""
+    n_rings, distance_m = found.quality["n_rings"], found.quality["distance_m"]
+    closer_m = max(0.1, distance_m * (1.0 - n_rings / min_rings))
+    return Refusal(
+        "lidar.too_few_rings",
+        figures={
+            "n_rings": int(n_rings),
+            "min_rings": min_rings,
+            "distance_m": distance_m,
+            "closer_m": closer_m,
+        },
+    )
+
+
+def too_thick(heights_m: Array, limit_m: float) -> Refusal:
+    """Refuse a board whose returns scatter about its plane by more than the LiDAR's noise explains.
+
+    Args:
+        heights_m: (N,) of the returns over the plane.
+        limit_m: largest rms of them.
+    """
+    low_m, high_m = np.percentile(heights_m, [2.5, 97.5])
+    return Refusal(
+        "lidar.too_thick",
+        figures={
+            "thickness_m": float(high_m - low_m),
+            "rms_m": float(np.sqrt(np.mean(heights_m**2))),
+            "max_rms_m": limit_m,
+        },
+    )
+
+
+def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_limit_m: float) -> Refusal:
+    """Refuse a plate whose outline is not the board's: it is warped, something touches it, parts are hidden.
+
+    Args:
+        view: beams about the plate.
+        placement: where the outline fits best.
+        limit_m: largest error of an outline.
+        rms_limit_m: largest rms distance of the returns from the plane.
+    """
+    distance = placement.distance_m(view.uv)
+    n_on = max(1, int((view.is_on & (distance <= 0)).sum()))
+    beyond = int((view.is_on & (distance > 0.03)).sum()) / n_on
+    heights_m = view.height_m[(distance < -0.03) & (np.abs(view.height_m) < LAYER_M)]
+    is_one_sheet = len(heights_m) > 0.8 * max(1, int((distance < -0.03).sum()))
+    if is_one_sheet and np.sqrt(np.mean(heights_m**2)) > rms_limit_m:
+        return too_thick(heights_m, rms_limit_m)
+    distance_m = float(np.linalg.norm(view.origin))
+    if beyond > TOUCHING_SHARE:
+        return Refusal("lidar.touching", figures={"distance_m": distance_m, "beyond_share": beyond})
+    hidden = float(np.mean(~view.is_on[distance <= -0.03])) if np.any(distance <= -0.03) else 0.0
+    return Refusal(
+        "lidar.outline",
+        figures={
+            "distance_m": distance_m,
+            "error_m": float(placement.error_m),
+            "max_error_m": limit_m,
+            "hidden_share": hidden,
+        },
+    )
+
+
+def no_plate(
+    scan: OrderedScan, board: Board, limit_m: float, min_range_m: float, max_range_m: float
+) -> Refusal:
+    """Refuse a scan in which no plate is the board, naming what comes nearest to it.
+
+    The search is repeated for plates of any size and of returns that scatter more than the LiDAR's do.
+
+    Args:
+        scan: all returns.
+        board: what was looked for.
+        limit_m: largest error of an outline.
+        min_range_m: from where it was looked for.
+        max_range_m: up to where.
+    """
+    coarse = replace(scan, sigma_m=scan.sigma_m + SCATTER_M)
+    plates, ends = propose_plates(coarse, cut_segments(coarse, max_range_m), board, is_any_size=True)
+    for plane, centre, placement in screen_plates(plates, ends, board, limit_m):
+        radius_m = float(np.hypot(*placement.half_m))
+        view = view_plane(scan, beams_about(scan, centre, radius_m), plane, centre, radius_m, LAYER_M)
+        distance = placement.distance_m(view.uv)
+        heights_m = view.height_m[(distance < -0.03) & view.is_on]
+        if len(heights_m) > 0.8 * (distance < -0.03).sum() and np.std(heights_m) > 2.0 * scan.sigma_m + 0.008:
+            return too_thick(heights_m, 2.0 * scan.sigma_m + 0.008)
+    board_m = np.array([max(board.width_m, board.height_m), min(board.width_m, board.height_m)])
+    wanted = {"board_width_m": board.width_m, "board_height_m": board.height_m}
+    misfit = np.abs(np.log(np.maximum(plates.size_m, 1e-2) / board_m)).sum(axis=1)
+    misfit[plates.n_rings < 3] += 1.0
+    if len(misfit) and misfit.min() < MAX_SIZE_MISFIT:
+        best = int(np.argmin(misfit))
+        return Refusal(
+            "lidar.other_plate",
+            figures={
+                "width_m": float(plates.size_m[best, 0]),
+                "height_m": float(plates.size_m[best, 1]),
+                "distance_m": float(np.linalg.norm(plates.centre[best])),
+                **wanted,
+            },
+        )
+    return Refusal(
+        "lidar.no_plate", figures={**wanted, "min_range_m": min_range_m, "max_range_m": max_range_m}
+    )
+
+
+MAX_CANDIDATES = 4
+# A plate with as many rings and as little else in its plane is clear.
+CLEAR_RINGS = 6
+CLEAR_SHARE = 0.05
+# Beside a clear board, a plate with such a share of returns beyond its outline is a patch of a wall.
+PATCH_SHARE = 0.20
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a plate must meet to be taken for the board.
+
+    Attributes:
+        template_m: largest mean distance of the outline from where the rings end.
+        rms_m: largest rms distance of the returns from the plane.
+        min_rings: fewest rings on the board.
+    """
+
+    template_m: float
+    rms_m: float
+    min_rings: int
+
+    def widened(self, sigma_m: float) -> "Limits":
+        """Allow for the noise that a scan shows."""
+        template_m = min(self.template_m + 1.5 * sigma_m, 0.06)
+        return Limits(template_m, self.rms_m + 1.5 * sigma_m, self.min_rings)
+
+
+STANDARD = Limits(template_m=0.025, rms_m=0.012, min_rings=4)
+
+
+def find_lidar_boards(
+    scan: Scan,
+    board: Board,
+    *,
+    min_range_m: float = 0.4,
+    max_range_m: float = 6.0,
+    min_rings: int = STANDARD.min_rings,
+    max_template_m: float = STANDARD.template_m,
+    max_rms_m: float = STANDARD.rms_m,
+    beam: Beam | None = None,
+) -> list[LidarBoard] | Refusal:
+    """Find the plates of the board's size in a scan, best first.
+
+    Rings are cut into straight segments, segments in one plane grow into plates, the board's outline is
+    registered with each plate, and the plates that it fits are measured. All thresholds widen with the noise
+    that the scan itself shows.
+
+    Args:
+        scan: one revolution, or part of one.
+        board: the outer size is what is looked for.
+        min_range_m: nearer returns are ignored.
+        max_range_m: plates farther away are ignored.
+        min_rings: fewest rings on the board.
+        max_template_m: largest mean distance of the outline from where the rings end, without noise.
+        max_rms_m: largest rms distance of the board's returns from its plane, without noise.
+        beam: light spot of the LiDAR; that of a VLP-16 where None.
+
+    Returns:
+        At most 4 boards that do not overlap, or why there is none.
+
+    References:
+        LCE-Calib, "Automatic Feature Extraction From LiDARs": selection and features.
+    """
+    ordered = order_scan(scan, min_range_m)
+    if len(ordered.index) == 0:
+        return no_returns(len(scan.points), min_range_m)
+    segments = cut_segments(ordered, max_range_m, 2.0 * float(np.hypot(board.width_m, board.height_m)))
+    plates, ends = propose_plates(ordered, segments, board)
+    limits = Limits(max_template_m, max_rms_m, min_rings).widened(ordered.sigma_m)
+    found: list[LidarBoard] = []
+    misses: list[Refusal] = []
+    max_beyond = np.inf
+    for plane, origin, start in screen_plates(plates, ends, board, limits.template_m):
+        measured = measure_plate(ordered, scan, board, plane, origin, start, limits, beam, max_beyond)
+        if isinstance(measured, Refusal):
+            misses.append(measured)
+        elif measured is not None:
+            found.append(measured)
+            if _is_clear(measured):
+                max_beyond = PATCH_SHARE
+    if found:
+        return _distinct(found, board)
+    if misses:
+        return misses[0]
+    return no_plate(ordered, board, limits.template_m, min_range_m, max_range_m)
+
+
+def measure_plate(
+    ordered: OrderedScan,
+    scan: Scan,
+    board: Board,
+    plane: Array,
+    origin: Array,
+    start: Placement,
+    limits: Limits,
+    beam: Beam | None = None,
+    max_beyond: float = np.inf,
+) -> LidarBoard | Refusal | None:
+    """Register the board's outline from a first guess, measure the board and check it against the limits.
+
+    Args:
+        ordered: the returns of the scan.
+        scan: where they come from.
+        board: nominal size.
+        plane: (4,) first guess, as (n, d).
+        origin: (3,) m, the point of the plane the first guess is counted from.
+        start: first guess of the outline.
+        limits: with the scan's noise.
+        beam: light spot of the LiDAR; that of a VLP-16 where None.
+        max_beyond: largest share of returns in the plane beyond the outline, as it is guessed.
+
+    Returns:
+        The board, why it is refused, None where there is no plate.
+    """
+    refined = refine(ordered, plane, origin, start, limits.template_m, max_beyond)
+    if refined is None:
+        return None
+    view, placement = refined
+    if placement.error_m > limits.template_m:
+        return outline_misfit(view, placement, limits.template_m, limits.rms_m)
+    measured = build_board(ordered, scan, board, view, placement, beam or Beam())
+    if measured is None:
+        return None
+    if measured.quality["n_rings"] < limits.min_rings:
+        return too_few_rings(measured, limits.min_rings)
+    if measured.sigma_m > limits.rms_m:
+        heights_m = measured.points @ measured.plane[:3] + measured.plane[3]
+        return too_thick(heights_m, limits.rms_m)
+    return measured
+
+
+def _is_clear(found: LidarBoard) -> bool:
+    """Return whether a candidate has many rings and its plane almost to itself."""
+    return found.quality["n_rings"] >= CLEAR_RINGS and found.quality["beyond_share"] < CLEAR_SHARE
+
+
+def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
+    """Rank the candidates and drop those that overlap a better one."""
+    distinct: list[LidarBoard] = []
+    for candidate in sorted(found, key=lambda c: _doubt(c, board)):
+        centre = candidate.T_lidar_board[:3, 3]
+        away = [float(np.linalg.norm(centre - other.T_lidar_board[:3, 3])) for other in distinct]
+        if all(a > min(board.width_m, board.height_m) / 2 for a in away):
+            distinct.append(candidate)
+    return distinct[:MAX_CANDIDATES]
+
+
+def _doubt(found: LidarBoard, board: Board) -> float:
+    """Rate a candidate in m: misfit of outline and size, what no ring shows, what else is in its plane."""
+    q = found.quality
+    doubt = q["template_m"] + 0.03 / q["n_rings"] + 0.15 * (q["width_sigma_m"] + q["height_sigma_m"])
+    doubt += 0.05 * q["beyond_share"]
+    for measured_m, sigma_m, wanted_m in (
+        (q["width_m"], q["width_sigma_m"], board.width_m),
+        (q["height_m"], q["height_sigma_m"], board.height_m),
+    ):
+        doubt += 0.5 * max(0.0, abs(measured_m - wanted_m) - 2 * sigma_m - 0.005)
+    return doubt

@@ -1,0 +1,294 @@
+"""Register the board's rectangle in a plane: where the beams end, meet the plane, or pass through it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.detect.lidar.segments import MAX_STEPS, Indices, OrderedScan
+
+N_ANGLES = 12
+CAP_M = 0.10
+MAX_SAMPLES = 64
+MIN_ON_RING = 3  # returns that make a chord
+# What a beam says about the outline: it ends a chord, or should lie inside or outside.
+END, INSIDE, OUTSIDE, UNUSED = range(4)
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneView:
+    """The beams about a plate as they pierce its plane, M of them, by ring and azimuth.
+
+    Attributes:
+        plane: (4,) as (n, d), n towards the LiDAR.
+        axes: (3, 2) unit vectors u (level) and v (up) in the plane, right-handed with n.
+        origin: (3,) m, the point of the plane from which u and v are counted.
+        member: (M,) index in the `OrderedScan`.
+        uv: (M, 2) where each beam pierces the plane, m.
+        height_m: (M,) distance of each return from the plane, positive before it.
+        tolerance_m: returns within it lie on the plane.
+    """
+
+    plane: Array
+    axes: Array
+    origin: Array
+    member: Indices
+    uv: Array
+    height_m: Array
+    tolerance_m: float
+
+    @property
+    def is_on(self) -> NDArray[np.bool_]:
+        """Which beams return from the plane (M,)."""
+        return np.abs(self.height_m) <= self.tolerance_m
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A rectangle in a plane view.
+
+    Attributes:
+        u_m, v_m: its centre.
+        angle_rad: of its width axis from u.
+        half_m: half width and half height.
+        error_m: how far the beams contradict it: mean capped distance of the chords' ends from the border,
+            plus the cap for each beam that contradicts it elsewhere, per chord end or beam on the plane.
+    """
+
+    u_m: float
+    v_m: float
+    angle_rad: float
+    half_m: tuple[float, float]
+    error_m: float = np.inf
+
+    def local(self, uv: Array) -> Array:
+        """Take points (..., 2) of the plane view to the rectangle's axes, m."""
+        cosine, sine = np.cos(self.angle_rad), np.sin(self.angle_rad)
+        offset = uv - [self.u_m, self.v_m]
+        return np.asarray(offset @ np.array([[cosine, -sine], [sine, cosine]]))
+
+    def distance_m(self, uv: Array) -> Array:
+        """Measure the distance of points (..., 2) of the plane view from the border, negative inside."""
+        over = np.abs(self.local(uv)) - self.half_m
+        return _distance_over(over[..., 0], over[..., 1])[0]
+
+
+def beams_about(scan: OrderedScan, centre: Array, radius_m: float) -> Indices:
+    """List the beams (M,) in the cone about a sphere: most are elsewhere, and need no closer look."""
+    distance = float(np.linalg.norm(centre))
+    cosine = np.sqrt(max(0.0, 1.0 - (radius_m / max(distance, 1e-6)) ** 2))
+    along = scan.points @ centre.astype(np.float32)
+    return np.flatnonzero(along > np.float32(cosine * distance) * scan.range_m)
+
+
+def view_plane(
+    scan: OrderedScan, among: Indices, plane: Array, centre: Array, radius_m: float, tolerance_m: float
+) -> PlaneView:
+    """Pierce a plane by those beams that do so within a radius of a point.
+
+    Args:
+        scan: all returns.
+        among: (K,) beams that are tried, of `beams_about`.
+        plane: (4,) as (n, d), n towards the LiDAR.
+        centre: (3,) m, near the plane.
+        radius_m: of the disc that is looked at.
+        tolerance_m: returns within it lie on the plane.
+    """
+    normal, d = plane[:3], plane[3]
+    origin = centre - (centre @ normal + d) * normal
+    points = scan.points.take(among, axis=0).astype(np.float64)
+    along_normal = points @ normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pierced = points * (-d / along_normal)[:, None] - origin
+    is_near = (along_normal < 0) & (np.einsum("ij,ij->i", pierced, pierced) <= radius_m**2)
+    axes = plane_axes(normal)
+    uv = pierced[is_near] @ axes
+    return PlaneView(plane, axes, origin, among[is_near], uv, along_normal[is_near] + d, tolerance_m)
+
+
+def plane_axes(normal: Array) -> Array:
+    """Build unit vectors (..., 3, 2) of a plane: the first level, the second upwards; right-handed with n."""
+    x, y, z = normal[..., 0], normal[..., 1], normal[..., 2]
+    length = np.hypot(x, y)
+    is_level = length < 1e-3
+    safe = np.where(is_level, 1.0, length)
+    a, b = np.where(is_level, 0.0, -y / safe), np.where(is_level, -1.0, x / safe)
+    axes = np.zeros((*normal.shape, 2))
+    axes[..., 0, 0], axes[..., 1, 0] = a, b
+    # n x level, written out.
+    axes[..., 0, 1], axes[..., 1, 1], axes[..., 2, 1] = -z * b, z * a, x * b - y * a
+    return axes
+
+
+def find_chords(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[Indices, Indices]:
+    """Find on each ring the run of returns from the plane that shares most with the placed rectangle.
+
+    Other runs of the ring belong to other things that happen to lie in the plane.
+
+    Args:
+        scan: all returns.
+        view: beams about the plate.
+        placement: where the board is thought to be.
+
+    Returns:
+        First and last beam of each run (C,), as indices into the view.
+    """
+    on = np.flatnonzero(view.is_on)
+    if len(on) < 2:
+        return on[:0], on[:0]
+    ring = scan.ring[view.member[on]]
+    turn = np.mod(np.diff(scan.azimuth[view.member[on]]), 2 * np.pi)
+    is_cut = (np.diff(ring) != 0) | (turn > MAX_STEPS * scan.step_rad)
+    start = np.concatenate([[0], np.flatnonzero(is_cut) + 1])
+    end = np.append(start[1:], len(on)) - 1
+    is_inside = placement.distance_m(view.uv[on]) < 0
+    n_inside = np.add.reduceat(is_inside.astype(np.intp), start)
+    order = np.lexsort((-n_inside, ring[start]))
+    best = order[np.diff(ring[start][order], prepend=-1) != 0]
+    best = best[n_inside[best] >= MIN_ON_RING]
+    return on[start[best]], on[end[best]]
+
+
+def register(scan: OrderedScan, view: PlaneView, start: Placement) -> Placement | None:
+    """Find the placement of a rectangle, near a first guess, that the beams contradict least.
+
+    The chords' ends should lie on the border, beams that return from the plane inside it, and beams that
+    return from behind the plane outside.
+
+    Args:
+        scan: all returns.
+        view: beams about the plate.
+        start: first guess; gives the size.
+
+    Returns:
+        The placement, None where no ring shows the plate.
+    """
+    samples, kind = _samples(scan, view, start)
+    if not (kind == END).any():
+        return None
+    guess = np.array([[[start.u_m, start.v_m, start.angle_rad]]])
+    state, error_m = _search(guess, samples[None], kind[None], start.half_m, (0.04, 0.03, 0.03, 0.03))
+    u_m, v_m, angle_rad = (float(x) for x in state[0])
+    return Placement(u_m, v_m, angle_rad, start.half_m, float(error_m[0]))
+
+
+def rate(scan: OrderedScan, view: PlaneView, placement: Placement) -> float:
+    """Compute `Placement.error_m` of a placement as it stands; infinite where no ring shows the plate."""
+    samples, kind = _samples(scan, view, placement)
+    if not (kind == END).any():
+        return float("inf")
+    state = np.array([[[placement.u_m, placement.v_m, placement.angle_rad]]])
+    return float(_cost(state, samples[None], kind[None], placement.half_m)[0, 0])
+
+
+def _samples(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[Array, Indices]:
+    """Collect what beams say about the outline: points (M, 2) of the view and their kind (M,)."""
+    first, last = find_chords(scan, view, placement)
+    ends = view.uv[np.concatenate([first, last])]
+    bound = np.zeros(len(view.uv) + 1, dtype=np.int8)
+    bound[first] += 1
+    bound[last + 1] -= 1
+    is_inside = view.is_on & (np.cumsum(bound[:-1]) > 0)
+    inside, outside = view.uv[is_inside], view.uv[view.height_m < -view.tolerance_m]
+    # Beams far from any border say the same as their neighbours: a sample is enough.
+    inside = inside[:: max(1, -(-len(inside) // MAX_SAMPLES))]
+    outside = outside[:: max(1, -(-len(outside) // MAX_SAMPLES))]
+    kind = np.repeat([END, INSIDE, OUTSIDE], [len(ends), len(inside), len(outside)])
+    return np.concatenate([ends, inside, outside]), kind
+
+
+def register_ends(ends: Array, board: Board) -> list[Placement]:
+    """Find for each of G plates the placement of the board's outline whose border is nearest to its ends.
+
+    Args:
+        ends: (G, M, 2) where the rings begin and end in each plate's plane, m; NaN fills the rows up.
+        board: gives the rectangle.
+    """
+    half = (board.width_m / 2, board.height_m / 2)
+    is_unused = np.isnan(ends[..., 0])
+    kind = np.where(is_unused, UNUSED, END)
+    samples = np.where(is_unused[..., None], ends[:, :1], ends)
+    angle = np.arange(N_ANGLES) * np.pi / N_ANGLES
+    cosine, sine = np.cos(angle), np.sin(angle)
+    # At each angle the rectangle starts in the middle of the ends' extent.
+    u, v = samples[:, None, :, 0], samples[:, None, :, 1]
+    x = u * cosine[:, None] + v * sine[:, None]
+    y = v * cosine[:, None] - u * sine[:, None]
+    x, y = (x.min(axis=2) + x.max(axis=2)) / 2, (y.min(axis=2) + y.max(axis=2)) / 2
+    starts = np.stack([x * cosine - y * sine, x * sine + y * cosine, np.broadcast_to(angle, x.shape)], axis=2)
+    cost = _cost(starts, samples, kind, half)
+    best = np.argsort(cost, axis=1, kind="stable")[:, :2]
+    starts = np.take_along_axis(starts, best[..., None], axis=1)
+    state, error_m = _search(starts, samples, kind, half, (0.08, 0.06, 0.04, 0.03))
+    return [
+        Placement(float(x[0]), float(x[1]), float(x[2]), half, float(e))
+        for x, e in zip(state, error_m, strict=True)
+    ]
+
+
+def _distance_over(over_x: Array, over_y: Array) -> tuple[Array, Array]:
+    """Turn how far points lie over the sides, m, into signed distances and distances outside."""
+    away = np.hypot(np.maximum(over_x, 0.0), np.maximum(over_y, 0.0))
+    return away + np.minimum(np.maximum(over_x, over_y), 0.0), away
+
+
+def _search(
+    state: Array, samples: Array, kind: Indices, half: tuple[float, float], scales_m: tuple[float, ...]
+) -> tuple[Array, Array]:
+    """Improve states (G, A, 3) and return the best of each group (G, 3) with its error (G,).
+
+    Gauss-Newton on the signed distance from the rectangle, with Geman-McClure weights of falling scale.
+    """
+    for scale_m in scales_m:
+        state = _step(state, samples, kind, half, scale_m)
+    cost = _cost(state, samples, kind, half)
+    best = np.argmin(cost, axis=1)
+    rows = np.arange(len(best))
+    return state[rows, best], cost[rows, best]
+
+
+def _residuals(
+    state: Array, samples: Array, kind: Indices, half: tuple[float, float]
+) -> tuple[Array, Array, Array, Array]:
+    """Compute signed violations, local x and y, and distances outside, each (G, A, M)."""
+    cosine, sine = np.cos(state[..., 2])[..., None], np.sin(state[..., 2])[..., None]
+    u = samples[:, None, :, 0] - state[..., 0, None]
+    v = samples[:, None, :, 1] - state[..., 1, None]
+    x, y = u * cosine + v * sine, v * cosine - u * sine
+    distance, away = _distance_over(np.abs(x) - half[0], np.abs(y) - half[1])
+    kind = kind[:, None]
+    counts = (kind == END) | (kind == np.where(distance > 0, INSIDE, OUTSIDE))
+    return distance * counts, x, y, away
+
+
+def _cost(state: Array, samples: Array, kind: Indices, half: tuple[float, float]) -> Array:
+    """Compute `Placement.error_m` of each state (G, A)."""
+    violation = np.minimum(np.abs(_residuals(state, samples, kind, half)[0]), CAP_M)
+    is_end, is_inside = (kind == END)[:, None], (kind == INSIDE)[:, None]
+    at_ends = (violation * is_end).sum(axis=-1) / np.maximum(is_end.sum(axis=-1), 1)
+    elsewhere = ((violation > 0.3 * CAP_M) & ~is_end).sum(axis=-1) / np.maximum(is_inside.sum(axis=-1), 1)
+    return np.asarray(at_ends + CAP_M * elsewhere)
+
+
+def _step(state: Array, samples: Array, kind: Indices, half: tuple[float, float], scale_m: float) -> Array:
+    """Take one damped Gauss-Newton step of (u, v, angle) from each state (G, A, 3)."""
+    residual, x, y, away = _residuals(state, samples, kind, half)
+    weight = (residual != 0) / (1.0 + (residual / scale_m) ** 2) ** 2
+    over_x, over_y = np.abs(x) - half[0], np.abs(y) - half[1]
+    # Gradient of the signed distance: away from the nearest point of the border.
+    is_outside, scale = away > 0, np.maximum(away, 1e-12)
+    along_x = np.copysign(np.where(is_outside, np.maximum(over_x, 0.0) / scale, over_x > over_y), x)
+    along_y = np.copysign(np.where(is_outside, np.maximum(over_y, 0.0) / scale, over_x <= over_y), y)
+    # The shift is counted along the rectangle's axes, which spares turning every gradient.
+    jacobian = np.empty((*residual.shape[:2], 3, residual.shape[2]))
+    np.negative(along_x, out=jacobian[:, :, 0])
+    np.negative(along_y, out=jacobian[:, :, 1])
+    np.subtract(along_x * y, along_y * x, out=jacobian[:, :, 2])
+    weighted = jacobian * weight[:, :, None]
+    hessian = weighted @ np.swapaxes(jacobian, -1, -2) + np.diag([0.1, 0.1, 0.01])
+    step = np.linalg.solve(hessian, weighted @ residual[..., None])[..., 0]
+    cosine, sine = np.cos(state[..., 2]), np.sin(state[..., 2])
+    turned = (step[..., 0] * cosine - step[..., 1] * sine, step[..., 0] * sine + step[..., 1] * cosine)
+    return np.asarray(state - np.stack([*turned, step[..., 2]], axis=-1))

@@ -1,0 +1,1 @@
+"""DAVIS event cameras through dv-processing."""

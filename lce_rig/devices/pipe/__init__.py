@@ -1,0 +1,1 @@
+"""Images from a command's standard output."""

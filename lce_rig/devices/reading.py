@@ -1,0 +1,389 @@
+"""How attached sensors are read: one thread each, one queue, and what is counted on the way."""
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from types import TracebackType
+from typing import TypeVar
+
+from lce_rig.core.data import LiveSample
+from lce_rig.core.errors import SourceError
+from lce_rig.devices.protocol import SourceStatus
+
+_TAKE_S = 0.2
+_RATE_WINDOW_S = 3.0
+# Two seconds of images, six of scans: longer than a busy computer lets them wait.
+_N_SHARED_SLOTS = 64
+REOPEN_EVERY_S = 1.0
+
+AnySource = TypeVar("AnySource", bound="LiveSource")
+
+
+class RateMeter:
+    """How many a second came over the last seconds; may be asked from any thread.
+
+    Args:
+        now_s: the clock.
+    """
+
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
+        self._came: deque[tuple[float, int]] = deque()
+        self._lock = threading.Lock()
+
+    def add(self, n: int) -> None:
+        """Count n that have just come."""
+        with self._lock:
+            self._came.append((self._now_s(), n))
+
+    @property
+    def rate_hz(self) -> float:
+        """How many a second; 0 before two have come, or where none has come for long."""
+        now_s = self._now_s()
+        with self._lock:
+            while self._came and self._came[0][0] < now_s - _RATE_WINDOW_S:
+                self._came.popleft()
+            if len(self._came) < 2:
+                return 0.0
+            first_s, last_s = self._came[0][0], self._came[-1][0]
+            # Up to now where the next is overdue: what has just stopped must not look alive.
+            typical_s = (last_s - first_s) / (len(self._came) - 1)
+            n = sum(n for _, n in self._came) - self._came[0][1]
+            return n / max(max(last_s, now_s - typical_s) - first_s, 1e-9)
+
+
+class Inbox:
+    """The queue that readers feed and one taker empties; of each sensor the newest samples wait.
+
+    Attributes:
+        n_put, n_dropped: samples by sensor.
+    """
+
+    def __init__(self) -> None:
+        self.n_put: Counter[str] = Counter()
+        self.n_dropped: Counter[str] = Counter()
+        self._waiting: deque[tuple[str, LiveSample]] = deque()
+        self._n_waiting: Counter[str] = Counter()
+        self._is_closed = False
+        self._error: SourceError | None = None
+        self._changed = threading.Condition()
+
+    def put(self, sensor: str, samples: Iterable[LiveSample], n_slots: int) -> None:
+        """Hand samples over; never blocks.
+
+        Args:
+            sensor: they come from.
+            samples: in order.
+            n_slots: so many of this sensor may wait.
+        """
+        with self._changed:
+            for sample in samples:
+                if self._n_waiting[sensor] >= n_slots:
+                    self._drop_oldest(sensor)
+                self._waiting.append((sensor, sample))
+                self._n_waiting[sensor] += 1
+                self.n_put[sensor] += 1
+            self._changed.notify()
+
+    def close(self, error: SourceError | None = None) -> None:
+        """End the queue; what is in it can still be taken, then `error` is raised if there is one."""
+        with self._changed:
+            self._is_closed = True
+            self._error = self._error or error
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float) -> tuple[str, LiveSample] | None:
+        """Take the oldest sample and its sensor; None where nothing came in time, or the queue has ended.
+
+        Raises:
+            SourceError: the reader failed, and all that it read before has been taken.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._is_closed, timeout_s)
+            if self._waiting:
+                sensor, sample = self._waiting.popleft()
+                self._n_waiting[sensor] -= 1
+                return sensor, sample
+            if self._error is not None:
+                raise self._error
+            return None
+
+    @property
+    def is_ended(self) -> bool:
+        """Whether the queue was closed and everything taken."""
+        with self._changed:
+            return self._is_closed and not self._waiting
+
+    def _drop_oldest(self, sensor: str) -> None:
+        place = next(k for k, (name, _) in enumerate(self._waiting) if name == sensor)
+        del self._waiting[place]
+        self._n_waiting[sensor] -= 1
+        self.n_dropped[sensor] += 1
+
+
+class LiveSource(ABC):
+    """An attached sensor, read by a thread of its own while its `with` block lasts.
+
+    A driver opens, reads, closes and describes its device; the thread, silence, rates, the queue and opening
+    again what was lost are here, the same for all.
+
+    Attributes:
+        sensor: its name in the profile.
+    """
+
+    def __init__(
+        self, sensor: str, who: str, n_slots: int, silence_s: float, what_to_check: str = ""
+    ) -> None:
+        """Prepare; nothing is opened yet.
+
+        Args:
+            sensor: its name in the profile.
+            who: the same for messages: "camera 'cam'".
+            n_slots: samples that may wait to be taken; when more do, the oldest is dropped.
+            silence_s: so long without a sample is an error.
+            what_to_check: the hint of that error.
+        """
+        self.sensor = sensor
+        self._who = who
+        self._n_slots, self._silence_s, self._what_to_check = n_slots, silence_s, what_to_check
+        self._inbox, self._is_shared, self._reopen_every_s = Inbox(), False, 0.0
+        self._stopping = threading.Event()
+        self._rate = RateMeter()
+        self._heard_s = 0.0
+        self._lost: tuple[SourceError, float] | None = None
+        self._n_reopened = 0
+        self._thread: threading.Thread | None = None
+
+    @abstractmethod
+    def open(self) -> None:
+        """Open the device; it sends, or will be heard, when this returns.
+
+        Raises:
+            SourceError: it is absent, busy or of another model; the hint says what to check.
+        """
+
+    @abstractmethod
+    def read(self) -> Iterable[LiveSample]:
+        """Give the samples that came; waits a moment at most.
+
+        Raises:
+            SourceError: the device failed for good.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the device, open or not; never raises."""
+
+    @abstractmethod
+    def describe(self) -> SourceStatus:
+        """Say how the device does; asked from any thread, open or not. What was taken is counted here."""
+
+    def explain_silence(self, *, has_sent: bool) -> SourceError:
+        """Say what to check where nothing has come for `silence_s`, since it was opened or since it sent."""
+        what = "fell silent" if has_sent else "sends nothing"
+        return SourceError(f"{self._who} {what}: nothing for {self._silence_s:g} s", self._what_to_check)
+
+    def feed(self, inbox: Inbox, reopen_every_s: float) -> None:
+        """Feed a queue that others feed, too, and open what is lost again and again; before it is opened."""
+        self._inbox, self._is_shared, self._reopen_every_s = inbox, True, reopen_every_s
+        self._n_slots = max(self._n_slots, _N_SHARED_SLOTS)
+
+    def __enter__(self: AnySource) -> AnySource:
+        """Open the device and start reading; what an own queue held and counted before is forgotten.
+
+        Raises:
+            SourceError: as `open` does.
+        """
+        self._stopping.clear()
+        if not self._is_shared:
+            self._inbox = Inbox()
+        self._rate = RateMeter()
+        self._open()
+        thread = threading.Thread(target=self._run, name=f"read {self.sensor}", daemon=True)
+        thread.start()
+        self._thread = thread  # Closing, which another thread may do meanwhile, waits for one that has begun.
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop reading and close the device; never raises."""
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join()
+        self.close()
+        if not self._is_shared:
+            self._inbox.close()
+
+    def take(self, timeout_s: float) -> LiveSample | None:
+        """Take the oldest sample; None where none came in time, or the source was closed.
+
+        Raises:
+            SourceError: why reading ended, unless it was stopped.
+        """
+        came = self._inbox.take(timeout_s)
+        return None if came is None else came[1]
+
+    def samples(self) -> Iterator[LiveSample]:
+        """Yield samples as they come, until the source is closed.
+
+        Raises:
+            SourceError: why reading ended, unless it was stopped.
+        """
+        while not self._inbox.is_ended:
+            sample = self.take(_TAKE_S)
+            if sample is not None:
+                yield sample
+        self.take(0)
+
+    def status(self) -> SourceStatus:
+        """Say how the sensor does; may be called from any thread."""
+        counts = self._inbox
+        return replace(
+            self.describe(),
+            n_samples=counts.n_put[self.sensor],
+            n_dropped=counts.n_dropped[self.sensor],
+            rate_hz=self._rate.rate_hz,
+        )
+
+    @property
+    def lost(self) -> tuple[SourceError, float] | None:
+        """Why the sensor is lost now, and since when by time.monotonic(); None while it is not."""
+        return self._lost
+
+    @property
+    def n_reopened(self) -> int:
+        """How often it came back after it was lost."""
+        return self._n_reopened
+
+    def note_heard(self) -> None:
+        """Call the device alive, though no sample is complete yet."""
+        self._heard_s = time.monotonic()
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether to give up what waits for the device."""
+        return self._stopping.is_set()
+
+    def _open(self) -> None:
+        try:
+            self.open()
+        except BaseException:  # Ctrl-C while waiting, too.
+            self.close()
+            raise
+
+    def _run(self) -> None:
+        while True:
+            failure = self._read_on()
+            if not self._is_shared:
+                self._inbox.close(failure)
+            if failure is None or not self._is_shared or not self._reopen(failure):
+                return
+
+    def _read_on(self) -> SourceError | None:
+        """Read until told to stop, and give what else ended it."""
+        heard_s, has_sent = time.monotonic(), False
+        try:
+            while not self._stopping.is_set():
+                came = list(self.read())
+                now_s = time.monotonic()
+                if came:
+                    self._inbox.put(self.sensor, came, self._n_slots)
+                    self._rate.add(len(came))
+                    heard_s, has_sent = now_s, True
+                    self._note_back()
+                elif now_s - max(heard_s, self._heard_s) > self._silence_s:
+                    return self.explain_silence(has_sent=has_sent)
+        except SourceError as error:
+            return error
+        except Exception as error:  # A bug must not look like the end of the stream.
+            failure = SourceError(f"{self._who}: its reader failed: {error!r}", "This is a bug: report it.")
+            failure.__cause__ = error
+            return failure
+        return None
+
+    def _note_back(self) -> None:
+        """Call a sensor back when it sends: a program that can be started may still find no camera."""
+        if self._lost is not None:
+            self._lost = None
+            self._n_reopened += 1
+
+    def _reopen(self, failure: SourceError) -> bool:
+        """Open the device again; False where reading is to end before that."""
+        self._lost = failure, self._lost[1] if self._lost is not None else time.monotonic()
+        self.close()
+        while not self._stopping.wait(self._reopen_every_s):
+            try:
+                self._open()
+            except SourceError as error:
+                self._lost = error, self._lost[1]
+                continue
+            return True
+        return False
+
+
+class AttachedSensors:
+    """The attached sensors of a rig, read side by side into one queue; open while its `with` block lasts.
+
+    A sensor that fails is closed and opened again and again; meanwhile the others go on.
+
+    Attributes:
+        sources: by the sensor's name.
+    """
+
+    def __init__(self, sources: Sequence[LiveSource], reopen_every_s: float = REOPEN_EVERY_S) -> None:
+        """Take the sources; none is opened yet."""
+        self.sources = {source.sensor: source for source in sources}
+        self._inbox = Inbox()
+        for source in sources:
+            source.feed(self._inbox, reopen_every_s)
+
+    def __enter__(self) -> "AttachedSensors":
+        """Open every sensor.
+
+        Raises:
+            SourceError: of the first that cannot be opened; its hint names the others.
+        """
+        with ExitStack() as stack:
+            failures: list[SourceError] = []
+            for source in self.sources.values():
+                try:
+                    stack.enter_context(source)
+                except SourceError as error:
+                    failures.append(error)
+            if failures:
+                raise _join(failures)
+            self._stack = stack.pop_all()
+        self._inbox.n_dropped.clear()  # What came too soon, while others were being opened, is no loss.
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close every sensor."""
+        self._stack.close()
+        self._inbox.close()
+
+    def take(self, timeout_s: float) -> tuple[str, LiveSample] | None:
+        """Take the next sample, with the sensor it comes from; None where none came in time."""
+        return self._inbox.take(timeout_s)
+
+    def lost(self) -> dict[str, tuple[SourceError, float]]:
+        """Name the sensors that are lost now: why, and since when by time.monotonic()."""
+        lost = {name: source.lost for name, source in self.sources.items()}
+        return {name: why for name, why in lost.items() if why is not None}
+
+    def statuses(self) -> dict[str, SourceStatus]:
+        """Ask every sensor how it does."""
+        return {name: source.status() for name, source in self.sources.items()}
+
+
+def _join(failures: Sequence[SourceError]) -> SourceError:
+    """Make one error of several: the first, with the others in its hint."""
+    first, *others = failures
+    hint = "\n  ".join(text for text in (first.hint, *(f"Also: {other.what}" for other in others)) if text)
+    return SourceError(first.what, f"{hint}\n  `lce-rig doctor` looks at every device.".strip())

@@ -1,0 +1,1 @@
+"""The sync board on a serial port."""

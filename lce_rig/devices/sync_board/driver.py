@@ -1,0 +1,397 @@
+"""A sync board on a serial port: its trigger pulses as they come, and its clock tied to the computer's."""
+
+import errno
+import math
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from lce_rig.core.data import Pulse
+from lce_rig.core.errors import SourceError
+from lce_rig.devices.protocol import SourceStatus
+from lce_rig.devices.reading import LiveSource
+from lce_rig.devices.sync_board.board_state import Arrival, BoardState
+from lce_rig.devices.sync_board.lines import DIALECTS, LineReader
+from lce_rig.devices.sync_board.lines.lce1 import VERSION
+from lce_rig.devices.sync_board.lines.messages import Hello
+from lce_rig.devices.sync_board.report import BoardView, clock_state, device_words, figures, problems
+from lce_rig.rig.sync_settings import BOARD, SyncSettings
+from lce_rig.timing.clock import NS_PER_S, ClockModel
+
+# The serial port of a sync board, opened without resetting it, its failures explained.
+
+_READ_S = 0.02
+_WRITE_S = 0.2
+_BY_ID = Path("/dev/serial/by-id")
+
+
+class BoardPort:
+    """An open serial port, for this program alone.
+
+    Attributes:
+        n_unwritten: commands that did not go out because the board took nothing.
+    """
+
+    def __init__(self, who: str, device: str, baud: int) -> None:
+        """Open the port.
+
+        DTR and RTS are low before it opens: on many boards they are wired to the reset. Some kernels raise
+        them for a moment all the same.
+
+        Raises:
+            SourceError: it is absent, busy, not permitted or no serial port, or pyserial is missing.
+        """
+        self.n_unwritten = 0
+        self._who = who
+        self._device = device
+        try:
+            import serial
+        except ImportError:
+            raise SourceError(f"{who} needs the package pyserial", "Run: pip install pyserial") from None
+        self._failures: tuple[type[Exception], ...] = (serial.SerialException, OSError)
+        self._timeouts: type[Exception] = serial.SerialTimeoutException
+        self._port: Any = serial.Serial()
+        self._port.port = device
+        self._port.baudrate = baud
+        self._port.timeout = _READ_S
+        self._port.write_timeout = _WRITE_S
+        self._port.exclusive = True
+        self._port.dtr = False
+        self._port.rts = False
+        try:
+            self._port.open()
+        except (*self._failures, ValueError) as error:
+            raise _explained(who, device, error) from None
+
+    def read(self) -> bytes:
+        """Wait for bytes, 20 ms at most, and give what is there.
+
+        Raises:
+            SourceError: the board was unplugged.
+        """
+        try:
+            return bytes(self._port.read(max(1, self._port.in_waiting)))
+        except self._failures as error:
+            raise self._gone(error) from None
+
+    def write(self, data: bytes) -> int:
+        """Send a command; gives the time of day in ns when it went out.
+
+        Raises:
+            SourceError: the board was unplugged.
+        """
+        sent_ns = time.time_ns()
+        try:
+            self._port.write(data)
+        except self._timeouts:
+            self.n_unwritten += 1
+        except self._failures as error:
+            raise self._gone(error) from None
+        return sent_ns
+
+    def close(self) -> None:
+        """Close the port; never raises."""
+        try:
+            self._port.close()
+        except self._failures:
+            return
+
+    def __enter__(self) -> "BoardPort":
+        """Use the port until the block ends."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the port."""
+        self.close()
+
+    def _gone(self, error: Exception) -> SourceError:
+        return SourceError(
+            f"{self._who} on {self._device} is gone: {_cause(error)}",
+            "Check its plug and cable and its power; what was captured before is safe. Begin again when "
+            "`ls -l /dev/serial/by-id` shows it.",
+        )
+
+
+def _cause(error: Exception) -> str:
+    number = getattr(error, "errno", None)
+    return f"{errno.errorcode.get(number, number)}" if number else str(error).partition("(")[0].strip()
+
+
+def _explained(who: str, device: str, error: Exception) -> SourceError:
+    """Say why a port cannot be opened, and what to do about it."""
+    number = getattr(error, "errno", None)
+    if number == errno.ENOENT:
+        found = sorted(path.name for path in _BY_ID.iterdir()) if _BY_ID.is_dir() else []
+        there = f"there is {', '.join(f'{_BY_ID}/{name}' for name in found)}" if found else "no port is there"
+        return SourceError(f"{who}: there is no {device}", f"Check plug and cable, and sync.device; {there}.")
+    if number in (errno.EACCES, errno.EPERM):
+        hint = "Run: sudo usermod -aG dialout $USER, then log in again."
+        return SourceError(f"{who}: {device} may not be opened by this user", hint)
+    if number in (errno.EBUSY, errno.EAGAIN):
+        hint = f"Close it: a serial monitor, ModemManager or another lce-rig. `fuser {device}` shows which."
+        return SourceError(f"{who}: {device} is in use by another program", hint)
+    if number in (errno.ENOTTY, errno.EINVAL) or "configure" in str(error):
+        return SourceError(f"{who}: {device} is no serial port", "Check sync.device in the profile.")
+    return SourceError(f"{who}: {device} cannot be opened: {error}", "Check sync.device in the profile.")
+
+
+# Opening the port may reset the board, and a VLP-16 takes 2.3 s to lock on its pulses again.
+HELLO_S = 6.0
+SILENCE_S = 30.0
+
+_N_SLOTS = 4096
+_GREET_AGAIN_NS = NS_PER_S
+_ANSWER_WITHIN_NS = NS_PER_S // 2
+# Often while little is known, then as often as a changing drift needs.
+_ASK_EVERY_NS = (NS_PER_S // 20, NS_PER_S // 5)
+_ASK_OFTEN_NS = 10 * NS_PER_S
+_SET_UTC_EVERY_NS = 10 * NS_PER_S
+_UTC_SIGMA_NS = 1_000_000
+_UTC_MIN_ANSWERS = 8
+_N_HEARD_BYTES = 2048
+
+
+class SyncBoard(LiveSource):
+    """An attached sync board; a `LiveSource` of pulses.
+
+    A reader thread always drains the port: some boards block, and hold their pulse high, when nobody does.
+    """
+
+    def __init__(
+        self,
+        settings: SyncSettings,
+        sensor: str = BOARD,
+        hello_s: float = HELLO_S,
+        silence_s: float = SILENCE_S,
+    ) -> None:
+        """Prepare; nothing is opened yet.
+
+        Args:
+            settings: how the board is reached, and which camera each line triggers.
+            sensor: its name in messages.
+            hello_s: how long to wait for its first words.
+            silence_s: so long without a message is an error.
+        """
+        super().__init__(sensor, f"sync board '{sensor}'", _N_SLOTS, math.inf)
+        self._settings = settings
+        self._hello_s, self._silence_ns = hello_s, silence_s * NS_PER_S
+        self._reader = LineReader(DIALECTS[settings.type]())
+        lines = {trigger.channel: camera for camera, trigger in settings.triggers.items()}
+        self._state = BoardState(lines, self._reader.dialect.has_own_counts)
+        self._lock = threading.Lock()
+        self._is_heard = False
+        self._early: list[Pulse] = []
+        self._heard = deque[int](maxlen=_N_HEARD_BYTES)
+        self._outbox: deque[bytes] = deque()
+        self._are_triggers_on = True
+        self._rate_hz: float | None = None
+        self._n_resets_seen = 0
+        self._cookie = 0
+        self._opened_ns = self._line_ns = self._asked_ns = self._told_utc_ns = self._greeted_ns = 0
+        self._busy_until_ns = 0
+        self._port: BoardPort | None = None
+
+    def open(self) -> None:
+        """Open the port, wait for the board's first words, set its lines and start them.
+
+        Raises:
+            SourceError: the port cannot be opened, or the board is silent or talks otherwise.
+        """
+        self._port = BoardPort(self._who, self._settings.device, self._settings.port_baud)
+        with self._lock:
+            # A board that was unplugged knows nothing any more.
+            self._is_heard, self._state.hello = False, None
+        self._early = []
+        self._opened_ns = self._line_ns = self._busy_until_ns = time.monotonic_ns()
+        self._busy_until_ns += _ASK_OFTEN_NS
+        until_s = time.monotonic() + self._hello_s
+        while not self._is_heard and not self.is_stopping:
+            self._early = self.read()
+            if not self._is_heard and time.monotonic() > until_s:
+                raise self._silent()
+        self._check_version()
+
+    def close(self) -> None:
+        """Close the port; the board's pulses go on, so that the LiDAR stays locked."""
+        if self._port is not None:
+            self._port.close()
+
+    def read(self) -> list[Pulse]:
+        """Give the pulses that came, and say to the board what is due.
+
+        Their `sensor` is the camera, or "pps"; stamps are the board's own time.
+
+        Raises:
+            SourceError: the board was unplugged, or fell silent for good.
+        """
+        assert self._port is not None  # it is open
+        early, self._early = self._early, []
+        data = self._port.read()
+        arrival = Arrival(time.time_ns(), time.monotonic_ns())
+        with self._lock:
+            pulses = self._take(data, arrival)
+        self._talk(self._port, arrival.steady_ns)
+        return early + pulses
+
+    def describe(self) -> SourceStatus:
+        """Say how the board does."""
+        with self._lock:
+            view = self._view()
+            return SourceStatus(
+                self.sensor,
+                n_lost=sum(self._state.counts.n_lost.values()),
+                clock=clock_state(view),
+                problems=problems(view),
+                figures=figures(view),
+                device=device_words(view),
+                n_lost_by_line=dict(self._state.counts.n_lost),
+            )
+
+    @property
+    def host_clock(self) -> ClockModel | None:
+        """The computer's time of day on the board's clock; None before it is known."""
+        with self._lock:
+            return self._state.host_clock
+
+    @property
+    def utc_clock(self) -> ClockModel | None:
+        """UTC on the board's clock, which is the LiDAR's; None where the board does not know UTC."""
+        with self._lock:
+            return self._state.utc_clock
+
+    def start_triggers(self, rate_hz: float | None = None) -> None:
+        """Let the pulses of the cameras begin; running numbers go on.
+
+        Args:
+            rate_hz: of all lines in place of the profile's: slow pulses tell which picture is of which.
+        """
+        with self._lock:
+            self._are_triggers_on, self._rate_hz = True, rate_hz
+            self._configure()
+
+    def stop_triggers(self) -> None:
+        """End the pulses of the cameras; those per second go on."""
+        with self._lock:
+            self._are_triggers_on = False
+            self._outbox.append(self._reader.dialect.stop())
+
+    def _take(self, data: bytes, arrival: Arrival) -> list[Pulse]:
+        self._heard.extend(data)
+        messages = self._reader.feed(data)
+        pulses: list[Pulse] = []
+        for message in messages:
+            pulses += self._state.take(message, arrival)
+        if messages:
+            self._line_ns = arrival.steady_ns
+        elif arrival.steady_ns - self._line_ns > self._silence_ns and self._is_heard:
+            raise SourceError(
+                f"{self._who} fell silent: nothing for {self._silence_ns / NS_PER_S:g} s",
+                "Check its cable and power, and press its reset.",
+            )
+        if not self._is_heard and self._is_introduced(bool(messages)):
+            self._configure()
+            self._is_heard = True
+        if self._state.counts.n_resets != self._n_resets_seen:
+            self._n_resets_seen = self._state.counts.n_resets
+            self._busy_until_ns = arrival.steady_ns + _ASK_OFTEN_NS
+            self._told_utc_ns = 0
+            self._configure()
+        return pulses
+
+    def _is_introduced(self, has_said_anything: bool) -> bool:
+        return self._state.hello is not None if self._settings.type == "lce1" else has_said_anything
+
+    def _configure(self) -> None:
+        """Queue the commands that set the lines, for a board that knows nothing yet."""
+        dialect = self._reader.dialect
+        for trigger in self._settings.triggers.values():
+            rate_hz = self._rate_hz or trigger.rate_hz
+            self._outbox.append(
+                dialect.set_trigger(trigger.channel, rate_hz, trigger.phase_us, trigger.pulse_us)
+            )
+        if self._settings.triggers and self._are_triggers_on:
+            self._outbox.append(dialect.start())
+
+    def _talk(self, port: BoardPort, now_ns: int) -> None:
+        """Send what is due: greetings, commands, UTC, a time request."""
+        if not self._is_heard:
+            if now_ns - self._greeted_ns > _GREET_AGAIN_NS:
+                self._greeted_ns = now_ns
+                self._send(port, self._reader.dialect.greeting())
+            return
+        while self._outbox:
+            self._send(port, self._outbox.popleft())
+        if now_ns - self._told_utc_ns > _SET_UTC_EVERY_NS:
+            self._tell_utc(port, now_ns)
+        is_busy = now_ns < self._busy_until_ns
+        is_free = self._state.has_answered or now_ns - self._asked_ns > _ANSWER_WITHIN_NS
+        if is_free and now_ns - self._asked_ns > _ASK_EVERY_NS[0 if is_busy else 1]:
+            self._asked_ns = now_ns
+            self._cookie += 1
+            request = self._reader.dialect.time_request(self._cookie)
+            if request:
+                # The answer is read by this same thread: it cannot overtake the note.
+                self._state.asked(self._cookie, port.write(request))
+
+    def _tell_utc(self, port: BoardPort, now_ns: int) -> None:
+        """Tell a board that has no receiver when a second begins, by the computer's time of day."""
+        with self._lock:
+            pps, model = self._state.pps, self._state.host_tracker.model
+        if pps is None or pps[0].origin == "G" or model is None or model.n_used < _UTC_MIN_ANSWERS:
+            return
+        utc_s = time.time_ns() // NS_PER_S + 2
+        board_clock = model.inverse()
+        if board_clock.sigma_ns(utc_s * NS_PER_S) < _UTC_SIGMA_NS:
+            self._told_utc_ns = now_ns
+            t_us = round(board_clock.convert(utc_s * NS_PER_S) / 1000)
+            self._send(port, self._reader.dialect.set_utc(t_us, utc_s))
+
+    def _send(self, port: BoardPort, data: bytes) -> None:
+        if data:
+            port.write(data)
+
+    def _view(self) -> BoardView:
+        return BoardView(
+            self._state,
+            self._reader,
+            time.monotonic_ns(),
+            self._opened_ns,
+            self._line_ns,
+            tuple(sorted(self._settings.triggers)) if self._are_triggers_on else (),
+            self._port.n_unwritten if self._port else 0,
+        )
+
+    def _check_version(self) -> None:
+        hello = self._state.hello
+        if self._settings.type == "lce1" and isinstance(hello, Hello) and hello.version != VERSION:
+            raise SourceError(
+                f"{self._who} speaks version {hello.version} of LCE1, and this program {VERSION}",
+                "Flash the firmware of this version of lce-rig.",
+            )
+
+    def _silent(self) -> SourceError:
+        """Say what is wrong with a board that has not introduced itself: silent, or of another kind."""
+        device, baud = self._settings.device, self._settings.port_baud
+        with self._lock:
+            heard = bytes(self._heard)
+        if not heard:
+            return SourceError(
+                f"{self._who} on {device} is silent: nothing for {self._hello_s:g} s",
+                "Check its power and firmware, and that sync.device is its port.",
+            )
+        for name, make in DIALECTS.items():
+            other = LineReader(make())
+            if name != self._settings.type and other.feed(heard + b"\n"):
+                return SourceError(
+                    f"{self._who} on {device} does not talk {self._settings.type}, but {name}",
+                    f"Set sync.type to {name}.",
+                )
+        return SourceError(
+            f"{self._who} on {device} talks, but not {self._settings.type}: {heard[:40]!r}",
+            f"Check sync.type and sync.baud (now {baud}), and that this is the board's port.",
+        )

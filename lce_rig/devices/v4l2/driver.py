@@ -1,0 +1,211 @@
+"""A camera of the kernel's video interface: pictures with the kernel's stamps, counted, in UTC."""
+
+import time
+from contextlib import ExitStack
+
+from lce_rig.core.data import Image, LiveSample
+from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, find_format
+from lce_rig.devices.protocol import ClockState, SourceStatus
+from lce_rig.devices.reading import LiveSource
+from lce_rig.devices.v4l2.controls import apply_controls, list_controls, read_exposure_us
+from lce_rig.devices.v4l2.kernel_clock import FrameTiming, Mark, StampClock, frame_timing, stamped_moment
+from lce_rig.devices.v4l2.video_device import RawFrame, VideoDevice, video_devices
+from lce_rig.rig import CameraSettings
+
+# Two buffers drop pictures as soon as the computer stalls for one; eight ride out a quarter of a second.
+N_BUFFERS = 8
+_N_SLOTS = 16
+_WAIT_S = 0.25
+_EXPOSURE_EVERY_S = 1.0
+_SILENT_HINT = (
+    "Check the camera's cable and power; a triggered camera sends nothing without pulses (sync board, FSYNC)."
+)
+
+
+class V4l2Source(LiveSource):
+    """A camera at /dev/video*; see `LiveSource`.
+
+    Stamps are mid exposure in the computer's UTC: the driver's stamp, moved by the rules of `v4l2_timing` and
+    read by the clock that it fits (`v4l2_clock`). Where none fits it is the arrival, and the status says so.
+
+    Args:
+        sensor: the camera's name in the profile.
+        settings: its block of the profile.
+        silence_s: so long without a picture is an error.
+    """
+
+    def __init__(self, sensor: str, settings: CameraSettings, silence_s: float = 5.0) -> None:
+        super().__init__(sensor, f"camera {sensor!r}", _N_SLOTS, silence_s, _SILENT_HINT)
+        self._settings = settings
+        self._channel = settings.first_channel("frames") or "frames"
+        self._clock = StampClock(settings.driver.frame_timing.clock)
+        self._has_sent = False
+        self._stack = ExitStack()
+        self._last_sequence: int | None = None
+        self._n_lost = 0
+        self._n_damaged = 0
+        self._notes: list[Finding] = []
+        self._device_in_words = ""
+        self._mark: Mark = "start_of_frame"
+        self._timing = FrameTiming(settings.resolution_px[1], None)
+
+    @property
+    def timing(self) -> FrameTiming:
+        """How the rows are exposed; `to_mid_ns("trigger")` is what a pulse's stamp lacks to mid exposure."""
+        return self._timing
+
+    def open(self) -> None:
+        """Open, set up and start the camera.
+
+        Raises:
+            SourceError: it is absent, busy, or cannot do what the profile wants.
+        """
+        with ExitStack() as stack:
+            self._open_device(stack)
+            self._stack = stack.pop_all()
+
+    def close(self) -> None:
+        """Stop and close the camera."""
+        self._stack.close()
+
+    def describe(self) -> SourceStatus:
+        """Say how the camera does."""
+        figures = {
+            "n_damaged": float(self._n_damaged),
+            "stamp_to_mid_exposure_ms": self._timing.to_mid_ns(self._mark) * 1e-6,
+            "trigger_to_mid_exposure_ms": self._timing.to_mid_ns("trigger") * 1e-6,
+        }
+        if self._timing.exposure_ns is not None:
+            figures["exposure_ms"] = self._timing.exposure_ns * 1e-6
+        return SourceStatus(
+            self.sensor,
+            n_lost=self._n_lost,
+            clock=self._clock_state(),
+            problems=tuple(self._problems()),
+            figures=figures,
+            device=self._device_in_words,
+        )
+
+    def _open_device(self, stack: ExitStack) -> None:
+        driver = self._settings.driver
+        if driver.device is None:
+            found = ", ".join(video_devices()) or "none"
+            line = "driver: {type: v4l2, device: /dev/video0}"
+            hint = f"Add to cameras.{self.sensor}: {line}\nVideo devices of this computer: {found}."
+            raise SourceError(f"{self.sensor}: the profile does not say how it is reached", hint)
+        self._last_sequence = None
+        self._device = VideoDevice(driver.device, self.sensor)
+        stack.callback(self._device.close)
+        self._decoder = self._set_up_pictures()
+        self._device_in_words = (
+            f"{self._device.card} at {self._device.path} ({self._device.driver}, {self._device.bus}), "
+            f"{self._decoder.code.strip()}"
+        )
+        self._known = list_controls(self._device)
+        self._notes = apply_controls(self._device, self.sensor, driver.controls)
+        if driver.frame_rate_hz is not None:
+            given_hz = self._device.set_rate(driver.frame_rate_hz)
+            if given_hz is not None and abs(given_hz / driver.frame_rate_hz - 1) > 0.01:
+                rates = {"rate_hz": given_hz, "expected_hz": driver.frame_rate_hz}
+                self._notes.append(Finding("stream.rate_refused", "warning", figures=rates))
+        self._read_exposure()
+        n_buffers = self._device.start(N_BUFFERS)
+        if n_buffers < N_BUFFERS:
+            buffers = {"n": n_buffers, "expected": N_BUFFERS}
+            self._notes.append(Finding("stream.few_buffers", "warning", figures=buffers))
+
+    def _set_up_pictures(self) -> PixelDecoder:
+        """Agree on the form of the pictures.
+
+        Raises:
+            SourceError: another size than the intrinsics', or no pixel format that is read here.
+        """
+        device, (width, height) = self._device, self._settings.resolution_px
+        where = f"camera {self.sensor!r}: {device.path} ({device.card})"
+        offered = device.formats()
+        wanted = self._settings.driver.pixel_format
+        code = find_format(wanted) if wanted else next((c for c in offered if c in FORMATS), None)
+        if code is None or (offered and code not in offered):
+            what = f"does not offer pixel format {wanted}" if wanted else "offers no pixel format read here"
+            listing = ", ".join(c.strip() for c in offered) or "none"
+            raise SourceError(
+                f"{where} {what}", f"It offers {listing}: set driver.pixel_format to one of them."
+            )
+        layout = device.set_layout(code, width, height)
+        if (layout.width, layout.height) != (width, height):
+            sizes = ", ".join(device.sizes(code)) or "unknown"
+            raise SourceError(
+                f"{where} sends {layout.width}x{layout.height} px in {code.strip()}, "
+                f"the intrinsics belong to {width}x{height} px",
+                f"Is it another camera? Its sizes: {sizes}. Choose another, or measure intrinsics anew.",
+            )
+        if layout.code != code:
+            raise SourceError(
+                f"{where} sends {layout.code.strip()}, not {code.strip()} as it was asked for",
+                f"Set driver.pixel_format to {layout.code.strip()}.",
+            )
+        return PixelDecoder(code, width, height, layout.stride)
+
+    def read(self) -> list[LiveSample]:
+        """Give what came; see `LiveSource`."""
+        try:
+            frame = self._device.read(_WAIT_S)
+        except OSError:
+            # The kernel calls it temporary; should it last, the silence ends it.
+            self._n_damaged += 1
+            time.sleep(_WAIT_S)
+            return []
+        if frame is None:
+            return []
+        image = self._to_image(frame)
+        return [] if image is None else [image]
+
+    def _to_image(self, frame: RawFrame) -> Image | None:
+        host_ns = time.time_ns()
+        utc_ns = self._clock.to_utc_ns(frame.stamp_ns)
+        self._count(frame.sequence)
+        self._has_sent = True
+        if frame.is_damaged:
+            self._n_damaged += 1
+            return None
+        try:
+            pixels = self._decoder.decode(frame.data)
+        except ValueError:
+            self._n_damaged += 1
+            return None
+        if time.monotonic() - self._exposure_read_s > _EXPOSURE_EVERY_S:
+            self._read_exposure()
+        self._mark = stamped_moment(self._settings.driver, frame.flags, self._device.driver)
+        stamp_ns = host_ns if utc_ns is None else utc_ns + self._timing.to_mid_ns(self._mark)
+        return Image(self.sensor, self._channel, stamp_ns, pixels, host_ns, frame.sequence)
+
+    def _count(self, sequence: int) -> None:
+        if self._last_sequence is not None and sequence > self._last_sequence:
+            self._n_lost += sequence - self._last_sequence - 1
+        self._last_sequence = sequence
+
+    def _read_exposure(self) -> None:
+        """Ask for the exposure, which automatics may change at any time."""
+        self._exposure_read_s = time.monotonic()
+        given = self._settings.driver.frame_timing.exposure_us
+        asked = read_exposure_us(self._device, self._known) if given is None else None
+        self._timing = frame_timing(self._settings.driver, self._settings.resolution_px[1], asked)
+
+    def _clock_state(self) -> ClockState | None:
+        if not self._has_sent:
+            return None
+        if self._clock.used is None:
+            return ClockState(Finding("clock.arrival", "note"))
+        delay_ms = self._clock.delay_ns * 1e-6
+        figures: dict[str, Figure] = {"clock": self._clock.used, "mark": self._mark, "delay_ms": delay_ms}
+        return ClockState(Finding("clock.mid_exposure", "note", figures=figures))
+
+    def _problems(self) -> list[Finding]:
+        found = self._notes + self._clock.problems()
+        if self._n_damaged:
+            found.append(Finding("stream.damaged_images", "warning", figures={"n": self._n_damaged}))
+        if self._clock.used is not None and self._timing.exposure_ns is None and self._has_sent:
+            found.append(Finding("clock.exposure_unknown", "warning"))
+        return found

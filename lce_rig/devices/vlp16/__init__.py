@@ -1,0 +1,1 @@
+"""The VLP-16: packets from the network, its web page, its status."""

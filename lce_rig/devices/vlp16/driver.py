@@ -1,0 +1,213 @@
+"""A VLP-16 on the network: UDP packets in, scans of one revolution each out."""
+
+import select
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from lce_rig.core import velodyne
+from lce_rig.core.data import Scan
+from lce_rig.core.errors import SourceError
+from lce_rig.devices.protocol import SourceStatus
+from lce_rig.devices.reading import LiveSource
+from lce_rig.devices.vlp16.packet_recorder import PcapRecorder
+from lce_rig.devices.vlp16.socket import UdpPort
+from lce_rig.devices.vlp16.status import Reception, to_status
+from lce_rig.devices.vlp16.web import VelodyneWeb, WebReport, find_problems
+from lce_rig.recordings.velodyne.datagrams import Datagram
+from lce_rig.recordings.velodyne.settings import read_controls
+from lce_rig.recordings.velodyne.stream import Vlp16Stream
+from lce_rig.rig import LidarSettings
+from lce_rig.words import as_line, describe, sentence
+
+# Why no packets of a VLP-16 come: what can be told from here, and what is left to check.
+
+_WEB_TIMEOUT_S = 1.0
+_EVERYBODY = "255.255.255.255"
+_MAX_SHOWN = 3
+
+
+def explain_silence(
+    sensor: str,
+    settings: LidarSettings,
+    stream: Vlp16Stream,
+    reception: Reception,
+    silence_s: float,
+    web_port: int,
+) -> SourceError:
+    """Find the likeliest reason; the sensor's web page is asked."""
+    port, address = settings.driver.port or velodyne.DATA_PORT, settings.driver.address
+    whose = f" from {address}" if address else ""
+    began = "have stopped" if stream.counts.n_data else "come"
+    none = "" if stream.counts.n_data else "no "
+    what = f"{sensor}: {none}data packets{whose} on UDP port {port} {began} (for {silence_s:g} s)"
+    others = stream.counts.other_models.most_common(1)
+    if others:
+        return SourceError(
+            f"{sensor}: the packets on UDP port {port} come from a {others[0][0]}, not a VLP-16",
+            "Only the VLP-16 (Puck, Puck LITE) is read: check driver.address.",
+        )
+    if stream.counts.n_bad:
+        bad = ", ".join(describe(flaw) for flaw in stream.counts.flaws()[:_MAX_SHOWN])
+        return SourceError(f"{what}: only {bad}", "Check which program sends to this port.")
+    if reception.strangers:
+        there = ", ".join(sorted(reception.strangers))
+        return SourceError(what, f"Packets come from {there}: set driver.address in the profile.")
+    return SourceError(what, _ask_the_web_page(address or velodyne.FACTORY_ADDRESS, port, settings, web_port))
+
+
+def _ask_the_web_page(address: str, port: int, settings: LidarSettings, web_port: int) -> str:
+    try:
+        report = VelodyneWeb(address, web_port, _WEB_TIMEOUT_S).read()
+    except SourceError:
+        return (
+            f"Its web page http://{address} does not answer either. Check its power and cable; that this "
+            "computer has an address in its network (192.168.1.x, mask 255.255.255.0); and driver.address."
+        )
+    return " ".join([f"Its web page http://{address} answers.", *_advise(report, port, settings)])
+
+
+def _advise(report: WebReport, port: int, settings: LidarSettings) -> list[str]:
+    problems = [as_line(sentence(problem)) for problem in find_problems(report, settings)]
+    if report.host and report.host != _EVERYBODY:
+        problems.append(f"Data go to {report.host} only: check that this is this computer.")
+    return problems or [f"Open UDP port {port} in this computer's firewall (sudo ufw allow {port}/udp)."]
+
+
+SILENCE_S = 2.0
+_WAIT_S = 0.1
+# Half a second of scans: whoever is slower wants the newest.
+N_SLOTS = 5
+_GATHER_S = 0.005
+
+
+class Vlp16Source(LiveSource):
+    """The scans of an attached VLP-16; open while its `with` block lasts.
+
+    `driver.address` is whose packets are taken, those of the VLP-16 heard first where it is not set;
+    `driver.port` is the port of data packets (2368); `driver.controls` may hold what `Vlp16Controls` does.
+
+    Attributes:
+        sensor: its name in the profile.
+    """
+
+    def __init__(
+        self,
+        sensor: str,
+        settings: LidarSettings,
+        *,
+        silence_s: float = SILENCE_S,
+        n_slots: int = N_SLOTS,
+        record_to: Path | None = None,
+        web_port: int = 80,
+    ) -> None:
+        """Take the settings; nothing is opened yet.
+
+        Args:
+            sensor: its name in the profile.
+            settings: its block of the profile.
+            silence_s: without packets for so long, it is taken to be gone.
+            n_slots: scans that wait for a slow taker; the oldest are dropped.
+            record_to: a pcap file for the raw packets; it must not exist.
+            web_port: of the sensor's web server, which is asked when no packets come.
+        """
+        super().__init__(sensor, sensor, n_slots, silence_s)
+        self._settings = settings
+        self._record_to = record_to
+        self._web_port = web_port
+        self._lock = threading.Lock()
+        self._reception = Reception()
+        self._stream: Vlp16Stream | None = None
+        self._recorder: PcapRecorder | None = None
+        self._ports: tuple[UdpPort, ...] = ()
+        self._early: list[Scan] = []
+        self._n_lost_before = 0
+
+    def open(self) -> None:
+        """Open the ports and wait for the first packet.
+
+        Raises:
+            SourceError: no packets come, or those of another model; a port is held by another program;
+                velodyne-decoder is not installed; the recording cannot be made.
+        """
+        with self._lock:
+            self._n_lost_before += self._stream.counts.order.n_lost if self._stream is not None else 0
+            self._stream, self._reception = Vlp16Stream(self.sensor, self._settings), Reception()
+        position_port = read_controls(self.sensor, self._settings).position_port
+        data = UdpPort(self._settings.driver.port or velodyne.DATA_PORT, f"{self.sensor}: data packets")
+        self._ports = (data,)
+        self._ports = data, UdpPort(position_port, f"{self.sensor}: position packets")
+        if self._record_to is not None and self._recorder is None:
+            self._recorder = PcapRecorder(self._record_to)
+        self._early = []
+        until_s = time.monotonic() + self._silence_s
+        while not self._stream.counts.n_data and not self.is_stopping:
+            self._early = self.read()
+            if not self._stream.counts.n_data and time.monotonic() > until_s:
+                raise self.explain_silence(has_sent=False)
+
+    def read(self) -> list[Scan]:
+        """Take the packets that came, and give the scans that they complete.
+
+        Raises:
+            SourceError: the network failed.
+        """
+        assert self._stream is not None  # it is open
+        scans, self._early = self._early, []
+        ready, _, _ = select.select(self._ports, (), (), _WAIT_S)
+        n_before = self._stream.counts.n_data
+        try:
+            for port in ready:
+                for datagram in port.receive_many():
+                    scan = self._take(datagram, self._stream, is_data=port is self._ports[0])
+                    scans += [] if scan is None else [scan]
+        except OSError as error:
+            what = f"{self.sensor}: the network failed: {error.strerror}"
+            raise SourceError(what, "Check the cable.") from None
+        if self._stream.counts.n_data > n_before:
+            self.note_heard()
+            # The kernel has stamped what comes meanwhile: several packets cost hardly more than one.
+            time.sleep(_GATHER_S)
+        return scans
+
+    def close(self) -> None:
+        """Close the ports; what is recorded goes on when they are opened again."""
+        for port in self._ports:
+            port.close()
+        self._ports = ()
+        if self._recorder is not None and self.is_stopping:
+            self._recorder.close()
+            self._recorder = None
+
+    def explain_silence(self, *, has_sent: bool) -> SourceError:
+        """Find the likeliest reason; the sensor's web page is asked."""
+        assert self._stream is not None  # it was open
+        return explain_silence(
+            self.sensor, self._settings, self._stream, self._reception, self._silence_s, self._web_port
+        )
+
+    def describe(self) -> SourceStatus:
+        """Say how the sensor does; may be called from any thread."""
+        with self._lock:
+            reception, ports = self._reception, self._ports
+            reception.n_overflowed = sum(port.n_overflowed for port in ports)
+            reception.granted_bytes = min((port.granted_bytes for port in ports), default=0)
+            status = to_status(self.sensor, self._settings, self._stream, reception, self._recorder)
+            return replace(status, n_lost=status.n_lost + self._n_lost_before)
+
+    def _take(self, datagram: Datagram, stream: Vlp16Stream, *, is_data: bool) -> Scan | None:
+        address = self._settings.driver.address or self._reception.address
+        if address and datagram.source != address:
+            self._reception.see_stranger(datagram.source)
+            return None
+        if self._recorder is not None:
+            self._recorder.put(datagram)
+        with self._lock:
+            if not is_data:
+                stream.push_position(datagram.payload, datagram.host_ns)
+                return None
+            scan = stream.push_data(datagram.payload, datagram.host_ns)
+            if stream.counts.n_data and not self._reception.address:
+                self._reception.address = datagram.source
+            return scan

@@ -1,0 +1,164 @@
+"""The joint estimate as a method of calibration: Algorithm 1 finds the place, the likelihood the optimum."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Observation
+from lce_rig.extrinsics.algorithm_1 import calibrate_by_algorithm_1
+from lce_rig.extrinsics.estimate import CalibrationEstimate
+from lce_rig.extrinsics.likelihood.levels import Levels, Priors
+from lce_rig.extrinsics.likelihood.refine import JointEstimate, refine
+from lce_rig.extrinsics.likelihood.spread import inflate
+from lce_rig.extrinsics.likelihood.system import PER_CAMERA
+from lce_rig.extrinsics.metrics import error_to_reference
+from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M, EstimateSettings
+from lce_rig.extrinsics.report import name_sigmas, report_estimate
+from lce_rig.residuals.along_rays import N_SHIFTS, SHIFTS
+from lce_rig.residuals.features import extract_features
+from lce_rig.residuals.placements import group_placements
+from lce_rig.residuals.quadratics import Quadratics
+
+# A profile that states no error of the ranges is taken at its word.
+_EXACT_M = 1e-6
+
+
+def calibrate_by_likelihood(
+    observations: Sequence[Observation],
+    board: Board,
+    options: EstimateSettings,
+    progress: Callable[[int, int], None] | None = None,
+) -> CalibrationEstimate:
+    """Estimate T_cam_lidar from boards whose pairing is settled.
+
+    Outliers, certificate and held-out residuals are those of Algorithm 1, from whose solution the joint
+    estimate starts.
+
+    Args:
+        observations: one a capture.
+        board: its specification.
+        options: switches of Algorithm 1, and what is known of the LiDAR's ranges.
+        progress: called with (subsets done, subsets in all).
+
+    Raises:
+        NotEnoughDataError: the captures leave a direction undetermined, which is named.
+    """
+    start = calibrate_by_algorithm_1(observations, board, options, progress)
+    used = [observation for observation in observations if observation.capture in start.used]
+    priors, usual = what_is_known(options)
+    joint = refine([used], board, [start.T_cam_lidar], priors, usual)
+    placement = group_placements(used)
+    cov, inflation = inflate(joint, placement)
+    offset_deg, offset_m = error_to_reference(joint.T_cam_lidar[0], start.T_cam_lidar)
+    figures = {
+        **figures_of(joint, 0),
+        "algorithm_1_offset_deg": offset_deg,
+        "algorithm_1_offset_m": offset_m,
+        "covariance_inflation": inflation,
+    }
+    estimate = describe(joint, 0, cov, start, used, board, options, figures)
+    return replace(estimate, expansion=expand_joint(joint, 0, placement))
+
+
+def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
+    """Read off the options what is known of constant errors and of noise before any capture is seen."""
+    priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=EDGE_SHIFT_SIGMA_M)
+    return priors, Levels(laser_m=options.laser_bias_sigma_m)
+
+
+def describe(
+    joint: JointEstimate,
+    camera: int,
+    cov: Array,
+    start: CalibrationEstimate,
+    used: Sequence[Observation],
+    board: Board,
+    options: EstimateSettings,
+    figures: Mapping[str, float],
+) -> CalibrationEstimate:
+    """Report one camera's extrinsic of a joint estimate.
+
+    Args:
+        joint: of one or several cameras.
+        camera: its number there.
+        cov: (6, 6) of its extrinsic.
+        start: Algorithm 1's estimate, or one that stands on it: certificate, held-out residuals, refusals.
+        used: the camera's observations, those that the start used.
+        board: the board.
+        options: switches of the features.
+        figures: diagnostics; those of the start are overwritten.
+    """
+    features = [extract_features(observation, board, options.parts.features) for observation in used]
+    return report_estimate(
+        joint.T_cam_lidar[camera],
+        cov,
+        used,
+        features,
+        board,
+        certificate=start.certificate,
+        held_out_m=np.array([residual.held_out_m for residual in start.residuals]),
+        refused=start.refused,
+        diagnostics={**start.diagnostics, **figures},
+    )
+
+
+def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp]) -> Quadratics:
+    """Expand the cost about a joint estimate, in the extrinsics alone, the camera's own first.
+
+    Constant errors are held where they are.
+
+    Args:
+        joint: of F captures.
+        camera: its number.
+        placement: (F,) number of each capture's placement.
+    """
+    n_cameras = len(joint.T_cam_lidar)
+    order = [camera, *(c for c in range(n_cameras) if c != camera)]
+    mine = np.concatenate([np.arange(6) + PER_CAMERA * c for c in order])
+    # Shares of captures that another camera did not see leave its extrinsic open: 1 m, 1 rad.
+    prior = np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6))
+    return replace(joint.cost.of(mine), prior=prior, prior_gradient=np.zeros(len(mine)), placement=placement)
+
+
+def figures_of(joint: JointEstimate, camera: int) -> dict[str, float]:
+    """Name the constant errors and noise levels; those of Algorithm 1 that they replace are overwritten."""
+    levels = joint.levels
+    shifts = dict(zip(SHIFTS, joint.shifts.tolist(), strict=True))
+    return {
+        **_sigmas(joint, camera),
+        "edge_shift_m": shifts["d_0"],
+        "edge_shift_sigma_m": float(joint.constants_sigma[-N_SHIFTS]),
+        "edge_shift_echo_m": shifts["d_1"],
+        "edge_shift_blended_m": shifts["d_2"],
+        "edge_shift_blended_echo_m": shifts["d_3"],
+        "range_offset_m": float(np.mean(joint.offset_m)),
+        "laser_spread_m": float(np.std(joint.offset_m)),
+        "lens_lateral_m": float(joint.lens_m[0]),
+        "lens_vertical_m_per_rad": float(joint.lens_m[1]),
+        "camera_scale": 1.0 - float(joint.scale[camera]),
+        "noise_range_m": levels.range_m,
+        "noise_ring_m": levels.ring_m,
+        "noise_ring_end_mrad": 1e3 * levels.edge_rad,
+        "ring_ends_lost": levels.lost_share,
+        "noise_tilt_deg": float(np.degrees(levels.tilt_rad)),
+        "noise_spin_deg": float(np.degrees(levels.spin_rad)),
+        "noise_depth_m": levels.depth_m,
+        "noise_across_m": levels.across_m,
+    }
+
+
+def _sigmas(joint: JointEstimate, camera: int) -> dict[str, float]:
+    """Part a camera's claim in what differs between sessions and what priors of constant errors let through.
+
+    With information H = sum_k H_k + P, the covariance H^-1 is H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1.
+    """
+    cost = joint.cost
+    J = joint.to_extrinsics[camera] @ cost.covariance()
+    figures: dict[str, float] = {}
+    for name, part in (("scatter", cost.hessians.sum(axis=0)), ("systematic", cost.prior)):
+        figures |= name_sigmas(name, J @ part @ J.T)
+    return figures

@@ -1,0 +1,140 @@
+"""Several cameras that share scans of one LiDAR, estimated as one: they share board poses and its errors."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Observation, Refusal
+from lce_rig.extrinsics.estimate import CalibrationEstimate
+from lce_rig.extrinsics.likelihood.calibrate_jointly import describe, expand_joint, figures_of, what_is_known
+from lce_rig.extrinsics.likelihood.levels import PoseLevels
+from lce_rig.extrinsics.likelihood.refine import refine
+from lce_rig.extrinsics.likelihood.spread import inflate
+from lce_rig.extrinsics.options import EstimateSettings
+from lce_rig.extrinsics.shared_scans import scan_key, take_apart
+from lce_rig.residuals.placements import group_shared_placements
+
+# Diagnostics that hold a camera's pose errors beyond corner noise, by the level that they are.
+_POSE_FIGURES = {
+    "tilt_rad": "noise_tilt_deg",
+    "spin_rad": "noise_spin_deg",
+    "depth_m": "noise_depth_m",
+    "across_m": "noise_across_m",
+}
+# Those that say what a camera's own estimate did, and nothing of this one.
+_OF_ONE = ("algorithm_1_offset_deg", "algorithm_1_offset_m")
+
+
+@dataclass(frozen=True, eq=False)
+class TogetherEstimate:
+    """Extrinsics of C cameras with one LiDAR.
+
+    Attributes:
+        cameras: their names, sorted.
+        estimates: of each.
+        cov: (6 C, 6 C) of all extrinsics, in the order of `cameras`; its diagonal blocks are those of the
+            estimates.
+    """
+
+    cameras: tuple[str, ...]
+    estimates: Mapping[str, CalibrationEstimate]
+    cov: Array
+
+    def covariance_of(self, first: str, second: str) -> Array:
+        """Take the covariance (12, 12) of two cameras' extrinsics out."""
+        places = [np.arange(6) + 6 * self.cameras.index(name) for name in (first, second)]
+        mine = np.concatenate(places)
+        return self.cov[mine[:, None], mine]
+
+
+def calibrate_together(
+    alone: Mapping[str, CalibrationEstimate], board: Board, options: EstimateSettings
+) -> TogetherEstimate:
+    """Estimate the extrinsics of cameras that share scans of one LiDAR in one likelihood.
+
+    What a camera alone says is where the estimate starts, and how large the errors of its pictures are
+    compared with those of the others'. Scans of which the cameras use different places are left out.
+
+    Args:
+        alone: by camera, its estimate by the joint likelihood without the others; boards stood still.
+        board: its specification.
+        options: what is known of the LiDAR's ranges.
+    """
+    # The order of cameras must not matter to the last digit.
+    names = tuple(sorted(alone))
+    conflicts = _conflicts(alone)
+    starts = [_without(alone[name], conflicts) for name in names]
+    used = [[start.observations[capture] for capture in start.used] for start in starts]
+    labelled = _label_scans(used)
+    priors, usual = what_is_known(options)
+    T_start = [start.T_cam_lidar for start in starts]
+    joint = refine(labelled, board, T_start, priors, usual, pose_ratios=_pose_ratios(starts))
+    order = {name: k for k, name in enumerate(sorted({o.capture for own in labelled for o in own}))}
+    placement = group_shared_placements(labelled, order)
+    J = joint.to_extrinsics.reshape(-1, joint.to_extrinsics.shape[2])
+    scales, estimates = [], {}
+    for k, (name, start) in enumerate(zip(names, starts, strict=True)):
+        n_seen = len(np.unique(placement[[order[o.capture] for o in labelled[k]]]))
+        cov, inflation = inflate(joint, placement, k, n_seen)
+        scales.append(np.full(6, np.sqrt(inflation)))
+        figures = {**figures_of(joint, k), "covariance_inflation": inflation}
+        estimate = describe(joint, k, cov, start, used[k], board, options, figures)
+        estimates[name] = replace(
+            estimate,
+            method=start.method,
+            expansion=expand_joint(joint, k, placement),
+            estimated_with=tuple(other for other in names if other != name),
+        )
+    scale = np.concatenate(scales)
+    cov = scale[:, None] * (J @ joint.cost.covariance() @ J.T) * scale
+    return TogetherEstimate(names, estimates, cov)
+
+
+def _without(start: CalibrationEstimate, conflicts: Mapping[str, Refusal]) -> CalibrationEstimate:
+    """Leave captures out, and figures that hold for the camera alone."""
+    singles = [take_apart([name]) for name in start.used]
+    kept = [k for k, names in enumerate(singles) if not names & conflicts.keys()]
+    mine = {name: why for name, why in conflicts.items() if name in set().union(*singles)}
+    return replace(
+        start,
+        used=tuple(start.used[k] for k in kept),
+        residuals=tuple(start.residuals[k] for k in kept),
+        refused={**start.refused, **mine},
+        diagnostics={name: value for name, value in start.diagnostics.items() if name not in _OF_ONE},
+    )
+
+
+def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
+    """Find captures in which cameras put the board at different places of the scan."""
+    seen: dict[str, tuple[str, bytes]] = {}
+    found = {}
+    for camera, estimate in sorted(alone.items()):
+        for observation in estimate.observations.values():
+            key = scan_key(observation)
+            for capture in sorted(take_apart([observation.capture])):
+                other, held = seen.setdefault(capture, (camera, key))
+                if held != key:
+                    figures = {"first": other, "second": camera}
+                    found[capture] = Refusal("pair.two_places", figures=figures)
+    return found
+
+
+def _label_scans(used: Sequence[Sequence[Observation]]) -> list[list[Observation]]:
+    """Give observations of the same scan the same name, whatever captures they lie in."""
+    names: dict[bytes, str] = {}
+    labelled = []
+    for own in used:
+        for observation in own:
+            names.setdefault(scan_key(observation), f"{len(names):06d}")
+        labelled.append([replace(o, capture=names[scan_key(o)]) for o in own])
+    return labelled
+
+
+def _pose_ratios(starts: Sequence[CalibrationEstimate]) -> list[PoseLevels]:
+    """Compare cameras' pose errors, as each alone estimates them, with their geometric mean."""
+    logs = np.log([[start.diagnostics[name] for name in _POSE_FIGURES.values()] for start in starts])
+    ratios = np.exp(logs - logs.mean(axis=0))
+    return [PoseLevels(**dict(zip(_POSE_FIGURES, own, strict=True))) for own in ratios.tolist()]

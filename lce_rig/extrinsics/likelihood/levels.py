@@ -1,0 +1,110 @@
+"""Sizes of the errors that the likelihood knows, and what is believed of them before any capture is seen."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from lce_rig.core.geometry import Array
+from lce_rig.extrinsics.background import BACKGROUND_SIGMAS_M
+from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M
+
+
+class PoseLevels(NamedTuple):
+    """Errors of a board's pose in a picture beyond corner noise, as in `Levels`; or ratios of them."""
+
+    tilt_rad: float
+    spin_rad: float
+    depth_m: float
+    across_m: float
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Standard deviations of errors that differ from one measurement to the next; estimated.
+
+    The defaults are what recordings show; how far from that they may well lie stands in `LOG_SIGMA`.
+
+    Attributes:
+        range_m: noise of a single range.
+        ring_m: error that the returns of one ring in one capture share, beyond the laser's offset.
+        edge_rad: blur of the ends of a ring end's interval, across the beam, by range (`along_rays`).
+        backed_rad: the same where something stands close behind.
+        lost_share: of ring ends whose last returns are missing; a share, not a deviation.
+        tilt_rad, spin_rad: errors of a board's turn in a picture beyond corner noise.
+        depth_m, across_m: errors of its place, along and across the line of sight.
+        laser_m: of the lasers' range offsets about their mean.
+    """
+
+    range_m: float = 0.008
+    ring_m: float = 0.002
+    edge_rad: float = 0.0005
+    backed_rad: float = 0.001
+    lost_share: float = 0.08
+    tilt_rad: float = 3.5e-3
+    spin_rad: float = 5e-4
+    depth_m: float = 0.004
+    across_m: float = 0.0013
+    laser_m: float = 0.008
+
+    @property
+    def pose(self) -> PoseLevels:
+        """Those of a picture's pose."""
+        return PoseLevels(self.tilt_rad, self.spin_rad, self.depth_m, self.across_m)
+
+    def blurred(self, blur_rad: float) -> "Levels":
+        """Blur ring ends by so much at least."""
+        edge_rad, backed_rad = max(self.edge_rad, blur_rad), max(self.backed_rad, blur_rad)
+        return replace(self, edge_rad=edge_rad, backed_rad=backed_rad)
+
+
+LOG_SIGMA: Mapping[str, float] = {
+    "range_m": 0.7,
+    "ring_m": 0.7,
+    "edge_rad": 0.7,
+    "backed_rad": 1.0,
+    "lost_share": 1.0,
+    "tilt_rad": 0.7,
+    "spin_rad": 0.7,
+    "depth_m": 0.7,
+    "across_m": 0.7,
+    "laser_m": 0.3,
+}
+"""One deviation of the logarithm of each level, a priori; the lasers' spread is the profile's to state."""
+# Most ring ends are where the board ends, or there would be nothing to go by.
+MOST_LOST = 0.6
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Standard deviations a priori of the constant errors, which are the same in every capture.
+
+    Attributes:
+        offset_m: range offset common to all lasers.
+        shift_m: edge shift d_0, `along_rays`.
+        growth: c, its change with range; recordings show none.
+        background_m: d_1, d_2 and d_3, by what is behind the edge.
+        displacement_m: displacement of all ring ends against the returns between them.
+        lateral_m: lens beside the LiDAR's axis, `along_rays`.
+        vertical_m: its height, per rad of elevation.
+        scale: of the camera's distances, by which squares or focal length are off.
+    """
+
+    offset_m: float = 0.005
+    shift_m: float = EDGE_SHIFT_SIGMA_M
+    growth: float = 0.0001
+    background_m: tuple[float, float, float] = BACKGROUND_SIGMAS_M
+    displacement_m: float = 0.00025
+    lateral_m: float = 0.02
+    vertical_m: float = 0.04
+    scale: float = 0.0005
+
+    @property
+    def shifts(self) -> Array:
+        """Deviations (7,) in the order of `along_rays.SHIFTS`."""
+        return np.array([self.shift_m, self.growth, *self.background_m, *2 * [self.displacement_m]])
+
+
+# Offsets of lasers that the profile says have none.
+NO_LASER_M = 1e-6

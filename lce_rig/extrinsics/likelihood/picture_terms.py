@@ -1,0 +1,89 @@
+"""Poses of boards in pictures against T_cam_lidar T_lidar_board.
+
+Corners act through the pose that fits them and its covariance, which holds to first order all that they
+say. Beyond their noise a picture's pose errs by what its corners have in common: the lens model's misfit in
+that part of the picture, the print, the board's bend, its motion. The covariance of that error is
+
+    Q = sigma_tilt^2 about axes in the board's plane, sigma_spin^2 about its normal,
+        sigma_depth^2 along the line of sight, sigma_across^2 across it                                   (1)
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lce_rig.core.geometry import Array, difference, skew
+from lce_rig.core.results import ImageBoard
+from lce_rig.extrinsics.likelihood.levels import PoseLevels
+from lce_rig.residuals.along_rays import Indices
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """What one camera saw of boards, in P captures.
+
+    Attributes:
+        capture: (P,) which of the stacked captures.
+        T_cam_board: (P, 4, 4).
+        cov: (P, 6, 6) of the corners' noise, tangent of T_cam_board.
+        shapes: (P, 6, 6) each, derivative of Q by the square of each of `PoseLevels`, by name.
+    """
+
+    capture: Indices
+    T_cam_board: Array
+    cov: Array
+    shapes: Mapping[str, Array]
+
+    def total_cov(self, levels: PoseLevels) -> Array:
+        """Add Q to the corners' covariance: (P, 6, 6)."""
+        Q = np.zeros_like(self.cov)
+        for name, shape in self.shapes.items():
+            Q += getattr(levels, name) ** 2 * shape
+        return self.cov + Q
+
+    def with_larger_errors(self, ratios: PoseLevels) -> "Pictures":
+        """Let the pictures err beyond corner noise by so many times what levels say."""
+        shapes = {name: getattr(ratios, name) ** 2 * shape for name, shape in self.shapes.items()}
+        return replace(self, shapes=shapes)
+
+
+def stack_pictures(capture: Indices, images: Sequence[ImageBoard], n_repeats: Array) -> Pictures:
+    """Stack the pictures of one camera.
+
+    Args:
+        capture: (P,) which of the stacked captures they belong to.
+        images: P of them.
+        n_repeats: (P,) pictures that show the board in the same place: they share the error Q, and count
+            together as one.
+    """
+    T = np.array([image.T_cam_board for image in images])
+    cov = np.array([image.cov for image in images])
+    shapes = {name: np.zeros((len(T), 6, 6)) for name in PoseLevels._fields}
+    normal, sight = T[:, :3, 2], T[:, :3, 3] / np.linalg.norm(T[:, :3, 3], axis=1, keepdims=True)
+    about, along = (v[:, :, None] * v[:, None, :] for v in (normal, sight))
+    shapes["tilt_rad"][:, 3:, 3:], shapes["spin_rad"][:, 3:, 3:] = np.eye(3) - about, about
+    shapes["depth_m"][:, :3, :3], shapes["across_m"][:, :3, :3] = along, np.eye(3) - along
+    return Pictures(
+        capture, T, cov, {name: n_repeats[:, None, None] * shape for name, shape in shapes.items()}
+    )
+
+
+def picture_rows(pictures: Pictures, T_cam_lidar: Array, T_lidar_board: Array, scale: float) -> Array:
+    """Linearise the tangent from T_cam_board to T_cam_lidar T_lidar_board.
+
+    Returns:
+        (P, 6, 14): by extrinsic (6), by board pose (6), by scale, residual. A scale s stretches what the
+        camera measures to t_cam_board (1 + s): squares or a focal length that are not what the profile
+        says.
+    """
+    Y = T_lidar_board[pictures.capture]
+    R = T_cam_lidar[:3, :3]
+    rows = np.zeros((len(Y), 6, 14))
+    rows[:, :3, :3] = rows[:, 3:, 3:6] = np.eye(3)
+    rows[:, :3, 3:6] = -skew(Y[:, :3, 3] @ R.T)
+    rows[:, :3, 6:9] = rows[:, 3:, 9:12] = R
+    rows[:, :3, 12] = -pictures.T_cam_board[:, :3, 3]
+    rows[:, :, 13] = difference(T_cam_lidar @ Y, pictures.T_cam_board)
+    rows[:, :3, 13] += scale * rows[:, :3, 12]
+    return rows

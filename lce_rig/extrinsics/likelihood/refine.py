@@ -1,0 +1,222 @@
+"""Joint refinement: extrinsics of cameras that share one LiDAR, board poses, constant errors, noise levels.
+
+Fisher scoring: Gauss-Newton on ranges and pictures, mean information and score for the density of ring ends
+(`end_density`); noise levels are fitted in between.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, invert, perturb
+from lce_rig.core.results import Observation
+from lce_rig.extrinsics.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, PoseLevels, Priors
+from lce_rig.extrinsics.likelihood.picture_terms import Pictures, stack_pictures
+from lce_rig.extrinsics.likelihood.system import PER_CAMERA, Assembly, State, Terms, assemble, linearise
+from lce_rig.residuals.along_rays import N_FIELDS, N_SHIFTS, StackedScans, interior, lens_fields, stack_scans
+from lce_rig.residuals.placements import group_placements
+from lce_rig.residuals.quadratics import Quadratics
+
+# Noise levels from the data: the ones under which the data are most probable.
+#
+# All unknowns are integrated out (restricted maximum likelihood), so that residuals which the fit itself
+# made
+# small are not taken for small noise. The terms stay linearised: an evaluation is some small matrices, no
+# pass over points.
+
+_STEP = 1e-3
+# Levels lie within these factors of what is usual, e^-4.6 and e^3.
+_BELOW, _ABOVE = -4.6, 3.0
+
+
+def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, n_rounds: int) -> Levels:
+    """Find the levels that minimise -2 ln p(data | levels) - 2 ln p(levels).
+
+    Args:
+        terms: linearised near the optimum.
+        start: levels to start from.
+        usual: middle of what is believed of them; lasers that have no offsets there have none.
+        priors: of the constants.
+        n_rounds: of the search, at most.
+    """
+    from scipy.optimize import minimize
+
+    names = [name for name in LOG_SIGMA if name != "laser_m" or usual.laser_m > NO_LASER_M]
+    sigma = np.array([LOG_SIGMA[name] for name in names])
+    middle = _logs(usual, names)
+    assembly = Assembly(terms, priors)
+
+    def levels_at(logs: Array) -> Levels:
+        return replace(usual, **dict(zip(names, np.exp(logs).tolist(), strict=True)))
+
+    def cost(logs: Array) -> float:
+        unlikely = float(np.sum(((logs - middle) / sigma) ** 2))
+        return assembly.at(levels_at(logs)).minus_2_log_evidence + unlikely
+
+    highest = np.where(np.array(names) == "lost_share", np.log(MOST_LOST), middle + _ABOVE)
+    bounds = list(zip(middle + _BELOW, highest, strict=True))
+    options = {"maxiter": n_rounds, "eps": _STEP, "ftol": 1e-6}
+    return levels_at(minimize(cost, _logs(start, names), method="L-BFGS-B", bounds=bounds, options=options).x)
+
+
+def _logs(levels: Levels, names: list[str]) -> Array:
+    return np.log([getattr(levels, name) for name in names])
+
+
+# Steps between changes of the levels, and at most in the end.
+_STEPS, _LAST_STEPS = 3, 20
+# Rounds of the search for noise levels, after each of which all is linearised anew.
+_LEVEL_ROUNDS = (12, 4, 4)
+_SETTLED = 1e-7
+# Blurs that ring ends are first given: as long as the edge shift is unknown, all of them may lie outside
+# their intervals, where a sharp density is flat.
+_BLURS_RAD = (4e-3, 1.5e-3)
+
+
+@dataclass(frozen=True, eq=False)
+class JointEstimate:
+    """The optimum.
+
+    Attributes:
+        T_cam_lidar: (C, 4, 4).
+        T_lidar_board: (F, 4, 4).
+        cov: (C, 6, 6) of each extrinsic, everything else marginalised, tangent (translation m, rotation rad).
+        to_extrinsics: (C, 6, G) derivative of each extrinsic's tangent by the unknowns z of `system`.
+        offset_m: (L,) by which ranges of each ring read too long.
+        lens_m: (2,) lateral and vertical displacement of the LiDAR's lens, `along_rays`.
+        shifts: (7,) of ring ends, `along_rays.SHIFTS`.
+        scale: (C,) by how much of themselves each camera's distances are too short.
+        constants_sigma: (L + 9,) standard deviations of offsets, lens and shifts.
+        levels: of the noise.
+        cost: of the F captures at the optimum, in the unknowns z of `system`.
+    """
+
+    T_cam_lidar: Array
+    T_lidar_board: Array
+    cov: Array
+    to_extrinsics: Array
+    offset_m: Array
+    lens_m: Array
+    shifts: Array
+    scale: Array
+    constants_sigma: Array
+    levels: Levels
+    cost: Quadratics
+
+
+def refine(
+    cameras: Sequence[Sequence[Observation]],
+    board: Board,
+    T_cam_lidar: Sequence[Array],
+    priors: Priors | None = None,
+    usual: Levels | None = None,
+    levels: Levels | None = None,
+    pose_ratios: Sequence[PoseLevels] | None = None,
+) -> JointEstimate:
+    """Refine extrinsics of C cameras; captures of the same name share their scan and the board's pose.
+
+    Args:
+        cameras: observations of each.
+        board: the board.
+        T_cam_lidar: (4, 4) of each, good to some degrees and centimetres.
+        priors: of the constant errors.
+        usual: what the noise levels usually are.
+        levels: of the noise, where they are known; else estimated.
+        pose_ratios: for each camera, by how many times its pictures' errors beyond corner noise are larger
+            than `levels` says; 1 where None.
+    """
+    priors, usual = priors or Priors(), usual or Levels()
+    usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
+    seen = {o.capture: (o, T) for own, T in zip(cameras, T_cam_lidar, strict=True) for o in own}
+    order = {name: k for k, name in enumerate(sorted(seen))}
+    scans = stack_scans([interior(seen[name][0].lidar, board) for name in order])
+    pictures = tuple(_pictures(own, order) for own in cameras)
+    if pose_ratios is not None:
+        pictures = tuple(p.with_larger_errors(r) for p, r in zip(pictures, pose_ratios, strict=True))
+    state = State(
+        np.array(T_cam_lidar),
+        np.array([invert(T) @ o.image.T_cam_board for o, T in (seen[name] for name in order)]),
+        np.zeros(PER_CAMERA * len(cameras) + len(scans.rings) + N_FIELDS + N_SHIFTS),
+    )
+    problem = _Problem(scans, pictures, board, priors)
+    now = levels or usual
+    for blur_rad in _BLURS_RAD:
+        state = problem.settle(state, now.blurred(blur_rad))
+    for n_rounds in _LEVEL_ROUNDS if levels is None else ():
+        state = problem.settle(state, now)
+        now = fit_levels(problem.linearise(state), now, usual, priors, n_rounds)
+    state = problem.settle(state, now, _LAST_STEPS)
+    return _summarise(state, problem.linearise(state), now, priors)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What stays the same while the unknowns are sought."""
+
+    scans: StackedScans
+    pictures: tuple[Pictures, ...]
+    board: Board
+    priors: Priors
+
+    def linearise(self, state: State) -> Terms:
+        return linearise(self.scans, self.pictures, self.board, state)
+
+    def settle(self, state: State, levels: Levels, n_steps: int = _STEPS) -> State:
+        """Find the optimum at given levels."""
+        for _ in range(n_steps):
+            z, y = assemble(self.linearise(state), levels, self.priors).step()
+            state = state.moved(z, y)
+            if max(np.abs(z).max(), np.abs(y).max()) < _SETTLED:
+                break
+        return state
+
+
+def _pictures(observations: Sequence[Observation], order: dict[str, int]) -> Pictures:
+    placement = group_placements(observations)
+    capture = np.array([order[o.capture] for o in observations], dtype=np.intp)
+    n_repeats = np.bincount(placement)[placement].astype(np.float64)
+    return stack_pictures(capture, [o.image for o in observations], n_repeats)
+
+
+def to_extrinsic(T_cam_lidar: Array, camera: int, n_unknowns: int) -> Array:
+    """Differentiate a camera's extrinsic, as it is reported, by the unknowns z.
+
+    Straight ahead of the camera a lens beside the axis is a shift of the whole LiDAR: that goes to the
+    extrinsic, which is to be used with points as the driver gives them.
+
+    Args:
+        T_cam_lidar: (4, 4) for points whose displacement is taken off.
+        camera: its number.
+        n_unknowns: G.
+
+    Returns:
+        (6, G).
+    """
+    J = np.zeros((6, n_unknowns))
+    J[:, PER_CAMERA * camera : PER_CAMERA * camera + 6] = np.eye(6)
+    # The third row of R is the camera's line of sight in frame lidar.
+    J[:3, -N_SHIFTS - N_FIELDS] = T_cam_lidar[:3, :3] @ lens_fields(T_cam_lidar[2:3, :3])[0, :, 0]
+    return J
+
+
+def _summarise(state: State, terms: Terms, levels: Levels, priors: Priors) -> JointEstimate:
+    cost = assemble(terms, levels, priors).cost
+    C, constants = len(state.T_cam_lidar), state.constants
+    cov = cost.covariance()
+    J = np.stack([to_extrinsic(T, c, len(cov)) for c, T in enumerate(state.T_cam_lidar)])
+    rest = constants[PER_CAMERA * C :]
+    return JointEstimate(
+        T_cam_lidar=perturb(state.T_cam_lidar, J @ constants),
+        T_lidar_board=state.T_lidar_board,
+        cov=J @ cov @ np.swapaxes(J, 1, 2),
+        to_extrinsics=J,
+        offset_m=rest[: -N_FIELDS - N_SHIFTS],
+        lens_m=rest[-N_FIELDS - N_SHIFTS : -N_SHIFTS],
+        shifts=rest[-N_SHIFTS:],
+        scale=constants[PER_CAMERA * np.arange(C) + 6],
+        constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
+        levels=levels,
+        cost=cost,
+    )

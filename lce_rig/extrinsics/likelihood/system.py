@@ -1,0 +1,359 @@
+"""All terms at one state, and their normal equations for any levels of noise.
+
+Unknowns are the tangent y_k (6) of each board's T_lidar_board, and z, which all captures share:
+
+    z = [tangent of T_cam_lidar (6) and scale of each camera, range offset of each ring (L), lens (2),
+         shifts of ring ends (7)]
+
+A board pose meets only the terms of its own capture: the matrix is an arrow head, and y_k is eliminated
+capture by capture (Schur complement).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, perturb
+from lce_rig.extrinsics.likelihood.levels import Levels, PoseLevels, Priors
+from lce_rig.extrinsics.likelihood.picture_terms import Pictures, picture_rows
+from lce_rig.residuals.along_rays import (
+    N_FIELDS,
+    N_SHIFTS,
+    EdgeRows,
+    RangeSums,
+    StackedScans,
+    edge_rows,
+    range_system,
+    sum_ranges,
+    weigh_ranges,
+)
+from lce_rig.residuals.quadratics import Quadratics
+
+# How a ring's last return on the board lies to the board's edge: the density, its score and information.
+#
+# In units of the step to the next ray, let x be the distance of the last return inside the edge, less half
+# a
+# step, beam width included. Without noise x is uniform in -1/2..1/2: the edge lies somewhere between the
+# last
+# ray that met the board and the first that did not. Three things blur that:
+#
+#     p(x) = (1 - a - b) core + a lost + b stray
+#     (1)
+#
+# core   the uniform interval, its ends blurred by t (print, width of the beam): what remains of the
+# interval
+#        tells more of the edge than a normal distribution of the same variance would;
+# lost   the last returns on the board are missing (weak, or blended with whoever holds it): an exponential
+# tail
+#        inwards, of few ring ends where the board is on a stand, of a fifth where a person stands behind
+#        it;
+# stray  anything else (the neighbouring ray met something just behind the board), Cauchy's distribution.
+
+STRAY = 0.01
+"""Share b of (1), as in simulated and recorded captures; a is theirs to say."""
+_LOST_STEPS = 1.1
+# Blurs and lost shares that the table of informations spans. Narrower ones count as the narrowest; wider
+# ones leave a normal density.
+_NARROWEST = 0.01
+_BLURS = np.geomspace(_NARROWEST, 30.0, 60)
+_SHARES = np.array([0.001, 0.02, 0.05, 0.1, 0.2, 0.35, 0.6])
+
+
+def density(x: Array, blur: Array, lost_share: float) -> tuple[Array, Array]:
+    """Compute (1) and its derivative.
+
+    Args:
+        x: (M,) steps.
+        blur: (M,) t, steps.
+        lost_share: a.
+
+    Returns:
+        p and dp/dx, (M,) each.
+    """
+    from scipy.special import ndtr
+
+    t = np.maximum(blur, _NARROWEST)
+    low, high = (x + 0.5) / t, (x - 0.5) / t
+    core, core_slope = ndtr(low) - ndtr(high), (_normal(low) - _normal(high)) / t
+    lost = _exponential_with_noise(x, t)
+    lost_slope = (_normal(x / t) / t - lost) / _LOST_STEPS
+    width = np.maximum(t, 1.0)
+    stray = 1 / (np.pi * width * (1 + (x / width) ** 2))
+    stray_slope = -2 * x * np.pi / width * stray**2
+    shares = (1 - lost_share - STRAY, lost_share, STRAY)
+    p, slope = (
+        sum(share * part for share, part in zip(shares, parts, strict=True))
+        for parts in ((core, lost, stray), (core_slope, lost_slope, stray_slope))
+    )
+    return np.asarray(p), np.asarray(slope)
+
+
+def _exponential_with_noise(x: Array, t: Array) -> Array:
+    """Compute the density of an exponential error of mean `_LOST_STEPS` plus a normal one of deviation t."""
+    from scipy.special import erfcx, ndtr
+
+    s = t / _LOST_STEPS
+    z = x / t - s
+    # Both forms are the same; either overflows where the other does not.
+    below = np.exp(-0.5 * (x / t) ** 2) * erfcx(-np.minimum(z, 0.0) / np.sqrt(2)) / 2
+    above = np.exp(np.minimum(s**2 / 2 - x / _LOST_STEPS, 0.0)) * ndtr(z)
+    return np.asarray(np.where(z < 0, below, above) / _LOST_STEPS)
+
+
+def information(blur: Array, lost_share: float) -> Array:
+    """Compute Fisher's information (M,) of the edge's place, the mean of (d ln p / dx)^2, per step^2."""
+    table = _log_informations()
+    row = float(np.interp(lost_share, _SHARES, np.arange(len(_SHARES))))
+    low = min(int(row), len(_SHARES) - 2)
+    between = table[low] + (row - low) * (table[low + 1] - table[low])
+    inside = np.exp(np.interp(np.log(np.maximum(blur, _NARROWEST)), np.log(_BLURS), between))
+    return np.asarray(inside * np.minimum(_BLURS[-1] / np.maximum(blur, _NARROWEST), 1.0) ** 2)
+
+
+def edge_system(
+    edges: EdgeRows, edge_rad: float, backed_rad: float, lost_share: float, n_captures: int
+) -> Array:
+    """Expand -2 ln p of the ring ends to second order, by capture: (F, 16, 16).
+
+    With J a row without its residual: J J^T times the information, J times the score in the last column, and
+    -2 ln p itself in the corner. The information is the mean over all ring ends of such a blur: that of a
+    single one is zero in the middle of its interval, and no Hessian to step by.
+    """
+    size = edges.rows.shape[1]
+    system = np.zeros((n_captures, size, size))
+    if len(edges.rows):
+        D, blur = edges.step_m, edges.blur_m(edge_rad, backed_rad) / edges.step_m
+        p, slope = density(edges.rows[:, -1] / D, blur, lost_share)
+        weighted = [
+            edges.products * (information(blur, lost_share) / D**2),
+            edges.columns * (-slope / p / D),
+            -2 * np.log(p / D)[None],
+        ]
+        first = np.flatnonzero(np.diff(edges.capture, prepend=-1))
+        sums = np.add.reduceat(np.concatenate(weighted), first, axis=1).T
+        seen, (i, j) = edges.capture[first], np.triu_indices(size - 1)
+        system[seen[:, None], i, j] = system[seen[:, None], j, i] = sums[:, : len(i)]
+        system[seen, :-1, -1] = system[seen, -1, :-1] = sums[:, len(i) : -1]
+        system[seen, -1, -1] = sums[:, -1]
+    return system
+
+
+@lru_cache(maxsize=1)
+def _log_informations() -> Array:
+    """Tabulate ln of the information by lost share and blur."""
+    x = np.linspace(-1.0, 1.0, 2001)[:, None]
+    # Finest where the core rises and falls.
+    at = np.sign(x) * np.abs(x) ** 2 * (12.0 + 8.0 * _BLURS)
+    blurs = np.broadcast_to(_BLURS, at.shape)
+    both = (density(at, blurs, float(share)) for share in _SHARES)
+    return np.array([np.log(np.trapezoid(slope**2 / p, at, axis=0)) for p, slope in both])
+
+
+def _normal(z: Array) -> Array:
+    return np.asarray(np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi))
+
+
+PER_CAMERA = 7
+# The mean of the lasers' own offsets is not theirs but the common one: this much of it is left.
+_MEAN_FLOOR_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Values of all unknowns.
+
+    Attributes:
+        T_cam_lidar: (C, 4, 4).
+        T_lidar_board: (F, 4, 4).
+        constants: (7 C + L + 9,) z, zero in the places of the tangents.
+    """
+
+    T_cam_lidar: Array
+    T_lidar_board: Array
+    constants: Array
+
+    def moved(self, z: Array, y: Array) -> "State":
+        """Apply a step."""
+        tangents = np.arange(PER_CAMERA * len(self.T_cam_lidar)).reshape(-1, PER_CAMERA)[:, :6]
+        constants = self.constants + z
+        constants[tangents] = 0
+        return State(perturb(self.T_cam_lidar, z[tangents]), perturb(self.T_lidar_board, y), constants)
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """All residuals at one state, before they are weighted.
+
+    Attributes:
+        ranges: of points.
+        edges: of ring ends.
+        pictures: of each camera.
+        picture_rows: linearised, of each camera.
+        constants: z of the state.
+    """
+
+    ranges: RangeSums
+    edges: EdgeRows
+    pictures: tuple[Pictures, ...]
+    picture_rows: tuple[Array, ...]
+    constants: Array
+
+    @property
+    def n_rings(self) -> int:
+        """L."""
+        return int(self.ranges.sums.shape[1])
+
+
+def linearise(scans: StackedScans, pictures: Sequence[Pictures], board: Board, state: State) -> Terms:
+    """Linearise all terms."""
+    per_camera = state.constants[: PER_CAMERA * len(pictures)].reshape(-1, PER_CAMERA)
+    of_lidar = state.constants[PER_CAMERA * len(pictures) :]
+    offsets, lens, shifts = np.split(of_lidar, [len(scans.rings), len(scans.rings) + N_FIELDS])
+    T_lidar_board = state.T_lidar_board
+    return Terms(
+        sum_ranges(scans, T_lidar_board, offsets, lens),
+        edge_rows(scans, T_lidar_board, board, lens, shifts),
+        tuple(pictures),
+        tuple(
+            picture_rows(own, T, T_lidar_board, float(constants[-1]))
+            for own, T, constants in zip(pictures, state.T_cam_lidar, per_camera, strict=True)
+        ),
+        state.constants,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """Normal equations with the board poses eliminated.
+
+    Attributes:
+        cost: of F captures in z, at the constants' present values.
+        board_steps: (F, 6, G + 1), y = -board_steps [z; 1].
+        minus_2_log_evidence: -2 ln p(data | levels) up to a constant, all unknowns integrated out.
+    """
+
+    cost: Quadratics
+    board_steps: Array
+    minus_2_log_evidence: float
+
+    def step(self) -> tuple[Array, Array]:
+        """Solve for z (G,) and y (F, 6)."""
+        # Priors of constants differ by many orders of magnitude, too many for `Quadratics.optimum`.
+        gradient = self.cost.gradients.sum(axis=0) + self.cost.prior_gradient
+        z = -np.linalg.solve(self.cost.information, gradient)
+        return z, -self.board_steps @ np.append(z, 1.0)
+
+
+def assemble(terms: Terms, levels: Levels, priors: Priors) -> Reduced:
+    """Weigh all terms and eliminate the board poses.
+
+    Args:
+        terms: of F captures.
+        levels: of their noise.
+        priors: of the constants.
+    """
+    return Assembly(terms, priors).at(levels)
+
+
+class Assembly:
+    """The normal equations of terms at one level of noise after another.
+
+    A search for levels changes one at a time: what the others weigh is kept from the evaluations before.
+
+    Args:
+        terms: of F captures.
+        priors: of the constants.
+    """
+
+    def __init__(self, terms: Terms, priors: Priors) -> None:
+        self._terms, self._priors = terms, priors
+        self._range_block = lru_cache(maxsize=2)(partial(_range_block, terms))
+        self._edge_block = lru_cache(maxsize=2)(partial(_edge_block, terms))
+        self._picture_block = lru_cache(maxsize=2)(partial(_picture_block, terms))
+
+    def at(self, levels: Levels) -> Reduced:
+        """Weigh all terms and eliminate the board poses."""
+        of_ranges, range_volume = self._range_block(levels.range_m, levels.ring_m)
+        of_edges = self._edge_block(levels.edge_rad, levels.backed_rad, levels.lost_share)
+        of_pictures, picture_volume = self._picture_block(levels.pose)
+        return _eliminate(
+            of_ranges + of_edges + of_pictures,
+            self._terms,
+            levels,
+            self._priors,
+            range_volume + picture_volume,
+        )
+
+
+def _range_block(terms: Terms, range_m: float, ring_m: float) -> tuple[Array, float]:
+    """Weigh what the returns say, and add up the logs of their covariances' determinants."""
+    block = _no_block(terms)
+    weighted, log_volumes = weigh_ranges(terms.ranges, range_m, ring_m)
+    place = np.r_[
+        0:6, 6 + PER_CAMERA * len(terms.pictures) : block.shape[1] - 1 - N_SHIFTS, block.shape[1] - 1
+    ]
+    block[:, place[:, None], place] = range_system(terms.ranges, weighted)
+    return block, float(log_volumes.sum())
+
+
+def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: float) -> Array:
+    """Weigh what the ring ends say."""
+    block = _no_block(terms)
+    place = np.r_[0:6, block.shape[1] - 1 - N_FIELDS - N_SHIFTS : block.shape[1]]
+    block[:, place[:, None], place] = edge_system(terms.edges, edge_rad, backed_rad, lost_share, len(block))
+    return block
+
+
+def _picture_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, float]:
+    """Weigh what the pictures say, and add up the logs of their covariances' determinants."""
+    block, log_volume = _no_block(terms), 0.0
+    for c, (pictures, rows) in enumerate(zip(terms.pictures, terms.picture_rows, strict=True)):
+        cov = pictures.total_cov(pose_levels)
+        own = 6 + PER_CAMERA * c
+        place = np.r_[own : own + 6, 0:6, own + 6, block.shape[1] - 1]
+        products = np.swapaxes(rows, 1, 2) @ np.linalg.solve(cov, rows)
+        block[pictures.capture[:, None, None], place[:, None], place] += products
+        log_volume += float(np.linalg.slogdet(cov)[1].sum())
+    return block, log_volume
+
+
+def _no_block(terms: Terms) -> Array:
+    """Make room for products of [board pose (6), z (G), residual] by capture."""
+    size = 6 + len(terms.constants) + 1
+    return np.zeros((len(terms.ranges.sums), size, size))
+
+
+def _eliminate(M: Array, terms: Terms, levels: Levels, priors: Priors, log_volume: float) -> Reduced:
+    """Take the board poses out of M (F, 6 + G + 1, 6 + G + 1) and add the priors."""
+    of_boards, rest = M[:, :6, :6], M[:, :6, 6:]
+    steps = np.linalg.solve(of_boards, rest)
+    reduced = M[:, 6:, 6:] - np.swapaxes(rest, 1, 2) @ steps
+    hessians, gradients, costs = reduced[:, :-1, :-1], reduced[:, :-1, -1], reduced[:, -1, -1]
+    prior, log_prior_volume = _prior(terms, levels, priors)
+    summed = Quadratics(gradients, hessians, prior, prior @ terms.constants, np.arange(len(M)))
+    information, gradient = summed.information, gradients.sum(axis=0) + summed.prior_gradient
+    least = costs.sum() + terms.constants @ summed.prior_gradient
+    least -= gradient @ np.linalg.solve(information, gradient)
+    log_volume += np.linalg.slogdet(of_boards)[1].sum() + np.linalg.slogdet(information)[1]
+    evidence = float(least + log_volume + log_prior_volume)
+    return Reduced(summed, np.asarray(steps), evidence)
+
+
+def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, float]:
+    """Build the information (G, G) of the priors and the log of their covariance's determinant.
+
+    Offsets of L rings have the covariance sigma_laser^2 (I - 1 1^T / L) + sigma_offset^2 1 1^T.
+    """
+    L, C = terms.n_rings, len(terms.pictures)
+    prior = np.zeros((len(terms.constants), len(terms.constants)))
+    scale = PER_CAMERA * np.arange(C) + 6
+    prior[scale, scale] = 1 / priors.scale**2
+    cov = levels.laser_m**2 * (np.eye(L) - 1 / L) + priors.offset_m**2 + _MEAN_FLOOR_M**2 * np.eye(L)
+    ring = np.arange(PER_CAMERA * C, PER_CAMERA * C + L)
+    prior[ring[:, None], ring] = np.linalg.inv(cov)
+    last = np.arange(PER_CAMERA * C + L, len(prior))
+    prior[last, last] = np.concatenate([[priors.lateral_m, priors.vertical_m], priors.shifts]) ** -2.0
+    return prior, float(np.linalg.slogdet(cov)[1])

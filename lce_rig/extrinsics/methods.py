@@ -1,0 +1,100 @@
+"""One camera and one LiDAR: pairs that agree on one extrinsic, then the method that the options name."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+from lce_rig.core.board import Board
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.results import Observation
+from lce_rig.extrinsics.algorithm_1 import calibrate_by_algorithm_1
+from lce_rig.extrinsics.consensus import Consensus, find_consensus
+from lce_rig.extrinsics.estimate import CalibrationEstimate
+from lce_rig.extrinsics.likelihood import calibrate_by_likelihood
+from lce_rig.extrinsics.options import CaptureCandidates, EstimateSettings, Estimator, Method
+
+Progress = Callable[[int, int], None]
+
+# Three planes determine six unknowns.
+_MIN_CAPTURES = 3
+METHODS: Mapping[Method, Estimator] = {
+    "ml": calibrate_by_likelihood,
+    "paper": calibrate_by_algorithm_1,
+}
+"""Name -> what estimates T_cam_lidar from boards whose pairing is settled."""
+
+
+def fit_extrinsic(
+    candidates: Sequence[CaptureCandidates],
+    board: Board,
+    options: EstimateSettings | None = None,
+    progress: Progress | None = None,
+) -> CalibrationEstimate:
+    """Estimate T_cam_lidar from what both sensors saw of the board.
+
+    Args:
+        candidates: of each capture in which both sensors saw something; their order does not matter.
+        board: its specification.
+        options: switches of the algorithm.
+        progress: called with (subsets done, subsets in all).
+
+    Raises:
+        NotEnoughDataError: too few captures, captures that agree with no extrinsic, or captures that leave a
+            direction undetermined, which is named.
+    """
+    options = options or EstimateSettings()
+    consensus = agree(candidates, board)
+    estimate = calibrate_observations(consensus.observations, board, options, progress)
+    return with_consensus(estimate, consensus)
+
+
+def calibrate_observations(
+    observations: Sequence[Observation],
+    board: Board,
+    options: EstimateSettings,
+    progress: Progress | None = None,
+) -> CalibrationEstimate:
+    """Estimate T_cam_lidar by the settings' method from boards whose pairing is settled.
+
+    Args:
+        observations: one a capture.
+        board: its specification.
+        options: switches of the algorithm.
+        progress: called with (subsets done, subsets in all).
+
+    Raises:
+        NotEnoughDataError: the captures leave a direction undetermined, which is named.
+    """
+    estimator = options.estimator or METHODS[options.method]
+    estimate = estimator(observations, board, options, progress)
+    return replace(estimate, method=options.method)
+
+
+def with_consensus(estimate: CalibrationEstimate, consensus: Consensus) -> CalibrationEstimate:
+    """Add to an estimate what the consensus had refused before."""
+    return replace(
+        estimate,
+        refused=dict(sorted({**consensus.refused, **estimate.refused}.items())),
+        diagnostics={**estimate.diagnostics, "n_alternative_poses": float(consensus.n_alternative_poses)},
+    )
+
+
+def agree(candidates: Sequence[CaptureCandidates], board: Board) -> Consensus:
+    """Find the consensus, or explain why there is none.
+
+    Raises:
+        NotEnoughDataError: too few captures, or captures that agree with no extrinsic.
+    """
+    needed = _MIN_CAPTURES
+    if len(candidates) < needed:
+        raise NotEnoughDataError(
+            f"{len(candidates)} captures show the board in both sensors, {needed} are needed",
+            "add captures: ten or more, with the board at different places and tilts",
+        )
+    consensus = find_consensus(candidates, board)
+    n_agreeing = 0 if consensus is None else len(consensus.observations)
+    if consensus is None or n_agreeing < needed:
+        raise NotEnoughDataError(
+            f"only {n_agreeing} of {len(candidates)} captures agree with one extrinsic, {needed} are needed",
+            "check the board's size, the intrinsics and the pairing of pictures with scans; add captures",
+        )
+    return consensus

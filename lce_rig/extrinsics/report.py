@@ -1,0 +1,78 @@
+"""From a solution to an estimate with residuals and figures, the same whatever method found it."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, sigma_sizes
+from lce_rig.core.results import Certificate, Observation, Refusal
+from lce_rig.extrinsics.estimate import CalibrationEstimate
+from lce_rig.extrinsics.metrics import capture_residual, summarise
+from lce_rig.extrinsics.observability import describe_weakest
+from lce_rig.residuals.features import CaptureFeatures
+from lce_rig.residuals.placements import group_placements
+
+# Of methods that prove nothing about their minimum.
+NO_CERTIFICATE = Certificate(is_optimal=False, gap=float("inf"))
+
+
+def name_sigmas(part: str, cov: Array) -> dict[str, float]:
+    """Name the sizes of a part of a claim, "scatter" or "systematic", as diagnostics: cov (6 + k, 6 + k)."""
+    sigma_deg, sigma_m = sigma_sizes(cov)
+    return {f"sigma_{part}_rotation_deg": sigma_deg, f"sigma_{part}_translation_m": sigma_m}
+
+
+def report_estimate(
+    T_cam_lidar: Array,
+    cov: Array,
+    observations: Sequence[Observation],
+    features: Sequence[CaptureFeatures],
+    board: Board,
+    *,
+    fitted: Sequence[Observation] | None = None,
+    certificate: Certificate = NO_CERTIFICATE,
+    held_out_m: Array | None = None,
+    refused: Mapping[str, Refusal],
+    diagnostics: Mapping[str, float],
+) -> CalibrationEstimate:
+    """Measure the residuals of an extrinsic and put everything known about it together.
+
+    Args:
+        T_cam_lidar: (4, 4).
+        cov: (6, 6) of it, tangent (translation m, rotation rad).
+        observations: the F captures used, as measured: residuals are of these.
+        features: of each.
+        board: the board.
+        fitted: the same as the method's cost takes them, where it moves ring ends; as measured where None.
+        certificate: of the minimum, where the method gives one.
+        held_out_m: (F,) rms residual of each capture where it was not fitted, where the method knows it.
+        refused: captures that the method left out.
+        diagnostics: the method's own figures.
+    """
+    held_out = np.full(len(observations), np.nan) if held_out_m is None else held_out_m
+    residuals = tuple(
+        capture_residual(T_cam_lidar, observation, board, float(error))
+        for observation, error in zip(observations, held_out, strict=True)
+    )
+    metrics = summarise(residuals)
+    figures = {
+        # The paper's code counts every ring end twice, which halves its mean.
+        "paper_mee_m": metrics.mee_m / 2,
+        "held_out_m": float(np.mean(held_out)),
+        "n_placements": float(group_placements(observations).max() + 1),
+    }
+    return CalibrationEstimate(
+        T_cam_lidar=T_cam_lidar,
+        cov=cov,
+        certificate=certificate,
+        metrics=metrics,
+        used=tuple(f.capture for f in features),
+        refused=dict(sorted(refused.items())),
+        observations={observation.capture: observation for observation in observations},
+        fitted={observation.capture: observation for observation in fitted or observations},
+        residuals=residuals,
+        held_out_m=float(np.mean(held_out)),
+        weak_direction=describe_weakest(cov, features),
+        diagnostics={**diagnostics, **figures},
+    )

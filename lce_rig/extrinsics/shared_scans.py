@@ -1,0 +1,142 @@
+"""What the channels of one camera saw while the LiDAR made one scan."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lce_rig.core.results import ImageBoard, LidarBoard, Observation, Refusal
+from lce_rig.extrinsics.board_motion import PoseSamples, sample_poses
+from lce_rig.extrinsics.consensus import Consensus
+from lce_rig.extrinsics.options import CaptureCandidates
+
+# Pictures without stamps may lie anywhere about the scan they were saved with.
+NO_STAMPS_SIGMA_S = 0.15
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """What the profile says of time.
+
+    Attributes:
+        sweep_s: duration of a revolution.
+        lidar_offset_s: what to add to the LiDAR's stamps to come to the rig's time.
+        channel_offset_s: the same of each channel's.
+        tolerance_s: how far each channel's stamps may be off after that.
+    """
+
+    sweep_s: float = 0.1
+    lidar_offset_s: float = 0.0
+    channel_offset_s: Mapping[str, float] = field(default_factory=dict)
+    tolerance_s: Mapping[str, float] = field(default_factory=dict)
+
+    def after_scan_s(self, channel: str, image: ImageBoard, lidar: LidarBoard) -> float:
+        """Compute how long after a scan's first firing a picture was taken; 0 where stamps are missing."""
+        if image.stamp_ns is None or lidar.stamp_ns is None:
+            return 0.0
+        apart_s = (image.stamp_ns - lidar.stamp_ns) * 1e-9
+        return apart_s + self.channel_offset_s.get(channel, 0.0) - self.lidar_offset_s
+
+
+@dataclass(frozen=True, eq=False)
+class SharedScan:
+    """One scan of the board and the pictures that go with it.
+
+    Attributes:
+        capture: its name; captures that hold the same scan are joined by "+".
+        images: the board by channel, at least one.
+        lidar: the board in the scan.
+    """
+
+    capture: str
+    images: Mapping[str, ImageBoard]
+    lidar: LidarBoard
+
+    def observation(self) -> Observation:
+        """Pair the scan with its first channel's picture."""
+        return Observation(self.capture, next(iter(self.images.values())), self.lidar)
+
+
+def join_scans(
+    agreed: Mapping[str, Consensus], candidates: Mapping[str, Sequence[CaptureCandidates]]
+) -> tuple[list[SharedScan], dict[str, Refusal]]:
+    """Bring the channels' observations of the same scan together, in whatever captures they lie.
+
+    Recordings often hold the pictures of each channel in a folder of its own, with copies of the same scans.
+
+    Args:
+        agreed: consensus of each channel, the most trusted first.
+        candidates: of each channel, all places that each scan offers.
+
+    Returns:
+        The scans by name; and refusals of pictures that go with another place in the scan than those of the
+        channel before.
+    """
+    scan_of = {
+        (channel, item.capture): item.lidar[0].points.tobytes()
+        for channel, items in candidates.items()
+        for item in items
+        if item.lidar
+    }
+    groups: dict[bytes, dict[str, Observation]] = {}
+    refused: dict[str, Refusal] = {}
+    for channel, consensus in agreed.items():
+        for observation in consensus.observations:
+            group = groups.setdefault(scan_of[channel, observation.capture], {})
+            first = next(iter(group.values()), observation)
+            if not np.array_equal(first.lidar.points, observation.lidar.points):
+                figures = {"first": next(iter(group)), "second": channel}
+                refused[observation.capture] = Refusal("pair.two_places", figures=figures)
+            elif channel not in group:
+                group[channel] = observation
+    scans = [
+        SharedScan(
+            "+".join(sorted({o.capture for o in group.values()})),
+            {channel: o.image for channel, o in group.items()},
+            next(iter(group.values())).lidar,
+        )
+        for group in groups.values()
+    ]
+    return sorted(scans, key=lambda scan: scan.capture), refused
+
+
+def take_apart(names: Iterable[str]) -> set[str]:
+    """Take names of captures that share a scan ("000003+000060") apart."""
+    return {single for name in names for single in name.split("+")}
+
+
+def sample_scans(scans: Sequence[SharedScan], clocks: Clocks, noise_px: Mapping[str, float]) -> PoseSamples:
+    """Gather the poses and times of the pictures that go with each scan."""
+    return sample_poses(
+        [
+            [
+                (channel, image, clocks.after_scan_s(channel, image, scan.lidar))
+                for channel, image in scan.images.items()
+            ]
+            for scan in scans
+        ],
+        noise_px,
+    )
+
+
+def time_sigmas_s(scans: Sequence[SharedScan], clocks: Clocks, channels: Sequence[str]) -> list[float]:
+    """Say how far times may be off by channel: the profile's tolerance, or more where stamps are missing."""
+    sigmas = []
+    for channel in channels:
+        stamped = [
+            scan.images[channel].stamp_ns is not None and scan.lidar.stamp_ns is not None
+            for scan in scans
+            if channel in scan.images
+        ]
+        sigmas.append(clocks.tolerance_s.get(channel, 0.05) if all(stamped) else NO_STAMPS_SIGMA_S)
+    return sigmas
+
+
+def scan_key(observation: Observation) -> bytes:
+    """Identify the board of a scan by its points."""
+    return observation.lidar.points.tobytes()
+
+
+def pooled_noise_px(images: Sequence[ImageBoard]) -> float:
+    """Estimate a channel's corner noise per coordinate from the residuals of all its boards."""
+    return float(np.sqrt(np.mean([image.sigma_px**2 for image in images])))

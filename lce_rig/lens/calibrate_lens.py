@@ -1,0 +1,352 @@
+"""Intrinsics of a camera from pictures of the board, with covariance and errors on pictures left out."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Refusal
+from lce_rig.lens.fit import N_MODES, Setup, State, corners_of, fit, reduced, refine_poses, residuals_px
+from lce_rig.lens.lens_estimate import IntrinsicsEstimate, View
+from lce_rig.lens.models import MODELS, LensModel, convert, model_of
+from lce_rig.solvers.pnp import solve_planar_pose
+
+MIN_CAPTURES = 4
+N_FOLDS = 10
+# Rounds of fitting and weighing anew, until no weight changes by more than a tenth.
+_ROUNDS, _STEADY = 6, 0.1
+# A board's noise is its own, known no better than from this many residuals of its channel beside its own.
+_PRIOR_DOF = 30.0
+# Corners of one picture that lie off by this many times what is usual in its channel are no corners.
+_BAD = 4.0
+# A capture that alone decides a direction has no others to be held against.
+_LEAST_REST = 1e-3
+# A focal length known no better than this is not known.
+_MAX_FOCAL_SIGMA = 0.1
+
+
+def estimate_intrinsics(
+    views: Sequence[View],
+    board: Board,
+    start: Intrinsics,
+    model: LensModel,
+    *,
+    n_folds: int = N_FOLDS,
+) -> IntrinsicsEstimate:
+    """Fit lens and shape of the board to the corners of all views, each with a pose and a noise of its own.
+
+    Boards are weighted by their own residuals, so that blurred pictures and noisier channels count less, and
+    views that do not fit the others are refused by name.
+
+    Args:
+        views: of at least `MIN_CAPTURES` captures.
+        board: the board.
+        start: the best guess, at the pictures' size; it may be off by a third.
+        model: of the lens to fit.
+        n_folds: parts that are left out in turn.
+
+    Raises:
+        NotEnoughDataError: too few captures, or captures that leave the focal length open.
+    """
+    _require_captures(views)
+    setup = Setup.of(np.array([view.board.corners_px for view in views]), board, model)
+    starts = np.array([view.board.T_cam_board for view in views])
+    channels = np.array([view.channel for view in views])
+    state = State(convert(start, model), np.zeros(len(setup.shapes)), starts)
+    kept = np.ones(len(views), dtype=bool)
+    for rounds_left in reversed(range(_ROUNDS)):
+        fitted, weights = _fit_weighted(setup.select(kept), state.select(kept), channels[kept])
+        # Views that a bad start made look bad come back where they fit after all.
+        starts[kept] = fitted.T_cam_board
+        starts[~kept] = _posed_anew(setup.select(~kept), starts[~kept], fitted, start)
+        state = refine_poses(setup, fitted.with_poses(starts))
+        fits = _fitting(setup, state, channels)
+        if rounds_left == 0 or np.array_equal(fits, kept):
+            break
+        kept = fits
+        _require_captures([view for view, is_kept in zip(views, kept, strict=True) if is_kept])
+    used = tuple(view for view, is_kept in zip(views, kept, strict=True) if is_kept)
+    refused = _refusals(_distances(setup, state), kept, views)
+    return _estimate(setup.select(kept), fitted, weights, used, refused, start, n_folds)
+
+
+def distances_under(intrinsics: Intrinsics, views: Sequence[View], board: Board) -> Array:
+    """Measure how well given intrinsics fit: only poses and the board's shape are fitted.
+
+    Returns:
+        Rms distance (K,) of each view's corners from their prediction, px.
+    """
+    model = model_of(intrinsics)
+    corners = np.array([view.board.corners_px for view in views])
+    setup = replace(Setup.of(corners, board, model), is_lens_free=False)
+    poses = np.array([view.board.T_cam_board for view in views])
+    start = refine_poses(setup, State(model.vector(intrinsics), np.zeros(len(setup.shapes)), poses))
+    return _distances(setup, fit(setup, start, np.ones(len(views))))
+
+
+def _require_captures(views: Sequence[View]) -> None:
+    n = len({view.capture for view in views})
+    if n < MIN_CAPTURES:
+        raise NotEnoughDataError(
+            f"intrinsics need the board in at least {MIN_CAPTURES} captures, it is in {n}",
+            "collect 15 or more, tilted in different directions, all over the picture",
+        )
+
+
+def _fit_weighted(setup: Setup, state: State, channels: NDArray[np.str_]) -> tuple[State, Array]:
+    """Fit and weigh in turn; weights (K,) are 1 / px^2."""
+    state = refine_poses(setup, state)
+    weights = _weights(setup, state, channels)
+    for done in range(_ROUNDS):
+        state = fit(setup, state, weights)
+        if done < 2:
+            # A better lens may show that a board's tilt was mirrored.
+            state = refine_poses(setup, state)
+        before, weights = weights, _weights(setup, state, channels)
+        if np.all(np.abs(weights - before) < _STEADY * before):
+            break
+    return fit(setup, state, weights), weights
+
+
+def _posed_anew(setup: Setup, poses: Array, fitted: State, size: Intrinsics) -> Array:
+    """Solve for poses (K, 4, 4) without a start; those given stay where corners fit no pose."""
+    lens = setup.model.intrinsics(fitted.lens, size.width_px, size.height_px)
+    solved = [solve_planar_pose(corners, setup.corners_board, lens) for corners in setup.corners_px]
+    return np.array(
+        [old if found is None else found.T_cam_board for old, found in zip(poses, solved, strict=True)]
+    ).reshape(-1, 4, 4)
+
+
+def _variances(setup: Setup, state: State) -> Array:
+    residuals = residuals_px(setup, state).reshape(len(setup.corners_px), -1)
+    # A start that draws nothing at some board: it gets no weight in this round.
+    variances = np.sum(residuals**2, axis=1) / (residuals.shape[1] - 6)
+    return np.where(np.isfinite(variances), variances, 1e12)
+
+
+def _usual(variances: Array, channels: NDArray[np.str_]) -> Array:
+    """Give each board the median of its channel (K,)."""
+    return np.array([np.median(variances[channels == name]) for name in channels])
+
+
+def _weights(setup: Setup, state: State, channels: NDArray[np.str_]) -> Array:
+    variances = _variances(setup, state)
+    dof = 2 * setup.corners_px.shape[1] - 6
+    usual = _usual(variances, channels)
+    return np.asarray((dof + _PRIOR_DOF) / (dof * variances + _PRIOR_DOF * usual + 1e-12))
+
+
+def _fitting(setup: Setup, state: State, channels: NDArray[np.str_]) -> NDArray[np.bool_]:
+    """Tell which boards fit about as well as their channel's usually do (K,)."""
+    variances = _variances(setup, state)
+    return np.asarray(variances <= _BAD**2 * _usual(variances, channels))
+
+
+def _refusals(distances_px: Array, kept: NDArray[np.bool_], views: Sequence[View]) -> dict[str, Refusal]:
+    """Say of each view that was left out how far its corners are from where the others' lens puts them."""
+    usual = float(np.median(distances_px[kept]))
+    return {
+        view.name: Refusal("calibrate.other_lens", figures={"rms_px": float(px), "median_px": usual})
+        for view, px, is_kept in zip(views, distances_px, kept, strict=True)
+        if not is_kept
+    }
+
+
+def _distances(setup: Setup, state: State) -> Array:
+    """Rms distance (K,) of each board's corners from their prediction, px."""
+    return np.asarray(np.sqrt(np.mean(np.sum(residuals_px(setup, state) ** 2, axis=2), axis=1)))
+
+
+def _estimate(
+    setup: Setup,
+    state: State,
+    weights: Array,
+    views: tuple[View, ...],
+    refused: Mapping[str, Refusal],
+    start: Intrinsics,
+    n_folds: int,
+) -> IntrinsicsEstimate:
+    captures = np.unique([view.capture for view in views], return_inverse=True)[1]
+    advice = "add captures with the board tilted by 20 deg or more, left and right as well as up and down"
+    try:
+        cov, inflation = _covariance(setup, state, weights, captures)
+    except np.linalg.LinAlgError as error:
+        raise NotEnoughDataError("the captures leave the lens open", advice) from error
+    P = setup.model.size
+    focal_sigma = float(np.sqrt(cov[0, 0]) / state.lens[0])
+    if not 0 <= focal_sigma < _MAX_FOCAL_SIGMA:
+        raise NotEnoughDataError(f"the focal length is known to {100 * focal_sigma:.0f} % only", advice)
+    return IntrinsicsEstimate(
+        model=setup.model,
+        intrinsics=setup.model.intrinsics(state.lens, start.width_px, start.height_px),
+        cov=cov[:P, :P],
+        inflation=inflation,
+        corners_board=corners_of(setup, state.shape),
+        shape=state.shape[:N_MODES],
+        shape_sigma=np.sqrt(np.diag(cov)[P : P + N_MODES]),
+        print_rms_m=float(np.sqrt(2 * np.mean(state.shape[N_MODES:] ** 2))),
+        views=views,
+        T_cam_board=state.T_cam_board,
+        residuals_px=-residuals_px(setup, state),
+        held_out_px=_held_out(setup, state, weights, captures, n_folds),
+        refused=refused,
+    )
+
+
+def _covariance(
+    setup: Setup, state: State, weights: Array, captures: NDArray[np.intp]
+) -> tuple[Array, float]:
+    """Compute the covariance (Q, Q) of lens and shape, inflated to what the captures' scatter shows.
+
+    H^-1 holds where corner errors are independent. They are not: what the model lacks moves all corners of a
+    picture together. With g_k and H_k what capture k says, H = L L^T and S_k = L^-1 H_k L^-T, each
+    e_k = (I - S_k)^-1/2 L^-1 g_k has the covariance S_k where they are independent, whatever weight single
+    captures have. The scatter sum_k L^-T e_k e_k^T L^-1 of the lens over what H^-1 says of it inflates H^-1.
+
+    References:
+        R. Bell, D. McCaffrey: Bias reduction in standard errors for linear regression with multi-stage
+        samples. Survey Methodology 28 (2002).
+    """
+    gradients, information = reduced(setup, state, weights)
+    scale = 1.0 / np.sqrt(np.einsum("kii->i", information) + setup.information)
+    gradients, information = gradients * scale, information * np.outer(scale, scale)
+    L = np.linalg.cholesky(information.sum(axis=0) + np.diag(setup.information * scale**2))
+    back = np.linalg.inv(L)
+    cov = back.T @ back
+    # Residuals are too small by what the shared unknowns took from them.
+    n_residuals = len(weights) * (2 * setup.corners_px.shape[1] - 6)
+    lost = float(np.einsum("ij,kji->", cov, information))
+    cov *= n_residuals / max(n_residuals - lost, 1.0)
+    P = setup.model.size
+    scatter = np.zeros((P, P))
+    for capture in range(int(captures.max()) + 1):
+        own = captures == capture
+        values, vectors = np.linalg.eigh(back @ information[own].sum(axis=0) @ back.T)
+        e = vectors.T @ back @ gradients[own].sum(axis=0) / np.sqrt(np.maximum(1.0 - values, _LEAST_REST))
+        move = (back.T @ vectors @ e)[:P]
+        scatter += np.outer(move, move)
+    inflation = float(np.sqrt(max(np.trace(np.linalg.solve(cov[:P, :P], scatter)) / P, 1.0)))
+    return inflation**2 * cov * np.outer(scale, scale), inflation
+
+
+def _held_out(setup: Setup, state: State, weights: Array, captures: NDArray[np.intp], n_folds: int) -> Array:
+    """Rms distance (K,) of each board's corners under a lens and shape fitted to the other folds."""
+    distances = np.empty(len(captures))
+    n = min(n_folds, int(captures.max()) + 1)
+    for fold in range(n):
+        out = captures % n == fold
+        fitted = fit(setup.select(~out), state.select(~out), weights[~out])
+        seen = refine_poses(setup.select(out), fitted.with_poses(state.T_cam_board[out]), tries_mirror=False)
+        distances[out] = _distances(setup.select(out), seen)
+    return distances
+
+
+# Which lens model? That with the fewest parameters which foretells left-out captures as well as the best.
+
+# Models whose mean squared distances differ by less than this fraction are alike for any use.
+_ALIKE = 0.02
+
+
+@dataclass(frozen=True)
+class ModelScore:
+    """How well a model does.
+
+    Attributes:
+        name: of the model.
+        n_parameters: it has.
+        rms_px: rms distance of corners it was fitted to.
+        held_out_px: the same of captures left out.
+        excess_px2: by how much its mean squared distance on these is worse than the best model's.
+        excess_sigma_px2: standard deviation of that, from how captures differ.
+    """
+
+    name: str
+    n_parameters: int
+    rms_px: float
+    held_out_px: float
+    excess_px2: float
+    excess_sigma_px2: float
+
+    @property
+    def is_as_good_as_the_best(self) -> bool:
+        """Whether the captures left out do not tell it from the best, or it hardly matters."""
+        return self.excess_px2 <= max(self.excess_sigma_px2, _ALIKE * self.held_out_px**2)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The model chosen, why, and how all of them did."""
+
+    name: str
+    reason: str
+    scores: tuple[ModelScore, ...]
+
+
+def choose_model(
+    views: Sequence[View], board: Board, start: Intrinsics, *, n_folds: int = N_FOLDS
+) -> tuple[IntrinsicsEstimate, Choice]:
+    """Fit every model and choose one by its error on captures that were left out.
+
+    Of the models that are no worse than the best by more than one standard deviation of the difference, the
+    one with the fewest parameters is chosen; of those one of the same family as `start`, and then the best.
+
+    Args:
+        views: of at least `MIN_CAPTURES` captures.
+        board: the board.
+        start: the best guess, of any model.
+        n_folds: parts that are left out in turn.
+
+    Raises:
+        NotEnoughDataError: no model can be fitted.
+    """
+    fitted: dict[str, IntrinsicsEstimate] = {}
+    troubles = []
+    for name, model in MODELS.items():
+        try:
+            fitted[name] = estimate_intrinsics(views, board, start, model, n_folds=n_folds)
+        except NotEnoughDataError as error:
+            troubles.append(error)
+    if not fitted:
+        raise troubles[0]
+    scores = _scores(fitted)
+    equals = [score for score in scores if score.is_as_good_as_the_best]
+    chosen = min(equals, key=lambda s: (s.n_parameters, MODELS[s.name].family != start.model, s.held_out_px))
+    return fitted[chosen.name], Choice(chosen.name, _reason(chosen, scores), scores)
+
+
+def _scores(fitted: Mapping[str, IntrinsicsEstimate]) -> tuple[ModelScore, ...]:
+    """Compare the models on the captures that none of them refused; the best first."""
+    squares = {name: _squares_by_capture(estimate) for name, estimate in fitted.items()}
+    shared = sorted(set.intersection(*(set(by_capture) for by_capture in squares.values())))
+    table = {name: np.array([squares[name][capture] for capture in shared]) for name in fitted}
+    best = min(table, key=lambda name: (float(table[name].mean()), name))
+    scores = []
+    for name, estimate in fitted.items():
+        excess = table[name] - table[best]
+        sigma = float(excess.std(ddof=1) / np.sqrt(len(excess))) if len(excess) > 1 else 0.0
+        held_out_px = float(np.sqrt(table[name].mean()))
+        mean = float(excess.mean())
+        scores.append(ModelScore(name, estimate.model.size, estimate.rms_px, held_out_px, mean, sigma))
+    return tuple(sorted(scores, key=lambda score: score.held_out_px))
+
+
+def _squares_by_capture(estimate: IntrinsicsEstimate) -> dict[str, float]:
+    """Mean squared distance of each capture's corners when it was left out, px^2."""
+    captures = np.array([view.capture for view in estimate.views])
+    return {str(name): float(np.mean(estimate.held_out_px[captures == name] ** 2)) for name in set(captures)}
+
+
+def _reason(chosen: ModelScore, scores: Sequence[ModelScore]) -> str:
+    def listed(some: Sequence[ModelScore]) -> str:
+        return ", ".join(f"{score.name} {score.held_out_px:.3f} px" for score in some)
+
+    text = f"{chosen.name}: {chosen.held_out_px:.3f} px on captures left out"
+    alike = [score for score in scores if score.is_as_good_as_the_best and score.name != chosen.name]
+    worse = [score for score in scores if not score.is_as_good_as_the_best]
+    text += f"; no surely better: {listed(alike)}" if alike else ", the least"
+    return text + (f"; worse: {listed(worse)}" if worse else "")

@@ -1,0 +1,158 @@
+"""How far two lens models draw the same rays apart, once the camera may turn to make up for it.
+
+A shift of the principal point is nearly a small turn of the camera: compared number by number, two intrinsics
+may look different and still be the same lens. What counts is how far pixels move after the best turn, and the
+turn.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array, exp_so3, log_so3, project_to_so3, skew
+from lce_rig.lens.models import LensModel
+
+_GRID = 40
+_STEPS = 10
+# Fewer pixels that both lenses draw are no picture to turn.
+_LEAST_ALIGNED = 10
+
+
+@dataclass(frozen=True, eq=False)
+class LensDifference:
+    """Where a second lens draws what a first one draws at each pixel.
+
+    Attributes:
+        pixels: (G, 2) grid over the picture.
+        displacement_px: (G, 2) the second lens's pixel minus the first's; NaN where either draws nothing.
+        is_covered: (G,) whether boards were seen there.
+        turn_rad: (3,) rotation vector from the first camera's rays to the second's.
+        sigma_px: root of the mean variance of the displacement over the covered pixels.
+        cov_turn: (3, 3) of the rotation vector, rad^2.
+    """
+
+    pixels: Array
+    displacement_px: Array
+    is_covered: NDArray[np.bool_]
+    turn_rad: Array
+    sigma_px: float
+    cov_turn: Array
+
+    @property
+    def rms_px(self) -> float:
+        """Rms distance over the covered pixels; infinite where the first lens draws none of them."""
+        return float(np.sqrt(np.mean(self._lengths**2)))
+
+    @property
+    def max_px(self) -> float:
+        """Largest distance over the covered pixels; infinite likewise."""
+        return float(self._lengths.max())
+
+    @property
+    def _lengths(self) -> Array:
+        lengths = np.linalg.norm(self.displacement_px[self.is_covered], axis=1)
+        drawn = lengths[np.isfinite(lengths)]
+        return drawn if len(drawn) else np.array([np.inf])
+
+
+@dataclass(frozen=True, eq=False)
+class LensCertainty:
+    """How well a lens is known, pixel by pixel, after the turn of the camera that least matters.
+
+    Attributes:
+        pixels: (H, W, 2) grid over the picture.
+        sigma_px: (H, W) root of the summed variances of both coordinates; NaN where the lens draws nothing.
+        is_covered: (H, W) whether boards were seen there.
+    """
+
+    pixels: Array
+    sigma_px: Array
+    is_covered: NDArray[np.bool_]
+
+
+def compare_lenses(
+    first: Intrinsics, second: Intrinsics, corners_px: Array, cov: Array, model: LensModel
+) -> LensDifference:
+    """Measure how far two intrinsics move pixels after the best rotation between their rays.
+
+    The rotation minimises sum |project_2(R ray_1(u)) - u|^2 over the pixels u in the corners' convex hull.
+
+    Args:
+        first, second: of pictures of the same size.
+        corners_px: (n, 2) where boards were seen.
+        cov: (P, P) of the second's parameters.
+        model: of the second, whose parameters these are.
+
+    References:
+        D. Kogan, mrcal: projection difference and implied transformation.
+    """
+    pixels = _grid(first).reshape(-1, 2)
+    is_covered = _inside_hull(pixels, corners_px)
+    rays, backward = first.unproject(pixels), second.unproject(pixels)
+    aligned = is_covered & np.isfinite(rays).all(axis=1) & np.isfinite(backward).all(axis=1)
+    if np.count_nonzero(aligned) < _LEAST_ALIGNED:
+        nothing = np.full_like(pixels, np.nan)
+        return LensDifference(pixels, nothing, is_covered, np.zeros(3), 0.0, np.zeros((3, 3)))
+    vector = model.vector(second)
+    R = project_to_so3(backward[aligned].T @ rays[aligned])
+    for _ in range(_STEPS):
+        predicted, J, _ = _by_turn(model, vector, rays[aligned] @ R.T)
+        phi = -np.linalg.lstsq(J, (predicted - pixels[aligned]).ravel(), rcond=None)[0]
+        R = exp_so3(np.asarray(phi)) @ R
+    moved, _ = second.project(rays @ R.T)
+    turn, left = _best_turn(model, vector, rays[aligned] @ R.T)
+    variances = np.einsum("ni,ij,nj->n", left, cov, left)
+    sigma_px = float(np.sqrt(2 * np.mean(variances)))
+    return LensDifference(pixels, moved - pixels, is_covered, log_so3(R), sigma_px, turn @ cov @ turn.T)
+
+
+def certainty_of(intrinsics: Intrinsics, corners_px: Array, cov: Array, model: LensModel) -> LensCertainty:
+    """Propagate the covariance of a lens to the pixels of its picture.
+
+    Args:
+        intrinsics: the lens.
+        corners_px: (n, 2) where boards were seen; the camera is turned to fit best there.
+        cov: (P, P) of its parameters.
+        model: whose parameters these are.
+    """
+    grid = _grid(intrinsics)
+    pixels = grid.reshape(-1, 2)
+    rays = intrinsics.unproject(pixels)
+    is_covered, is_drawn = _inside_hull(pixels, corners_px), np.isfinite(rays).all(axis=1)
+    vector = model.vector(intrinsics)
+    turn, _ = _best_turn(model, vector, rays[is_covered & is_drawn])
+    _, J, A = _by_turn(model, vector, rays[is_drawn])
+    left = (A + J @ turn).reshape(-1, 2, model.size)
+    sigma_px = np.full(len(pixels), np.nan)
+    sigma_px[is_drawn] = np.sqrt(np.einsum("nai,ij,naj->n", left, cov, left))
+    shape = grid.shape[:2]
+    return LensCertainty(grid, sigma_px.reshape(shape), is_covered.reshape(shape))
+
+
+def _by_turn(model: LensModel, vector: Array, rays: Array) -> tuple[Array, Array, Array]:
+    """Project rays (n, 3); derivatives (2 n, 3) by a rotation of them and (2 n, P) by the parameters."""
+    pixels, by_point, by_lens = model.project(vector, rays)
+    return pixels, (-by_point @ skew(rays)).reshape(-1, 3), by_lens.reshape(-1, model.size)
+
+
+def _best_turn(model: LensModel, vector: Array, rays: Array) -> tuple[Array, Array]:
+    """Find the rotation (3, P) that best undoes a change of each parameter, and what is left (2 n, P)."""
+    _, J, A = _by_turn(model, vector, rays)
+    turn = np.asarray(-np.linalg.lstsq(J, A, rcond=None)[0])
+    return turn, np.asarray(A + J @ turn)
+
+
+def _grid(intrinsics: Intrinsics) -> Array:
+    """Lay points (H, W, 2) over the picture, `_GRID` along its longer side."""
+    width, height = intrinsics.width_px, intrinsics.height_px
+    step = max(width, height) / _GRID
+    u, v = (np.arange(step / 2, length, step) - 0.5 for length in (width, height))
+    return np.stack(np.meshgrid(u, v), axis=-1)
+
+
+def _inside_hull(pixels: Array, corners_px: Array) -> NDArray[np.bool_]:
+    from scipy.spatial import Delaunay
+
+    return np.asarray(Delaunay(corners_px).find_simplex(pixels) >= 0)

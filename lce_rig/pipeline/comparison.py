@@ -1,0 +1,211 @@
+"""The same rig calibrated in several sessions: what each says, and whether they agree."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
+from lce_rig.core.results import Calibration
+from lce_rig.export.result import read_result
+from lce_rig.pipeline.calibration import calibrate
+from lce_rig.pipeline.detect_session import Progress, silent
+from lce_rig.pipeline.result_files import RESULT
+from lce_rig.session import Session
+from lce_rig.session.identity import differing_keys
+from lce_rig.session.session import CALIBRATION
+from lce_rig.validation.repeatability import Repeatability, compare_calibrations
+
+# What an extrinsic depends on beside the captures: another lens is another camera.
+_SAME_SENSORS = frozenset({"intrinsics", "resolution_px", "model"})
+
+
+@dataclass(frozen=True, eq=False)
+class Repeat:
+    """Sessions of one rig, compared.
+
+    Attributes:
+        rig: its name.
+        comparisons: one for each camera and LiDAR that at least two sessions calibrate.
+        calibrated: names of the sessions that held no result and were calibrated for this.
+        remarks: what else the reader should know.
+        failed: sessions whose own calibration must not be used, with the sensors.
+    """
+
+    rig: str
+    comparisons: tuple[Repeatability, ...]
+    calibrated: tuple[str, ...]
+    remarks: tuple[str, ...]
+    failed: tuple[str, ...]
+
+
+def repeat(folders: Sequence[Path | str], *, progress: Progress = silent) -> Repeat:
+    """Compare the results of independent sessions of one rig.
+
+    A session without a result is calibrated with the usual options; nothing is written.
+
+    Args:
+        folders: of the sessions.
+        progress: called with (done, total) sessions.
+
+    Raises:
+        UsageError: fewer than two sessions, or one given twice.
+        SessionError: sessions of different rigs, a result of another rig, captures in two sessions, or no
+            camera and LiDAR in two of them.
+        NotEnoughDataError: a session holds too few captures to be calibrated; it is named.
+    """
+    paths = [Path(folder) for folder in folders]
+    if len(paths) < 2:
+        raise UsageError("one session alone has nothing to agree with", "Name two sessions or more.")
+    _require_different(paths)
+    sessions = dict(zip(_names(paths), (Session.open(path) for path in paths), strict=True))
+    _require_one_rig(sessions)
+    _require_independent(sessions)
+    results: dict[str, list[Calibration]] = {}
+    calibrated: list[str] = []
+    troubles: list[str] = []
+    for done, (name, session) in enumerate(sessions.items(), start=1):
+        if (session.path / CALIBRATION / RESULT).exists():
+            results[name] = _read_calibrations(session)
+        else:
+            results[name], own_troubles = _calibrate(name, session)
+            calibrated.append(name)
+            troubles += own_troubles
+        progress(done, len(sessions))
+    rig = next(iter(sessions.values())).rig.name
+    comparisons, lonely = _comparisons(results)
+    if not comparisons:
+        raise SessionError(
+            "no camera and LiDAR are calibrated in two of the sessions",
+            "\n".join(_calibrated_sensors(name, own) for name, own in results.items()),
+        )
+    failed = [
+        f"{name} ({c.camera} and {c.lidar})"
+        for name, own in results.items()
+        for c in own
+        if c.verdict == "fail"
+    ]
+    remarks = (*_board_remarks(sessions), *troubles, *lonely)
+    return Repeat(rig, comparisons, tuple(calibrated), remarks, tuple(failed))
+
+
+def _require_different(paths: Sequence[Path]) -> None:
+    resolved = [path.resolve() for path in paths]
+    for path, where in zip(paths, resolved, strict=True):
+        if resolved.count(where) > 1:
+            raise UsageError(f"{path} is given twice", "A session agrees with itself; name independent ones.")
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Call sessions by their folder's name, or by their path where two have the same."""
+    short = [path.resolve().name for path in paths]
+    return short if len(set(short)) == len(short) else [str(path) for path in paths]
+
+
+def _require_one_rig(sessions: dict[str, Session]) -> None:
+    (first_name, first), *others = sessions.items()
+    for name, session in others:
+        if session.rig.name != first.rig.name:
+            raise SessionError(
+                f"{first_name} is of rig {first.rig.name!r}, {name} of rig {session.rig.name!r}",
+                "Only sessions of one rig can be compared.",
+            )
+        keys = [text for text in differing_keys(first.rig, session.rig) if _is_of_sensors(text)]
+        if keys:
+            raise SessionError(
+                f"{first_name} and {name} were made with different sensors: {'; '.join(keys[:4])}",
+                "Put the same intrinsics into both (rig.yaml of the session) and calibrate again.",
+            )
+
+
+def _is_of_sensors(difference: str) -> bool:
+    """Tell whether a difference between profiles, "cameras.cam.frame a there, b here", moves extrinsics."""
+    block, *keys = difference.split(" ")[0].split(".")
+    return block in ("cameras", "lidars") and not _SAME_SENSORS.isdisjoint(keys)
+
+
+def _require_independent(sessions: dict[str, Session]) -> None:
+    """Refuse sessions that share pictures or scans: a copy agrees with its original whatever is wrong."""
+    hashes: dict[str, list[frozenset[str]]] = {}
+    for name, session in sessions.items():
+        hashes[name] = []
+        for capture in session.captures:
+            # A damaged capture is named where it is read.
+            with suppress(SessionError):
+                hashes[name].append(capture.file_hashes)
+    for one, other in combinations(sessions, 2):
+        theirs = frozenset().union(*hashes[other])
+        n_shared = sum(not own.isdisjoint(theirs) for own in hashes[one])
+        if n_shared:
+            raise SessionError(
+                f"{one} and {other} share {n_shared} captures: they are not independent",
+                "Collect each session anew, best with the board put up again.",
+            )
+
+
+def _board_remarks(sessions: dict[str, Session]) -> list[str]:
+    (first_name, first), *others = sessions.items()
+    return [
+        f"{first_name} and {name} were taken with different boards"
+        for name, session in others
+        if session.rig.board != first.rig.board
+    ]
+
+
+def _calibrate(name: str, session: Session) -> tuple[list[Calibration], list[str]]:
+    """Calibrate a session; and say which of its sensors could not be, and why.
+
+    Raises:
+        NotEnoughDataError: none of them could; the session is named.
+    """
+    try:
+        result = calibrate(session)
+    except NotEnoughDataError as error:
+        raise NotEnoughDataError(f"{name}: {error.what}", error.hint) from None
+    return list(result.pairs), [f"{name}: {shortage}" for shortage in result.shortages]
+
+
+def _calibrated_sensors(name: str, calibrations: Sequence[Calibration]) -> str:
+    sensors = ", ".join(f"{c.camera} and {c.lidar}" for c in calibrations)
+    return f"{name}: {sensors or 'its result holds no sensors'}"
+
+
+def _read_calibrations(session: Session) -> list[Calibration]:
+    path = session.path / CALIBRATION / RESULT
+    saved = read_result(path)
+    if saved.rig != session.rig.name:
+        raise SessionError(
+            f"{path} is of rig {saved.rig!r}, its session of rig {session.rig.name!r}",
+            "Run `lce-rig calibrate` again.",
+        )
+    for calibration in saved.pairs:
+        if np.linalg.eigvalsh(calibration.cov).min() <= 0:
+            raise SessionError(
+                f"{path}: the covariance of {calibration.camera} and {calibration.lidar} has no inverse",
+                "Run `lce-rig calibrate` again.",
+            )
+    return list(saved.pairs)
+
+
+def _comparisons(results: dict[str, list[Calibration]]) -> tuple[tuple[Repeatability, ...], list[str]]:
+    """Compare camera by camera and LiDAR by LiDAR; and say what only one session calibrates."""
+    groups: dict[tuple[str, str], dict[str, Calibration]] = {}
+    for name, calibrations in results.items():
+        for calibration in calibrations:
+            group = groups.setdefault((calibration.camera, calibration.lidar), {})
+            if name in group:
+                raise SessionError(
+                    f"{name}: its result holds {calibration.camera} and {calibration.lidar} twice",
+                    "Run `lce-rig calibrate` again.",
+                )
+            group[name] = calibration
+    comparisons = [compare_calibrations(group) for _, group in sorted(groups.items()) if len(group) > 1]
+    lonely = [
+        f"{camera} and {lidar} are calibrated in {next(iter(group))} only"
+        for (camera, lidar), group in sorted(groups.items())
+        if len(group) == 1
+    ]
+    return tuple(comparisons), lonely

@@ -1,0 +1,91 @@
+"""Recordings of all kinds: `open_recording` finds the reader for a path."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+from lce_rig.core.errors import SourceError
+from lce_rig.recordings.folder.recorded_folder import list_parts
+from lce_rig.recordings.protocol import Recording, SourceOptions
+from lce_rig.recordings.ros.bag_file import is_bag_file
+from lce_rig.rig import Rig
+
+RECORDINGS = {
+    "folder": "lce_rig.recordings.folder.folder:FolderRecording",
+    ".bag": "lce_rig.recordings.ros.rosbag:BagRecording",
+    ".db3": "lce_rig.recordings.ros.rosbag:BagRecording",
+    ".mcap": "lce_rig.recordings.ros.rosbag:BagRecording",
+    ".pcap": "lce_rig.recordings.velodyne.pcap:PcapRecording",
+    ".pcapng": "lce_rig.recordings.velodyne.pcap:PcapRecording",
+    ".aedat4": "lce_rig.recordings.events.camera_file:EventCameraFile",
+    ".raw": "lce_rig.recordings.events.camera_file:EventCameraFile",
+    ".h5": "lce_rig.recordings.events.camera_file:EventCameraFile",
+    ".hdf5": "lce_rig.recordings.events.camera_file:EventCameraFile",
+    ".npz": "lce_rig.recordings.events.camera_file:EventCameraFile",
+    ".txt": "lce_rig.recordings.events.camera_file:EventCameraFile",
+    ".zip": "lce_rig.recordings.events.camera_file:EventCameraFile",
+}
+"""Reader by suffix, or "folder"; imported when wanted."""
+
+
+def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = None) -> Recording:
+    """Open what lies at a path: a folder of images and point clouds, a bag, or a file of an event camera.
+
+    Raises:
+        SourceError: nothing is there, or nothing that can be read.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise SourceError(f"{path} does not exist")
+    kind = _kind(path)
+    if kind not in RECORDINGS:
+        known = ", ".join(suffix for suffix in RECORDINGS if suffix != "folder")
+        hint = f"Give a folder with img/ and pcd/, a bag, or a file of events ({known})."
+        raise SourceError(f"{path} is no recording this program reads", hint)
+    module, name = RECORDINGS[kind].split(":")
+    recording: Recording = getattr(import_module(module), name)(path, rig, options or SourceOptions())
+    return recording
+
+
+def open_recordings(
+    paths: Iterable[Path], rig: Rig, options: SourceOptions | Sequence[SourceOptions] | None = None
+) -> list[Recording]:
+    """Open what lies at several paths; a folder that several recorders filled gives each of their files.
+
+    Args:
+        paths: of the recordings.
+        rig: the profile.
+        options: how they are read: all alike, or each by its own.
+
+    Raises:
+        SourceError: as `open_recording`; of a folder's files only where none of them can be read.
+    """
+    paths, options = list(paths), options or SourceOptions()
+    by_path = [options] * len(paths) if isinstance(options, SourceOptions) else options
+    recordings: list[Recording] = []
+    for path, own in zip(paths, by_path, strict=True):
+        own = replace(own, is_part=own.is_part or len(paths) > 1)
+        recordings += _open_parts(list_parts(path, rig, own), rig)
+    return recordings
+
+
+def _open_parts(parts: list[tuple[Path, SourceOptions]], rig: Rig) -> list[Recording]:
+    """Open the recordings of one folder; a file that a killed recorder left empty is passed over."""
+    opened: list[Recording] = []
+    failures: list[SourceError] = []
+    for path, options in parts:
+        try:
+            opened.append(open_recording(path, rig, options))
+        except SourceError as error:
+            failures.append(error)
+    if not opened:
+        raise failures[0]
+    opened[0].notes.extend(f"left out: {error.what}" for error in failures)
+    return opened
+
+
+def _kind(path: Path) -> str:
+    if not path.is_dir():
+        return path.suffix.lower()
+    return ".bag" if any(is_bag_file(file) for file in path.iterdir()) else "folder"

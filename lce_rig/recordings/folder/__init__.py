@@ -1,0 +1,1 @@
+"""Folders of images, point clouds and other recorders' files."""

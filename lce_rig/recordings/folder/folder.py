@@ -1,0 +1,281 @@
+"""A folder of images and point clouds: per board placement one point cloud, and one image per camera."""
+
+import hashlib
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lce_rig.core.data import Image
+from lce_rig.core.errors import SourceError
+from lce_rig.core.limits import read_file
+from lce_rig.recordings.folder import cloud_file, image_file
+from lce_rig.recordings.folder.cloud import to_scan
+from lce_rig.recordings.folder.file_pairs import Pairing, natural_order, pair_names, parse_times
+from lce_rig.recordings.protocol import Pair, PairMethod, SourceOptions
+from lce_rig.recordings.sensor_choice import choose_camera, choose_lidar
+from lce_rig.rig import LidarSettings, Rig
+
+# The layout of a folder: its images and point clouds, and the camera of each image folder.
+
+IMAGE_FOLDERS = ("img", "imgs", "image", "images", "camera", "cam", "rgb", "color", "frames")
+CLOUD_FOLDERS = (
+    "pcd",
+    "raw_pcd",
+    "pcds",
+    "cloud",
+    "clouds",
+    "lidar",
+    "velodyne",
+    "points",
+    "pointcloud",
+    "ply",
+)
+
+
+def list_pictures(folder: Path, notes: list[str]) -> list[Path]:
+    """List the images of one camera, in natural order; what was chosen between is noted.
+
+    Raises:
+        SourceError: there are none, or several folders have some and no name tells which is meant.
+    """
+    return _list(folder, IMAGE_FOLDERS, image_file.SUFFIXES, "pictures", notes)
+
+
+def list_clouds(folder: Path, notes: list[str]) -> list[Path]:
+    """List the point clouds, in natural order; what was chosen between is noted.
+
+    Raises:
+        SourceError: as `list_pictures`.
+    """
+    return _list(folder, CLOUD_FOLDERS, frozenset(cloud_file.DECODERS), "clouds", notes)
+
+
+def list_pictures_by_camera(folder: Path, cameras: Collection[str]) -> dict[str, list[Path]]:
+    """List the images in folders named after cameras: img/left/ and img/right/, or left/ and right/.
+
+    Returns:
+        Images by camera, in the order of `cameras`; empty where no folder is named after one.
+    """
+    above = [path for name, path in _folders(folder).items() if name in IMAGE_FOLDERS and name not in cameras]
+    for place in (*above, folder):
+        folders = _folders(place)
+        found = {
+            name: files
+            for name in cameras
+            if name in folders and (files := _files(folders[name], image_file.SUFFIXES))
+        }
+        if found:
+            return found
+    return {}
+
+
+def _list(
+    folder: Path, names: Sequence[str], suffixes: frozenset[str], what: str, notes: list[str]
+) -> list[Path]:
+    """List the files of one kind in the folder whose name says so, else in the only one that has any."""
+    folders = _folders(folder)
+    holding = {name: files for name, path in folders.items() if (files := _files(path, suffixes))}
+    named = [name for name in names if name in holding]
+    if len(named) > 1:
+        notes.append(f"{folder.name}: {what} taken from {named[0]}/, not from {', '.join(named[1:])}")
+    if named:
+        return holding[named[0]]
+    if here := _files(folder, suffixes):
+        return here
+    if len(holding) == 1:
+        return next(iter(holding.values()))
+    hint = f"Put them into {names[0]}/ below it; {', '.join(sorted(suffixes))} are read."
+    if holding:
+        raise SourceError(f"{folder}: {what} lie in {', '.join(sorted(holding))}: which?", hint)
+    empty = next((name for name in names if name in folders), None)
+    raise SourceError(f"{folder}{'/' + empty if empty else ''}: no {what} there", hint)
+
+
+def _folders(folder: Path) -> dict[str, Path]:
+    """List the folders in one, by name in lower case."""
+    return {p.name.lower(): p for p in sorted(folder.iterdir()) if p.is_dir() and p.name[0] != "."}
+
+
+def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
+    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and p.name[0] != "."]
+    return sorted(found, key=lambda p: (natural_order(p.stem), p.name))
+
+
+@dataclass(frozen=True)
+class PictureOnDisk:
+    """An image that has not been read yet; the timestamp comes from its name.
+
+    Attributes:
+        label: its name, for messages; with its folder's where several cameras may have the same names.
+    """
+
+    path: Path
+    label: str
+    camera: str
+    channel: str
+    stamp_ns: int | None
+
+    def read(self) -> Image:
+        """Decode it.
+
+        Raises:
+            SourceError: it is missing, empty, truncated or damaged.
+        """
+        return Image(self.camera, self.channel, self.stamp_ns, image_file.read_image(self.path))
+
+
+@dataclass(frozen=True)
+class PairOnDisk:
+    """Images and a point cloud that have not been read yet; the timestamp comes from the file name."""
+
+    pictures: tuple[PictureOnDisk, ...]
+    cloud_path: Path
+    lidar: str
+    settings: LidarSettings
+    cloud_stamp_ns: int | None
+
+    @property
+    def label(self) -> str:
+        """The files' names, for messages."""
+        return " + ".join([*(picture.label for picture in self.pictures), self.cloud_path.name])
+
+    def key(self) -> str:
+        """Fingerprint the bytes of all files and the sensors they are read for.
+
+        Raises:
+            SourceError: a file cannot be read.
+        """
+        sensors = [f"{picture.camera} {picture.channel}" for picture in self.pictures]
+        digest = hashlib.sha256(" ".join([*sensors, self.lidar]).encode())
+        for path in (*(picture.path for picture in self.pictures), self.cloud_path):
+            try:
+                digest.update(hashlib.sha256(read_file(path)).digest())
+            except OSError as error:
+                raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
+            except ValueError as error:
+                raise SourceError(f"{path}: {error}") from None
+        return digest.hexdigest()
+
+    def read(self) -> Pair:
+        """Decode all files.
+
+        Raises:
+            SourceError: one is missing, empty, truncated or damaged.
+        """
+        images = tuple(picture.read() for picture in self.pictures)
+        cloud = cloud_file.read_cloud(self.cloud_path)
+        reading = to_scan(cloud, self.lidar, self.settings, str(self.cloud_path), self.cloud_stamp_ns)
+        notes = list(reading.notes)
+        if reading.n_not_finite or reading.n_zero_range:
+            n_dropped = reading.n_not_finite + reading.n_zero_range
+            notes.append(f"{self.cloud_path.name}: {n_dropped} points without a return left out")
+        return Pair(self.label, self.key(), images, (reading.scan,), tuple(notes))
+
+
+class FolderRecording:
+    """Images and point clouds in folders side by side, or in one; images of several cameras in a folder each.
+
+    Attributes:
+        path: the folder.
+        notes: how pairs were found and what was left over.
+        pairs: every point cloud with its images, by name of the point cloud; read them one by one.
+    """
+
+    def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
+        """Find the files and pair them; nothing is decoded yet.
+
+        Raises:
+            SourceError: no images, no point clouds, no way to pair them, or no telling whose images they are.
+        """
+        self.path = path
+        self.notes: list[str] = []
+        self._rig, self._options = rig, options
+        lidar = choose_lidar(rig, options, self.notes)
+        pictures = self._pictures()
+        clouds = list_clouds(path, self.notes)
+        cloud_ns = parse_times([cloud.stem for cloud in clouds])
+        # The second image of one camera that goes with a point cloud makes a pair of its own.
+        together: dict[tuple[int, int], list[PictureOnDisk]] = {}
+        lone = []
+        for own, pairing in zip(pictures, self._pair(pictures, clouds), strict=True):
+            n_held = Counter[int]()
+            for i, j in pairing.pairs:
+                together.setdefault((j, n_held[j]), []).append(own[i])
+                n_held[j] += 1
+            lone += [own[i].label for i in pairing.lone_images]
+        with_picture = {j for j, _ in together}
+        lone += [cloud.name for j, cloud in enumerate(clouds) if j not in with_picture]
+        if lone:
+            self.notes.append(f"{path.name}: without a partner: {_shorten(lone)}")
+        self.pairs = [
+            PairOnDisk(
+                tuple(held),
+                clouds[j],
+                lidar,
+                rig.lidars[lidar],
+                None if cloud_ns is None else int(cloud_ns[j]),
+            )
+            for (j, _), held in sorted(together.items(), key=lambda item: item[0])
+        ]
+
+    def _pictures(self) -> list[list[PictureOnDisk]]:
+        """List the images of each camera.
+
+        Raises:
+            SourceError: there are none, or none of the camera that was asked for.
+        """
+        rig, wanted = self._rig, self._options.camera
+        found = list_pictures_by_camera(self.path, rig.cameras) if len(rig.cameras) > 1 else {}
+        if not found:
+            return [self._of_camera(list_pictures(self.path, self.notes), None, is_alone=True)]
+        if wanted in rig.cameras:
+            if wanted not in found:
+                raise SourceError(f"{self.path}: pictures of {', '.join(found)} lie there, none of {wanted}")
+            found = {wanted: found[wanted]}
+        return [self._of_camera(paths, camera, is_alone=len(found) == 1) for camera, paths in found.items()]
+
+    def _of_camera(self, paths: Sequence[Path], camera: str | None, *, is_alone: bool) -> list[PictureOnDisk]:
+        camera, channel = choose_camera(self._rig, self._options, self.notes, camera)
+        times_ns = parse_times([path.stem for path in paths])
+        return [
+            PictureOnDisk(
+                path,
+                path.name if is_alone else f"{path.parent.name}/{path.name}",
+                camera,
+                channel,
+                None if times_ns is None else int(times_ns[i]),
+            )
+            for i, path in enumerate(paths)
+        ]
+
+    def _pair(self, pictures: Sequence[Sequence[PictureOnDisk]], clouds: Sequence[Path]) -> list[Pairing]:
+        """Match each camera's images with the point clouds, all cameras' in one way."""
+        pairings = [self._pair_camera(own, clouds, self._options.pair) for own in pictures]
+        methods = {pairing.method for pairing in pairings}
+        if len(methods) > 1:
+            # A camera whose names match less well must not be counted off against the others' names.
+            method: PairMethod = "stem" if "stem" in methods else "time"
+            pairings = [self._pair_camera(own, clouds, method) for own in pictures]
+        for own, pairing in zip(pictures, pairings, strict=True):
+            whose = f"{own[0].camera}: " if len(pictures) > 1 else ""
+            self.notes.append(f"{self.path.name}: {whose}{pairing.explanation}")
+        return pairings
+
+    def _pair_camera(
+        self, pictures: Sequence[PictureOnDisk], clouds: Sequence[Path], method: PairMethod
+    ) -> Pairing:
+        first, tolerance_s = pictures[0], self._options.pair_tolerance_s
+        if tolerance_s is None:
+            tolerance_s = self._rig.cameras[first.camera].channels[first.channel].timestamps.tolerance_s
+        stems = [picture.path.stem for picture in pictures], [cloud.stem for cloud in clouds]
+        try:
+            return pair_names(*stems, method, tolerance_s)
+        except SourceError as error:
+            whose = f" (camera {first.camera})" if len(self._rig.cameras) > 1 else ""
+            raise SourceError(f"{self.path}{whose}: {error.what}", error.hint) from None
+
+
+def _shorten(names: Sequence[str], n_shown: int = 6) -> str:
+    shown = ", ".join(names[:n_shown])
+    return shown if len(names) <= n_shown else f"{shown} and {len(names) - n_shown} more"

@@ -1,0 +1,409 @@
+"""A bag as a stream of images, scans and events, by the timestamps in their headers."""
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cache
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core import limits
+from lce_rig.core.data import Image, Sample, Scan, Stream
+from lce_rig.core.errors import SourceError
+from lce_rig.recordings.events.choice import CameraEvents
+from lce_rig.recordings.events.event_recording import EventRecording
+from lce_rig.recordings.events.stream import NoEventsError
+from lce_rig.recordings.folder.cloud import to_scan
+from lce_rig.recordings.folder.image_file import decode_image, to_8_bit
+from lce_rig.recordings.merging import merge_by_time
+from lce_rig.recordings.overlap import check_overlap
+from lce_rig.recordings.protocol import SourceOptions, Span
+from lce_rig.recordings.ros.bag_file import BagFile, list_topics
+from lce_rig.recordings.ros.event_messages import BagEvents
+from lce_rig.recordings.ros.message_fields import MessageReader, read_header
+from lce_rig.recordings.ros.storage import RawMessage
+from lce_rig.recordings.ros.topics import CLOUD_TYPES, Target, choose_topics
+from lce_rig.rig import Rig
+
+# sensor_msgs/Image and CompressedImage as grey or BGR images.
+#
+# References:
+#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/image__encodings_8h_source.html
+
+# Encoding: bytes of one channel, channels, name of OpenCV's conversion to BGR ("" where none is needed).
+_ENCODINGS = {
+    "mono8": (1, 1, ""),
+    "8uc1": (1, 1, ""),
+    "mono16": (2, 1, ""),
+    "16uc1": (2, 1, ""),
+    "bgr8": (1, 3, ""),
+    "8uc3": (1, 3, ""),
+    "bgr16": (2, 3, ""),
+    "rgb8": (1, 3, "COLOR_RGB2BGR"),
+    "rgb16": (2, 3, "COLOR_RGB2BGR"),
+    "bgra8": (1, 4, "COLOR_BGRA2BGR"),
+    "8uc4": (1, 4, "COLOR_BGRA2BGR"),
+    "rgba8": (1, 4, "COLOR_RGBA2BGR"),
+    "yuv422": (1, 2, "COLOR_YUV2BGR_UYVY"),
+    "uyvy": (1, 2, "COLOR_YUV2BGR_UYVY"),
+    "yuv422_yuy2": (1, 2, "COLOR_YUV2BGR_YUY2"),
+    "yuyv": (1, 2, "COLOR_YUV2BGR_YUY2"),
+    **{f"bayer_{m}8": (1, 1, f"COLOR_Bayer{m.upper()}2BGR") for m in ("rggb", "bggr", "gbrg", "grbg")},
+    **{f"bayer_{m}16": (2, 1, f"COLOR_Bayer{m.upper()}2BGR") for m in ("rggb", "bggr", "gbrg", "grbg")},
+}
+
+
+def decode_ros_image(message: Any) -> NDArray[np.uint8]:
+    """Decode sensor_msgs/Image.
+
+    Returns:
+        (H, W) grey or (H, W, 3) BGR.
+
+    Raises:
+        ValueError: an unknown encoding, or sizes that contradict each other.
+    """
+    encoding = str(message.encoding).lower()
+    if encoding not in _ENCODINGS:
+        raise ValueError(f"its encoding {message.encoding!r} is not known; known are {', '.join(_ENCODINGS)}")
+    n_bytes, n_channels, conversion = _ENCODINGS[encoding]
+    width, height = int(message.width), int(message.height)
+    if width * height > limits.MAX_PIXELS:
+        raise ValueError(f"it declares {width}x{height} pixels, at most {limits.MAX_PIXELS} are read")
+    n_row = width * n_channels * n_bytes
+    step = int(message.step) or n_row
+    data = np.ascontiguousarray(message.data, dtype=np.uint8)
+    if width * height == 0 or step < n_row or len(data) < (height - 1) * step + n_row:
+        raise ValueError(
+            f"{len(data)} bytes are no {width}x{height} picture in {encoding} with rows of {step} bytes"
+        )
+    kind = np.dtype(f"{'>' if message.is_bigendian else '<'}u{n_bytes}")
+    rows = np.ndarray((height, width, n_channels), kind, data.data, 0, (step, n_channels * n_bytes, n_bytes))
+    pixels = rows[:, :, 0] if n_channels == 1 else rows
+    return _convert(to_8_bit(pixels.astype(kind.newbyteorder("="))), conversion)
+
+
+def decode_ros_compressed_image(message: Any) -> NDArray[np.uint8]:
+    """Decode sensor_msgs/CompressedImage.
+
+    Returns:
+        (H, W) grey or (H, W, 3) BGR.
+
+    Raises:
+        ValueError: it is damaged, or no image.
+    """
+    form = str(message.format).lower()
+    if "compresseddepth" in form:
+        raise ValueError("it is a depth image, not a picture")
+    pixels = decode_image(bytes(message.data))
+    mosaic = form.split(";")[0].strip()
+    # A camera's raw mosaic may have been compressed as if it were grey.
+    if mosaic.startswith("bayer_") and mosaic in _ENCODINGS and pixels.ndim == 2:
+        return _convert(pixels, _ENCODINGS[mosaic][2])
+    return pixels
+
+
+def _convert(pixels: NDArray[np.uint8], conversion: str) -> NDArray[np.uint8]:
+    if not conversion:
+        return pixels
+    import cv2
+
+    return np.asarray(cv2.cvtColor(pixels, getattr(cv2, conversion)), dtype=np.uint8)
+
+
+# sensor_msgs/PointCloud2 of any layout as a structured array.
+#
+# References:
+#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/PointCloud2.html
+
+_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+def check_field_count(data: bytes, encoding: str) -> None:
+    """Make sure that a message does not declare more fields than points have, before it is deserialised.
+
+    Args:
+        data: sensor_msgs/PointCloud2 as it lies in the bag.
+        encoding: "ros1" or "cdr".
+
+    Raises:
+        ValueError: it does, or it is damaged.
+    """
+    reader = MessageReader(data, encoding)
+    read_header(reader)  # Height and width stand behind the header as they do in messages of events.
+    n_fields = reader.number("I")
+    if n_fields > limits.MAX_FIELDS:
+        raise ValueError(f"it declares {n_fields} fields a point, at most {limits.MAX_FIELDS} are read")
+
+
+def decode_pointcloud2(message: Any) -> NDArray[Any]:
+    """View a message's points by their names, row by row.
+
+    Field offsets, gaps between fields, gaps behind rows and byte order are as the message says.
+
+    Args:
+        message: sensor_msgs/PointCloud2 of ROS 1 or 2.
+
+    Returns:
+        Structured (height * width,); fields with a count of c > 1 have shape (c,).
+
+    Raises:
+        ValueError: what in the message contradicts itself.
+    """
+    order = ">" if message.is_bigendian else "<"
+    names: list[str] = []
+    formats: list[Any] = []
+    offsets: list[int] = []
+    for entry in message.fields:
+        if entry.datatype not in _KINDS:
+            raise ValueError(f"field {entry.name!r} has the unknown datatype {entry.datatype}")
+        kind, count = np.dtype(order + _KINDS[entry.datatype]), max(int(entry.count), 1)
+        if entry.offset + kind.itemsize * count > message.point_step:
+            raise ValueError(f"field {entry.name!r} does not fit into point_step {message.point_step}")
+        if entry.name and entry.name not in names:
+            names.append(entry.name)
+            formats.append(kind if count == 1 else (kind, (count,)))
+            offsets.append(int(entry.offset))
+    width, height, step = int(message.width), int(message.height), int(message.point_step)
+    if width * height > limits.MAX_POINTS:
+        raise ValueError(f"it declares {width * height} points, at most {limits.MAX_POINTS} are read")
+    # Some drivers leave row_step at zero in point clouds of one row.
+    row_step = int(message.row_step) or width * step
+    if row_step < width * step:
+        raise ValueError(f"row_step {row_step} is less than {width} points of {step} bytes")
+    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    if width * height == 0:
+        return np.empty(0, dtype=dtype)
+    data = np.ascontiguousarray(message.data, dtype=np.uint8)
+    n_needed = (height - 1) * row_step + width * step
+    if len(data) < n_needed:
+        raise ValueError(f"{len(data)} of {n_needed} bytes of its points are there")
+    rows: NDArray[Any] = np.ndarray((height, width), dtype, data.data, 0, (row_step, step))
+    return rows.reshape(-1)
+
+
+# A timestamp this much earlier than the one before is a clock that was set, not a message that came late.
+CLOCK_JUMP_NS = 1_000_000_000
+# Drivers start within this many messages of each other; who comes later has no span told beforehand.
+_N_PROBED = 500
+
+
+@dataclass
+class _Stream:
+    """The messages of one topic so far."""
+
+    last_ns: int | None = None
+    n_yielded: int = 0
+    counts: Counter[str] = field(default_factory=Counter)
+    notes: set[str] = field(default_factory=set)
+    first_failure: str = ""
+
+
+class BagRecording:
+    """A ROS 1 or ROS 2 bag; one message of each kind is in memory at a time.
+
+    Attributes:
+        path: the bag's file or folder.
+        notes: topics taken, and after reading what was skipped and why.
+        key: fingerprint of the bag.
+        n_samples: number of messages with images and scans on the topics taken.
+        streams: what is read, with its span where the bag holds events or is a part of a recording.
+    """
+
+    def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
+        """Find the topics.
+
+        Raises:
+            SourceError: the bag cannot be read, or lacks a topic; the message lists those that are there.
+        """
+        self.path = path
+        self.notes: list[str] = []
+        self._rig = rig
+        self._bag = BagFile(path)
+        self._targets = choose_topics(path, self._bag.topics, rig, options, self.notes)
+        self._events = self._open_events()
+        self.n_samples = sum(self._bag.topics[topic][1] for topic in self._targets)
+        self.key = self._bag.fingerprint()
+        self.streams = self._list_streams(is_spanned=bool(self._events) or options.is_part)
+        events, scans = (
+            {s: span for s, span in self.streams.items() if s.kind == kind} for kind in ("events", "scans")
+        )
+        self.notes += check_overlap(scans, events, rig)
+        for journal in self._bag.unmerged_journals():
+            hint = "its last messages are not read; opening the bag once with sqlite3 merges them"
+            self.notes.append(f"{journal.name} lies beside the bag: {hint}")
+        if self._bag.damage:
+            self.notes.append(f"{path.name}: damaged ({self._bag.damage}); read as far as it goes")
+
+    def samples(self) -> Iterator[Sample]:
+        """Yield images and scans in the order the recorder received them, and events by their timestamps.
+
+        Each sensor's timestamps rise. Messages sent twice, late, or damaged are skipped and counted in
+        `notes`. Where the clock of a camera or LiDAR is set back by more than a second its timestamps start
+        again from there.
+
+        Raises:
+            SourceError: no message of a topic could be decoded; or, after all that can be read, the bag is
+                torn.
+        """
+        parts = [self._messages(), *(events.samples() for events in self._events.values())]
+        try:
+            yield from merge_by_time(parts, self._rig)
+        finally:
+            for events in self._events.values():
+                self.notes += [note for note in events.notes if note not in self.notes]
+
+    def _messages(self) -> Iterator[Sample]:
+        streams = {topic: _Stream() for topic in self._targets}
+        try:
+            for message in self._bag.messages(self._targets.keys()):
+                stream = streams[message.topic]
+                sample = self._decode(message, stream)
+                if sample is not None and _is_in_order(sample, stream):
+                    stream.n_yielded += 1
+                    yield sample
+        finally:
+            self._summarise(streams)
+        for topic, stream in streams.items():
+            if stream.n_yielded == 0 and stream.counts:
+                cause = stream.first_failure or "its stamps do not rise"
+                raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}")
+
+    def _open_events(self) -> dict[Stream, CameraEvents]:
+        """Take the topics of raw events out of the others and open them.
+
+        Raises:
+            SourceError: events of another resolution; or no events, and no images either.
+        """
+        opened: dict[Stream, CameraEvents] = {}
+        for topic, target in list(self._targets.items()):
+            stream = target.stream(self._bag.topics[topic][0])
+            if stream.kind != "events":
+                continue
+            del self._targets[topic]
+            size = self._rig.cameras[target.sensor].resolution_px
+            try:
+                events = BagEvents(self.path, topic, self._bag)
+                opened[stream] = CameraEvents(EventRecording(self.path, events, target.sensor, size))
+            except NoEventsError as error:
+                if all(other.channel is None for other in self._targets.values()):
+                    raise SourceError(f"{topic} of {error.what}", list_topics(self._bag.topics)) from None
+                self.notes.append(f"{topic} of {error.what}; read without")
+        return opened
+
+    def _list_streams(self, is_spanned: bool) -> dict[Stream, Span | None]:
+        streams: dict[Stream, Span | None] = {s: events.span_ns for s, events in self._events.items()}
+        begun = self._first_stamps() if is_spanned else {}
+        for topic, target in self._targets.items():
+            stamp_ns, log_ns = begun.get(topic, (None, None))
+            end_ns = self._bag.end_ns(topic) if topic in begun else None
+            stream = target.stream(self._bag.topics[topic][0])
+            if stamp_ns is None or log_ns is None or end_ns is None:
+                streams[stream] = None
+            else:
+                streams[stream] = stamp_ns, stamp_ns + end_ns - log_ns
+        return streams
+
+    def _first_stamps(self) -> dict[str, tuple[int, int]]:
+        """Find (timestamp, time of receipt) of the first message of each topic, as far as they come early."""
+        found: dict[str, tuple[int, int]] = {}
+        try:
+            for message in islice(self._bag.messages(self._targets.keys()), _N_PROBED):
+                if message.topic not in found:
+                    with suppress(ValueError):
+                        stamp_ns = _header_stamp_ns(_deserialize(message)) or message.log_ns
+                        found[message.topic] = stamp_ns, message.log_ns
+                if len(found) == len(self._targets):
+                    break
+        except SourceError:
+            pass  # It is said when everything in front of the damage has been read.
+        return found
+
+    def _decode(self, message: RawMessage, stream: _Stream) -> Image | Scan | None:
+        target = self._targets[message.topic]
+        try:
+            content = _deserialize(message)
+            stamp_ns = _header_stamp_ns(content)
+            if stamp_ns == 0:
+                stream.notes.add("headers carry no stamps: time of receipt taken")
+                stamp_ns = message.log_ns
+            return self._to_sample(message, content, target, stamp_ns, stream)
+        except (SourceError, ValueError) as error:
+            cause = error.what if isinstance(error, SourceError) else str(error)
+            stream.first_failure = stream.first_failure or cause
+            stream.counts["could not be decoded"] += 1
+            return None
+
+    def _to_sample(
+        self, message: RawMessage, content: Any, target: Target, stamp_ns: int, stream: _Stream
+    ) -> Image | Scan:
+        if target.channel is not None:
+            is_compressed = message.msgtype.endswith("CompressedImage")
+            pixels = decode_ros_compressed_image(content) if is_compressed else decode_ros_image(content)
+            channel = self._rig.cameras[target.sensor].channels[target.channel]
+            if channel.timestamps.reference == "start":
+                stream.notes.add("messages carry no exposure: stamps of its start are taken for its middle")
+            return Image(target.sensor, target.channel, stamp_ns, pixels, message.log_ns)
+        settings = self._rig.lidars[target.sensor]
+        cloud = decode_pointcloud2(content)
+        reading = to_scan(cloud, target.sensor, settings, message.topic, stamp_ns, message.log_ns)
+        stream.notes.update(reading.notes)
+        n_dropped = reading.n_not_finite + reading.n_zero_range
+        stream.counts["points without a return"] += n_dropped
+        return reading.scan
+
+    def _summarise(self, streams: dict[str, _Stream]) -> None:
+        for topic, stream in streams.items():
+            for note in sorted(stream.notes):
+                self.notes.append(f"{topic}: {note}")
+            for what, count in sorted(stream.counts.items()):
+                cause = f" ({stream.first_failure})" if what == "could not be decoded" else ""
+                if count:
+                    self.notes.append(f"{topic}: {count} {what}{cause}")
+
+
+def _header_stamp_ns(content: Any) -> int:
+    return int(content.header.stamp.sec * 10**9 + content.header.stamp.nanosec)
+
+
+def _deserialize(message: RawMessage) -> Any:
+    """Deserialise by ROS's own definitions; those in a bag may be missing, or beyond what rosbags parses."""
+    is_ros1 = message.encoding == "ros1"
+    if message.msgtype in CLOUD_TYPES:
+        check_field_count(message.data, message.encoding)
+    store = _typestore(is_ros1)
+    msgtype = message.msgtype.replace("/", "/msg/")
+    try:
+        if is_ros1:
+            return store.deserialize_ros1(message.data, msgtype)
+        return store.deserialize_cdr(message.data, msgtype)
+    except Exception as error:  # A damaged message fails in any way: struct, assert, unicode, index.
+        raise ValueError(f"a message is damaged: {str(error) or type(error).__name__}") from None
+
+
+@cache
+def _typestore(is_ros1: bool) -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+
+
+def _is_in_order(sample: Image | Scan, stream: _Stream) -> bool:
+    """Return whether a sample's timestamp is later than its predecessor's; count it where it is not."""
+    stamp_ns = sample.stamp_ns
+    if stamp_ns is None or stream.last_ns is None or stamp_ns > stream.last_ns:
+        stream.last_ns = stamp_ns
+        return True
+    if stamp_ns == stream.last_ns:
+        stream.counts["sent twice (equal stamps)"] += 1
+        return False
+    if stream.last_ns - stamp_ns < CLOCK_JUMP_NS:
+        stream.counts["out of order (stamps run backwards)"] += 1
+        return False
+    stream.counts["jumps of the clock back by more than a second"] += 1
+    stream.last_ns = stamp_ns
+    return True

@@ -1,0 +1,1 @@
+"""Velodyne packets from network recordings and live sensors."""

@@ -1,0 +1,287 @@
+"""A live collection in a terminal: one screen of 80x24, or plain lines for scripts and logs."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import pairwise
+from typing import Any, Protocol
+
+import numpy as np
+
+from lce_rig.collect.live.state import LiveState, Phase, StreamState
+from lce_rig.core.geometry import Array
+from lce_rig.screen.keys import HELP
+
+# Outlines drawn with braille characters: two by four dots each, which every terminal shows.
+
+# Bits of the dots of a braille character, by row and column; Unicode block U+2800.
+_BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
+_STEPS = 400
+
+
+def draw_outlines(
+    picture_px: tuple[int, int], solid_px: Array | None, dotted_px: Array | None, size: tuple[int, int]
+) -> list[str]:
+    """Draw two closed polygons into a frame of the picture's shape.
+
+    Args:
+        picture_px: (width, height) of the picture.
+        solid_px: (K, 2) polygon drawn as a line; None for none; NaN breaks it.
+        dotted_px: (K, 2) polygon drawn dotted.
+        size: (columns, rows) of characters, the frame's border included, at most.
+
+    Returns:
+        The lines.
+    """
+    # A character is about twice as high as wide: its dots are square.
+    columns = min(size[0] - 2, round(2 * (size[1] - 2) * picture_px[0] / picture_px[1]))
+    dots = np.zeros((4 * (size[1] - 2), 2 * columns), dtype=bool)
+    scale = np.array(dots.shape[::-1]) / np.array(picture_px)
+    for polygon, stride in ((solid_px, 1), (dotted_px, _STEPS // 12)):
+        if polygon is not None:
+            _draw(dots, polygon * scale, stride)
+    bits = dots.reshape(size[1] - 2, 4, columns, 2).transpose(0, 2, 1, 3) * _BITS
+    lines = ["".join(chr(0x2800 + int(code)) for code in row) for row in bits.sum(axis=(2, 3))]
+    return [f"┌{'─' * columns}┐", *(f"│{line}│" for line in lines), f"└{'─' * columns}┘"]
+
+
+def _draw(dots: np.ndarray, polygon: Array, stride: int) -> None:
+    """Set the dots along a polygon, each edge sampled densely, every stride-th sample."""
+    share = np.linspace(0, 1, max(_STEPS // max(len(polygon), 1), 8))[:, None]
+    samples = np.concatenate([a + share * (b - a) for a, b in pairwise(polygon)])
+    samples = samples[np.isfinite(samples).all(axis=1)][::stride]
+    at = np.floor(samples).astype(int)
+    is_inside = np.all((at >= 0) & (at < np.array(dots.shape[::-1])), axis=1)
+    dots[at[is_inside, 1], at[is_inside, 0]] = True
+
+
+_STYLES: dict[Phase, str] = {
+    "starting": "white on grey30",
+    "searching": "white on dark_red",
+    "moving": "black on yellow",
+    "holding": "black on green",
+    "saving": "black on green",
+    "refused": "black on dark_orange",
+    "enough": "black on green",
+    "lost": "white on red",
+    "ended": "white on grey30",
+}
+_BELLS = {"captured": 1, "refused": 2, "enough": 3, "lost": 3, "tick": 0}
+_HEIGHT = 24
+_LOG_LINES, _NOTE_LINES, _DRAWING_SIZE = 3, 2, (40, 9)
+# Two lines of 80 characters, broken between words.
+_LONGEST_NOTE = 150
+_PLAIN_EVERY_S = 3.0
+_BARS = ("left_right", "up_down", "near_far", "tilt", "roll")
+
+
+class View(Protocol):
+    """Shows states."""
+
+    def show(self, state: LiveState) -> None:
+        """Show a state."""
+        ...
+
+
+@contextmanager
+def open_view(*, is_plain: bool, has_keys: bool, links: tuple[str, ...] = ()) -> Iterator[View]:
+    """Open a screen where stderr is a terminal that can draw one, else, or where wanted, plain lines.
+
+    Args:
+        is_plain: lines are wanted.
+        has_keys: whether keys can be pressed.
+        links: of the page, the likeliest first; a screen covers what was printed before it.
+    """
+    if is_plain or not sys.stderr.isatty():
+        yield PlainView()
+        return
+    from rich.console import Console
+    from rich.live import Live
+
+    console = Console(stderr=True, highlight=False)
+    if console.is_dumb_terminal:
+        yield PlainView()
+        return
+    live = Live(console=console, screen=True, auto_refresh=False)
+    live.start()
+    try:
+        yield ScreenView(live, console, has_keys=has_keys, links=links)
+    finally:
+        with suppress(OSError):  # The terminal may be gone.
+            live.stop()
+
+
+class PlainView:
+    """A line on stderr whenever something changes; instructions, which change all the time, now and then."""
+
+    def __init__(self) -> None:
+        self._said: tuple[str, str] | None = None
+        self._said_s = -_PLAIN_EVERY_S
+        self._n_logged = 0
+        self._notes: set[str] = set()
+
+    def show(self, state: LiveState) -> None:
+        """Print what is new."""
+        for note in state.notes:
+            if note not in self._notes:
+                self._notes.add(note)
+                _print(f"note: {note}")
+        n_new = min(state.n_logged - self._n_logged, len(state.log))
+        for text in state.log[len(state.log) - n_new :]:
+            _print(text)
+        self._n_logged = state.n_logged
+        said = (state.phase, state.headline)
+        is_due = (
+            self._said is None or said[0] != self._said[0] or state.elapsed_s - self._said_s > _PLAIN_EVERY_S
+        )
+        if said != self._said and is_due and state.phase != "ended":
+            self._said, self._said_s = said, state.elapsed_s
+            detail = f" ({state.detail})" if state.detail else ""
+            _print(f"{_clock(state)} {state.phase}: {state.headline}{detail}")
+
+
+class ScreenView:
+    """One screen, drawn anew with every state."""
+
+    def __init__(self, live: Any, console: Any, *, has_keys: bool, links: tuple[str, ...] = ()) -> None:
+        self._live = live
+        self._console = console
+        self._has_keys = has_keys
+        self._links = links
+        self._n_cued = 0
+
+    def show(self, state: LiveState) -> None:
+        """Draw a state, and ring the bell for what is new in it."""
+        for cue in state.cues:
+            if cue.number > self._n_cued:
+                for _ in range(_BELLS[cue.sound]):
+                    self._console.bell()
+        self._n_cued = state.cues[-1].number if state.cues else 0
+        height = self._console.height
+        screen = render(state, has_keys=self._has_keys, links=self._links, height=height)
+        self._live.update(screen, refresh=True)
+
+
+def render(
+    state: LiveState, *, has_keys: bool = True, links: tuple[str, ...] = (), height: int = _HEIGHT
+) -> Any:
+    """Lay a state out for a terminal of 80x24 or lower; of the page's links the likeliest is shown."""
+    from rich.columns import Columns
+    from rich.console import Group
+    from rich.padding import Padding
+    from rich.text import Text
+
+    wanted = f" of {state.n_wanted}" if state.n_wanted is not None else ""
+    shown = state.n_captures if state.n_wanted is None else state.n_wanted
+    title = Text.assemble(
+        (f"lce-rig {state.rig}", "bold"),
+        f"  {_clock(state)}  ",
+        (f"{state.n_captures}{wanted} {'capture' if shown == 1 else 'captures'}", "bold"),
+        f"  {state.session}",
+        no_wrap=True,
+        overflow="ellipsis",
+    )
+    headline = state.headline.upper()
+    if state.hold_s is not None:
+        headline += f"   {state.hold_s:.1f} s"
+    n_lacking = max(_HEIGHT - height, 0)
+    edge = 0 if n_lacking else 1
+    banner = Padding(Text(headline, style="bold", justify="center"), (edge, 2), style=_STYLES[state.phase])
+    detail = Text(state.detail or " ", overflow="ellipsis", no_wrap=True, style="italic")
+    parts = [title, banner, detail, _stream_table(state.streams)]
+    drawing = _drawing(state, n_lacking)
+    side = _progress(state)
+    parts.append(Columns([side, drawing], padding=(0, 2)) if drawing is not None else side)
+    # A note that is alone may take the lines of all.
+    is_alone = len(state.notes) == 1 and not n_lacking
+    parts += [
+        Text(f"! {note}"[:_LONGEST_NOTE], style="yellow", no_wrap=not is_alone, overflow="ellipsis")
+        for note in state.notes[:_NOTE_LINES]
+    ]
+    n_lines = max(_LOG_LINES - len(links[:1]) - n_lacking // 4, 1)
+    parts += [Text(line, style="dim", no_wrap=True, overflow="ellipsis") for line in state.log[-n_lines:]]
+    # A link that is cut is none: it wraps where it is too long.
+    parts += [Text(f"page: {link}", overflow="fold") for link in links[:1]]
+    if has_keys:
+        parts.append(Text(HELP, style="bold dim"))
+    return Group(*parts)
+
+
+def _stream_table(streams: tuple[StreamState, ...]) -> Any:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, show_header=False, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column(width=14, no_wrap=True)
+    table.add_column(width=7, justify="right", no_wrap=True)
+    table.add_column(width=9, no_wrap=True)
+    table.add_column(no_wrap=True, overflow="ellipsis")
+    for stream in streams:
+        is_bad = stream.sees_board is False or bool(stream.reason)
+        mark, style = (
+            ("x", "bold red") if is_bad else ("o", "bold green") if stream.sees_board else ("-", "dim")
+        )
+        lost = f"{stream.n_lost} lost" if stream.n_lost else ""
+        table.add_row(
+            Text(f"{mark} {stream.name}", style=style),
+            f"{stream.rate_hz:.1f}/s" if stream.rate_hz < 1000 else f"{stream.rate_hz / 1e6:.2f}M/s",
+            Text(lost, style="red"),
+            Text(stream.reason or stream.figures, style="red" if is_bad else ""),
+        )
+    return table
+
+
+def _progress(state: LiveState) -> Any:
+    """Show coverage as bars, and the predicted standard deviations against their targets."""
+    from rich.text import Text
+
+    lines = Text()
+    for name in _BARS:
+        share = 0.0 if state.coverage is None else float(getattr(state.coverage, name))
+        filled = round(14 * share)
+        style = "green" if share >= 0.99 else "yellow"
+        lines.append(f"{name.replace('_', '-'):<11}")
+        lines.append("█" * filled, style=style)
+        lines.append("░" * (14 - filled) + f" {100 * share:3.0f} %\n", style="dim")
+    for name, sigma, target, unit in (
+        ("rotation", state.sigma_deg, state.target_deg, "deg"),
+        ("position", state.sigma_mm, state.target_mm, "mm"),
+    ):
+        is_known = np.isfinite(sigma)
+        shown = f"{sigma:.2g}" if sigma < 10 else f"{sigma:.0f}"
+        lines.append(f"{name:<11}")
+        lines.append(
+            f"+-{shown} {unit}" if is_known else "-",
+            style="green" if is_known and sigma <= target else "yellow",
+        )
+        lines.append(f" (target {target:g})\n")
+    lines.rstrip()
+    return lines
+
+
+def _drawing(state: LiveState, n_lacking: int) -> Any:
+    """Draw where the board is (dotted) and where it should be, as small as it gets."""
+    from rich.text import Text
+
+    drawing = state.drawing
+    if drawing is None:
+        return None
+    height, width = drawing.pixels.shape[:2]
+    columns, lines = _DRAWING_SIZE
+    # No lower than the bars beside it, whose lines are taken anyway.
+    size = columns, max(lines - n_lacking, 7)
+    rows = draw_outlines((width, height), drawing.wanted_px, drawing.present_px, size)
+    if sum("." in stream.name for stream in state.streams) > 1:
+        # Guidance goes from camera to camera: whose picture this is stands in its border.
+        name = f" {drawing.camera} "[: len(rows[0]) - 3]
+        rows[0] = f"┌─{name}{rows[0][2 + len(name) :]}"
+    return Text("\n".join(rows), style="green" if drawing.is_there else "", no_wrap=True)
+
+
+def _clock(state: LiveState) -> str:
+    elapsed_s = int(state.elapsed_s)
+    return f"{elapsed_s // 60:02d}:{elapsed_s % 60:02d}"
+
+
+def _print(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)  # noqa: T201

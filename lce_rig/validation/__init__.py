@@ -1,0 +1,1 @@
+"""Checks that try to refute a result, and the verdict."""

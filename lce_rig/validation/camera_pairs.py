@@ -1,0 +1,233 @@
+"""Two cameras that saw the same boards: where their pictures put them, and whether their extrinsics agree.
+
+Each board held still that both see gives T_second_first = T_second_board T_first_board^-1 without any LiDAR.
+The extrinsics of both cameras with one LiDAR say the same thing by another way.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import Array, difference, tangent_sizes
+from lce_rig.core.results import Observation
+from lce_rig.extrinsics.estimate import CalibrationEstimate
+from lce_rig.extrinsics.likelihood.levels import Levels
+from lce_rig.extrinsics.likelihood.picture_terms import stack_pictures
+from lce_rig.extrinsics.mean_pose import mean_pose
+from lce_rig.extrinsics.relative_pose import relative_covariance, relative_pose
+from lce_rig.extrinsics.shared_scans import scan_key
+from lce_rig.residuals.placements import group_placements
+from lce_rig.residuals.quadratics import Quadratics, without_prior
+from lce_rig.rig import CalibrationSettings, VerdictSettings
+from lce_rig.solvers.covariance import symmetric_inverse
+from lce_rig.validation.split_consistency import contrast_halves, doubt_halves
+from lce_rig.validation.weighing import SURPRISING_CHI2, doubt
+
+# Fewer placements show no scatter.
+_MIN_PLACEMENTS = 4
+# Of fewer, the scatter has no shape that could be told: that of usual errors is taken.
+_MIN_JACKKNIFE = 10
+# Freedoms of the Student distribution that weighs single boards: one in some may be seen wrongly.
+_STUDENT = 5.0
+# Boards scatter for a reason where they do so by this many times what is usual.
+_MAX_SCATTER = 2.0
+
+_BY_IMAGES = {
+    "verdict.changed": "verdict.camera_changed",
+    "verdict.shares_differ": "verdict.camera_shares_differ",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PicturePose:
+    """Where one camera sits to another by the pictures of both.
+
+    Attributes:
+        T_second_first: (4, 4), p_second = R p_first + t.
+        cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the second camera: from the scatter
+            between placements.
+        captures: (F,) that both cameras used, as the first names them.
+        board_rms_m: how far apart the two cameras put the middle of a board, rms.
+        scatter: of single boards about it, in standard deviations that poses in pictures usually have.
+        expansion: of the cost about T_second_first, capture by capture.
+        centres: (F, 3) middle of the board in each, frame of the first camera, m.
+    """
+
+    T_second_first: Array
+    cov: Array
+    captures: tuple[str, ...]
+    board_rms_m: float
+    scatter: float
+    expansion: Quadratics
+    centres: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPair:
+    """Two cameras calibrated to one LiDAR.
+
+    Attributes:
+        captures: that both used, as the first names them.
+        T_second_first: (4, 4) to which their extrinsics compose.
+        pictures: what their pictures say; None where too few boards were seen by both.
+        apart: (6,) tangent from the extrinsics' pose to the pictures'; None likewise.
+        surprise: square of its length in standard deviations that both claim.
+        board_rms_m: how far apart the extrinsics' pose puts the middle of a board, rms.
+    """
+
+    captures: tuple[str, ...]
+    T_second_first: Array
+    pictures: PicturePose | None
+    apart: Array | None
+    surprise: float
+    board_rms_m: float
+
+
+def shared_boards(
+    first: Mapping[str, Observation], second: Mapping[str, Observation]
+) -> list[tuple[Observation, Observation]]:
+    """Pair observations of two cameras of the same board in the same scan, whatever captures they lie in.
+
+    Args:
+        first: observations by capture, of one camera.
+        second: of the other.
+    """
+    there = {scan_key(observation): observation for observation in second.values()}
+    found = [(observation, there.get(scan_key(observation))) for observation in first.values()]
+    return [(one, other) for one, other in found if other is not None]
+
+
+def relate(first: CalibrationEstimate, second: CalibrationEstimate) -> CameraPair | None:
+    """Hold the extrinsics of two cameras, whose boards stood still, against their pictures.
+
+    Returns:
+        None where the cameras share no capture.
+    """
+    shared = shared_boards(first.observations, second.observations)
+    if not shared:
+        return None
+    T, J = relative_pose(second.T_cam_lidar, first.T_cam_lidar)
+    pictures = pose_from_pictures(shared)
+    captures = tuple(one.capture for one, _ in shared)
+    board_rms_m = _board_rms_m(shared, T)
+    if pictures is None:
+        return CameraPair(captures, T, None, None, 0.0, board_rms_m)
+    apart = difference(pictures.T_second_first, T)
+    # Errors that both ways share, those of the pictures, are counted twice: the surprise is rather too small.
+    cov = relative_covariance(J, second.cov, first.cov) + pictures.cov
+    surprise = float(apart @ np.linalg.solve(cov, apart))
+    return CameraPair(captures, T, pictures, apart, surprise, board_rms_m)
+
+
+def pose_from_pictures(shared: Sequence[tuple[Observation, Observation]]) -> PicturePose | None:
+    """Estimate T_second_first from what both cameras' pictures say of the same boards.
+
+    A picture's pose errs by its corners' noise and by what corners have in common (`picture_terms`).
+
+    Returns:
+        None for fewer than four placements.
+    """
+    firsts, seconds = ([pair[k] for pair in shared] for k in (0, 1))
+    placement = group_placements(firsts)
+    if placement.max() + 1 < _MIN_PLACEMENTS:
+        return None
+    T_first, cov_first = _poses(firsts)
+    T_second, cov_second = _poses(seconds)
+    T, J = relative_pose(T_second, T_first)
+    information = symmetric_inverse(relative_covariance(J, cov_second, cov_first))
+    middle = T[int(np.argmin(np.median(_distances(T, information), axis=1)))]
+    mean, weight = mean_pose(T, information, middle, _student_weights)
+    apart = difference(T, mean)
+    chi2 = float(np.einsum("ki,kij,kj->", apart, information, apart))
+    hessians = weight[:, None, None] * information
+    gradients = -(hessians @ apart[..., None])[..., 0]
+    expansion = without_prior(gradients, hessians, placement)
+    scatter = float(np.sqrt(chi2 / (6 * (len(T) - 1))))
+    if len(expansion.groups) < _MIN_JACKKNIFE:
+        cov = max(scatter, 1.0) ** 2 * expansion.covariance()
+    else:
+        cov = expansion.jackknife_covariance()
+    captures = tuple(one.capture for one in firsts)
+    board_rms_m = _board_rms_m(shared, mean)
+    return PicturePose(mean, cov, captures, board_rms_m, scatter, expansion, T_first[:, :3, 3])
+
+
+def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
+    """List T_cam_board (F, 4, 4) and their covariances (F, 6, 6)."""
+    images = [observation.image for observation in observations]
+    every = np.arange(len(images), dtype=np.intp)
+    pictures = stack_pictures(every, images, np.ones(len(images)))
+    return pictures.T_cam_board, pictures.total_cov(Levels().pose)
+
+
+def _student_weights(chi2: Array) -> Array:
+    """Weigh poses by their squared distances (F,) from the mean, in units of what is usual among them."""
+    return np.asarray((_STUDENT + 6) / (_STUDENT + chi2 / max(float(np.median(chi2)) / 6, 1.0)))
+
+
+def _distances(T: Array, information: Array) -> Array:
+    """Compute squared distances (F, F) of all poses from each."""
+    apart = difference(T[None].repeat(len(T), axis=0), T[:, None].repeat(len(T), axis=1))
+    return np.asarray(np.einsum("mki,kij,mkj->mk", apart, information, apart))
+
+
+def _board_rms_m(shared: Sequence[tuple[Observation, Observation]], T_second_first: Array) -> float:
+    middles = [(T_second_first @ one.image.T_cam_board[:, 3])[:3] for one, _ in shared]
+    seen = [other.image.T_cam_board[:3, 3] for _, other in shared]
+    return float(np.sqrt(np.mean(np.sum((np.array(middles) - seen) ** 2, axis=1))))
+
+
+def doubt_cameras(
+    pair: CameraPair, names: tuple[str, str], target: CalibrationSettings, limits: VerdictSettings
+) -> list[Finding]:
+    """Doubt the extrinsics of two cameras that contradict the cameras' own pictures.
+
+    Args:
+        pair: the cameras.
+        names: of the first and the second.
+        target: standard deviations to reach.
+        limits: of the profile.
+    """
+    if pair.pictures is None or pair.apart is None:
+        return []
+    # Pictures are exact enough to show any change that matters.
+    strict = limits.model_copy(update={"max_change": limits.max_camera_difference})
+    halves = contrast_halves(pair.pictures.expansion, pair.pictures.centres)
+    changed = doubt_halves(halves, pair.pictures.captures, target, strict)
+    by_images = [replace(each, code=_BY_IMAGES[each.code], subject=" to ".join(names)) for each in changed]
+    return [
+        *by_images,
+        *_scattered(pair.pictures, names, limits),
+        *_elsewhere(pair, pair.pictures, pair.apart, names, target, limits),
+    ]
+
+
+def _scattered(pictures: PicturePose, names: tuple[str, str], limits: VerdictSettings) -> list[Finding]:
+    if pictures.scatter <= _MAX_SCATTER or pictures.board_rms_m <= limits.max_plane_misfit_m:
+        return []
+    figures = {"rms_m": pictures.board_rms_m, "scatter": pictures.scatter}
+    return [doubt("verdict.cameras_scatter", figures, is_fail=False, subject=" to ".join(names))]
+
+
+def _elsewhere(
+    pair: CameraPair,
+    pictures: PicturePose,
+    apart: Array,
+    names: tuple[str, str],
+    target: CalibrationSettings,
+    limits: VerdictSettings,
+) -> list[Finding]:
+    rotation_deg, translation_m = tangent_sizes(apart)
+    excess = target.in_targets(rotation_deg, translation_m) / limits.max_camera_difference
+    if pair.surprise <= SURPRISING_CHI2 or excess <= 1:
+        return []
+    figures = {
+        "rms_m": pair.board_rms_m,
+        "images_rms_m": pictures.board_rms_m,
+        "rotation_deg": rotation_deg,
+        "translation_m": translation_m,
+    }
+    is_fail = excess > limits.fail_factor
+    return [doubt("verdict.cameras_differ", figures, is_fail=is_fail, subject=" to ".join(names))]

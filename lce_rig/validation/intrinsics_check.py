@@ -1,0 +1,203 @@
+"""Do the profile's intrinsics still fit the camera? Held against the boards of a calibration.
+
+Residuals alone do not tell: a focal length 2 % off moves the boards 2 % away and leaves corners a tenth of
+their noise worse. What tells is the lens that the boards themselves ask for, and how far it is from the
+profile's in units of its own uncertainty.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
+from lce_rig.lens.difference import LensDifference, compare_lenses
+from lce_rig.lens.lens_estimate import IntrinsicsEstimate, View
+from lce_rig.lens.models import model_of
+from lce_rig.validation.weighing import Verdict, doubt
+
+# A difference is real where chance makes it this seldom.
+_CHANCE = 0.002
+# In units of the rotation to reach. A picture bent by as much as that cannot give it; a camera turned by its
+# principal point turns the extrinsic by the same angle, and three times the target counts as wrong.
+_BENT_MARGINAL, _BENT_FAIL = 0.5, 1.0
+_TURN_MARGINAL, _TURN_FAIL = 1.5, 2.5
+_N_FOLDS = 2
+# Residuals by this much above the possible ones can be seen with the eye.
+_VISIBLE = 1.2
+
+
+@dataclass(frozen=True)
+class IntrinsicsCheck:
+    """Intrinsics against the lens that the boards ask for.
+
+    Attributes:
+        n_captures: behind the check.
+        rms_px: rms distance of a corner from its prediction by the given intrinsics.
+        possible_px: the same by a fitted lens, on captures it was not fitted to.
+        displacement_px: by how much the fitted lens draws elsewhere, rms where boards were seen, after the
+            turn of the camera that makes it least.
+        displacement_sigma_px: standard deviation of that.
+        displacement_deg: the same as an angle.
+        turn_deg: that turn; an extrinsic under the given intrinsics is off by it.
+        turn_sigma_deg: standard deviation of that.
+        focal_ratio: fitted over given focal length.
+        focal_sigma: standard deviation of that.
+        chance: probability that boards seen by the given lens ask for one as different as the fitted one;
+            None where the models are not of one family.
+    """
+
+    n_captures: int
+    rms_px: float
+    possible_px: float
+    displacement_px: float
+    displacement_sigma_px: float
+    displacement_deg: float
+    turn_deg: float
+    turn_sigma_deg: float
+    focal_ratio: float
+    focal_sigma: float
+    chance: float | None
+
+    def verdict(self, target_deg: float = 0.2) -> Verdict:
+        """Judge the given intrinsics: what is not surely different from the fitted ones passes.
+
+        Args:
+            target_deg: standard deviation of the extrinsic's rotation to reach.
+        """
+        # Noise alone displaces pixels: what exceeds it counts.
+        noise = min(self.displacement_sigma_px / max(self.displacement_px, 1e-12), 1.0)
+        bent = self.displacement_deg * float(np.sqrt(1 - noise**2)) if self.is_bent else 0.0
+        turned = self.turn_deg if self.is_turned else 0.0
+        if bent > _BENT_FAIL * target_deg or turned > _TURN_FAIL * target_deg:
+            return "fail"
+        is_marginal = bent > _BENT_MARGINAL * target_deg or turned > _TURN_MARGINAL * target_deg
+        return "marginal" if is_marginal else "pass"
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether pixels surely lie elsewhere: by how far they do, or by all parameters together."""
+        is_other = self.chance is not None and self.chance < _CHANCE
+        return is_other or self.displacement_px > self._sure * self.displacement_sigma_px
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether the camera is surely turned."""
+        return self.turn_deg > self._sure * self.turn_sigma_deg
+
+    @property
+    def is_focal_off(self) -> bool:
+        """Whether the focal length is surely another one."""
+        return abs(self.focal_ratio - 1) > self._sure * self.focal_sigma
+
+    @property
+    def _sure(self) -> float:
+        """How many standard deviations are no chance; few captures know their own deviation badly."""
+        from scipy.special import stdtrit  # scipy.stats takes a second to import
+
+        return float(stdtrit(self.n_captures - 1, 1 - _CHANCE / 2))
+
+
+def check_intrinsics(
+    image_boards: Sequence[View], intrinsics: Intrinsics, board: Board
+) -> IntrinsicsCheck | None:
+    """Hold intrinsics against the corners of the boards that were seen with them.
+
+    Args:
+        image_boards: of one camera, by capture and channel.
+        intrinsics: to be checked.
+        board: the board.
+
+    Returns:
+        None where there are too few boards, or too little tilt, to fit a lens at all.
+    """
+    # Intrinsics that are wrong beyond measure lead nowhere; without their distortion they may.
+    plain = replace(intrinsics, distortion=(0.0,) * 4)
+    for start in (intrinsics, plain):
+        with suppress(NotEnoughDataError):
+            fitted = estimate_intrinsics(image_boards, board, start, model_of(intrinsics), n_folds=_N_FOLDS)
+            return compare_with_given(fitted, intrinsics, board)[0]
+    return None
+
+
+def compare_with_given(
+    fitted: IntrinsicsEstimate, intrinsics: Intrinsics, board: Board
+) -> tuple[IntrinsicsCheck, LensDifference]:
+    """Hold intrinsics against a fitted lens.
+
+    Args:
+        fitted: of any model.
+        intrinsics: to be checked, at the same resolution.
+        board: the board.
+    """
+    given_px = distances_under(intrinsics, fitted.views, board)
+    corners_px = fitted.corners_px.reshape(-1, 2)
+    difference = compare_lenses(intrinsics, fitted.intrinsics, corners_px, fitted.cov, fitted.model)
+    turn = difference.turn_rad
+    angle = float(np.linalg.norm(turn))
+    along = turn / max(angle, 1e-12)
+    given_focal = np.sqrt(intrinsics.fx_px * intrinsics.fy_px)
+    by_focal = np.zeros(fitted.model.size)
+    by_focal[:2] = 0.5 / given_focal
+    check = IntrinsicsCheck(
+        n_captures=len({view.capture for view in fitted.views}),
+        rms_px=float(np.sqrt(np.mean(given_px**2))),
+        possible_px=fitted.held_out_rms_px,
+        displacement_px=difference.rms_px,
+        displacement_sigma_px=difference.sigma_px,
+        displacement_deg=float(np.degrees(difference.rms_px / given_focal)),
+        turn_deg=float(np.degrees(angle)),
+        turn_sigma_deg=float(np.degrees(np.sqrt(along @ difference.cov_turn @ along))),
+        focal_ratio=float(np.sqrt(fitted.intrinsics.fx_px * fitted.intrinsics.fy_px) / given_focal),
+        focal_sigma=float(np.sqrt(by_focal @ fitted.cov @ by_focal)),
+        chance=_chance(fitted, intrinsics),
+    )
+    return check, difference
+
+
+def _chance(fitted: IntrinsicsEstimate, intrinsics: Intrinsics) -> float | None:
+    """Compare all parameters at once by the F distribution, as the deviations come from few captures."""
+    from scipy.special import fdtrc
+
+    try:
+        change = fitted.model.vector(intrinsics) - fitted.model.vector(fitted.intrinsics)
+    except ValueError:
+        return None
+    n_captures = len({view.capture for view in fitted.views})
+    scale = 1.0 / fitted.sigma
+    correlation = fitted.cov * np.outer(scale, scale)
+    chi2 = float(change * scale @ np.linalg.solve(correlation, change * scale))
+    return float(fdtrc(len(change), n_captures - 1, chi2 / len(change)))
+
+
+def describe(check: IntrinsicsCheck) -> str:
+    """State the figures of a check, whatever the verdict."""
+    return (
+        f"profile   corners off by {check.rms_px:.3f} px ({check.possible_px:.3f} px possible); pixels "
+        f"{check.displacement_px:.2f} +- {check.displacement_sigma_px:.2f} px elsewhere, turned by "
+        f"{check.turn_deg:.2f} +- {check.turn_sigma_deg:.2f} deg; focal length "
+        f"{100 * (check.focal_ratio - 1):+.2f} +- {100 * check.focal_sigma:.2f} %"
+    )
+
+
+def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
+    """Find that the given intrinsics do not fit, and what is different.
+
+    Args:
+        check: whose verdict is not "pass".
+        target_deg: standard deviation of the extrinsic's rotation to reach.
+    """
+    figures: dict[str, Figure] = {
+        **asdict(check),
+        "is_visible": check.rms_px >= _VISIBLE * check.possible_px,
+        "is_bent": check.is_bent,
+        "is_turned": check.is_turned,
+        "is_focal_off": check.is_focal_off,
+    }
+    action = "refocused" if check.is_focal_off else ""
+    return doubt("verdict.intrinsics", figures, is_fail=check.verdict(target_deg) == "fail", action=action)

@@ -1,0 +1,101 @@
+"""A control that must fail: an extrinsic known to be bad has to fit captures worse that were left out.
+
+Where it does not, the captures cannot tell the result from one that is several of its standard deviations,
+and as much as the target, away: the result is not the best one, or it is less certain than it says.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.geometry import Array, perturb
+from lce_rig.core.results import Observation
+from lce_rig.extrinsics.observability import lever_arm, name_direction
+from lce_rig.residuals.features import extract_features
+from lce_rig.residuals.plane_and_ends import capture_costs, feature_sigmas
+from lce_rig.residuals.quadratics import Quadratics
+from lce_rig.rig import CalibrationSettings
+from lce_rig.validation.weighing import doubt
+
+# A gain in the wrong direction that is this many of its standard errors sure is no chance.
+_SURE = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """What moving the result does to the residuals of captures left out.
+
+    Attributes:
+        moves: (B, 6) tangents by which the result was moved.
+        worse: (B,) mean increase of a left-out capture's cost over the result's own, in units of that.
+        worse_sigma: (B,) standard error of it.
+    """
+
+    moves: Array
+    worse: Array
+    worse_sigma: Array
+
+
+def run_control(
+    observations: Sequence[Observation],
+    board: Board,
+    T_cam_lidar: Array,
+    cov: Array,
+    expansion: Quadratics,
+    target: CalibrationSettings,
+    n_sigmas: float,
+) -> Control:
+    """Move an extrinsic both ways along the axes of its covariance, and judge it on captures left out.
+
+    Each capture is judged under the extrinsic that the captures of the other placements give.
+
+    Args:
+        observations: F captures.
+        board: the board.
+        T_cam_lidar: (4, 4) the result.
+        cov: (6, 6) as it claims.
+        expansion: of these captures, settled.
+        target: the result is moved by no less than this, in rotation or in translation.
+        n_sigmas: by how many standard deviations it is moved otherwise.
+    """
+    features = [extract_features(seen, board) for seen in observations]
+    lever_m = lever_arm(features)
+    scale = np.r_[np.ones(3), np.full(3, lever_m)]
+    values, vectors = np.linalg.eigh(cov * np.outer(scale, scale))
+    steps = n_sigmas * (np.sqrt(np.maximum(values, 0)) * vectors).T / scale
+    sizes = np.maximum(
+        np.degrees(np.linalg.norm(steps[:, 3:], axis=1)) / target.target_sigma_deg,
+        np.linalg.norm(steps[:, :3], axis=1) / target.target_sigma_m,
+    )
+    steps /= np.minimum(sizes, 1.0)[:, None]
+    moves = np.concatenate([steps, -steps])
+    left_out = expansion.without_each()[expansion.placement]
+    own = perturb(T_cam_lidar, left_out)
+    sigmas = feature_sigmas(features, board, T_cam_lidar)
+    costs = np.array(
+        [
+            capture_costs(f, board, perturb(T, np.vstack([np.zeros(6), moves])), sigmas)
+            for f, T in zip(features, own, strict=True)
+        ]
+    )
+    usual = float(np.median(costs[:, 0]))
+    increase = (costs[:, 1:] - costs[:, :1]) / max(usual, 1e-12)
+    return Control(moves, increase.mean(axis=0), increase.std(axis=0, ddof=1) / np.sqrt(len(observations)))
+
+
+def doubt_control(control: Control) -> list[Finding]:
+    """Doubt a result that captures left out do not tell from a bad one."""
+    worst = int(np.argmin(control.worse / control.worse_sigma))
+    if control.worse[worst] > 0:
+        return []
+    move = control.moves[worst]
+    figures: dict[str, Figure] = {
+        "rotation_deg": float(np.degrees(np.linalg.norm(move[3:]))),
+        "translation_m": float(np.linalg.norm(move[:3])),
+        "direction": name_direction(move),
+    }
+    is_fail = bool(control.worse[worst] < -_SURE * control.worse_sigma[worst])
+    return [doubt("verdict.control", figures, is_fail=is_fail)]

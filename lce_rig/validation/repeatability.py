@@ -1,0 +1,191 @@
+"""Do independent calibrations of one rig agree, as far as their stated uncertainties let expect?"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from lce_rig.core.geometry import Array, difference, log_so3
+from lce_rig.core.results import Calibration
+from lce_rig.extrinsics.mean_pose import mean_pose
+
+# Agreement is denied where chance spreads sound calibrations so far this seldom.
+_CHANCE = 0.01
+# Where chance spreads sound calibrations farther this often, the stated uncertainties are generous.
+_GENEROUS = 0.95
+_COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+
+
+@dataclass(frozen=True)
+class PairDifference:
+    """How far two calibrations lie apart.
+
+    Attributes:
+        first, second: names of their sessions.
+        rotation_deg, translation_m: angle and distance between the extrinsics.
+        distance: Mahalanobis distance d, d^2 = x^T (cov_1 + cov_2)^-1 x with x the tangent between them.
+        p: probability that sound calibrations lie this far apart or farther.
+    """
+
+    first: str
+    second: str
+    rotation_deg: float
+    translation_m: float
+    distance: float
+    p: float
+
+
+@dataclass(frozen=True, eq=False)
+class Repeatability:
+    """Calibrations of the same sensors in several sessions, held against each other.
+
+    Attributes:
+        names: of the sessions.
+        sensors: what is calibrated, in words.
+        T_cam_lidar: (4, 4) mean, all sessions alike.
+        deviations: (K, 6) tangents from the mean to each, translation m, rotation rad.
+        spread_rotation_deg, spread_translation_m: standard deviation of one calibration, from these.
+        claimed_rotation_deg, claimed_translation_m: the same as the calibrations state it, rms.
+        scatter_rotation_deg, scatter_translation_m: the part of it that differs from session to session;
+            None where a calibration does not say. The rest, constant errors of the LiDAR, all share.
+        chi2: least sum of squared distances from one common extrinsic, in units of the stated covariances.
+        dof: what it is on average where these are true.
+        p: probability that sound calibrations spread so far or farther.
+        differences: of each two.
+        odd_one: the session without which the others agree; None where all agree or none can be blamed.
+    """
+
+    names: tuple[str, ...]
+    sensors: str
+    T_cam_lidar: Array
+    deviations: Array
+    spread_rotation_deg: float
+    spread_translation_m: float
+    claimed_rotation_deg: float
+    claimed_translation_m: float
+    scatter_rotation_deg: float | None
+    scatter_translation_m: float | None
+    chi2: float
+    dof: int
+    p: float
+    differences: tuple[PairDifference, ...]
+    odd_one: str | None
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the stated uncertainties explain the spread."""
+        return self.p >= _CHANCE
+
+    @property
+    def ratio(self) -> float:
+        """Spread over what the stated uncertainties predict."""
+        return float(np.sqrt(self.chi2 / self.dof))
+
+    @property
+    def max_rotation_deg(self) -> float:
+        """Largest angle between two of them."""
+        return max(pair.rotation_deg for pair in self.differences)
+
+    @property
+    def max_translation_m(self) -> float:
+        """Largest distance between two of them."""
+        return max(pair.translation_m for pair in self.differences)
+
+    def sentence(self) -> str:
+        """Say whether they agree, for somebody who signs for it."""
+        n = len(self.names)
+        count = _COUNTS[n] if n < len(_COUNTS) else str(n)
+        apart = f"{self.max_rotation_deg:.2g} deg and {1000 * self.max_translation_m:.2g} mm"
+        who = f"The {count} calibrations of {self.sensors}"
+        if self.agrees:
+            how = "less than" if self.p > _GENEROUS else "as"
+            return f"{who} agree: they differ by at most {apart}, {how} their stated uncertainties predict."
+        text = (
+            f"{who} do not agree: they differ by up to {apart}, {self.ratio:.1f} times more than their "
+            "stated uncertainties predict"
+        )
+        if self.odd_one is not None:
+            return f"{text}. Without {self.odd_one} the others agree: find out what is wrong with it."
+        return f"{text}. Use none of them before the cause is known."
+
+
+def compare_calibrations(calibrations: Mapping[str, Calibration]) -> Repeatability:
+    """Hold calibrations of the same camera and LiDAR against each other.
+
+    Args:
+        calibrations: by the name of their session, at least two.
+
+    Raises:
+        ValueError: there are fewer than two.
+    """
+    if len(calibrations) < 2:
+        raise ValueError("one calibration has nothing to be compared with")
+    names = tuple(calibrations)
+    T = np.array([calibrations[name].T_cam_lidar for name in names])
+    cov = np.array([calibrations[name].cov for name in names])
+    # Weighted by full covariances a mean may lie beside all it is made of: right for chi2, odd to look at.
+    mean, _ = mean_pose(T, np.broadcast_to(np.eye(6), cov.shape))
+    deviations = difference(T, mean)
+    chi2 = _spread(T, cov)
+    dof = 6 * (len(names) - 1)
+    p = _tail(chi2, dof)
+    first = calibrations[names[0]]
+    scatter_deg = _rms_figure(calibrations.values(), "sigma_scatter_rotation_deg")
+    scatter_m = _rms_figure(calibrations.values(), "sigma_scatter_translation_m")
+    spread = np.sum(deviations**2, axis=0) / (len(names) - 1)
+    return Repeatability(
+        names=names,
+        sensors=f"{first.camera} and {first.lidar}",
+        T_cam_lidar=mean,
+        deviations=deviations,
+        spread_rotation_deg=float(np.degrees(np.sqrt(spread[3:].sum()))),
+        spread_translation_m=float(np.sqrt(spread[:3].sum())),
+        claimed_rotation_deg=float(np.degrees(np.sqrt(np.mean(np.trace(cov[:, 3:, 3:], axis1=1, axis2=2))))),
+        claimed_translation_m=float(np.sqrt(np.mean(np.trace(cov[:, :3, :3], axis1=1, axis2=2)))),
+        scatter_rotation_deg=scatter_deg,
+        scatter_translation_m=scatter_m,
+        chi2=chi2,
+        dof=dof,
+        p=p,
+        differences=tuple(_difference(names, T, cov, i, j) for i, j in combinations(range(len(names)), 2)),
+        odd_one=_odd_one(names, T, cov) if p < _CHANCE else None,
+    )
+
+
+def _spread(T: Array, cov: Array) -> float:
+    """Compute chi2: the least sum of squared Mahalanobis distances from one pose."""
+    weights = np.asarray(np.linalg.inv(cov))
+    deviations = difference(T, mean_pose(T, weights)[0])
+    return float(np.einsum("ki,kij,kj->", deviations, weights, deviations))
+
+
+def _difference(names: Sequence[str], T: Array, cov: Array, i: int, j: int) -> PairDifference:
+    tangent = difference(T[i], T[j])
+    chi2 = float(tangent @ np.linalg.solve(cov[i] + cov[j], tangent))
+    angle_deg = float(np.degrees(np.linalg.norm(log_so3(T[i, :3, :3] @ T[j, :3, :3].T))))
+    distance_m = float(np.linalg.norm(tangent[:3]))
+    return PairDifference(names[i], names[j], angle_deg, distance_m, float(np.sqrt(chi2)), _tail(chi2, 6))
+
+
+def _odd_one(names: Sequence[str], T: Array, cov: Array) -> str | None:
+    """Name the calibration without which the others agree, if there is exactly one such."""
+    if len(names) < 3:
+        return None
+    blamed = []
+    for index, name in enumerate(names):
+        rest = np.arange(len(names)) != index
+        if _tail(_spread(T[rest], cov[rest]), 6 * (len(names) - 2)) >= _CHANCE:
+            blamed.append(name)
+    return blamed[0] if len(blamed) == 1 else None
+
+
+def _rms_figure(calibrations: Iterable[Calibration], key: str) -> float | None:
+    values = np.array([calibration.diagnostics.get(key, np.nan) for calibration in calibrations])
+    return float(np.sqrt(np.mean(np.square(values)))) if np.isfinite(values).all() else None
+
+
+def _tail(chi2: float, dof: int) -> float:
+    from scipy.special import chdtrc
+
+    return float(chdtrc(dof, chi2))

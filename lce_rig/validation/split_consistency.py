@@ -1,0 +1,142 @@
+"""Do two shares of the captures give the same extrinsic? Early and late, near and far, left and right.
+
+Shares drawn by lot differ by noise; so do these, unless something changed on the way or is bent: a sensor
+that was nudged, a lens that is not the profile's. How far shares drawn by lot differ is the measure.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.geometry import Array, tangent_sizes
+from lce_rig.residuals.quadratics import Quadratics
+from lce_rig.rig import CalibrationSettings, VerdictSettings
+from lce_rig.validation.weighing import doubt
+
+# Fewer placements are not worth halving.
+_MIN_PLACEMENTS = 6
+_MIN_SHARE = 3
+_N_LOTS = 400
+# Median of the chi-squared distribution of six freedoms.
+_MEDIAN_CHI2 = 5.348
+# Differences beyond this many limits leave nothing to be used.
+_FAIL = 2.0
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """Two shares of the captures, calibrated apart.
+
+    Attributes:
+        first, second: what tells them apart, in words: "near" and "far".
+        rotation_deg, translation_m: angle and distance between their extrinsics.
+        chance: how often shares drawn by lot differ as much, in units of their noise.
+        n_first: captures in the first share.
+    """
+
+    first: str
+    second: str
+    rotation_deg: float
+    translation_m: float
+    chance: float
+    n_first: int
+
+
+def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tuple[Contrast, ...]:
+    """Compare shares that ought to agree.
+
+    Args:
+        expansion: of F captures in the order in which they were taken, settled.
+        centres: (F, 3) middle of the board in each, frame camera, m.
+        seed: of the lots.
+
+    Returns:
+        Before and after the capture where the session splits best, near and far, left and right, upper and
+        lower; none for fewer than 6 placements.
+    """
+    n_placements = len(expansion.groups)
+    if n_placements < _MIN_PLACEMENTS:
+        return ()
+    order = np.argsort(np.random.default_rng(seed).random((_N_LOTS, n_placements)), axis=1)
+    by_lot, _ = _chi2(expansion, (order < n_placements // 2) @ expansion.groups)
+    unit = max(float(np.median(by_lot)) / _MEDIAN_CHI2, 1e-12)
+    x, y, z = centres.T
+    found = [_changed_on_the_way(expansion, unit)]
+    for first, second, key in (
+        ("near", "far", np.linalg.norm(centres, axis=1)),
+        ("left", "right", x / z),
+        ("upper", "lower", y / z),
+    ):
+        is_first = (np.argsort(np.argsort(key)) < len(key) // 2)[None].astype(np.float64)
+        chi2, apart = _chi2(expansion, is_first)
+        found.append(_contrast(first, second, apart[0], _tail(chi2[0] / unit), int(is_first.sum())))
+    return tuple(found)
+
+
+def _changed_on_the_way(expansion: Quadratics, unit: float) -> Contrast:
+    """Find the capture from which on the others differ most; with as many chances as there are captures."""
+    n = len(expansion.gradients)
+    cuts = np.arange(_MIN_SHARE, n - _MIN_SHARE + 1)
+    chi2, apart = _chi2(expansion, (np.arange(n)[None] < cuts[:, None]).astype(np.float64))
+    best = int(np.argmax(chi2))
+    chance = min(len(cuts) * _tail(chi2[best] / unit), 1.0)
+    return _contrast("before", "after", apart[best], chance, int(cuts[best]))
+
+
+def _tail(chi2: float) -> float:
+    from scipy.special import chdtrc
+
+    return float(chdtrc(6, chi2))
+
+
+def _chi2(expansion: Quadratics, shares: Array) -> tuple[Array, Array]:
+    """Hold shares (B, F) against the rest: squared distance (B,) in units of noise, tangents (B, 6)."""
+    H_first = np.tensordot(shares, expansion.hessians, axes=1)
+    g_first = shares @ expansion.gradients
+    H_rest = expansion.hessians.sum(axis=0) - H_first
+    g_rest = expansion.gradients.sum(axis=0) - g_first
+    # A share of few captures may leave a direction all but open; a floor of 1 m and 1 rad keeps it finite.
+    floor = np.eye(6)
+    C_first, C_rest = np.linalg.inv(H_first + floor), np.linalg.inv(H_rest + floor)
+    apart = -(C_first @ g_first[..., None] - C_rest @ g_rest[..., None])[..., 0]
+    scaled = np.linalg.solve(C_first + C_rest, apart[..., None])[..., 0]
+    return np.asarray(np.sum(apart * scaled, axis=1)), np.asarray(apart)
+
+
+def _contrast(first: str, second: str, apart: Array, chance: float, n_first: int) -> Contrast:
+    rotation_deg, translation_m = tangent_sizes(apart)
+    return Contrast(first, second, rotation_deg, translation_m, chance, n_first)
+
+
+def doubt_halves(
+    contrasts: Sequence[Contrast],
+    captures: Sequence[str],
+    target: CalibrationSettings,
+    limits: VerdictSettings,
+) -> list[Finding]:
+    """Doubt a result whose shares differ by more than the target, and more than lots make them.
+
+    Args:
+        contrasts: see `contrast_halves`.
+        captures: names, in the order in which they were taken.
+        target: standard deviations to reach.
+        limits: of the profile.
+    """
+    doubts = []
+    for c in contrasts:
+        is_change = c.first == "before"
+        excess = target.in_targets(c.rotation_deg, c.translation_m)
+        excess /= limits.max_change if is_change else limits.max_contrast
+        if c.chance > limits.least_chance or excess <= 1:
+            continue
+        apart = {"rotation_deg": c.rotation_deg, "translation_m": c.translation_m, "chance": c.chance}
+        if is_change:
+            figures: dict[str, Figure] = {"capture": captures[c.n_first], **apart}
+            doubts.append(doubt("verdict.changed", figures, is_fail=excess > _FAIL))
+        else:
+            figures = {"first": c.first, "second": c.second, **apart}
+            action = "near" if c.first == "near" else ""
+            doubts.append(doubt("verdict.shares_differ", figures, is_fail=excess > _FAIL, action=action))
+    return doubts

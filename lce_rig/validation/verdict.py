@@ -1,0 +1,233 @@
+"""May this extrinsic be used? Each doubt is one reason with its figure and what to do about it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.findings import Figure, Finding, ranked
+from lce_rig.core.geometry import Array, rotation_angle, tangent_sizes
+from lce_rig.core.results import Metrics
+from lce_rig.extrinsics.estimate import CalibrationEstimate
+from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
+from lce_rig.validation.intrinsics_check import explain
+from lce_rig.validation.negative_control import doubt_control
+from lce_rig.validation.nuisances import doubt_nuisances
+from lce_rig.validation.split_consistency import doubt_halves
+from lce_rig.validation.validate import Examination
+from lce_rig.validation.weighing import SURPRISING_CHI2, Verdict, doubt, verdict_of
+
+# A side of the plate counts as measured below this deviation; 5 % of it is more than the beam's spot.
+PLATE_KNOWN_M, PLATE_FAIL = 0.03, 0.05
+
+
+def judge(
+    estimate: CalibrationEstimate,
+    examination: Examination,
+    rig: Rig,
+    camera: str,
+    lidar: str,
+    n_captures: int,
+    between_cameras: Sequence[Finding] = (),
+) -> tuple[Verdict, tuple[Finding, ...]]:
+    """Weigh everything known about an extrinsic.
+
+    Args:
+        estimate: the extrinsic with its residuals and refusals, and what each channel says.
+        examination: what checks on its captures found.
+        rig: thresholds, targets and the nominal extrinsic.
+        camera: name of the camera.
+        lidar: name of the LiDAR.
+        n_captures: captures looked at, with those in which no board was found.
+        between_cameras: where this camera and another contradict each other.
+
+    Returns:
+        The verdict, and the reasons for anything but a pass: worst first, causes before symptoms. A remark on
+        a widened standard deviation may stand beside a pass.
+    """
+    doubts = [
+        *_certificate(estimate),
+        *_intrinsics(examination, rig),
+        *_plate(estimate, rig.board.to_board()),
+        *_shared(examination, rig, lidar),
+        *doubt_halves(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
+        *between_cameras,
+        *_motion(estimate, rig.verdict.max_plane_misfit_m),
+        *_channels(estimate, rig),
+        *_residuals(estimate, rig),
+        *_control(examination),
+        *_refusals(estimate),
+        *_detected(estimate, n_captures, rig.quality.min_detected_fraction),
+        *_placements(estimate, rig.quality.min_captures),
+        *_nominal(estimate, rig.nominal(camera, lidar)),
+        *_precision(estimate, examination.cov, rig),
+    ]
+    if examination.remark is not None:
+        doubts.append(examination.remark)
+    return verdict_of(doubts), ranked(doubts)
+
+
+def _intrinsics(examination: Examination, rig: Rig) -> list[Finding]:
+    check, target_deg = examination.intrinsics, rig.calibration.target_sigma_deg
+    if check is None or check.verdict(target_deg) == "pass":
+        return []
+    return [explain(check, target_deg)]
+
+
+def _shared(examination: Examination, rig: Rig, lidar: str) -> list[Finding]:
+    if examination.nuisances is None:
+        return []
+    return doubt_nuisances(examination.nuisances, rig.board.to_board(), rig.lidars[lidar], rig.verdict)
+
+
+def _control(examination: Examination) -> list[Finding]:
+    return [] if examination.control is None else doubt_control(examination.control)
+
+
+def _certificate(estimate: CalibrationEstimate) -> list[Finding]:
+    if estimate.certificate.is_optimal:
+        return []
+    if np.isinf(estimate.certificate.gap):
+        return [doubt("verdict.no_certificate", {"method": estimate.method}, is_fail=False)]
+    return [doubt("verdict.not_certified", {"gap": estimate.certificate.gap}, is_fail=True)]
+
+
+def _precision(estimate: CalibrationEstimate, cov: Array, rig: Rig) -> list[Finding]:
+    found = []
+    target = rig.calibration
+    sigmas = np.sqrt(np.diag(cov))
+    for axes, goal, what, code in (
+        (np.degrees(sigmas[3:]), target.target_sigma_deg, "rotation_deg", "verdict.rotation_uncertain"),
+        (sigmas[:3], target.target_sigma_m, "translation_m", "verdict.translation_uncertain"),
+    ):
+        sigma = float(np.linalg.norm(axes))
+        if sigma > goal:
+            # Where the LiDAR's own errors alone miss the target, no number of captures will reach it.
+            is_lidar = estimate.diagnostics.get(f"sigma_systematic_{what}", 0.0) > goal
+            unit = what.partition("_")[2]
+            figures: dict[str, Figure] = {
+                f"sigma_{unit}": sigma,
+                f"target_{unit}": goal,
+                f"by_axis_{unit}": tuple(float(axis) for axis in axes),
+                "weakest": estimate.weak_direction,
+            }
+            is_fail = sigma > rig.verdict.fail_factor * goal
+            action = "measure_ranges" if is_lidar else ""
+            found.append(doubt(code, figures, is_fail=is_fail, action=action))
+    return found
+
+
+def residuals_beyond(metrics: Metrics, limits: QualitySettings) -> list[Finding]:
+    """List the mean residuals of an extrinsic that exceed the profile's limits."""
+    return [
+        doubt(code, {"mean_m": value, "limit_m": limit}, is_fail=True)
+        for value, limit, code in (
+            (metrics.mpe_m, limits.max_mpe_m, "verdict.plane_residual"),
+            (metrics.mee_m, limits.max_mee_m, "verdict.edge_residual"),
+        )
+        if value > limit
+    ]
+
+
+def _residuals(estimate: CalibrationEstimate, rig: Rig) -> list[Finding]:
+    found = residuals_beyond(estimate.metrics, rig.quality)
+    fitted_m = float(np.mean([np.hypot(r.plane_rms_m, r.edge_rms_m) for r in estimate.residuals]))
+    if np.isfinite(estimate.held_out_m) and estimate.held_out_m > rig.verdict.max_held_out_ratio * fitted_m:
+        figures = {"held_out_m": estimate.held_out_m, "fitted_m": fitted_m}
+        found.append(doubt("verdict.held_out", figures, is_fail=False))
+    return found
+
+
+def _motion(estimate: CalibrationEstimate, limit_m: float) -> list[Finding]:
+    rms_m = estimate.diagnostics.get("fit_plane_rms_m", 0.0)
+    if rms_m <= limit_m:
+        return []
+    is_compensated = any(channel.time_offset_s is not None for channel in estimate.channels)
+    action = "compensated" if is_compensated else ""
+    return [doubt("verdict.planes_apart", {"rms_m": rms_m}, is_fail=False, action=action)]
+
+
+def _channels(estimate: CalibrationEstimate, rig: Rig) -> list[Finding]:
+    """Hold the channels of one camera against each other: it cannot sit in two places."""
+    apart, cov = estimate.channel_difference, estimate.channel_difference_cov
+    if apart is None or cov is None:
+        return []
+    surprise = float(apart @ np.linalg.solve(cov, apart))
+    rotation_deg, translation_m = tangent_sizes(apart)
+    excess = rig.calibration.in_targets(rotation_deg, translation_m)
+    if surprise <= SURPRISING_CHI2 or excess <= 1:
+        return []
+    first, second = (channel.channel for channel in estimate.channels[:2])
+    figures: dict[str, Figure] = {
+        "first": first,
+        "second": second,
+        "rotation_deg": rotation_deg,
+        "translation_m": translation_m,
+    }
+    return [doubt("verdict.channels_differ", figures, is_fail=excess > rig.verdict.fail_factor)]
+
+
+def _refusals(estimate: CalibrationEstimate) -> list[Finding]:
+    refused = sorted(estimate.refused.items())
+    disagreeing = [name for name, why in refused if why.stage in ("pair", "calibrate")]
+    n = len(disagreeing) + len(estimate.used)
+    if 4 * len(disagreeing) <= n:
+        return []
+    shown = ", ".join(disagreeing[:4]) + (" ..." if len(disagreeing) > 4 else "")
+    figures: dict[str, Figure] = {"n_refused": len(disagreeing), "n_captures": n, "captures": shown}
+    return [doubt("verdict.sensors_disagree", figures, is_fail=2 * len(disagreeing) > n)]
+
+
+def _detected(estimate: CalibrationEstimate, n_captures: int, min_fraction: float) -> list[Finding]:
+    if len(estimate.used) >= min_fraction * n_captures:
+        return []
+    figures = {"n_used": len(estimate.used), "n_captures": n_captures}
+    return [doubt("verdict.few_used", figures, is_fail=False)]
+
+
+def _placements(estimate: CalibrationEstimate, needed: int) -> list[Finding]:
+    n = int(estimate.diagnostics.get("n_placements", len(estimate.used)))
+    if n >= needed:
+        return []
+    figures = {"n_used": len(estimate.used), "n_placements": n, "n_needed": needed}
+    return [doubt("verdict.few_placements", figures, is_fail=False)]
+
+
+def _nominal(estimate: CalibrationEstimate, nominal: NominalExtrinsic | None) -> list[Finding]:
+    if nominal is None:
+        return []
+    expected = nominal.to_matrix()
+    T = estimate.T_cam_lidar
+    angle_deg = float(np.degrees(rotation_angle(T[:3, :3], expected[:3, :3])))
+    shift_m = float(np.linalg.norm(T[:3, 3] - expected[:3, 3]))
+    if angle_deg <= nominal.tolerance_deg and shift_m <= nominal.tolerance_m:
+        return []
+    figures = {
+        "rotation_deg": angle_deg,
+        "translation_m": shift_m,
+        "tolerance_deg": nominal.tolerance_deg,
+        "tolerance_m": nominal.tolerance_m,
+    }
+    return [doubt("verdict.far_from_nominal", figures, is_fail=True)]
+
+
+def _plate(estimate: CalibrationEstimate, board: Board) -> list[Finding]:
+    """Compare the plate as the LiDAR measures it with the profile; sigmas are mostly the beam's spot."""
+    found = []
+    records = [estimate.observations[name].lidar.quality for name in estimate.used]
+    for side, wanted_m in (("width", board.width_m), ("height", board.height_m)):
+        known = [q for q in records if q.get(f"{side}_sigma_m", np.inf) < PLATE_KNOWN_M]
+        if len(known) < 3:
+            continue
+        measured_m = float(np.median([q[f"{side}_m"] for q in known]))
+        sigma_m = float(np.median([q[f"{side}_sigma_m"] for q in known]))
+        if abs(measured_m - wanted_m) > 2 * sigma_m:
+            figures: dict[str, Figure] = {
+                "side": side,
+                "measured_m": measured_m,
+                "sigma_m": sigma_m,
+                "profile_m": wanted_m,
+            }
+            is_fail = abs(measured_m - wanted_m) > PLATE_FAIL * wanted_m
+            found.append(doubt("verdict.plate_size", figures, is_fail=is_fail))
+    return found

@@ -1,0 +1,293 @@
+"""The DAVIS on dv-processing's own objects: from a file that it wrote, and live over its own network."""
+
+import inspect
+import re
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Events, Image, LiveSample, Pulse
+from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
+from lce_rig.devices.davis import opened as davis_device
+from lce_rig.devices.davis.driver import DavisSamples, DavisSource
+from lce_rig.devices.davis.opened import OpenedCamera, bias_of, number_of
+from lce_rig.rig import CameraSettings, load_rig
+
+dv = pytest.importorskip("dv_processing")
+START_US = 1_763_733_600_000_000
+SIZE = (346, 260)
+INTERVAL_US, EXPOSURE_US = 40_000, 4_001
+
+
+def camera(**changes: Any) -> CameraSettings:
+    return load_rig("rles").cameras["davis"].model_copy(update=changes)
+
+
+def only_events() -> CameraSettings:
+    return camera(channels={"events": camera().channels["events"]})
+
+
+def store(start_us: int, n: int = 500) -> Any:
+    rng = np.random.default_rng(start_us % 1000)
+    events = dv.EventStore()
+    for k, (x, y) in enumerate(zip(rng.integers(0, 346, n), rng.integers(0, 260, n), strict=True)):
+        events.push_back(start_us + 20 * k, int(x), int(y), bool(k % 3))
+    return events
+
+
+def edges(start_us: int) -> Any:
+    kinds = (
+        "APS_EXPOSURE_START",
+        "EXTERNAL_SIGNAL_RISING_EDGE",
+        "EXTERNAL_SIGNAL_FALLING_EDGE",
+        "APS_FRAME_END",
+    )
+    triggers = [dv.Trigger(start_us + 100 * k, getattr(dv.TriggerType, kind)) for k, kind in enumerate(kinds)]
+    return dv.TriggerPacket(dv.TriggerPacket.TriggersVector(triggers))
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """A file with all streams: 8 x 10 ms of events, 8 frames of which one is missing, 8 trigger edges."""
+    config = dv.io.MonoCameraWriter.Config("DAVIS346_00000499")
+    config.addEventStream(SIZE)
+    config.addFrameStream(SIZE)
+    config.addImuStream()
+    config.addTriggerStream()
+    writer = dv.io.MonoCameraWriter(str(tmp_path / "davis.aedat4"), config)
+    for k in range(8):
+        now_us = START_US + INTERVAL_US * k
+        writer.writeEvents(store(now_us))
+        grey = np.full(SIZE[::-1], 10 * k, np.uint8)
+        if k != 5:
+            writer.writeFrame(dv.Frame(now_us, EXPOSURE_US, 0, 0, grey, dv.FrameSource.SENSOR))
+        writer.writeTriggerPacket(edges(now_us))
+    del writer
+    return tmp_path / "davis.aedat4"
+
+
+A_NOTE = Finding("clock.trigger_input_off", "warning")
+
+
+def playing(path: Path, device: str = "DAVIS346_00000499") -> Any:
+    return lambda sensor, settings: OpenedCamera(dv.io.MonoCameraRecording(str(path)), device, (A_NOTE,))
+
+
+def play(path: Path, settings: CameraSettings) -> tuple[list[LiveSample], DavisSource]:
+    """Read a file to its end, as if it were a camera that is then unplugged."""
+    came: list[LiveSample] = []
+    with (
+        DavisSource("davis", settings, playing(path)) as source,
+        pytest.raises(SourceError, match="DAVIS346_00000499"),
+    ):
+        came.extend(source.samples())
+    return came, source
+
+
+def test_all_that_dv_processing_wrote_comes_out(recording: Path) -> None:
+    came, source = play(recording, camera())
+    events = [sample for sample in came if isinstance(sample, Events)]
+    t_us = np.concatenate([part.t_ns for part in events]) // 1000
+    written = [store(START_US + INTERVAL_US * k).numpy() for k in range(8)]
+    assert (t_us == np.concatenate([part["timestamp"] for part in written])).all()
+    assert (
+        np.concatenate([part.x for part in events]) == np.concatenate([part["x"] for part in written])
+    ).all()
+    assert (
+        np.concatenate([part.y for part in events]) == np.concatenate([part["y"] for part in written])
+    ).all()
+    polarity = np.concatenate([part.polarity for part in events])
+    assert (polarity == np.concatenate([part["polarity"] for part in written]).astype(bool)).all()
+    assert {(part.sensor, part.width_px, part.height_px) for part in events} == {("davis", 346, 260)}
+    figures = source.status().figures
+    assert (figures["n_events"], figures["n_frames"], figures["n_pulses"]) == (4000, 7, 8)
+
+
+def test_frames_are_stamped_in_the_middle_of_their_exposure(recording: Path) -> None:
+    came, source = play(recording, camera())
+    images = [sample for sample in came if isinstance(sample, Image)]
+    starts_us = [START_US + INTERVAL_US * k for k in range(8) if k != 5]
+    assert [image.stamp_ns for image in images] == [1000 * t + 500 * EXPOSURE_US for t in starts_us]
+    assert [int(image.pixels[7, 9]) for image in images] == [10 * k for k in range(8) if k != 5]
+    assert {(image.channel, image.pixels.shape) for image in images} == {("frames", SIZE[::-1])}
+    assert source.status().n_lost == 1
+
+
+def test_rising_edges_become_counted_pulses_and_others_do_not(recording: Path) -> None:
+    came, _ = play(recording, camera())
+    pulses = [sample for sample in came if isinstance(sample, Pulse)]
+    assert [pulse.stamp_ns for pulse in pulses] == [
+        1000 * (START_US + INTERVAL_US * k + 100) for k in range(8)
+    ]
+    assert [pulse.count for pulse in pulses] == list(range(8))
+    assert {pulse.sensor for pulse in pulses} == {"davis"}
+
+
+def test_stamps_far_from_this_computers_clock_are_a_problem(recording: Path) -> None:
+    _, source = play(recording, camera())
+    status = source.status()
+    assert status.problems[0] == A_NOTE and status.problems[1].code == "clock.differs_from_computer"
+    assert status.device == "DAVIS346_00000499"
+    assert status.clock is not None and status.clock.finding.code == "clock.davis"
+
+
+def test_another_size_is_another_camera(recording: Path) -> None:
+    small = camera(resolution_px=(240, 180))
+    with (
+        DavisSource("davis", small, playing(recording)) as source,
+        pytest.raises(SourceError, match="240x180"),
+    ):
+        list(source.samples())
+
+
+def test_a_reset_of_the_cameras_clock_is_noticed() -> None:
+    samples = DavisSamples("davis", camera())
+    triggers = [dv.Trigger(START_US, dv.TriggerType.TIMESTAMP_RESET)]
+    assert list(samples.to_pulses(triggers, 0)) == []
+    assert samples.n_resets == 1
+
+
+def test_colour_frames_stay_bgr() -> None:
+    pixels = np.zeros((260, 346, 3), np.uint8)
+    pixels[:, :, 0] = 200
+    frame = dv.Frame(START_US, 1000, 0, 0, pixels, dv.FrameSource.SENSOR)
+    image = DavisSamples("davis", camera()).to_image(frame, 5)
+    assert (image.pixels == pixels).all()
+    assert (image.stamp_ns, image.host_ns) == (1000 * START_US + 500_000, 5)
+
+
+SENDER = """
+import sys, time
+import dv_processing as dv
+stream = dv.io.Stream.EventStream(0, "events", "DAVIS346_00000499", (346, 260))
+writer = dv.io.NetworkWriter("127.0.0.1", int(sys.argv[1]), stream)
+print("ready", flush=True)
+while writer.getClientCount() == 0:
+    time.sleep(0.01)
+for _ in range(int(sys.argv[2])):
+    events, now_us = dv.EventStore(), time.time_ns() // 1000
+    for k in range(50):
+        events.push_back(now_us + k, k, k, True)
+    writer.writeEvents(events)
+    time.sleep(0.02)
+time.sleep(60)
+"""
+
+
+@contextmanager
+def sender(n_batches: int) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    """A process that sends events live, as dv-processing's network writer does."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-c", SENDER, str(port), str(n_batches)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"ready\n"
+            yield process, port
+        finally:
+            process.kill()
+
+
+def over_network(port: int) -> Any:
+    return lambda sensor, settings: OpenedCamera(dv.io.NetworkReader("127.0.0.1", port), "a sender")
+
+
+def test_live_events_come_with_a_small_delay_and_a_lost_sender_is_gone() -> None:
+    with (
+        sender(10_000) as (process, port),
+        DavisSource("davis", only_events(), over_network(port)) as source,
+    ):
+        came = [sample for sample in islice(source.samples(), 10) if isinstance(sample, Events)]
+        status = source.status()
+        process.kill()
+        with pytest.raises(SourceError, match="a sender") as caught:
+            list(source.samples())
+    assert sum(len(part) for part in came) == 500
+    assert all(abs(part.host_ns - int(part.t_ns[0])) < 10**9 for part in came if part.host_ns)
+    assert status.problems == ()
+    assert status.rates_hz["events"] > 0
+    assert status.clock is not None and abs(status.clock.finding.figure("delay_ms")) < 500
+    assert "unplugged" in caught.value.hint
+
+
+def test_a_camera_that_falls_silent_is_said_to() -> None:
+    with (
+        sender(3) as (_, port),
+        DavisSource("davis", only_events(), over_network(port), silence_s=0.6) as source,
+        pytest.raises(SourceError, match=r"camera 'davis' fell silent: nothing for 0\.6 s"),
+    ):
+        list(source.samples())
+
+
+def test_a_stream_that_the_profile_wants_must_be_there() -> None:
+    with sender(1) as (_, port):
+        source = DavisSource("davis", camera(), over_network(port))
+        with pytest.raises(SourceError, match="a sender has no frames for channel 'frames'"), source:
+            pass
+
+
+@pytest.mark.skipif(bool(dv.io.camera.discover()), reason="a camera is attached")
+@pytest.mark.parametrize(("device", "name"), [(None, "DAVIS"), ("DAVIS346_00000499", "DAVIS 00000499")])
+def test_without_a_camera_there_is_one_clear_error(device: str | None, name: str) -> None:
+    settings = camera(driver=camera().driver.model_copy(update={"device": device}))
+    with pytest.raises(SourceError) as caught, DavisSource("davis", settings):
+        pass
+    assert caught.value.what == f"camera 'davis': no {name} is attached"
+    assert "lsusb" in caught.value.hint and "udev" in caught.value.hint
+
+
+def test_every_call_to_a_camera_exists_in_dv_processing() -> None:
+    source = inspect.getsource(davis_device)
+    new = source[source.index("def _set_up_new") : source.index("def _set_up_old")]
+    called = set(re.findall(r"camera\.(\w+)", new)) | {
+        "getCameraName",
+        "getEventResolution",
+        "getFirmwareVersion",
+    }
+    assert len(called) >= 12
+    assert [name for name in sorted(called) if not hasattr(dv.io.camera.DAVIS, name)] == []
+    for name in ("cameraModel", "serialNumber"):
+        assert hasattr(dv.io.camera.USBDevice.DeviceDescriptor, name)
+    asked = set(re.findall(r"_input\.(\w+)", inspect.getsource(DavisSource)))
+    assert len(asked) >= 9
+    assert [name for name in sorted(asked) if not hasattr(dv.io.camera.DAVIS, name)] == []
+
+
+def test_controls_that_make_no_sense_are_named() -> None:
+    assert number_of("davis", "exposure_us", 4000) * timedelta(microseconds=1) == timedelta(milliseconds=4)
+    for value in (True, "long", 0, -3):
+        with pytest.raises(SourceError, match=r"driver\.controls\.exposure_us"):
+            number_of("davis", "exposure_us", value)
+    assert bias_of("davis", "bias_on", "4, 39") == (4, 39)
+    for value in ("4", "8,1", "1,256", "a,b", 4):
+        with pytest.raises(SourceError, match="is no bias"):
+            bias_of("davis", "bias_on", value)
+
+
+@pytest.mark.hardware
+def test_an_attached_davis_sends_all_its_streams() -> None:
+    with DavisSource("davis", camera()) as source:
+        ends_s = time.monotonic() + 3
+        came = []
+        for sample in source.samples():
+            came.append(sample)
+            if time.monotonic() > ends_s:
+                break
+        status = source.status()
+    assert any(isinstance(sample, Events) for sample in came)
+    assert any(isinstance(sample, Image) for sample in came)
+    assert status.clock is not None and abs(status.clock.finding.figure("delay_ms")) < 100
+    assert status.problems == ()

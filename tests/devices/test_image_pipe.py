@@ -1,0 +1,347 @@
+"""Pictures over real pipes from real programs, and streams cut at any byte."""
+
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lce_rig.core.data import Image
+from lce_rig.core.errors import SourceError
+from lce_rig.devices.pipe.driver import ImagePipeSource
+from lce_rig.devices.pipe.image_streams import (
+    JpegPictures,
+    PictureStream,
+    PnmPictures,
+    RawPictures,
+    Y4mPictures,
+    find_stream,
+)
+from lce_rig.rig import CameraSettings, load_rig
+
+WIDTH, HEIGHT = 32, 18
+
+
+def camera(*command: str, pixel_format: str | None = None) -> CameraSettings:
+    settings = load_rig("rlfs").cameras["cam"]
+    driver = settings.driver.model_copy(update={"command": command, "pixel_format": pixel_format})
+    return settings.model_copy(update={"driver": driver, "resolution_px": (WIDTH, HEIGHT)})
+
+
+def grey_pictures(n: int) -> list[np.ndarray]:
+    return [np.full((HEIGHT, WIDTH), 30 + 10 * k, np.uint8) for k in range(n)]
+
+
+def y4m(pictures: list[np.ndarray], colour: str = "420jpeg") -> bytes:
+    n_chroma = {"mono": 0, "444": 2 * WIDTH * HEIGHT, "422": WIDTH * HEIGHT}.get(colour, WIDTH * HEIGHT // 2)
+    chroma = b"\x80" * n_chroma
+    frames = b"".join(b"FRAME Ip\n" + picture.tobytes() + chroma for picture in pictures)
+    return f"YUV4MPEG2 W{WIDTH} H{HEIGHT} F10:1 Ip A1:1 C{colour} XNOTE\n".encode() + frames
+
+
+def pgm(pictures: list[np.ndarray]) -> bytes:
+    return b"".join(f"P5\n# made here\n{WIDTH} {HEIGHT}\n255\n".encode() + p.tobytes() for p in pictures)
+
+
+def ppm(pictures: list[np.ndarray]) -> bytes:
+    head = f"P6 {WIDTH} {HEIGHT} 255\n".encode()
+    return b"".join(head + np.dstack((p, p, p)).tobytes() for p in pictures)
+
+
+def deep_pgm(pictures: list[np.ndarray]) -> bytes:
+    head = f"P5 {WIDTH} {HEIGHT} 4095\n".encode()
+    return b"".join(head + (p.astype(float) * 4095 / 255).round().astype(">u2").tobytes() for p in pictures)
+
+
+def jpegs(pictures: list[np.ndarray]) -> bytes:
+    return b"".join(cv2.imencode(".jpg", picture)[1].tobytes() for picture in pictures)
+
+
+def raw(pictures: list[np.ndarray]) -> bytes:
+    return b"".join(picture.tobytes() for picture in pictures)
+
+
+STREAMS: dict[str, tuple[Callable[[list[np.ndarray]], bytes], Callable[[], PictureStream]]] = {
+    "y4m": (y4m, Y4mPictures),
+    "grey y4m": (lambda pictures: y4m(pictures, "mono"), Y4mPictures),
+    "fine y4m": (lambda pictures: y4m(pictures, "444"), Y4mPictures),
+    "wide y4m": (lambda pictures: y4m(pictures, "422"), Y4mPictures),
+    "pgm": (pgm, PnmPictures),
+    "deep pgm": (deep_pgm, PnmPictures),
+    "ppm": (ppm, PnmPictures),
+    "jpeg": (jpegs, JpegPictures),
+    "raw": (raw, lambda: RawPictures("GREY", WIDTH, HEIGHT)),
+}
+
+
+def levels(images: list[np.ndarray]) -> list[float]:
+    return [float(image.mean()) for image in images]
+
+
+@pytest.mark.parametrize("kind", STREAMS)
+@given(data=st.data())
+def test_the_same_pictures_come_however_the_bytes_are_cut(kind: str, data: st.DataObject) -> None:
+    write, make = STREAMS[kind]
+    stream, whole, payload = make(), make(), write(grey_pictures(3))
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(payload)), max_size=12)))
+    pieces = [payload[a:b] for a, b in zip([0, *cuts], [*cuts, len(payload)], strict=True)]
+    came = [pixels for piece in pieces for pixels in stream.feed(piece)]
+    at_once = list(whole.feed(payload))
+    assert len(came) == 3
+    assert all((a == b).all() for a, b in zip(came, at_once, strict=True))
+    assert stream.n_left == 0
+    assert stream.n_damaged == 0
+
+
+@pytest.mark.parametrize("kind", ["grey y4m", "pgm", "deep pgm", "ppm", "jpeg", "raw"])
+def test_grey_values_are_kept(kind: str) -> None:
+    write, make = STREAMS[kind]
+    assert levels(list(make().feed(write(grey_pictures(3))))) == pytest.approx([30, 40, 50], abs=0.6)
+
+
+@pytest.mark.parametrize("colour", ["420", "420mpeg2", "422", "444"])
+def test_y4m_luma_is_of_video_range(colour: str) -> None:
+    came = levels(list(Y4mPictures().feed(y4m(grey_pictures(3), colour))))
+    assert came == pytest.approx([(level - 16) * 255 / 219 for level in (30, 40, 50)], abs=1)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in STREAMS if kind != "raw"])
+def test_streams_are_told_by_their_first_bytes(kind: str) -> None:
+    write, make = STREAMS[kind]
+    assert type(find_stream(write(grey_pictures(1))[:10])) is type(make())
+
+
+def test_a_small_picture_inside_a_jpegs_head_does_not_end_it() -> None:
+    jpeg = jpegs(grey_pictures(1))
+    thumbnail = jpegs([np.zeros((8, 8), np.uint8)])
+    segment = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
+    stream = JpegPictures()
+    came = list(stream.feed(b"--frame\r\n\r\n" + jpeg[:2] + segment + jpeg[2:] + b"\r\n" + jpeg))
+    assert [pixels.shape for pixels in came] == [(HEIGHT, WIDTH)] * 2
+
+
+def test_a_damaged_jpeg_is_counted_and_the_next_one_comes() -> None:
+    stream, jpeg = JpegPictures(), jpegs(grey_pictures(1))
+    broken = jpeg[:2] + b"\xff\xc0\x00\x05\x08\x00\x00" + jpeg[2:30] + jpeg[-2:]
+    came = [pixels for piece in (jpeg, broken, jpeg, jpeg) for pixels in stream.feed(piece)]
+    assert stream.n_damaged >= 1
+    assert len(came) >= 2
+
+
+@pytest.mark.parametrize(
+    ("begin", "says"),
+    [
+        (b"YUV4MPEG2 W32 H18 C411\n", "colour 411 is not read here"),
+        (b"YUV4MPEG2 W32 H18 C420p10\n", "colour 420p10 is not read here"),
+        (b"YUV4MPEG2 F25:1\n", "tells no size"),
+        (b"YUV4MPEG2 W346 H2 Cmono\nFRAME\n" + bytes(2 * 348) + b"FRAME\n", "use jpegenc"),
+        (b"YUV4MPEG2 W32 H18\n" + b"FROME\n", "a Y4M frame was expected"),
+        (b"YUV4MPEG2 " + b"x" * 5000, "a line of text was expected"),
+    ],
+)
+def test_y4m_that_is_not_read_is_explained(begin: bytes, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        list(Y4mPictures().feed(begin))
+
+
+def test_pnm_that_ends_in_something_else_is_explained() -> None:
+    stream = PnmPictures()
+    with pytest.raises(ValueError, match="a PGM or PPM picture was expected"):
+        list(stream.feed(pgm(grey_pictures(1)) + b"Segmentation fault"))
+
+
+# What follows runs real programs at the other end of a real pipe.
+
+WRITE = (
+    "import sys, time; out = sys.stdout.buffer; data = open(sys.argv[1], 'rb').read(); "
+    "out.write(data); out.flush(); "
+)
+
+
+def child(tmp_path: Path, data: bytes, then: str = "time.sleep(60)") -> list[str]:
+    (tmp_path / "pictures").write_bytes(data)
+    return [sys.executable, "-c", WRITE + then, str(tmp_path / "pictures")]
+
+
+def take(source: ImagePipeSource, n: int) -> list[Image]:
+    return [sample for sample in islice(source.samples(), n) if isinstance(sample, Image)]
+
+
+@pytest.mark.parametrize("kind", ["y4m", "pgm", "jpeg"])
+def test_pictures_of_a_program_are_taken_as_they_arrive(kind: str, tmp_path: Path) -> None:
+    command = child(tmp_path, STREAMS[kind][0](grey_pictures(5)))
+    before_ns = time.time_ns()
+    with ImagePipeSource("cam", camera(*command)) as source:
+        images = take(source, 5)
+        status = source.status()
+    assert [image.count for image in images] == [0, 1, 2, 3, 4]
+    assert {image.pixels.shape[:2] for image in images} == {(HEIGHT, WIDTH)}
+    stamps = [image.stamp_ns for image in images]
+    assert stamps == sorted(stamps) == [image.host_ns for image in images]
+    assert before_ns < stamps[0] and stamps[-1] < time.time_ns()
+    assert (images[0].sensor, images[0].channel) == ("cam", "frames")
+    assert status.n_samples == 5
+    assert status.clock is not None and status.clock.finding.code == "clock.arrival"
+
+
+def test_raw_pictures_need_their_format_in_the_profile(tmp_path: Path) -> None:
+    command = child(tmp_path, raw(grey_pictures(2)))
+    with ImagePipeSource("cam", camera(*command, pixel_format="GREY")) as source:
+        assert levels([image.pixels for image in take(source, 2)]) == [30, 40]
+        assert source.status().problems == ()
+    with (
+        ImagePipeSource("cam", camera(*command)) as source,
+        pytest.raises(SourceError, match="Y4M") as caught,
+    ):
+        take(source, 1)
+    assert "driver.pixel_format" in caught.value.hint
+
+
+def test_pictures_with_a_header_are_not_taken_for_raw_ones(tmp_path: Path) -> None:
+    header = f"P5 {WIDTH} {HEIGHT} 255\n".encode()
+    command = child(tmp_path, header + raw(grey_pictures(2)))
+    with (
+        ImagePipeSource("cam", camera(*command, pixel_format="UYVY")) as source,
+        pytest.raises(SourceError, match="UYVY") as caught,
+    ):
+        take(source, 1)
+    assert "pixel_format" in caught.value.hint
+
+
+def test_rows_that_gstreamer_would_pad_are_warned_of(tmp_path: Path) -> None:
+    odd = camera(*child(tmp_path, bytes(30 * HEIGHT)), pixel_format="GREY")
+    with ImagePipeSource("cam", odd.model_copy(update={"resolution_px": (30, HEIGHT)})) as source:
+        (problem,) = source.status().problems
+    assert problem.code == "device.row_padding"
+    assert problem.figures == {"row_bytes": 30, "padded_bytes": 32}
+
+
+def test_a_program_that_dies_is_quoted_with_what_it_left(tmp_path: Path) -> None:
+    payload = y4m(grey_pictures(2))[:-100]
+    command = child(tmp_path, payload, "sys.stderr.write('no signal\\nbye\\n'); sys.exit(3)")
+    with ImagePipeSource("cam", camera(*command)) as source, pytest.raises(SourceError) as caught:
+        take(source, 5)
+    n_left = WIDTH * HEIGHT * 3 // 2 - 100
+    assert all(figure in caught.value.what for figure in ("code 3", "1 pictures", f"{n_left} bytes"))
+    assert "signal | bye" in caught.value.hint
+
+
+def test_a_program_that_is_killed_is_said_to_be(tmp_path: Path) -> None:
+    command = child(tmp_path, pgm(grey_pictures(1)), "import os; os.kill(os.getpid(), 9)")
+    with (
+        ImagePipeSource("cam", camera(*command)) as source,
+        pytest.raises(SourceError, match="was ended by SIGKILL after 1 pictures"),
+    ):
+        take(source, 5)
+
+
+def test_a_program_that_stops_writing_falls_silent(tmp_path: Path) -> None:
+    # A program that starts at once: on a busy machine, others are silent before their first picture.
+    (tmp_path / "picture.pgm").write_bytes(pgm(grey_pictures(1)))
+    command = ("sh", "-c", 'cat "$0"; exec sleep 60', str(tmp_path / "picture.pgm"))
+    with (
+        ImagePipeSource("cam", camera(*command), silence_s=0.5) as source,
+        pytest.raises(SourceError, match=r"fell silent: nothing for 0\.5 s") as caught,
+    ):
+        take(source, 5)
+    assert "picture.pgm" in caught.value.hint
+
+
+def test_pictures_of_another_size_are_refused(tmp_path: Path) -> None:
+    command = child(tmp_path, jpegs([np.zeros((20, 32), np.uint8)]))
+    with (
+        ImagePipeSource("cam", camera(*command)) as source,
+        pytest.raises(SourceError, match="writes 32x20 px, the intrinsics belong to 32x18 px"),
+    ):
+        take(source, 1)
+
+
+def test_a_program_that_is_not_there_is_named() -> None:
+    with pytest.raises(SourceError, match="no-such-program cannot be started: No such file") as caught:
+        ImagePipeSource("cam", camera("no-such-program")).__enter__()
+    assert "installed" in caught.value.hint
+    with pytest.raises(SourceError, match="cam: the profile does not say how it is reached"):
+        ImagePipeSource("cam", camera()).__enter__()
+    with pytest.raises(SourceError, match="pixel_format 'H264' is not read here"):
+        ImagePipeSource("cam", camera("true", pixel_format="H264")).__enter__()
+
+
+def has_ended(pid: str) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][0] in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+def test_a_talkative_stubborn_program_and_its_children_are_stopped(tmp_path: Path) -> None:
+    then = (
+        "import os, signal, subprocess; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
+        "inner = subprocess.Popen(['sleep', '60']); "
+        "open(sys.argv[1] + '.pids', 'w').write(f'{os.getpid()} {inner.pid}'); "
+        "[sys.stderr.write('x' * 10000) for _ in range(100)]; out.write(data); out.flush(); time.sleep(60)"
+    )
+    command = child(tmp_path, pgm(grey_pictures(1)), then)
+    with ImagePipeSource("cam", camera(*command)) as source:
+        assert len(take(source, 2)) == 2
+    for pid in (tmp_path / "pictures.pids").read_text().split():
+        # A busy computer takes a moment to end what was killed.
+        deadline_s = time.monotonic() + 10.0
+        while not has_ended(pid):
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+
+
+def test_a_program_that_ended_can_be_started_again(tmp_path: Path) -> None:
+    source = ImagePipeSource("cam", camera(*child(tmp_path, pgm(grey_pictures(2)), "sys.exit(1)")))
+    for _ in range(2):
+        came = []
+        with source, pytest.raises(SourceError, match="after 2 pictures"):
+            came.extend(source.samples())
+        assert [image.count for image in came if isinstance(image, Image)] == [0, 1]
+
+
+def test_nothing_stays_open_after_the_end(tmp_path: Path) -> None:
+    n_open = len(list(Path("/proc/self/fd").iterdir()))
+    for _ in range(2):
+        with ImagePipeSource("cam", camera(*child(tmp_path, pgm(grey_pictures(1))))) as source:
+            take(source, 1)
+    assert len(list(Path("/proc/self/fd").iterdir())) == n_open
+
+
+@pytest.mark.parametrize(
+    "output", [("-f", "yuv4mpegpipe"), ("-c:v", "mjpeg", "-f", "mjpeg"), ("-c:v", "ppm", "-f", "image2pipe")]
+)
+def test_ffmpeg_is_read(output: tuple[str, ...]) -> None:
+    ffmpeg = shutil.which("ffmpeg")
+    if ffmpeg is None:
+        pytest.skip("ffmpeg is not installed")
+    size = f"testsrc2=size={WIDTH}x{HEIGHT}:rate=20"
+    command = (
+        ffmpeg,
+        "-loglevel",
+        "error",
+        "-f",
+        "lavfi",
+        "-i",
+        size,
+        "-pix_fmt",
+        "yuv420p" if "ppm" not in output else "rgb24",
+    )
+    with ImagePipeSource("cam", camera(*command, *output, "-")) as source:
+        images = take(source, 5)
+    assert {image.pixels.shape for image in images} == {(HEIGHT, WIDTH, 3)}
+    assert images[0].pixels.std() > 20
+
+
+@pytest.mark.parametrize("size", ["W64 H47", "W63 H48", "W60000 H60000"])
+def test_y4m_of_a_size_that_cannot_be_is_refused_in_words(size: str) -> None:
+    stream = Y4mPictures()
+    with pytest.raises(ValueError, match="Y4M images of"):
+        list(stream.feed(f"YUV4MPEG2 {size} F30:1 C420jpeg\n".encode()))

@@ -1,0 +1,65 @@
+"""Which driver a rig's sensors get."""
+
+from importlib import import_module
+from typing import Any
+
+import pytest
+
+from lce_rig.core.errors import SourceError
+from lce_rig.devices.opening import CAMERA_TYPES, LIDAR_TYPES, LIVE, driver_type, open_live
+from lce_rig.rig import DriverSettings, Rig, load_rig
+
+
+def with_driver(rig: Rig, camera: str, **driver: Any) -> Rig:
+    settings = rig.cameras[camera]
+    changed = settings.model_copy(update={"driver": settings.driver.model_copy(update=driver)})
+    return rig.model_copy(update={"cameras": rig.cameras | {camera: changed}})
+
+
+@pytest.mark.parametrize("kind", LIVE)
+def test_every_driver_can_be_imported(kind: str) -> None:
+    module, name = LIVE[kind].split(":")
+    source = getattr(import_module(module), name)
+    for method in ("__enter__", "__exit__", "samples", "status"):
+        assert callable(getattr(source, method))
+
+
+@pytest.mark.parametrize(
+    ("rig", "sources"),
+    [
+        ("rlfs", [("lidar", "Vlp16Source"), ("cam", "V4l2Source")]),
+        ("rles", [("lidar", "Vlp16Source"), ("davis", "DavisSource")]),
+    ],
+)
+def test_the_shipped_rigs_get_their_drivers(rig: str, sources: list[tuple[str, str]]) -> None:
+    made = [(source.sensor, type(source).__name__) for source in open_live(load_rig(rig))]
+    assert made[:2] == sources
+    assert all(name == "SyncBoard" for _, name in made[2:])
+
+
+def test_a_camera_with_a_command_is_read_through_it() -> None:
+    rig = with_driver(load_rig("rlfs"), "cam", type=None, command=("true",), device=None)
+    assert type(open_live(rig)[1]).__name__ == "ImagePipeSource"
+
+
+def test_the_profile_may_choose_the_driver() -> None:
+    rig = with_driver(load_rig("rles"), "davis", type="v4l2")
+    assert type(open_live(rig)[1]).__name__ == "V4l2Source"
+
+
+def test_an_unknown_driver_or_one_of_another_kind_is_named() -> None:
+    for wanted in ("v4l", "vlp16", "sync_board"):
+        rig = with_driver(load_rig("rlfs"), "cam", type=wanted)
+        with pytest.raises(SourceError, match=f"camera 'cam': driver.type '{wanted}' is unknown") as caught:
+            open_live(rig)
+        assert "v4l2, command, davis" in caught.value.hint
+
+
+def test_a_lidar_of_an_unknown_model_is_not_guessed() -> None:
+    with pytest.raises(SourceError, match="no driver goes with model 'HDL-32E'"):
+        driver_type("lidar", "lidar", "HDL-32E", DriverSettings())
+    assert driver_type("lidar", "lidar", "Puck LITE", DriverSettings()) == "vlp16"
+
+
+def test_the_types_of_both_kinds_are_in_the_table() -> None:
+    assert {*LIDAR_TYPES, *CAMERA_TYPES, "sync_board"} == set(LIVE)

@@ -1,0 +1,175 @@
+"""How attached sensors are read: in order, with the reason of the end, and again when they are back."""
+
+import threading
+import time
+
+import pytest
+
+from lce_rig.core.data import Pulse
+from lce_rig.core.errors import SourceError
+from lce_rig.devices.protocol import SourceStatus
+from lce_rig.devices.reading import AttachedSensors, LiveSource, RateMeter
+
+
+def pulse(count: int) -> Pulse:
+    return Pulse("cam", count, count, 0)
+
+
+class Script(LiveSource):
+    """A device that gives what it was told to, one entry a call; an error is raised; then nothing."""
+
+    def __init__(
+        self, *entries: list[Pulse] | Exception, name: str = "s", n_slots: int = 9, silence_s: float = 5.0
+    ) -> None:
+        super().__init__(name, f"sensor {name!r}", n_slots, silence_s, "Check the plug.")
+        self.entries = list(entries)
+        self.is_open = False
+
+    def open(self) -> None:
+        self.is_open = True
+
+    def read(self) -> list[Pulse]:
+        if not self.entries:
+            time.sleep(0.01)
+            return []
+        entry = self.entries.pop(0)
+        if isinstance(entry, Exception):
+            raise entry
+        return entry
+
+    def close(self) -> None:
+        self.is_open = False
+
+    def describe(self) -> SourceStatus:
+        return SourceStatus(self.sensor)
+
+
+def counts(source: LiveSource) -> list[int]:
+    return [sample.count for sample in source.samples() if isinstance(sample, Pulse)]
+
+
+def test_samples_come_in_order_and_then_the_reason_of_the_end() -> None:
+    with Script([pulse(0), pulse(1)], [pulse(2)], SourceError("gone")) as source:
+        came = []
+        with pytest.raises(SourceError, match="gone"):
+            came.extend(source.samples())
+        assert [each.count for each in came if isinstance(each, Pulse)] == [0, 1, 2]
+        assert source.status().n_samples == 3 and source.is_open
+    assert not source.is_open
+
+
+def test_nothing_for_too_long_is_an_error_with_a_hint() -> None:
+    with Script(silence_s=0.1) as source, pytest.raises(SourceError) as caught:
+        counts(source)
+    assert caught.value.hint == "Check the plug."
+
+
+def test_stopping_ends_the_samples_without_error() -> None:
+    source = Script([pulse(0)])
+    taken: list[int] = []
+    taker = threading.Thread(target=lambda: taken.extend(counts(source)))
+    with source:
+        taker.start()
+        while source.status().n_samples == 0:
+            time.sleep(0.005)
+    taker.join()
+    assert taken == [0]
+
+
+def test_reading_can_begin_anew() -> None:
+    source = Script([pulse(0)], SourceError("gone"), [pulse(1)], silence_s=0.1)
+    for expected in (0, 1):
+        with source:
+            came = []
+            with pytest.raises(SourceError):
+                came.extend(source.samples())
+            assert [sample.count for sample in came if isinstance(sample, Pulse)] == [expected]
+            assert source.status().n_samples == 1
+
+
+def test_what_nobody_takes_is_dropped_oldest_first_and_counted() -> None:
+    came = []
+    with Script([pulse(k) for k in range(10)], SourceError("gone"), n_slots=4) as source:
+        while source.status().n_samples < 10:
+            time.sleep(0.005)
+        with pytest.raises(SourceError, match="gone"):
+            for sample in source.samples():
+                came.append(sample)
+        assert (source.status().n_samples, source.status().n_dropped) == (10, 6)
+    assert [sample.count for sample in came if isinstance(sample, Pulse)] == [6, 7, 8, 9]
+
+
+def test_a_bug_in_a_driver_ends_the_samples_and_is_called_one() -> None:
+    with Script([pulse(0)], ZeroDivisionError("oops")) as source, pytest.raises(SourceError) as caught:
+        counts(source)
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+
+
+def test_one_of_several_sensors_that_fails_is_opened_again_and_nothing_of_the_others_is_lost() -> None:
+    lossy = Script([pulse(0)], SourceError("gone"), [pulse(1)])
+    steady = Script(*[[pulse(k)] for k in range(5)], name="t")
+    with AttachedSensors([lossy, steady], reopen_every_s=0.05) as sensors:
+        came = [each for each in (sensors.take(5.0) for _ in range(7)) if each is not None]
+        by_name = {
+            name: [each.count for key, each in came if key == name and isinstance(each, Pulse)]
+            for name in "st"
+        }
+        assert by_name == {"s": [0, 1], "t": [0, 1, 2, 3, 4]}
+        assert lossy.n_reopened == 1 and not sensors.lost()
+        assert {name: status.n_dropped for name, status in sensors.statuses().items()} == {"s": 0, "t": 0}
+
+
+def test_what_comes_while_others_are_being_opened_is_no_loss() -> None:
+    class Slow(Script):
+        def open(self) -> None:
+            while early.entries:
+                time.sleep(0.005)
+
+    early, late = Script([pulse(k) for k in range(100)], n_slots=1), Slow([pulse(0)], name="t")
+    with AttachedSensors([early, late]) as sensors:
+        assert sensors.take(5.0) == ("s", pulse(36))  # the newest 64 of 100
+        assert sensors.statuses()["s"].n_dropped == 0
+
+
+def test_a_sensor_that_stays_away_is_named_with_the_reason() -> None:
+    with AttachedSensors([Script(SourceError("gone"))], reopen_every_s=60.0) as sensors:
+        while not sensors.lost():
+            time.sleep(0.005)
+        error, since_s = sensors.lost()["s"]
+        assert error.what == "gone" and since_s <= time.monotonic()
+
+
+def test_all_is_closed_at_once_while_a_lost_sensor_is_being_opened_again() -> None:
+    class Absent(Script):
+        """Gone for good: opening it waits until it is told to give up."""
+
+        n_opened = 0
+
+        def open(self) -> None:
+            self.n_opened += 1
+            while self.n_opened > 1 and not self.is_stopping:
+                time.sleep(0.001)
+            super().open()
+
+    source = Absent(SourceError("gone"))
+    with AttachedSensors([source], reopen_every_s=0.0) as sensors:
+        while source.n_opened < 2:
+            time.sleep(0.005)
+        assert sensors.lost()
+    assert not source.is_open
+
+
+def test_a_rate_is_that_of_what_came_and_falls_when_nothing_comes() -> None:
+    clock_s = [100.0]
+    meter = RateMeter(lambda: clock_s[0])
+    assert meter.rate_hz == 0
+    for _ in range(21):
+        clock_s[0] += 0.1
+        meter.add(5)
+    assert meter.rate_hz == pytest.approx(50)
+    clock_s[0] += 0.1
+    assert meter.rate_hz == pytest.approx(50)
+    clock_s[0] += 0.8
+    assert meter.rate_hz < 40
+    clock_s[0] += 3
+    assert meter.rate_hz == 0

@@ -1,0 +1,223 @@
+"""A sync board on a real pty: heard, asked, tied to the computer's clock, and survived whatever it does."""
+
+import os
+import time
+from itertools import pairwise
+
+import pytest
+from fake_board import HELLO, FakeBoard
+
+from lce_rig.core.errors import SourceError
+from lce_rig.devices.sync_board.driver import SyncBoard
+from lce_rig.rig.sync_settings import SyncSettings
+
+
+def settings(path, kind="lce1", **more):
+    triggers = {} if kind == "nmea" else {"cam": {"channel": 0, "rate_hz": 100.0}}
+    return SyncSettings.model_validate({"type": kind, "device": path, "triggers": triggers, **more})
+
+
+def take(board, n, line="cam"):
+    pulses = []
+    for pulse in board.samples():
+        if pulse.sensor == line:
+            pulses.append(pulse)
+        if len(pulses) == n:
+            break
+    return pulses
+
+
+def wait_until(condition, patience_s=20.0):
+    end_s = time.monotonic() + patience_s
+    while not condition() and time.monotonic() < end_s:
+        time.sleep(0.01)
+    assert condition()
+
+
+def assert_tells_the_time(model, fake):
+    """Hold a clock against the board's own, by what the model claims: a busy computer answers late."""
+    error_ns = model.convert(model.last_ns) - fake.host_ns(model.last_ns)
+    assert abs(error_ns) < 5e6 + 5 * model.sigma_ns(model.last_ns)
+
+
+def test_pulses_come_one_by_one_with_the_boards_own_stamps():
+    with FakeBoard() as fake, SyncBoard(settings(fake.path)) as board:
+        pulses = take(board, 50)
+        assert [pulse.count for pulse in pulses] == list(range(pulses[0].count, pulses[0].count + 50))
+        assert all(5 * 10**9 < pulse.stamp_ns < 15 * 10**9 for pulse in pulses)
+        assert all(pulse.host_ns > fake.host_ns(pulse.stamp_ns) for pulse in pulses)
+        status = board.status()
+    assert status.n_lost == 0 and status.figures["n_resets"] == 0
+    assert status.rate_hz > 50 and status.device == "fake, firmware 1.0, LCE1"
+
+
+def test_its_clock_is_tied_to_the_computers_by_asking():
+    with FakeBoard(drift=2000e-6) as fake, SyncBoard(settings(fake.path)) as board:
+        wait_until(lambda: (clock := board.host_clock) is not None and clock.n_used >= 8)
+        model = board.host_clock
+        error_ns = model.convert(model.last_ns) - fake.host_ns(model.last_ns)
+        assert abs(error_ns) < 5 * model.sigma_ns(model.last_ns) + 1000
+        assert model.sigma_ns(model.last_ns) < 2_000_000
+        # On a busy machine any answer may come some milliseconds late.
+        assert model.drift == pytest.approx(-2000e-6, abs=200e-6 + 4e6 / (model.last_ns - model.first_ns))
+        told = board.status().clock
+        assert told is not None and told.finding.figure("host_drift_ppm") == pytest.approx(-2000, rel=0.5)
+
+
+def test_its_lines_are_set_and_started_as_the_profile_says():
+    with FakeBoard() as fake:
+        given = settings(fake.path)
+        given.triggers["cam"] = given.triggers["cam"].model_copy(update={"phase_us": 2500, "pulse_us": 50})
+        with SyncBoard(given) as board:
+            wait_until(lambda: "LCEGO" in fake.commands)
+            assert fake.commands.index("LCERT,0,100.000000,2500,50") < fake.commands.index("LCEGO")
+            board.stop_triggers()
+            wait_until(lambda: "LCESP" in fake.commands)
+            board.start_triggers(rate_hz=4.0)
+            wait_until(lambda: fake.commands.count("LCEGO") == 2)
+            assert "LCERT,0,4.000000,2500,50" in fake.commands
+
+
+def test_a_board_without_a_receiver_is_told_when_a_second_begins():
+    with FakeBoard() as fake, SyncBoard(settings(fake.path)):
+        wait_until(lambda: any(command.startswith("LCEUT") for command in fake.commands))
+        command = next(command for command in fake.commands if command.startswith("LCEUT"))
+        t_us, utc_s = (int(field) for field in command.split(",")[1:])
+        assert fake.host_ns(1000 * t_us) == pytest.approx(utc_s * 10**9, abs=3e6)
+
+
+def test_garbage_between_lines_is_survived_counted_and_told():
+    with FakeBoard(garbage_every=3) as fake, SyncBoard(settings(fake.path)) as board:
+        pulses = take(board, 60)
+        assert [b.count - a.count for a, b in pairwise(pulses)] == [1] * 59
+        status = board.status()
+    assert status.figures["n_bad_checksums"] >= 19
+    assert "stream.damaged_lines" in [problem.code for problem in status.problems]
+
+
+def test_pulses_whose_lines_are_lost_are_counted_and_told():
+    with FakeBoard() as fake, SyncBoard(settings(fake.path)) as board:
+        pulses = take(board, 10)
+        fake.n_to_lose = 4
+        wait_until(lambda: board.status().n_lost == 4)
+        while pulses[-1].count < fake.n_sent - 1:
+            pulses += take(board, 1)
+        assert sorted(b.count - a.count for a, b in pairwise(pulses))[-2:] == [1, 5]
+        status = board.status()
+    assert status.n_lost == status.n_lost_by_line["cam"] == 4
+    (lost,) = [problem for problem in status.problems if problem.code == "stream.pulse_lines_lost"]
+    assert lost.figures == {"n": 4, "by_line": (("cam", 4),)}
+
+
+@pytest.mark.parametrize("says_hello", [True, False])
+def test_a_board_that_begins_anew_is_set_again_and_told(says_hello):
+    with FakeBoard() as fake, SyncBoard(settings(fake.path)) as board:
+        take(board, 20)
+        fake.reset(says_hello)
+        wait_until(lambda: fake.commands.count("LCEGO") == 2)
+        wait_until(lambda: board.host_clock is not None and board.host_clock.n_used >= 4)
+        model, status = board.host_clock, board.status()
+        assert_tells_the_time(model, fake)
+    assert status.figures["n_resets"] == 1
+    (restarted,) = [each for each in status.problems if each.code == "device.board_restarted"]
+    assert restarted.figures["n"] == 1
+
+
+def test_a_board_that_stalls_goes_on_where_it_was():
+    with FakeBoard() as fake, SyncBoard(settings(fake.path)) as board:
+        take(board, 10)
+        fake.is_stalled = True
+        time.sleep(0.3)
+        fake.is_stalled = False
+        pulses = take(board, 10)
+        assert len(pulses) == 10
+        assert board.status().figures["n_resets"] == 0
+
+
+def test_a_board_that_falls_silent_ends_the_samples_with_what_to_check():
+    with FakeBoard() as fake, SyncBoard(settings(fake.path), silence_s=0.3) as board:
+        take(board, 3)
+        fake.is_stalled = True
+        with pytest.raises(SourceError, match=r"0\.3 s") as caught:
+            take(board, 10**6)
+    assert "reset" in caught.value.hint
+
+
+def test_a_board_that_is_unplugged_is_named_with_its_port():
+    with FakeBoard() as fake, SyncBoard(settings(fake.path)) as board:
+        take(board, 10)
+        fake.unplug()
+        with pytest.raises(SourceError, match=fake.path) as caught:
+            take(board, 10**6)
+        assert "cable" in caught.value.hint
+        board.status()
+
+
+def test_the_port_is_drained_though_nobody_takes_the_pulses():
+    with FakeBoard(period_s=0.0) as fake, SyncBoard(settings(fake.path)) as board:
+        # A pty holds some hundred lines.
+        wait_until(lambda: fake.n_sent > 500)
+        wait_until(lambda: board.status().n_samples > 500)
+        assert board.status().n_lost == 0
+
+
+@pytest.mark.parametrize("kind", ["simplesensorsync", "tline"])
+def test_boards_of_others_give_pulses_and_a_clock(kind):
+    with FakeBoard(kind) as fake, SyncBoard(settings(fake.path, kind)) as board:
+        assert len(take(board, 30)) == 30
+        wait_until(lambda: board.host_clock is not None and board.host_clock.n_used >= 6)
+        model = board.host_clock
+        assert_tells_the_time(model, fake)
+        if kind == "tline":
+            assert "GO" in fake.commands and "arrivals of pulses" in model.origin
+
+
+def test_plain_nmea_tells_the_second_and_no_pulses():
+    with FakeBoard("nmea") as fake, SyncBoard(settings(fake.path, "nmea")) as board:
+        status = board.status()
+        assert status.clock is not None and status.clock.finding.code == "clock.receiver"
+        assert status.problems == ()
+
+
+def test_a_silent_board_is_an_error_with_what_to_check():
+    with FakeBoard(is_mute=True) as fake:
+        with pytest.raises(SourceError, match=r"0\.3 s") as caught:
+            SyncBoard(settings(fake.path), hello_s=0.3).__enter__()
+        assert "firmware" in caught.value.hint
+        assert "LCEHI?" in fake.commands
+
+
+def test_a_board_that_talks_otherwise_is_named_for_what_it_is():
+    with FakeBoard("tline") as fake, pytest.raises(SourceError, match="tline"):
+        SyncBoard(settings(fake.path), hello_s=0.3).__enter__()
+    with FakeBoard("?", garbage_every=2) as fake, pytest.raises(SourceError, match="not lce1"):
+        SyncBoard(settings(fake.path), hello_s=0.3).__enter__()
+
+
+def test_a_board_of_another_version_is_refused():
+    hello = HELLO.replace("LCEHI,1", "LCEHI,2")
+    with FakeBoard(hello=hello) as fake, pytest.raises(SourceError, match="version 2"):
+        SyncBoard(settings(fake.path)).__enter__()
+
+
+def test_a_port_that_is_absent_busy_or_no_port_says_so(tmp_path):
+    with pytest.raises(SourceError, match="/dev/ttyLCE9") as caught:
+        SyncBoard(settings("/dev/ttyLCE9")).__enter__()
+    assert "sync.device" in caught.value.hint
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SourceError, match="file"):
+        SyncBoard(settings(str(tmp_path / "file"))).__enter__()
+    with FakeBoard() as fake, SyncBoard(settings(fake.path)):
+        with pytest.raises(SourceError, match=fake.path) as caught:
+            SyncBoard(settings(fake.path)).__enter__()
+        assert "fuser" in caught.value.hint
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may open everything")
+def test_a_port_without_permission_names_the_group(tmp_path):
+    path = tmp_path / "port"
+    path.write_text("")
+    path.chmod(0)
+    with pytest.raises(SourceError, match="port") as caught:
+        SyncBoard(settings(str(path))).__enter__()
+    assert "dialout" in caught.value.hint

@@ -1,0 +1,239 @@
+"""What a board's messages add up to: odd values left out, new beginnings believed, clocks followed."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lce_rig.devices.sync_board.board_state import Arrival, BoardState, RunningNumber, Verdict
+from lce_rig.devices.sync_board.lines import LineReader
+from lce_rig.devices.sync_board.lines.lce1 import Lce1
+from lce_rig.devices.sync_board.lines.messages import (
+    BoardError,
+    BoardStatus,
+    Exposure,
+    Hello,
+    PpsEdge,
+    TimeReply,
+    TriggerEdge,
+)
+from lce_rig.devices.sync_board.lines.nmea import Nmea
+from lce_rig.devices.sync_board.report import BoardView, clock_state, figures, problems
+from lce_rig.words import sentence
+
+S = 1_000_000_000
+DAY_NS = 1_753_000_000 * S
+HELLO = Hello(1, "1.0", "fake", 1_000_000)
+
+
+def arrival(steady_s, set_by_s=0.0):
+    return Arrival(DAY_NS + round((steady_s + set_by_s) * S), round(steady_s * S))
+
+
+def pulses(state, numbers, start_s=0.0, board_s=100.0, period_s=0.05):
+    """Feed pulses whose board time and arrival go with their numbers, and give those handed on."""
+    found = []
+    for number in numbers:
+        t_us = round((board_s + number * period_s) * 1e6)
+        found += state.take(TriggerEdge(0, number, t_us, True), arrival(start_s + number * period_s + 0.001))
+    return [pulse.count for pulse in found]
+
+
+def view(state, now_s=10.0, opened_s=0.0, line_s=10.0, dialect=None, wants=("cam",), n_unwritten=0):
+    reader = LineReader(dialect or Lce1())
+    return BoardView(
+        state, reader, round(now_s * S), round(opened_s * S), round(line_s * S), wants, n_unwritten
+    )
+
+
+def test_a_time_that_cannot_be_is_left_out_and_the_rest_goes_on():
+    state = BoardState({0: "cam"})
+    pulses(state, range(10))
+    for t_us in (100_450_000 + 2**40, 450_000, 110_450_000):
+        assert state.take(TriggerEdge(0, 10, t_us, True), arrival(0.501)) == []
+        assert pulses(state, [10 + state.counts.n_implausible]) == [10 + state.counts.n_implausible]
+    assert state.counts.n_implausible == 3 and state.counts.n_resets == 0
+
+
+def test_a_number_that_cannot_be_is_left_out_and_the_rest_goes_on():
+    state = BoardState({0: "cam"})
+    pulses(state, range(10))
+    for wrong in (400, 3, 12):
+        assert state.take(TriggerEdge(0, wrong, 100_500_000, True), arrival(0.501)) == []
+    assert pulses(state, range(11, 20)) == list(range(11, 20))
+    assert state.counts.n_implausible == 3
+    assert state.counts.n_lost == {"cam": 1}
+
+
+@given(st.lists(st.integers(1, 60), min_size=1, max_size=30))
+def test_every_gap_that_had_the_time_to_happen_is_believed_and_counted(steps):
+    number, judge = 0, RunningNumber()
+    judge.judge(0, 0)
+    judge.judge(1, 50_000)
+    for step in steps:
+        number += step
+        assert judge.judge(1 + number, (1 + number) * 50_000) is Verdict.SOUND
+    assert judge.n_lost == sum(steps) - len(steps)
+
+
+def test_numbers_that_begin_anew_are_believed_at_the_second():
+    judge = RunningNumber()
+    for number in range(10):
+        judge.judge(number, number * 1000)
+    verdicts = [judge.judge(number, 10_000 + number * 1000) for number in (1, 2, 3)]
+    assert verdicts == [Verdict.ODD, Verdict.ANEW, Verdict.SOUND]
+
+
+def test_a_computer_that_was_busy_and_reads_all_at_once_is_no_new_beginning():
+    state = BoardState({0: "cam"})
+    pulses(state, range(20))
+    for number in range(20, 120):
+        state.take(TriggerEdge(0, number, 100_000_000 + number * 50_000, True), arrival(6.0))
+    assert pulses(state, range(120, 140)) == list(range(120, 140))
+    assert state.counts.n_resets == state.counts.n_implausible == 0
+
+
+def test_a_new_beginning_is_believed_at_once_after_a_hello_and_else_at_the_second_message():
+    for hello, n_left_out in ((HELLO, 0), (None, 1)):
+        state = BoardState({0: "cam"})
+        pulses(state, range(20))
+        if hello:
+            state.take(hello, arrival(2.0))
+        assert pulses(state, range(1, 10), start_s=2.0, board_s=0.0) == list(range(1 + n_left_out, 10))
+        assert state.counts.n_resets == 1
+
+
+def test_a_hello_that_was_asked_for_begins_nothing_anew():
+    state = BoardState({0: "cam"})
+    state.take(HELLO, arrival(0.0))
+    pulses(state, range(10))
+    state.take(HELLO, arrival(0.51))
+    assert pulses(state, range(10, 20)) == list(range(10, 20))
+    assert state.counts.n_resets == 0
+
+
+def ask(state, steady_s, set_by_s=0.0, there_s=80e-6, back_s=80e-6, board_start_s=100.0, cookie=7):
+    state.asked(cookie, arrival(steady_s, set_by_s).host_ns)
+    board_us = round((board_start_s + steady_s + there_s) * 1e6)
+    state.take(
+        TimeReply(cookie, board_us, board_us + 10), arrival(steady_s + there_s + back_s + 1e-5, set_by_s)
+    )
+
+
+def test_the_computers_time_of_day_comes_from_answers():
+    state = BoardState({})
+    for k in range(100):
+        ask(state, 0.1 * k, cookie=k)
+    assert abs(state.host_clock.convert(105 * S) - DAY_NS - 5 * S) < 2000
+    assert state.host_clock.sigma_ns(105 * S) == pytest.approx(80_000 / np.sqrt(3), rel=0.05)
+    assert state.round_trip_ns == pytest.approx(160_000, abs=2000)
+
+
+def test_answers_to_other_questions_and_of_last_week_are_left_out():
+    state = BoardState({})
+    state.asked(3, DAY_NS)
+    state.take(TimeReply(2, 100_000_000, 100_000_010), arrival(0.001))
+    assert not state.has_answered
+    state.take(TimeReply(3, 100_000_000, 100_000_010), arrival(0.001, set_by_s=-3600))
+    assert state.has_answered and state.host_clock is None
+
+
+def test_a_computer_whose_clock_is_set_is_noticed_followed_and_told():
+    state = BoardState({})
+    for k in range(200):
+        ask(state, 0.1 * k, set_by_s=3.0 * (k >= 100), cookie=k)
+    assert state.counts.n_resets == 0
+    assert [round(step.size_ns / S) for step in state.host_tracker.steps] == [3]
+    assert abs(state.host_clock.convert(115 * S) - DAY_NS - 18 * S) < 5000
+    (jumped,) = [found for found in problems(view(state)) if found.code == "clock.computer_jumped"]
+    assert (jumped.figures["n"], jumped.figure("last_s")) == (1, pytest.approx(3, abs=1e-3))
+
+
+def test_utc_comes_from_pulses_that_know_their_second():
+    state = BoardState({})
+    found = []
+    for k in range(10):
+        edge = PpsEdge(k, 100_000_000 + 1_000_040 * k, 1_753_000_000 + k, "G")
+        found += state.take(edge, arrival(k + 0.001))
+    assert [pulse.sensor for pulse in found] == ["pps"] * 10
+    assert state.utc_clock.drift == pytest.approx(-40e-6, abs=0.1e-6)
+    assert abs(state.utc_clock.convert(100 * S) - DAY_NS) < 1000
+    told = clock_state(view(state)).finding
+    assert told.code == "clock.board" and told.figure("utc_drift_ppm") == pytest.approx(-40, abs=0.1)
+
+
+def test_falling_edges_and_strange_channels_make_no_pulses():
+    state = BoardState({0: "cam"})
+    assert state.take(TriggerEdge(0, 1, 5, False), arrival(0)) == []
+    assert state.take(TriggerEdge(3, 1, 5, True), arrival(0)) == []
+    state.take(Exposure(0, 1, 5, 4000), arrival(0))
+    assert figures(view(state))["exposure_us.cam"] == 4000
+
+
+def test_boards_with_one_number_for_all_channels_lose_nothing_by_gaps():
+    state = BoardState({0: "cam", 1: "davis"}, has_own_counts=False)
+    for number in range(40):
+        t_us = 100_000_000 + number * 25_000
+        state.take(TriggerEdge(number % 2, number, t_us, True), arrival(0.025 * number))
+    assert state.counts.n_pulses == {"cam": 20, "davis": 20}
+    assert sum(state.counts.n_lost.values()) == 0
+
+
+def test_every_trouble_is_told():
+    state = BoardState({0: "cam"})
+    state.take(HELLO, arrival(0))
+    (silent,) = problems(view(state, now_s=14.2, line_s=10))
+    assert (silent.code, silent.figure("silent_s")) == ("device.board_silent", pytest.approx(4.2))
+    told = {found.code: found.figures for found in problems(view(state, n_unwritten=2))}
+    assert told["device.commands_not_taken"]["n"] == 2 and told["stream.no_pulses"]["line"] == "cam"
+    assert {"clock.no_pps", "clock.board_not_tied"} <= set(told)
+    state.take(BoardError(4, "rate too high"), arrival(1))
+    state.take(BoardStatus(0, 1, 9, (0,)), arrival(1))
+    state.take(PpsEdge(1, 1_000_000, None, "I"), arrival(1))
+    told = {found.code: found.figures for found in problems(view(state))}
+    assert told["device.board_error"]["number"] == 4 and told["stream.lines_dropped_by_board"]["n"] == 9
+    assert told["clock.pps_stopped"]["silent_s"] == pytest.approx(9) and "clock.pps_output_off" in told
+    assert "clock.board_without_utc" in [found.code for found in problems(view(state, now_s=2, line_s=2))]
+
+
+def test_a_board_in_order_has_no_problems():
+    state = BoardState({0: "cam"})
+    state.take(HELLO, arrival(0))
+    for k in range(100):
+        pulses(state, (2 * k, 2 * k + 1))
+        ask(state, 0.1 * k + 0.05, cookie=k)
+        if k % 10 == 0:
+            edge = PpsEdge(k // 10, 100_000_000 + 100_000 * k, 1_753_000_000 + k // 10, "I")
+            state.take(edge, arrival(0.1 * k + 0.051))
+    state.take(BoardStatus(7, 10, 0, (200,)), arrival(9.9))
+    assert problems(view(state)) == ()
+
+
+def test_a_receiver_without_a_fix_is_told_to_look_at_the_sky():
+    found = problems(view(BoardState({}), dialect=Nmea(), wants=()))
+    assert [each.code for each in found] == ["clock.receiver_no_time"]
+
+
+MESSAGES = st.one_of(
+    st.just(HELLO),
+    st.builds(PpsEdge, st.integers(0, 2**32 - 1), st.integers(0, 2**40), st.none(), st.sampled_from("GIN")),
+    st.builds(
+        TriggerEdge, st.integers(0, 15), st.integers(0, 2**32 - 1), st.integers(0, 2**40), st.booleans()
+    ),
+    st.builds(TimeReply, st.integers(0, 5), st.integers(0, 10**6), st.integers(10**6, 2**40)),
+    st.builds(BoardStatus, st.integers(0, 99), st.integers(0, 99), st.integers(0, 99), st.just((1, 2))),
+)
+
+
+@given(st.lists(st.tuples(MESSAGES, st.integers(0, 10**10)), max_size=60))
+def test_whatever_is_said_in_whatever_order_breaks_nothing(said):
+    state, steady_ns = BoardState({0: "cam", 3: "davis"}), 0
+    for index, (message, later_ns) in enumerate(said):
+        steady_ns += later_ns
+        if index % 5 == 0:
+            state.asked(index % 6, DAY_NS + steady_ns)
+        for pulse in state.take(message, Arrival(DAY_NS + steady_ns, steady_ns)):
+            assert pulse.sensor in ("cam", "davis", "pps")
+    shown = view(state, now_s=steady_ns / S, line_s=steady_ns / S)
+    assert all(isinstance(value, int | float) for value in figures(shown).values())
+    assert all(sentence(found) for found in (clock_state(shown).finding, *problems(shown)))

@@ -1,0 +1,157 @@
+"""Opening cameras that are none, and the kernel's interface against its own headers."""
+
+import os
+import re
+import shutil
+import stat
+import subprocess
+from ctypes import sizeof
+from pathlib import Path
+
+import pytest
+
+from lce_rig.core.errors import SourceError
+from lce_rig.devices.v4l2 import abi as abi
+from lce_rig.devices.v4l2.driver import V4l2Source
+from lce_rig.rig import CameraSettings, load_rig
+
+HEADER = Path("/usr/include/linux/videodev2.h")
+
+
+def camera(device: str | None) -> CameraSettings:
+    settings = load_rig("rlfs").cameras["cam"]
+    return settings.model_copy(update={"driver": settings.driver.model_copy(update={"device": device})})
+
+
+def n_open_files() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def refusal(device: str | None) -> SourceError:
+    with pytest.raises(SourceError) as caught, V4l2Source("cam", camera(device)):
+        pass
+    return caught.value
+
+
+def test_a_camera_that_is_not_there_is_named_with_what_to_check() -> None:
+    error = refusal("/dev/video-of-nobody")
+    assert error.what == "camera 'cam': /dev/video-of-nobody is not there"
+    assert "driver.device" in error.hint or "check the camera's cable" in error.hint
+
+
+def test_a_missing_device_setting_is_said() -> None:
+    error = refusal(None)
+    assert error.what == "cam: the profile does not say how it is reached"
+    assert "Video devices of this computer:" in error.hint
+
+
+def test_what_is_no_device_is_not_opened(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    os.mkfifo(tmp_path / "fifo")
+    for path in (tmp_path / "file", tmp_path / "fifo", tmp_path):
+        assert refusal(str(path)).what == f"camera 'cam': {path} is no device file"
+
+
+def test_a_device_of_another_kind_is_refused() -> None:
+    assert stat.S_ISCHR(Path("/dev/null").stat().st_mode)
+    assert refusal("/dev/null").what == "camera 'cam': /dev/null is no video device"
+
+
+def test_a_device_that_may_not_be_opened_names_the_group(tmp_path: Path) -> None:
+    if os.getuid() == 0:
+        pytest.skip("root may open everything")
+    error = refusal("/dev/mem")
+    assert error.what == "camera 'cam': /dev/mem may not be opened by you"
+    assert "usermod -aG video" in error.hint
+
+
+def test_a_refused_source_leaves_nothing_open_and_can_be_tried_again() -> None:
+    source = V4l2Source("cam", camera("/dev/null"))
+    n_open = n_open_files()
+    for _ in range(3):
+        with pytest.raises(SourceError), source:
+            pass
+    assert n_open_files() == n_open
+    assert source.status().n_samples == 0
+
+
+STRUCTURES = {
+    "v4l2_capability": abi.Capability,
+    "v4l2_fmtdesc": abi.FormatDescription,
+    "v4l2_frmsizeenum": abi.FrameSize,
+    "v4l2_pix_format": abi.PixFormat,
+    "v4l2_format": abi.Format,
+    "v4l2_streamparm": abi.CaptureParameters,
+    "v4l2_requestbuffers": abi.BufferRequest,
+    "v4l2_buffer": abi.Buffer,
+    "v4l2_query_ext_ctrl": abi.ControlQuery,
+    "v4l2_querymenu": abi.MenuQuery,
+    "v4l2_ext_control": abi.Control,
+    "v4l2_ext_controls": abi.Controls,
+}
+NUMBERS = {
+    "VIDIOC_QUERYCAP": abi.QUERY_CAPABILITY,
+    "VIDIOC_ENUM_FMT": abi.ENUMERATE_FORMATS,
+    "VIDIOC_S_FMT": abi.SET_FORMAT,
+    "VIDIOC_REQBUFS": abi.REQUEST_BUFFERS,
+    "VIDIOC_QUERYBUF": abi.QUERY_BUFFER,
+    "VIDIOC_QBUF": abi.QUEUE_BUFFER,
+    "VIDIOC_DQBUF": abi.DEQUEUE_BUFFER,
+    "VIDIOC_STREAMON": abi.STREAM_ON,
+    "VIDIOC_STREAMOFF": abi.STREAM_OFF,
+    "VIDIOC_S_PARM": abi.SET_PARAMETERS,
+    "VIDIOC_QUERYMENU": abi.QUERY_MENU,
+    "VIDIOC_G_EXT_CTRLS": abi.GET_CONTROLS,
+    "VIDIOC_S_EXT_CTRLS": abi.SET_CONTROLS,
+    "VIDIOC_ENUM_FRAMESIZES": abi.ENUMERATE_SIZES,
+    "VIDIOC_QUERY_EXT_CTRL": abi.QUERY_CONTROL,
+    "V4L2_CAP_VIDEO_CAPTURE": abi.CAP_VIDEO_CAPTURE,
+    "V4L2_CAP_VIDEO_CAPTURE_MPLANE": abi.CAP_VIDEO_CAPTURE_MPLANE,
+    "V4L2_CAP_STREAMING": abi.CAP_STREAMING,
+    "V4L2_CAP_DEVICE_CAPS": abi.CAP_DEVICE_CAPS,
+    "V4L2_BUF_FLAG_ERROR": abi.BUFFER_ERROR,
+    "V4L2_BUF_FLAG_TSTAMP_SRC_MASK": abi.STAMP_SOURCE_MASK,
+    "V4L2_BUF_FLAG_TSTAMP_SRC_SOE": abi.STAMP_SOURCE_SOE,
+    "V4L2_CTRL_FLAG_NEXT_CTRL": abi.NEXT_CONTROL,
+    "V4L2_CTRL_FLAG_READ_ONLY": abi.CONTROL_READ_ONLY,
+    "V4L2_CTRL_FLAG_INACTIVE": abi.CONTROL_INACTIVE,
+    "V4L2_CTRL_TYPE_INTEGER64": abi.INTEGER64,
+    "V4L2_CTRL_TYPE_INTEGER_MENU": abi.INTEGER_MENU,
+    "V4L2_CID_EXPOSURE_ABSOLUTE": abi.EXPOSURE_ABSOLUTE_ID,
+}
+OFFSETS = {
+    "v4l2_buffer, timestamp": abi.Buffer.timestamp.offset,
+    "v4l2_buffer, sequence": abi.Buffer.sequence.offset,
+    "v4l2_buffer, m": abi.Buffer.m.offset,
+    "v4l2_buffer, length": abi.Buffer.length.offset,
+    "v4l2_format, fmt": abi.Format.fmt.offset,
+    "v4l2_streamparm, parm.capture.timeperframe": abi.CaptureParameters.numerator.offset,
+    "v4l2_query_ext_ctrl, minimum": abi.ControlQuery.minimum.offset,
+    "v4l2_query_ext_ctrl, flags": abi.ControlQuery.flags.offset,
+    "v4l2_ext_control, value64": abi.Control.value.offset,
+    "v4l2_ext_controls, controls": abi.Controls.controls.offset,
+    "v4l2_frmsizeenum, discrete": abi.FrameSize.sizes.offset,
+    "v4l2_querymenu, name": abi.MenuQuery.item.offset,
+}
+
+
+def test_structures_and_numbers_are_those_of_the_kernels_header(tmp_path: Path) -> None:
+    compiler = shutil.which("cc")
+    if compiler is None or not HEADER.exists():
+        pytest.skip("no C compiler, or no kernel headers")
+    asked = [f"sizeof(struct {name})" for name in STRUCTURES]
+    asked += [f"offsetof(struct {place})" for place in OFFSETS] + list(NUMBERS)
+    lines = "\n".join(f'printf("%lu\\n", (unsigned long)({text}) & 0xfffffffful);' for text in asked)
+    source = tmp_path / "ask.c"
+    source.write_text(
+        f"#include <stdio.h>\n#include <stddef.h>\n#include <linux/videodev2.h>\nint main(void){{{lines}}}"
+    )
+    subprocess.run([compiler, "-o", tmp_path / "ask", source], check=True, capture_output=True)
+    said = subprocess.run([tmp_path / "ask"], check=True, capture_output=True, text=True).stdout.split()
+    ours = [sizeof(kind) for kind in STRUCTURES.values()] + list(OFFSETS.values()) + list(NUMBERS.values())
+    assert dict(zip(asked, map(int, said), strict=True)) == dict(zip(asked, ours, strict=True))
+
+
+def test_buffers_lie_as_on_64_bit() -> None:
+    assert (sizeof(abi.Buffer), sizeof(abi.Format)) == (88, 208)
+    assert re.fullmatch("0xc0585611", hex(abi.DEQUEUE_BUFFER))

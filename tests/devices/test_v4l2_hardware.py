@@ -1,0 +1,182 @@
+"""A real video device, named by LCE_RIG_VIDEO: any camera, or the kernel's own (`sudo modprobe vivid`)."""
+
+import os
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Image
+from lce_rig.core.errors import SourceError
+from lce_rig.devices.pixel_formats import FORMATS
+from lce_rig.devices.v4l2.controls import list_controls, read_control
+from lce_rig.devices.v4l2.driver import V4l2Source
+from lce_rig.devices.v4l2.video_device import VideoDevice
+from lce_rig.rig import CameraSettings, load_rig
+
+pytestmark = pytest.mark.hardware
+DEVICE = os.environ.get("LCE_RIG_VIDEO", "/dev/video0")
+SIZE = tuple(int(n) for n in os.environ.get("LCE_RIG_VIDEO_SIZE", "640x360").split("x"))
+# Its stamps of an end of frame lie in the future; those of a start of exposure do not.
+VIVID = {"timestamp_source": "Start of Exposure", "osd_text_mode": "None"}
+
+
+@pytest.fixture(autouse=True)
+def device_name() -> str:
+    """The driver's name; skips where there is no device."""
+    if not Path(DEVICE).exists():
+        pytest.skip(f"{DEVICE} is not there: set LCE_RIG_VIDEO")
+    device = VideoDevice(DEVICE, "cam")
+    try:
+        return device.driver
+    finally:
+        device.close()
+
+
+@pytest.fixture
+def vivid(device_name: str) -> None:
+    """Skips where the device is not the kernel's virtual camera."""
+    if device_name != "vivid":
+        pytest.skip(f"{DEVICE} is a {device_name}, not vivid")
+
+
+def camera(controls: dict[str, Any] | None = None, **driver: Any) -> CameraSettings:
+    settings = load_rig("rlfs").cameras["cam"]
+    changed = settings.driver.model_copy(update={"device": DEVICE, "controls": controls or {}, **driver})
+    return settings.model_copy(update={"driver": changed, "resolution_px": SIZE})
+
+
+def n_open_files() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def take(source: V4l2Source, n: int) -> list[Image]:
+    return [sample for sample in islice(source.samples(), n) if isinstance(sample, Image)]
+
+
+def test_pictures_come_counted_stamped_and_in_order(device_name: str) -> None:
+    with V4l2Source("cam", camera(VIVID if device_name == "vivid" else {})) as source:
+        images = take(source, 20)
+        status = source.status()
+    assert {image.pixels.shape[:2] for image in images} == {SIZE[::-1]}
+    counts = np.array([image.count for image in images])
+    assert (np.diff(counts) >= 1).all()
+    stamps = np.array([image.stamp_ns for image in images])
+    assert (np.diff(stamps) > 0).all()
+    ages_s = np.array([image.host_ns for image in images if image.host_ns is not None]) * 1.0 - stamps
+    assert (ages_s > -50e6).all() and (ages_s < 2e9).all()
+    assert status.clock is not None and status.clock.finding.code == "clock.mid_exposure"
+    assert status.n_samples >= 20
+
+
+def test_a_running_camera_is_busy_for_others() -> None:
+    with V4l2Source("cam", camera()):
+        with pytest.raises(SourceError, match="is busy") as caught, V4l2Source("cam", camera()):
+            pass
+        assert "fuser -v" in caught.value.hint
+
+
+def test_it_can_be_opened_again_and_again() -> None:
+    n_open = n_open_files()
+    for _ in range(3):
+        with V4l2Source("cam", camera()) as source:
+            assert len(take(source, 2)) == 2
+    assert n_open_files() == n_open
+
+
+def test_a_size_that_it_does_not_have_is_refused() -> None:
+    odd = camera().model_copy(update={"resolution_px": (642, 362)})
+    with pytest.raises(SourceError, match="the intrinsics belong to 642x362 px"), V4l2Source("cam", odd):
+        pass
+
+
+def test_an_unknown_control_names_the_nearest(vivid: None) -> None:
+    with (
+        pytest.raises(SourceError, match="no such setting") as caught,
+        V4l2Source("cam", camera({"brightnes": 1})),
+    ):
+        pass
+    assert "mean brightness?" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("controls", "says"),
+    [
+        ({"brightness": 300}, "out of range"),
+        ({"brightness": 1.5}, "no whole number"),
+        ({"timestamp_source": "Dawn"}, "is no choice"),
+        ({"menu": 2}, "is no choice"),
+        ({"read_only_integer_32_bits": 1}, "is refused"),
+    ],
+)
+def test_values_it_cannot_take_are_refused(controls: dict[str, Any], says: str, vivid: None) -> None:
+    with pytest.raises(SourceError, match=says), V4l2Source("cam", camera(controls)):
+        pass
+
+
+def test_controls_are_set_by_number_and_by_name(vivid: None) -> None:
+    wanted = {"brightness": 77, "integer_64_bits": 1 << 40, "menu": "Menu Item 4", "gain_automatic": False}
+    with V4l2Source("cam", camera(wanted)) as source:
+        assert source.status().problems == ()
+    device = VideoDevice(DEVICE, "cam")
+    known = list_controls(device)
+    assert [read_control(device, known[name]) for name in wanted] == [77, 1 << 40, 4, 0]
+    device.close()
+
+
+def test_all_formats_show_the_same_picture(vivid: None) -> None:
+    still = VIVID | {"test_pattern": 0, "brightness": 128}
+    pictures: dict[str, np.ndarray] = {}
+    device = VideoDevice(DEVICE, "cam")
+    offered = [code for code in device.formats() if code in FORMATS]
+    device.close()
+    for code in offered:
+        with V4l2Source("cam", camera(still, pixel_format=code)) as source:
+            pictures[code] = take(source, 1)[0].pixels
+    true = pictures["BGR3"].astype(int)
+    assert len(pictures) >= 20
+    for code, pixels in pictures.items():
+        if pixels.ndim == 3:
+            apart = np.abs(pixels.astype(int) - true).max(2)
+            # Coarse chroma mixes the colours beside an edge of the bars.
+            assert np.median(apart) <= 4, code
+            assert np.mean(apart > 4) <= 0.05, code
+
+
+def test_lost_pictures_are_counted(vivid: None) -> None:
+    with V4l2Source("cam", camera(VIVID | {"percentage_of_dropped_buffers": 40})) as source:
+        images = take(source, 20)
+        counts = [image.count for image in images if image.count is not None]
+        n_missing = counts[-1] - counts[0] + 1 - len(counts)
+        assert source.status().n_lost >= n_missing > 0
+    camera_again = camera({"percentage_of_dropped_buffers": 0})
+    with V4l2Source("cam", camera_again):
+        pass
+
+
+def test_the_flag_of_a_start_of_exposure_is_believed(vivid: None) -> None:
+    with V4l2Source("cam", camera(VIVID)) as source:
+        take(source, 2)
+        told = source.status().clock
+        assert told is not None
+        assert (told.finding.figures["mark"], told.finding.figures["clock"]) == (
+            "start_of_exposure",
+            "monotonic",
+        )
+
+
+def test_stamps_in_the_future_are_not_trusted(vivid: None) -> None:
+    with V4l2Source("cam", camera({"timestamp_source": "End of Frame"}, frame_rate_hz=5.0)) as source:
+        take(source, 3)
+        assert any(problem.family == "clock" for problem in source.status().problems)
+
+
+def test_a_camera_without_pulses_falls_silent(vivid: None) -> None:
+    with V4l2Source("cam", camera({"percentage_of_dropped_buffers": 100}), silence_s=1.5) as source:
+        with pytest.raises(SourceError, match=r"nothing for 1\.5 s") as caught:
+            take(source, 5)
+        assert "FSYNC" in caught.value.hint
+    with V4l2Source("cam", camera({"percentage_of_dropped_buffers": 0})):
+        pass

@@ -1,0 +1,134 @@
+"""Pixel formats against the formulas they stand for, with rows of any length."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, find_format
+
+WIDTH, HEIGHT = 22, 12
+
+
+def smooth_picture(seed: int = 0) -> np.ndarray:
+    """A picture (H, W, 3) BGR whose neighbours differ little, so that halved chroma loses little."""
+    coarse = np.random.default_rng(seed).uniform(20, 235, (3, 4, 3)).astype(np.float32)
+    return cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR).astype(np.uint8)
+
+
+def to_yuv(bgr: np.ndarray) -> np.ndarray:
+    """ITU-R BT.601, video range: (H, W, 3) Y, U, V."""
+    blue, green, red = np.moveaxis(bgr.astype(float), 2, 0)
+    y = 16 + (65.481 * red + 128.553 * green + 24.966 * blue) / 255
+    u = 128 + (-37.797 * red - 74.203 * green + 112 * blue) / 255
+    v = 128 + (112 * red - 93.786 * green - 18.214 * blue) / 255
+    return np.rint(np.stack((y, u, v), 2)).astype(np.uint8)
+
+
+def pad(rows: np.ndarray, stride: int) -> bytes:
+    """Lay rows (H, n bytes) out at a stride, the gaps filled with what must not be seen."""
+    return np.pad(rows, ((0, 0), (0, stride - rows.shape[1])), constant_values=255).tobytes()
+
+
+def encode(code: str, bgr: np.ndarray, padding: int) -> tuple[bytes, int]:
+    """Write a picture in a pixel format; gives the bytes and the stride."""
+    height, width = bgr.shape[:2]
+    if code in ("UYVY", "YUYV", "YVYU"):
+        y, u, v = np.moveaxis(to_yuv(bgr), 2, 0)
+        rows = np.empty((height, width, 2), np.uint8)
+        at = {"UYVY": (1, 0, 0), "YUYV": (0, 1, 1), "YVYU": (0, 1, 1)}[code]
+        rows[:, :, at[0]] = y
+        first, second = (v, u) if code == "YVYU" else (u, v)
+        rows[:, 0::2, at[1]], rows[:, 1::2, at[2]] = first[:, 0::2], second[:, 1::2]
+        return pad(rows.reshape(height, -1), 2 * width + padding), 2 * width + padding
+    if code in ("NV12", "YU12", "YV12"):
+        y, u, v = np.moveaxis(to_yuv(bgr), 2, 0)
+        stride = width + 2 * padding
+        u, v = u[::2, ::2], v[::2, ::2]
+        if code == "NV12":
+            return pad(y, stride) + pad(np.stack((u, v), 2).reshape(height // 2, width), stride), stride
+        planes = (u, v) if code == "YU12" else (v, u)
+        return pad(y, stride) + b"".join(pad(plane, stride // 2) for plane in planes), stride
+    if code in ("BGR3", "RGB3", "BGR4"):
+        pixels = bgr if code != "RGB3" else bgr[:, :, ::-1]
+        if code == "BGR4":
+            pixels = np.dstack((bgr, np.full((height, width), 7, np.uint8)))
+        rows = pixels.reshape(height, -1)
+        return pad(rows, rows.shape[1] + padding), rows.shape[1] + padding
+    raise AssertionError(code)
+
+
+@pytest.mark.parametrize("code", ["UYVY", "YUYV", "YVYU", "NV12", "YU12", "YV12", "BGR3", "RGB3", "BGR4"])
+@pytest.mark.parametrize("padding", [0, 5])
+def test_a_colour_picture_comes_back(code: str, padding: int) -> None:
+    picture = smooth_picture()
+    data, stride = encode(code, picture, padding)
+    pixels = PixelDecoder(code, WIDTH, HEIGHT, stride).decode(data)
+    is_exact = code in ("BGR3", "RGB3", "BGR4")
+    # Chroma of every other pixel: as wrong as neighbours differ.
+    step = max(np.abs(np.diff(picture.astype(int), axis=axis)).max() for axis in (0, 1))
+    assert np.abs(pixels.astype(int) - picture).max() <= (0 if is_exact else 4 + 2 * step)
+    assert np.abs(pixels.astype(float).mean((0, 1)) - picture.mean((0, 1))).max() <= (0 if is_exact else 6)
+
+
+@pytest.mark.parametrize(
+    ("code", "red_at"), [("RGGB", (0, 0)), ("GRBG", (0, 1)), ("GBRG", (1, 0)), ("BA81", (1, 1))]
+)
+def test_a_mosaic_of_one_colour_gives_that_colour(code: str, red_at: tuple[int, int]) -> None:
+    mosaic = np.full((HEIGHT, WIDTH), 120, np.uint8)
+    mosaic[red_at[0] :: 2, red_at[1] :: 2] = 200
+    mosaic[1 - red_at[0] :: 2, 1 - red_at[1] :: 2] = 40
+    pixels = PixelDecoder(code, WIDTH, HEIGHT, WIDTH + 3).decode(pad(mosaic, WIDTH + 3))
+    assert (pixels[2:-2, 2:-2] == (40, 120, 200)).all()
+
+
+@pytest.mark.parametrize(("code", "bits"), [("Y10 ", 10), ("Y12 ", 12), ("Y16 ", 16)])
+def test_deep_grey_keeps_its_upper_bits(code: str, bits: int) -> None:
+    grey = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH)).astype(np.uint16)
+    data = pad((grey << (bits - 8)).astype("<u2").view(np.uint8), 2 * WIDTH + 6)
+    assert (PixelDecoder(code, WIDTH, HEIGHT, 2 * WIDTH + 6).decode(data) == grey).all()
+
+
+def test_left_aligned_bits_are_found_out_and_remembered() -> None:
+    decoder = PixelDecoder("Y12 ", WIDTH, HEIGHT)
+    bright, dark = np.full((HEIGHT, WIDTH), 200 << 8, "<u2"), np.full((HEIGHT, WIDTH), 3 << 8, "<u2")
+    assert (decoder.decode(bright.tobytes()) == 200).all()
+    assert (decoder.decode(dark.tobytes()) == 3).all()
+
+
+def test_a_jpeg_is_decoded_and_must_have_the_size() -> None:
+    data = cv2.imencode(".jpg", smooth_picture())[1].tobytes()
+    assert PixelDecoder("MJPG", WIDTH, HEIGHT).decode(data).shape == (HEIGHT, WIDTH, 3)
+    with pytest.raises(ValueError, match="22x12 px, not 24x12 px"):
+        PixelDecoder("MJPG", WIDTH + 2, HEIGHT).decode(data)
+    with pytest.raises(ValueError, match="truncated"):
+        PixelDecoder("MJPG", WIDTH, HEIGHT).decode(data[:-20])
+
+
+@given(code=st.sampled_from(sorted(FORMATS)), width=st.integers(1, 20), padding=st.integers(0, 9))
+def test_exactly_the_declared_bytes_make_a_picture(code: str, width: int, padding: int) -> None:
+    width, form = 2 * width, FORMATS[code]
+    row = width * form.n_channels * (2 if form.bits > 8 else 1)
+    decoder = PixelDecoder(code, width, 8, row + 2 * padding)
+    if not form.is_compressed:
+        pixels = decoder.decode(bytes(decoder.n_bytes))
+        assert pixels.shape[:2] == (8, width)
+        assert pixels.dtype == np.uint8
+    with pytest.raises(ValueError, match="bytes of a picture came"):
+        decoder.decode(bytes(decoder.n_bytes - 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [
+        ("uyvy", "UYVY"),
+        ("YUY2", "YUYV"),
+        ("Y16", "Y16 "),
+        ("GRAY", None),
+        ("I420", "YU12"),
+        ("mjpeg", "MJPG"),
+    ],
+)
+def test_formats_go_by_several_names(name: str, code: str | None) -> None:
+    assert find_format(name) == code

@@ -1,0 +1,397 @@
+"""A VLP-16 on a real socket: scans at full rate, and sentences for everything that goes wrong."""
+
+import resource
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lce_rig.core import velodyne
+from lce_rig.core.data import Scan
+from lce_rig.core.errors import SourceError
+from lce_rig.devices.vlp16.driver import Vlp16Source
+from lce_rig.devices.vlp16.packet_recorder import PcapRecorder
+from lce_rig.devices.vlp16.socket import N_AT_ONCE, UdpPort
+from lce_rig.devices.vlp16.status import Reception, to_status
+from lce_rig.recordings.protocol import SourceOptions
+from lce_rig.recordings.velodyne.datagrams import Datagram
+from lce_rig.recordings.velodyne.pcap import PcapRecording
+from lce_rig.recordings.velodyne.stream import Vlp16Stream
+from lce_rig.rig import LidarSettings, Rig
+from lce_rig.rig.sensors import DriverSettings
+from lce_rig.simulate.vlp16_packets import SensorPacket, Vlp16Clock
+from tests.recordings.vlp16_room import PERIOD_NS, T0_NS, packets_of, push, room_scans, settings
+
+HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"
+PATIENT_S = 10.0
+
+
+def free_ports() -> tuple[int, int]:
+    kind = socket.AF_INET, socket.SOCK_DGRAM
+    with socket.socket(*kind) as data, socket.socket(*kind) as position:
+        data.bind(("", 0))
+        position.bind(("", 0))
+        return data.getsockname()[1], position.getsockname()[1]
+
+
+@pytest.fixture
+def lidar() -> LidarSettings:
+    """A sensor at 127.0.0.1 on ports that nobody uses."""
+    data, position = free_ports()
+    driver = DriverSettings(port=data, address=HERE, controls={"position_port": position})
+    return settings(driver=driver)
+
+
+def wait_for(is_so: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENT_S
+    while not is_so():
+        assert time.monotonic() < deadline_s, "it never came to be"
+        time.sleep(0.005)
+
+
+class Sender:
+    """A thread that sends packets to a source once it has opened its ports, each when its time has come."""
+
+    def __init__(self, lidar: LidarSettings, source: Vlp16Source, address: str = HERE) -> None:
+        self._ports = {
+            velodyne.DATA_PORT: lidar.driver.port,
+            velodyne.POSITION_PORT: int(lidar.driver.controls["position_port"]),
+        }
+        self._source = source
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((address, 0))
+        self._stop = threading.Event()
+
+    @contextmanager
+    def sending(self, make_packets: Callable[[int], list[SensorPacket]]) -> Iterator[None]:
+        """Send what is made for a time a little ahead."""
+        thread = threading.Thread(target=self._run, args=(make_packets,))
+        thread.start()
+        try:
+            yield
+        finally:
+            self._stop.set()
+            thread.join()
+            self._socket.close()
+
+    def _run(self, make_packets: Callable[[int], list[SensorPacket]]) -> None:
+        while not self._source.status().figures.get("receive_buffer_bytes"):
+            if self._stop.wait(0.005):
+                return
+        packets = self._make_in_time(make_packets)
+        for n_sent, packet in enumerate(packets):
+            # Sleeping is not exact: packets leave in small bursts, as a network card hands them on.
+            while (ahead_s := (packet.sent_ns - time.time_ns()) * 1e-9) > 0.002:
+                if self._stop.wait(min(ahead_s, 0.1)):
+                    return
+            # What is late is sent at once, but no faster than a port can take it.
+            if n_sent % 50 == 49:
+                time.sleep(0.001)
+            self._socket.sendto(packet.payload, (HERE, self._ports[packet.port]))
+
+    @staticmethod
+    def _make_in_time(make_packets: Callable[[int], list[SensorPacket]]) -> list[SensorPacket]:
+        """Make packets before they are due; a busy computer needs longer."""
+        for ahead_ms in (200, 800, 3000):
+            start_ns = (time.time_ns() + 1_000_000 * ahead_ms) // 1000 * 1000
+            packets = make_packets(start_ns)
+            if time.time_ns() < start_ns:
+                break
+        return packets
+
+
+@contextmanager
+def streaming(
+    lidar: LidarSettings, make_packets: Callable[[int], list[SensorPacket]], **options: Any
+) -> Iterator[Vlp16Source]:
+    """An open source that packets come to."""
+    source = Vlp16Source("lidar", lidar, **{"silence_s": PATIENT_S, "n_slots": 100, **options})
+    with Sender(lidar, source).sending(make_packets), source:
+        yield source
+
+
+class Room:
+    """Makes the packets of some revolutions, and keeps the scans they were made from."""
+
+    def __init__(self, n: int, mode: int = velodyne.STRONGEST, clock: Vlp16Clock | None = None) -> None:
+        self.scans: list[Scan] = []
+        self._arguments = n, mode, clock
+
+    def __call__(self, start_ns: int) -> list[SensorPacket]:
+        n, mode, clock = self._arguments
+        self.scans = room_scans(n, start_ns)
+        return packets_of(self.scans, mode, clock)
+
+
+def take(source: Vlp16Source, n: int) -> list[Scan]:
+    scans = source.samples()
+    return [next(scans) for _ in range(n)]
+
+
+def stamps(scans: list[Scan]) -> np.ndarray:
+    return np.array([scan.stamp_ns for scan in scans], np.int64)
+
+
+# What comes
+
+
+def test_packets_at_full_rate_arrive_without_a_loss_and_with_the_sensors_time(lidar: LidarSettings) -> None:
+    room = Room(13)
+    with streaming(lidar, room) as source:
+        scans = take(source, 12)
+        status = source.status()
+    assert np.abs(stamps(scans) - stamps(room.scans[:12])).max() <= 1000
+    assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in room.scans[:12]]
+    assert (status.n_lost, status.n_dropped, status.figures["overflowed_packets"]) == (0, 0, 0)
+    assert status.figures["bad_packets"] == 0 and (status.n_packets or 0) >= 900
+    assert status.clock is not None and status.clock.is_utc
+    assert status.clock.finding.code == "clock.lidar_utc" and HERE in status.device
+    assert {problem.code for problem in status.problems} <= {"buffer.small"}
+    for scan in scans:
+        # The last packet of a scan ends after it; the sender is up to 2 ms early.
+        assert int(scan.host_ns or 0) - int(scan.stamp_ns or 0) >= PERIOD_NS - 2_000_000
+
+
+def test_a_dual_return_sensor_is_read_at_twice_the_rate(lidar: LidarSettings) -> None:
+    with streaming(lidar, Room(5, velodyne.DUAL)) as source:
+        scans = take(source, 4)
+        status = source.status()
+    assert len(scans) == 4 and status.n_lost == 0 and status.figures["is_dual"] == 1
+
+
+def test_a_sensor_without_pulses_is_stamped_by_arrival_and_said_so(lidar: LidarSettings) -> None:
+    room = Room(5, clock=Vlp16Clock("absent", has_nmea=False, error_us=721_000_000))
+    with streaming(lidar, room) as source:
+        scans = take(source, 4)
+        status = source.status()
+    late_ns = stamps(scans) - stamps(room.scans[:4])
+    assert late_ns.min() > -4_000_000 and late_ns.max() < 60 * 10**9
+    assert status.clock is not None and not status.clock.is_utc
+    (found,) = [each for each in status.problems if each.family == "clock"]
+    assert (found.code, found.figures["pps"]) == ("clock.pps_not_locked", "absent")
+    assert found == status.clock.finding
+
+
+def test_only_packets_of_the_profiles_address_are_taken(lidar: LidarSettings) -> None:
+    room = Room(3)
+    source = Vlp16Source("lidar", lidar, silence_s=PATIENT_S, n_slots=100)
+    stranger = Sender(lidar, source, ELSEWHERE)
+    with stranger.sending(lambda _: packets_of(room_scans(1))), Sender(lidar, source).sending(room), source:
+        scans = take(source, 2)
+        wait_for(lambda: source.status().figures["stranger_packets"] == 82)
+        status = source.status()
+    assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in room.scans[:2]]
+    assert status.figures["clock_steps"] == 0
+
+
+def test_without_an_address_the_sensor_heard_first_is_taken(lidar: LidarSettings) -> None:
+    driver = lidar.driver.model_copy(update={"address": None})
+    room = Room(4)
+    source = Vlp16Source(
+        "lidar", lidar.model_copy(update={"driver": driver}), silence_s=PATIENT_S, n_slots=100
+    )
+    second = Sender(lidar, source, ELSEWHERE)
+
+    def make_late(start_ns: int) -> list[SensorPacket]:
+        wait_for(lambda: HERE in source.status().device)
+        return packets_of(room_scans(1))
+
+    with Sender(lidar, source).sending(room), second.sending(make_late), source:
+        scans = take(source, 3)
+        wait_for(lambda: source.status().figures["stranger_packets"] == 82)
+    assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in room.scans[:3]]
+
+
+def test_a_slow_taker_gets_the_newest_scans_and_the_others_are_counted(lidar: LidarSettings) -> None:
+    with streaming(lidar, lambda _: packets_of(room_scans(12)), n_slots=5) as source:
+        wait_for(lambda: source.status().n_samples >= 11)
+        status = source.status()
+        first = next(source.samples())
+    assert status.n_dropped == status.n_samples - 5
+    assert int(first.stamp_ns or 0) >= T0_NS + 6 * PERIOD_NS - 1000
+
+
+def test_a_third_of_the_packets_may_be_lost_on_the_way(lidar: LidarSettings) -> None:
+    def lossy(start_ns: int) -> list[SensorPacket]:
+        is_kept = np.random.default_rng(2).random(1000) > 0.3
+        return [p for p, keep in zip(Room(6)(start_ns), is_kept, strict=False) if keep]
+
+    with streaming(lidar, lossy) as source:
+        scans = take(source, 4)
+        status = source.status()
+    assert all(len(scan.points) > 13_000 for scan in scans)
+    (found,) = [each for each in status.problems if each.code == "stream.packets_lost"]
+    assert found.figure("share") == pytest.approx(0.3, abs=0.06)
+    assert status.n_lost / (status.n_lost + (status.n_packets or 0)) == pytest.approx(0.3, abs=0.06)
+
+
+def test_an_open_source_ends_when_it_is_closed_and_can_be_opened_again(lidar: LidarSettings) -> None:
+    source = Vlp16Source("lidar", lidar, silence_s=PATIENT_S)
+    for _ in range(2):
+        with Sender(lidar, source).sending(Room(3)), source:
+            take(source, 1)
+        assert len(list(source.samples())) <= 5
+        assert f"read {source.sensor}" not in {thread.name for thread in threading.enumerate()}
+
+
+# What does not come
+
+
+def explain(lidar: LidarSettings, packets: list[SensorPacket] | None = None, **options: Any) -> SourceError:
+    """The error of opening a source that nothing good comes to."""
+    source = Vlp16Source("lidar", lidar, **{"silence_s": 0.3, "web_port": 9, **options})
+    with pytest.raises(SourceError) as caught, Sender(lidar, source).sending(lambda _: packets or []), source:
+        pass
+    return caught.value
+
+
+def test_an_absent_sensor_is_an_error_that_says_what_to_check(lidar: LidarSettings) -> None:
+    error = explain(lidar)
+    assert HERE in error.what and str(lidar.driver.port) in error.what
+    for word in ("power", "cable", "192.168.1.x", "driver.address"):
+        assert word in error.hint
+
+
+def test_a_sensor_that_falls_silent_is_an_error_after_what_it_sent(lidar: LidarSettings) -> None:
+    with streaming(lidar, lambda _: packets_of(room_scans(3)), silence_s=1.0, web_port=9) as source:
+        scans = source.samples()
+        assert len([next(scans) for _ in range(2)]) == 2
+        with pytest.raises(SourceError, match="have stopped"):
+            list(scans)
+
+
+def test_another_model_is_refused_by_name(lidar: LidarSettings) -> None:
+    others = [
+        SensorPacket(p.port, p.sent_ns, p.payload[:-1] + b"\x21")
+        for p in packets_of(room_scans(1))
+        if p.port == velodyne.DATA_PORT
+    ]
+    assert "HDL-32E" in explain(lidar, others).what
+
+
+def test_packets_of_another_address_are_named(lidar: LidarSettings) -> None:
+    driver = lidar.driver.model_copy(update={"address": ELSEWHERE})
+    error = explain(lidar.model_copy(update={"driver": driver}), packets_of(room_scans(1)))
+    assert HERE in error.hint and "driver.address" in error.hint
+
+
+def test_rubbish_on_the_port_is_counted_and_named(lidar: LidarSettings) -> None:
+    rubbish = [SensorPacket(velodyne.DATA_PORT, T0_NS, b"hello")] * 7
+    assert "7 data packets" in explain(lidar, rubbish).what
+
+
+def test_a_port_that_another_program_holds_is_named(lidar: LidarSettings) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("", lidar.driver.port))
+        error = explain(lidar)
+    assert str(lidar.driver.port) in error.what and "ss -ulpn" in error.hint
+
+
+# What is kept
+
+
+def test_what_was_recorded_replays_to_the_same_scans(lidar: LidarSettings, rig: Rig, tmp_path: Path) -> None:
+    path = tmp_path / "raw.pcap"
+    with streaming(lidar, Room(6), record_to=path) as source:
+        live = take(source, 5)
+    replayed = list(PcapRecording(path, rig, SourceOptions()).samples())[:5]
+    for a, b in zip(live, replayed, strict=True):
+        assert (a.stamp_ns, a.host_ns) == (b.stamp_ns, b.host_ns)
+        np.testing.assert_array_equal(a.points, b.points)
+        np.testing.assert_array_equal(a.offset_ns, b.offset_ns)
+
+
+def test_a_recording_is_never_written_over(lidar: LidarSettings, tmp_path: Path) -> None:
+    path = tmp_path / "raw.pcap"
+    path.write_bytes(b"kept")
+    assert str(path) in explain(lidar, record_to=path).what
+    assert path.read_bytes() == b"kept"
+
+
+def test_a_full_disk_ends_the_recording_and_nothing_else(lidar: LidarSettings, tmp_path: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        with streaming(lidar, Room(6), record_to=tmp_path / "raw.pcap") as source:
+            scans = take(source, 5)
+            wait_for(lambda: any(p.code == "device.recording_stopped" for p in source.status().problems))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert len(scans) == 5
+
+
+def test_a_disk_that_stalls_costs_recorded_packets_and_no_scans(tmp_path: Path) -> None:
+    recorder = PcapRecorder(tmp_path / "raw.pcap")
+    datagram = Datagram(T0_NS, HERE, 2368, 2368, bytes(1206))
+    for _ in range(40_000):
+        recorder.put(datagram)
+    recorder.close()
+    assert recorder.n_written + recorder.n_dropped == 40_000
+    n_bytes = (tmp_path / "raw.pcap").stat().st_size
+    assert n_bytes == 24 + recorder.n_written * (16 + 42 + 1206)
+
+
+# What is said
+
+
+def test_every_figure_out_of_line_is_a_problem_of_its_own() -> None:
+    stream = Vlp16Stream("lidar", settings(rate_hz=20))
+    push(stream, packets_of(room_scans(2)))
+    reception = Reception(n_overflowed=12, granted_bytes=200_000)
+    status = to_status("lidar", settings(rate_hz=20), stream, reception, None)
+    found = {problem.code: problem for problem in status.problems}
+    assert found["stream.computer_too_slow"].figures["n"] == 12
+    assert found["buffer.small"].figure("buffer_s") == pytest.approx(0.115, abs=0.001)
+    rotor = found["stream.rotor_rate"]
+    assert rotor.figure("rotor_hz") == pytest.approx(10, abs=0.1)
+    assert (rotor.figures["expected_hz"], rotor.figures["expected_rpm"]) == (20, 1200)
+
+
+def test_arrivals_are_stamped_by_the_kernel_not_when_they_are_taken() -> None:
+    port = UdpPort(free_ports()[0], "test")
+    late_s = 0.02
+
+    def is_stamped_before_taken() -> bool:
+        before_ns = time.time_ns()
+        sender.sendto(b"x", (HERE, port.port))
+        time.sleep(late_s)
+        taken_ns = time.time_ns()
+        datagram = port.receive()
+        assert datagram is not None and (datagram.source, datagram.payload) == (HERE, b"x")
+        assert datagram.host_ns >= before_ns - 1_000_000
+        return datagram.host_ns < taken_ns - 0.5 * late_s * 1e9
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        # The kernel takes a moment to begin; datagrams before that are stamped when they are taken.
+        wait_for(is_stamped_before_taken)
+    assert port.receive() is None
+    port.close()
+
+
+def test_datagrams_taken_at_once_are_those_taken_one_by_one() -> None:
+    port = UdpPort(free_ports()[0], "test")
+    wanted = [b"%d" % k * (k % 5) for k in range(N_AT_ONCE + 6)]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind((HERE, 0))
+        before_ns = time.time_ns() - 1_000_000
+        for payload in wanted:
+            sender.sendto(payload, (HERE, port.port))
+        came = port.receive_many()
+        one = port.receive()
+        assert len(came) == N_AT_ONCE and one is not None
+        came += [one, *port.receive_many()]
+        assert [each.payload for each in came] == wanted
+        assert {(each.source, each.source_port, each.port) for each in came} == {
+            (*sender.getsockname(), port.port)
+        }
+    stamps_ns = [each.host_ns for each in came]
+    assert stamps_ns == sorted(stamps_ns)
+    assert before_ns < stamps_ns[0] and stamps_ns[-1] <= time.time_ns()
+    assert port.receive_many() == []
+    port.close()

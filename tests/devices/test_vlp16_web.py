@@ -1,0 +1,226 @@
+"""The sensor's web page, over HTTP: whatever firmware answers, and settings that are read back."""
+
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import parse_qs
+
+import pytest
+
+from lce_rig.core.errors import SourceError
+from lce_rig.devices.vlp16.driver import explain_silence
+from lce_rig.devices.vlp16.status import Reception
+from lce_rig.devices.vlp16.web import VelodyneWeb, find_problems
+from lce_rig.recordings.velodyne.stream import Vlp16Stream
+from lce_rig.rig.sensors import DriverSettings
+from tests.recordings.vlp16_room import settings
+
+INFO = {
+    "model": "VLP-16",
+    "serial": "AG43510116",
+    "mac_addr": "60-76-88-10-24-93",
+    "version": {"gateware": {"id": "3.0.23.0"}, "application": {"id": "3.0.41.1", "date": "2018-05-01"}},
+}
+STATUS = {
+    "gps": {"pps_state": "Locked", "position": "49 00.00N 200 .00W"},
+    "motor": {"state": "On", "rpm": 599, "lock": "Off", "phase": 30755},
+    "laser": {"state": "On"},
+}
+SETTINGS = {
+    "rpm": 600,
+    "returns": "Strongest",
+    "laser": "On",
+    "fov": {"start": 0, "end": 359},
+    "host": {"addr": "255.255.255.255", "dport": 2368, "tport": 8308},
+    "phaselock": {"enabled": "Off", "offset": 0},
+}
+DIAGNOSTICS = {"volt_temp": {"top": {"lm20_temp": 1100}, "bot": {"lm20_temp": 1050}}}
+PAGES: dict[str, Any] = {"info": INFO, "status": STATUS, "settings": SETTINGS, "diag": DIAGNOSTICS}
+
+
+class FakeSensor:
+    """A sensor's web server; `pages` are what it answers, and settings change as on the real one.
+
+    Attributes:
+        pages: contents by name; bytes are sent as they are.
+        is_deaf: whether settings are acknowledged and not made.
+    """
+
+    def __init__(self, pages: dict[str, Any]) -> None:
+        self.pages = json.loads(json.dumps({k: v for k, v in pages.items() if not isinstance(v, bytes)}))
+        self.pages.update({k: v for k, v in pages.items() if isinstance(v, bytes)})
+        self.is_deaf = False
+
+    def set(self, fields: dict[str, list[str]]) -> None:
+        if not self.is_deaf:
+            self.pages["settings"].update({key: values[0] for key, values in fields.items()})
+
+
+@contextmanager
+def serving(pages: dict[str, Any]) -> Iterator[tuple[FakeSensor, VelodyneWeb]]:
+    sensor = FakeSensor(pages)
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            name = self.path.removeprefix("/cgi/").removesuffix(".json")
+            if name not in sensor.pages:
+                self.send_error(404)
+                return
+            content = sensor.pages[name]
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(content if isinstance(content, bytes) else json.dumps(content).encode())
+
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"])).decode()
+            assert self.path == "/cgi/setting"
+            sensor.set(parse_qs(body))
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, format: str, *arguments: Any) -> None:
+            return
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield sensor, VelodyneWeb("127.0.0.1", server.server_port)
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_the_page_of_a_healthy_sensor_is_read_without_a_complaint() -> None:
+    with serving(PAGES) as (sensor, web):
+        report = web.read()
+        assert sensor.pages == PAGES
+    assert (report.model, report.serial, report.firmware) == ("VLP-16", "AG43510116", "3.0.41.1")
+    assert (report.pps, report.returns, report.host) == ("locked", "strongest", "255.255.255.255")
+    assert report.is_motor_on and report.is_laser_on
+    assert report.rotor_hz == pytest.approx(9.98, abs=0.01) and report.wanted_rotor_hz == 10
+    assert (report.fov_deg, report.data_port, report.position_port) == ((0, 359), 2368, 8308)
+    assert report.temperature_c is not None and 20 < report.temperature_c < 60
+    assert find_problems(report, settings()) == []
+
+
+def test_types_that_differ_by_firmware_do_not_matter() -> None:
+    odd = {
+        "info": {"model": "VLP-16", "version": "3.0.29.0", "serial": 43510116},
+        "status": {"gps": {"pps_state": "Locked"}, "motor": {"state": True, "rpm": "600"}},
+        "settings": {
+            "rpm": "600",
+            "laser": "on",
+            "returns": "STRONGEST",
+            "fov": {"start": "0", "end": "359"},
+            "host": {"addr": "192.168.1.100", "dport": "2368", "tport": "8308"},
+        },
+    }
+    with serving(odd) as (_, web):
+        report = web.read()
+    assert (report.firmware, report.serial, report.is_motor_on, report.is_laser_on) == (
+        "3.0.29.0",
+        "43510116",
+        True,
+        True,
+    )
+    assert (report.rotor_hz, report.returns, report.data_port) == (10, "strongest", 2368)
+    assert report.temperature_c is None
+    assert find_problems(report, settings()) == []
+
+
+@pytest.mark.parametrize(
+    "nonsense", [{}, {"gps": 3, "motor": [], "rpm": None, "host": "x", "fov": {"start": {}}}]
+)
+def test_pages_that_say_nothing_of_use_give_an_empty_report(nonsense: dict[str, Any]) -> None:
+    with serving({"info": nonsense, "status": nonsense, "settings": nonsense, "diag": nonsense}) as (_, web):
+        report = web.read()
+    assert report.rotor_hz is None and report.data_port is None and report.pps == ""
+    assert find_problems(report, settings()) == []
+
+
+@pytest.mark.parametrize("body", [b"<html>router</html>", b"[1, 2]", b"\xff\xfe", b"", b"[" * 100_000])
+def test_another_device_at_the_address_is_told_from_a_sensor(body: bytes) -> None:
+    with (
+        serving({**PAGES, "info": body}) as (_, web),
+        pytest.raises(SourceError, match="cgi/info"),
+    ):
+        web.read()
+
+
+def test_an_address_where_nothing_answers_is_an_error_with_what_to_check() -> None:
+    with pytest.raises(SourceError, match=":9/") as caught:
+        VelodyneWeb("127.0.0.1", 9, 0.5).read()
+    assert "192.168.1.x" in caught.value.hint
+    with pytest.raises(SourceError, match="no such host"):
+        VelodyneWeb("no such host").read()
+
+
+def test_settings_are_made_and_read_back() -> None:
+    with serving(PAGES) as (sensor, web):
+        web.set_rotor_hz(20)
+        web.set_returns("dual")
+        assert (sensor.pages["settings"]["rpm"], sensor.pages["settings"]["returns"]) == ("1200", "Dual")
+        report = web.read()
+    assert (report.wanted_rotor_hz, report.returns) == (20, "dual")
+    with pytest.raises(ValueError, match="5 to 20 Hz"):
+        web.set_rotor_hz(30)
+    with pytest.raises(ValueError, match="strongest, last, dual"):
+        web.set_returns("first")
+
+
+def test_a_setting_that_is_not_made_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lce_rig.devices.vlp16.web._PAUSE_S", 0.0)
+    with serving(PAGES) as (sensor, web):
+        sensor.is_deaf = True
+        with pytest.raises(SourceError, match="rpm"):
+            web.set_rotor_hz(5)
+
+
+WRONG: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "settings.other_model": ({"info": {"model": "HDL-32E"}}, {"model": "HDL-32E"}),
+    "settings.motor_off": ({"status": {"motor": {"state": "Off"}}}, {}),
+    "settings.laser_off": ({"status": {"laser": {"state": "Disabled"}}, "settings": {"laser": "Off"}}, {}),
+    "settings.rotor_rate": (
+        {"settings": {"rpm": 1200}},
+        {"set_hz": 20.0, "expected_hz": 10.0, "expected_rpm": 600.0},
+    ),
+    "settings.fov_cut": (
+        {"settings": {"fov": {"start": 270, "end": 90}}},
+        {"start_deg": 270.0, "end_deg": 90.0},
+    ),
+    "settings.data_port": ({"settings": {"host": {"dport": 2369}}}, {"port": 2369, "expected_port": 2368}),
+    "settings.position_port": (
+        {"settings": {"host": {"tport": 8309}}},
+        {"port": 8309, "expected_port": 8308},
+    ),
+    "settings.pps": ({"status": {"gps": {"pps_state": "Absent"}}}, {"pps": "absent"}),
+}
+
+
+@pytest.mark.parametrize("code", sorted(WRONG))
+def test_what_keeps_scans_from_coming_is_found_with_its_figures(code: str) -> None:
+    changes, figures = WRONG[code]
+    with serving({key: {**page, **changes.get(key, {})} for key, page in PAGES.items()}) as (_, web):
+        problems = find_problems(web.read(), settings())
+    assert [(found.code, dict(found.figures)) for found in problems] == [(code, figures)]
+
+
+@pytest.mark.parametrize(
+    ("host", "advice"),
+    [
+        ({"addr": "255.255.255.255", "dport": 2368}, "firewall"),
+        ({"addr": "192.168.1.77", "dport": 2368}, "192.168.1.77"),
+        ({"addr": "255.255.255.255", "dport": 3000}, "3000"),
+    ],
+)
+def test_a_silent_sensor_is_asked_where_it_sends_to(host: dict[str, Any], advice: str) -> None:
+    lidar = settings(driver=DriverSettings(address="127.0.0.1", port=2368))
+    with serving({**PAGES, "settings": {**SETTINGS, "host": host}}) as (_, web):
+        port = int(web.url.rpartition(":")[2])
+        error = explain_silence("lidar", lidar, Vlp16Stream("lidar", lidar), Reception(), 2.0, port)
+    assert all(figure in error.what for figure in ("127.0.0.1", "2368", "2 s"))
+    assert "http://127.0.0.1" in error.hint and advice in error.hint

@@ -1,0 +1,156 @@
+"""A rig attached by real transports: a VLP-16 on loopback, its web page, a camera's pipe, a board's pty."""
+
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core import velodyne
+from lce_rig.core.board import Board
+from lce_rig.core.data import Scan
+from lce_rig.core.geometry import exp_so3, pose
+from lce_rig.rig import Rig
+from lce_rig.simulate.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets
+from tests.detect.scans import Plate
+from tests.devices.fake_board import FakeBoard
+from tests.devices.test_vlp16_web import PAGES, serving
+from tests.recordings.vlp16_room import T0_NS, room_scan
+
+HERE = "127.0.0.1"
+PERIOD_S = 0.1
+# Pictures come so long after the beginning of each tenth of a second, at which the board pulses.
+DELAY_S = 0.015
+CAMERA = """
+import sys, time
+data = open(sys.argv[1], "rb").read()
+period_s, delay_s = float(sys.argv[2]), float(sys.argv[3])
+due_s = (time.time() // period_s + 1) * period_s + delay_s
+while True:
+    time.sleep(max(0, due_s - time.time()))
+    sys.stdout.buffer.write(data)
+    sys.stdout.buffer.flush()
+    due_s += period_s
+"""
+
+
+class Vlp16Sender(threading.Thread):
+    """Sends the same scan again and again, as fast as a rotor turns, each packet when its time has come."""
+
+    def __init__(self, scan: Scan, ports: tuple[int, int], clock: Vlp16Clock | None) -> None:
+        super().__init__(daemon=True)
+        self.stop = threading.Event()
+        self._scan, self._clock = scan, clock
+        self._ports = dict(zip((velodyne.DATA_PORT, velodyne.POSITION_PORT), ports, strict=True))
+
+    def run(self) -> None:
+        packets = Vlp16Packets(clock=self._clock)
+        stamp_ns = (time.time_ns() + 50_000_000) // 1000 * 1000
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            while not self.stop.is_set():
+                for packet in packets.feed(replace(self._scan, stamp_ns=stamp_ns)):
+                    time.sleep(max(0.0, (packet.sent_ns - time.time_ns()) * 1e-9 - 0.001))
+                    sender.sendto(packet.payload, (HERE, self._ports[packet.port]))
+                stamp_ns += STREAMED_VLP16.period_ns
+
+
+def free_ports() -> tuple[int, int]:
+    kind = socket.AF_INET, socket.SOCK_DGRAM
+    with socket.socket(*kind) as data, socket.socket(*kind) as position:
+        data.bind(("", 0))
+        position.bind(("", 0))
+        return data.getsockname()[1], position.getsockname()[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Attached:
+    """What is attached, and how it does.
+
+    Attributes:
+        rig: a profile with LiDAR "lidar" and camera "cam"; where they are is filled in.
+        pixels: the picture that the camera sends again and again; None for no camera.
+        scan: what the LiDAR sends; None for no LiDAR.
+        clock: of the LiDAR.
+        has_board: whether there is a sync board; the profile has one at all events.
+        pages: of the LiDAR's web server in place of the usual, by name.
+    """
+
+    rig: Rig
+    pixels: NDArray[np.uint8] | None = None
+    scan: Scan | None = None
+    clock: Vlp16Clock | None = None
+    has_board: bool = True
+    pages: dict[str, Any] = field(default_factory=dict)
+
+
+@contextmanager
+def attach(attached: Attached, folder: Path) -> Iterator[tuple[Rig, int]]:
+    """Attach everything; gives the profile that reaches it, and the web server's port."""
+    ports = free_ports()
+    document = attached.rig.model_dump()
+    document["lidars"]["lidar"]["driver"] = {
+        "port": ports[0],
+        "address": HERE,
+        "controls": {"position_port": ports[1]},
+    }
+    command = ["false"] if attached.pixels is None else _camera(attached.pixels, folder)
+    document["cameras"]["cam"]["driver"] = {"type": "command", "command": command}
+    trigger = {"channel": 0, "rate_hz": 1 / PERIOD_S, "max_delay_s": 0.04}
+    document["sync"] = {"device": "/dev/not-there", "triggers": {"cam": trigger}}
+    with ExitStack() as stack:
+        host = {**PAGES["settings"]["host"], "dport": ports[0], "tport": ports[1]}
+        settings = {**PAGES["settings"], "host": host}
+        _, web = stack.enter_context(serving({**PAGES, "settings": settings, **attached.pages}))
+        if attached.scan is not None:
+            sender = Vlp16Sender(attached.scan, ports, attached.clock)
+            sender.start()
+            stack.callback(sender.join)
+            stack.callback(sender.stop.set)
+        if attached.has_board:
+            time.sleep(PERIOD_S - time.time() % PERIOD_S)
+            document["sync"]["device"] = stack.enter_context(FakeBoard(period_s=PERIOD_S)).path
+        yield Rig.model_validate(document), int(web.url.rpartition(":")[2])
+
+
+def scan_of(board: Board, distance_m: float) -> Scan:
+    """A round room with a board on one corner straight ahead, on the grid of a VLP-16's firings."""
+    scan = room_scan(T0_NS, dropout=0.0)
+    reach = np.linalg.norm(scan.points, axis=1, keepdims=True)
+    turn = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]) @ exp_so3(
+        np.array([0, 0, np.pi / 4])
+    )
+    plate = Plate(pose(turn, np.array([distance_m, 0.0, 0.0])), board.width_m, board.height_m)
+    seen_m = plate.ranges(scan.points / reach)[:, None]
+    noise_m = 0.01 * np.random.default_rng(0).standard_normal(reach.shape)
+    points = scan.points * (np.minimum(seen_m, reach) + noise_m) / reach
+    return replace(scan, points=points.astype(np.float32))
+
+
+def picture_of(board: Board, square_px: int = 20) -> NDArray[np.uint8]:
+    """The board from straight ahead in a picture of 346x260 px, as a lens without distortion shows it."""
+    picture = np.full((260, 346), 120, np.uint8)
+    rows, cols = board.rows + 1, board.cols + 1
+    squares = np.indices((rows, cols)).sum(axis=0) % 2
+    pattern = np.where(squares, 220, 30).astype(np.uint8).repeat(square_px, 0).repeat(square_px, 1)
+    top, left = (260 - rows * square_px) // 2, (346 - cols * square_px) // 2
+    margin = square_px // 2
+    picture[
+        top - margin : top + rows * square_px + margin, left - margin : left + cols * square_px + margin
+    ] = 220
+    picture[top : top + rows * square_px, left : left + cols * square_px] = pattern
+    return cv2.GaussianBlur(picture, (0, 0), 0.7)
+
+
+def _camera(pixels: NDArray[np.uint8], folder: Path) -> list[str]:
+    height, width = pixels.shape
+    path = folder / "picture.pgm"
+    path.write_bytes(f"P5 {width} {height} 255\n".encode() + pixels.tobytes())
+    return [sys.executable, "-c", CAMERA, str(path), str(PERIOD_S), str(DELAY_S)]

@@ -1,0 +1,202 @@
+"""Clocks: offsets and drifts are recovered, and boards may move only where every clock is tied."""
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from lce_rig.collect.live.frame_feed import FrameFeed
+from lce_rig.core.data import LiveSample, Pulse
+from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
+from lce_rig.devices.opening import edge_cameras
+from lce_rig.devices.protocol import ClockState, SourceStatus
+from lce_rig.devices.reading import AttachedSensors, LiveSource
+from lce_rig.doctor.clocks import check_clock, check_edges, check_offsets, check_sync, tie
+from lce_rig.doctor.observing import Observation
+from lce_rig.rig import Rig
+from lce_rig.timing.clock import ClockModel
+from lce_rig.timing.rig_clock import RigClock
+
+from .observed import LOCKED, START_NS, S, camera, codes, examination, lidar, make_rig, sync_board
+
+
+def with_utc(board: Observation) -> Observation:
+    """The board knows UTC, which the computer has exactly."""
+    assert board.host_clock is not None
+    return replace(board, utc_clock=board.host_clock)
+
+
+def v4l2_rig() -> Rig:
+    document = make_rig().model_dump()
+    document["cameras"]["cam"]["driver"] = {"type": "v4l2", "device": "/dev/video0"}
+    return Rig.model_validate(document)
+
+
+def davis_rig() -> Rig:
+    document = make_rig().model_dump()
+    document["cameras"]["cam"] |= {"model": "DAVIS346", "driver": {"type": "davis"}}
+    return Rig.model_validate(document)
+
+
+def davis(drift: float = -25e-6, offset_ns: int = 3_000_000, n: int = 20, **status: Any) -> Observation:
+    """A camera that sees each of the board's pulses, by a clock of its own."""
+    seen = camera(**status)
+    for number in range(n):
+        sent_ns = number * S // 4
+        stamp_ns = START_NS + offset_ns + round((1 + drift) * sent_ns)
+        seen.take(Pulse("cam", stamp_ns // 1000 * 1000, number, stamp_ns))
+    return seen
+
+
+def test_the_drift_and_offset_of_every_stream_are_measured_against_the_computer() -> None:
+    drifting = camera()
+    drifting.stamps["frames"] = [
+        (START_NS + round((1 + 30e-6) * (stamp_ns - START_NS)) - 7_000_000, host_ns)
+        for stamp_ns, host_ns in drifting.stamps["frames"]
+    ]
+    line = check_offsets(examination(lidar(clock=LOCKED), drifting, sync_board(), rig=v4l2_rig()))
+    assert line is not None and line.severity == "note"
+    by_sensor = {found.subject: found for found in line.findings}
+    assert by_sensor["lidar"].figure("offset_ms") == pytest.approx(0.3)
+    assert by_sensor["cam"].figure("offset_ms") == pytest.approx(-7.0, abs=0.2)
+    assert by_sensor["cam"].figure("drift_ppm") == pytest.approx(30, abs=5)
+    assert by_sensor["sync"].figure("drift_ppm") == pytest.approx(40)
+
+
+def test_first_scans_that_were_stamped_by_arrival_do_not_count() -> None:
+    seen = lidar(clock=LOCKED)
+    late = [(stamp_ns + S, host_ns) for stamp_ns, host_ns in seen.stamps["scans"][:3]]
+    seen.stamps["scans"] = late + seen.stamps["scans"][3:]
+    line = check_offsets(examination(seen))
+    assert line is not None and abs(line.findings[0].figure("drift_ppm")) < 1
+
+
+def test_a_clock_that_is_being_set_is_told() -> None:
+    stepped = camera()
+    stepped.stamps["frames"] = [
+        (START_NS + round(1.01 * (stamp_ns - START_NS)), host_ns)
+        for stamp_ns, host_ns in stepped.stamps["frames"]
+    ]
+    line = check_offsets(examination(stepped, rig=v4l2_rig()))
+    assert line is not None and line.severity == "warning" and "clock.drifts" in codes(line)
+
+
+def test_scans_and_pictures_stamped_by_arrival_say_nothing_of_a_clock() -> None:
+    assert check_offsets(examination(lidar(), camera())) is None
+
+
+def test_a_davis_is_fitted_to_the_edges_it_saw() -> None:
+    exam = examination(davis(), sync_board(4.0, drift=0.0), rig=davis_rig())
+    line = check_edges(exam, "cam")
+    assert line is not None and line.severity == "note"
+    assert line.figures["drift_ppm"] == pytest.approx(-25, abs=1)
+    assert line.findings[0].figure("rms_us") < 2
+
+
+def test_a_davis_that_sees_no_edges_is_red_and_says_what_to_wire() -> None:
+    line = check_edges(examination(davis(n=0), sync_board(4.0), rig=davis_rig()), "cam")
+    assert line is not None and line.severity == "error"
+    assert codes(line) == ["edges.not_fitted", "edges.none_seen"]
+    assert (line.figures["n_edges"], line.figures["n_pulses"]) == (0, 20)
+
+
+def test_boards_may_move_where_every_clock_is_tied() -> None:
+    exam = examination(lidar(clock=LOCKED), camera(), with_utc(sync_board()))
+    line = check_sync(exam)
+    assert line is not None and (line.severity, codes(line)) == ("note", ["sync.boards_may_move"])
+    model = tie(exam).common.model("cam")
+    assert isinstance(model, ClockModel)
+    assert model.convert(START_NS + S) == pytest.approx(START_NS + S, abs=1000)
+
+
+def test_a_clock_that_is_not_tied_is_named_with_the_way_out() -> None:
+    line = check_sync(examination(lidar(clock=LOCKED), camera(), rig=make_rig(sync=None)))
+    assert line is not None and line.severity == "warning"
+    verdict, reason = line.findings
+    assert (verdict.code, verdict.action) == ("sync.boards_must_stand", "add_board")
+    assert reason.code == "sync.no_board"
+
+
+def test_still_boards_are_no_fault_where_the_profile_promises_nothing() -> None:
+    rig = make_rig(
+        sync=None,
+        lidars={"lidar": {}},
+        cameras={"cam": {**make_rig().model_dump()["cameras"]["cam"], "channels": {"frames": {}}}},
+    )
+    line = check_sync(examination(lidar(), camera(), rig=rig))
+    assert line is not None and line.severity == "note" and codes(line)[0] == "sync.boards_must_stand"
+
+
+def test_absent_sensors_are_left_out_of_the_verdict() -> None:
+    absent = Observation("cam", failure=SourceError("it is not there"))
+    assert check_sync(examination(lidar(clock=LOCKED), absent, with_utc(sync_board()))) is None
+
+
+def test_how_old_pictures_are_and_how_long_the_board_takes_to_answer_is_said() -> None:
+    seen = Finding("clock.davis", "note", figures={"delay_ms": 12.4})
+    own = Finding("clock.board", "note", figures={"round_trip_ms": 0.24})
+    exam = examination(camera(clock=ClockState(seen)), sync_board(clock=ClockState(own)))
+    of_camera, of_board = check_clock(exam, "cam"), check_clock(exam, "sync")
+    assert of_camera is not None and of_board is not None
+    assert of_camera.figures["delay_ms"] == 12.4 and of_board.figures["round_trip_ms"] == 0.24
+
+
+def test_doubts_of_a_driver_about_its_clock_stand_in_its_line() -> None:
+    problem = Finding("clock.missing", "warning", figures={"clock": "tsc"})
+    arrival = ClockState(Finding("clock.arrival", "note"))
+    line = check_clock(examination(camera(clock=arrival, problems=(problem,))), "cam")
+    assert line is not None and line.severity == "warning"
+    assert codes(line) == ["clock.arrival", "clock.missing"]
+
+
+class Replayed(LiveSource):
+    """A device that sends what was observed of one."""
+
+    def __init__(self, seen: Observation) -> None:
+        super().__init__(seen.sensor, seen.sensor, 4096, 60.0)
+        self.host_clock, self.utc_clock = seen.host_clock, seen.utc_clock
+        self._seen = seen
+        self.left: list[LiveSample] = []
+
+    def open(self) -> None:
+        self.left = sorted([*self._seen.pulses, *self._seen.frames], key=lambda each: each.host_ns or 0)
+
+    def read(self) -> list[LiveSample]:
+        time.sleep(0.01)
+        came, self.left = self.left, []
+        return came
+
+    def close(self) -> None:
+        self.left = []
+
+    def describe(self) -> SourceStatus:
+        assert self._seen.status is not None
+        return self._seen.status
+
+    def start_triggers(self, rate_hz: float | None = None) -> None:
+        raise AssertionError("pulses at these rates are told apart")
+
+
+@pytest.mark.parametrize("sees_edges", [True, False])
+def test_doctor_and_collect_agree_on_every_clock(sees_edges: bool) -> None:
+    rig, eye = (davis_rig(), davis()) if sees_edges else (v4l2_rig(), camera())
+    seen = lidar(clock=LOCKED), eye, with_utc(sync_board(4.0))
+    examined = tie(examination(*seen, rig=rig))
+    sources = [Replayed(each) for each in seen]
+    clock = RigClock(rig, has_board=True, edge_cameras=edge_cameras(rig))
+    with AttachedSensors(sources) as sensors, FrameFeed(rig, sensors, clock, sources[-1]) as feed:
+        until_s = time.monotonic() + 20.0
+        while str(clock.common.model("cam")) != str(examined.common.model("cam")):
+            assert time.monotonic() < until_s
+            feed.take(0.05)
+    assert clock.verdict() == examined.verdict()
+    assert not clock.verdict().requires_still_boards
+    for name in ("lidar", "cam"):
+        ours, theirs = examined.common.model(name), clock.common.model(name)
+        assert ours is not None and theirs is not None
+        for late_s in (0, 1, 4):
+            stamp_ns = START_NS + late_s * S
+            assert ours.convert(stamp_ns) == theirs.convert(stamp_ns)
+            assert ours.sigma_ns(stamp_ns) == theirs.sigma_ns(stamp_ns)

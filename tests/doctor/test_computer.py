@@ -1,0 +1,76 @@
+"""The computer's lines say what the kernel and the disk do."""
+
+import socket
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from lce_rig.doctor import computer
+from lce_rig.rig import load_rig
+
+from .observed import codes, make_rig
+
+
+def test_python_and_the_packages_of_these_tests_are_in_order() -> None:
+    line = computer.check_python(make_rig(), Path())
+    assert line.severity == "note" and line.figures["n_bits"] == 64
+    assert computer.check_packages(make_rig(), Path()).severity == "note"
+
+
+def test_a_missing_package_is_named_with_the_line_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(computer, "_PACKAGES", {"no_such_module": "no-such-package"})
+    line = computer.check_packages(make_rig(), Path())
+    assert line.severity == "error" and codes(line) == ["computer.packages_missing"]
+    assert line.figures["packages"] == ("no-such-package",)
+
+
+def test_a_rig_with_a_davis_needs_its_library() -> None:
+    line = computer.check_packages(load_rig("rles"), Path())
+    is_there = find_spec("dv_processing") is not None
+    assert codes(line) == ["computer.packages" if is_there else "computer.dv_processing_missing"]
+    assert not is_there or line.figures["dv_processing"]
+
+
+def test_a_missing_system_library_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(computer, "_OPEN3D_LIBRARIES", {"libnosuch.so.7": "libnosuch7"})
+    line = computer.check_libraries(make_rig(), Path())
+    assert line.severity == "warning"
+    assert (line.figures["libraries"], line.figures["packages"]) == (("libnosuch.so.7",), ("libnosuch7",))
+
+
+def test_the_disk_of_a_folder_that_is_not_there_yet_is_measured_and_left_clean(tmp_path: Path) -> None:
+    line = computer.check_disk(make_rig(), tmp_path / "not" / "yet")
+    disk = line.findings[0]
+    assert disk.figure("write_mbps") > 0 and disk.figure("free_mb") > 0
+    assert disk.figures["folder"] == str(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_written_is_red() -> None:
+    line = computer.check_disk(make_rig(), Path("/proc"))
+    assert line.severity == "error" and codes(line) == ["computer.disk_not_writable"]
+
+
+def test_the_receive_buffer_is_what_the_kernel_grants() -> None:
+    line = computer.check_socket_buffer(make_rig(), Path())
+    assert line is not None
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
+        port.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+        granted_bytes = port.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    buffer_s = line.findings[0].figure("buffer_s")
+    assert line.figures["granted_kib"] == granted_bytes // 2048
+    # 754 packets a second of 2304 bytes each, as the kernel counts.
+    assert buffer_s == pytest.approx(granted_bytes / 2304 / 753.5, rel=1e-3)
+    assert ("computer.buffer_small" in codes(line)) == (buffer_s < 0.25) == (line.severity == "warning")
+
+
+def test_a_rig_without_a_vlp16_needs_no_buffer() -> None:
+    rig = make_rig(lidars={"lidar": {"model": "another"}})
+    assert computer.check_socket_buffer(rig, Path()) is None
+
+
+def test_the_clock_is_judged_by_the_kernel() -> None:
+    line = computer.check_clock(make_rig(), Path())
+    code = "computer.clock" if line.severity == "note" else "computer.clock_not_synchronised"
+    assert codes(line) == [code] and (line.severity == "note") == ("max_error_ms" in line.figures)

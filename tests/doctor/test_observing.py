@@ -1,0 +1,71 @@
+"""Sensors are watched side by side; one that is absent, or a bug in one driver, keeps no other from it."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from lce_rig.core.errors import SourceError
+from lce_rig.devices.reading import LiveSource
+from lce_rig.devices.sync_board.driver import SyncBoard
+from lce_rig.doctor.observing import observe
+from lce_rig.rig import load_rig
+from lce_rig.rig.sync_settings import SyncSettings
+from tests.devices.fake_board import FakeBoard
+
+
+def absent() -> LiveSource:
+    raise SourceError("it is not there", "Plug it in.")
+
+
+def faulty() -> LiveSource:
+    raise ZeroDivisionError("a slip")
+
+
+def test_what_fails_is_said_and_the_others_are_watched_all_the_same() -> None:
+    with FakeBoard(period_s=0.05) as fake:
+        settings = SyncSettings.model_validate(
+            {"device": fake.path, "triggers": {"cam": {"channel": 0, "rate_hz": 20.0}}}
+        )
+        seen = observe({"gone": absent, "bad": faulty, "sync": lambda: SyncBoard(settings)}, 1.0)
+    assert seen["gone"].failure is not None and seen["gone"].failure.hint == "Plug it in."
+    assert seen["bad"].failure is not None and "ZeroDivisionError" in seen["bad"].failure.what
+    board = seen["sync"]
+    assert board.failure is None and board.status is not None and board.watched_s > 0.4
+    assert {pulse.sensor for pulse in board.pulses} == {"cam", "pps"}
+    assert board.host_clock is not None
+
+
+def test_where_nothing_opens_nothing_is_waited_for() -> None:
+    start_s = time.monotonic()
+    seen = observe({"gone": absent}, 60.0)
+    assert time.monotonic() - start_s < 10 and not seen["gone"].has_opened
+
+
+def test_other_work_is_done_meanwhile_and_its_failure_is_not_hidden() -> None:
+    done = []
+    observe({"gone": absent}, 1.0, [lambda: done.append("work")])
+    assert done == ["work"]
+    with FakeBoard() as fake:
+        settings = SyncSettings.model_validate({"device": fake.path})
+        with pytest.raises(ZeroDivisionError):
+            observe({"sync": lambda: SyncBoard(settings)}, 60.0, [lambda: 1 / 0])  # type: ignore[func-returns-value,list-item]
+        # The port is free again.
+        with SyncBoard(settings):
+            pass
+
+
+def test_a_davis_over_the_network_has_its_events_counted(tmp_path: Path) -> None:
+    pytest.importorskip("dv_processing")
+    from lce_rig.devices.davis.driver import DavisSource
+    from tests.devices.test_davis import only_events, over_network, sender
+
+    assert load_rig("rles").cameras["davis"].model == "DAVIS346"
+    with sender(10_000) as (_, port):
+        seen = observe({"davis": lambda: DavisSource("davis", only_events(), over_network(port))}, 1.0)[
+            "davis"
+        ]
+    assert seen.failure is None
+    assert seen.n_events == sum(len(part) for part in seen.events) > 0
+    stamps, arrivals = seen.times("events")
+    assert len(stamps) == len(arrivals) > 1

@@ -1,0 +1,71 @@
+"""A VLP-16's settings and its lock on the pulse, from what packets and web page say."""
+
+from typing import Any
+
+import pytest
+
+from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
+from lce_rig.devices.protocol import ClockState
+from lce_rig.devices.vlp16.web import WebReport
+from lce_rig.doctor.devices import check_pulse, check_settings
+from lce_rig.rig import Rig
+
+from .observed import LOCKED, UNLOCKED, codes, examination, lidar, make_rig
+
+
+def with_timestamps(**timestamps: Any) -> Rig:
+    return make_rig(lidars={"lidar": {"timestamps": {"reference": "first_firing", **timestamps}}})
+
+
+def test_a_locked_sensor_is_green_with_the_time_it_was_told() -> None:
+    line = check_pulse(examination(lidar(clock=LOCKED)), "lidar")
+    assert line is not None and line.severity == "note"
+    assert codes(line) == ["clock.pulse", "clock.lidar_utc"]
+    assert (line.figures["pps"], line.figures["nmea_past_hour_s"]) == ("locked", 754)
+
+
+@pytest.mark.parametrize(
+    ("timestamps", "severity"),
+    [
+        ({"clock": "utc", "sync": "hardware"}, "error"),
+        ({"clock": "utc", "sync": "none"}, "warning"),
+        ({"clock": "host", "sync": "none"}, "note"),
+    ],
+)
+def test_a_sensor_without_pulses_is_judged_by_what_the_profile_promises(
+    timestamps: dict[str, str], severity: str
+) -> None:
+    seen = lidar(clock=UNLOCKED, problems=(UNLOCKED.finding,))
+    line = check_pulse(examination(seen, rig=with_timestamps(**timestamps)), "lidar")
+    assert line is not None and line.severity == severity
+    assert codes(line)[:2] == ["clock.pulse", "clock.pps_not_locked"]
+
+
+def test_without_position_packets_the_web_page_tells_of_the_pulse() -> None:
+    seen = lidar(clock=ClockState(Finding("clock.no_position_packets", "warning")))
+    line = check_pulse(examination(seen, web={"lidar": WebReport(pps="locked")}), "lidar")
+    assert line is not None and line.findings[0].figures["pps"] == "locked"
+    assert "clock.no_position_packets" in codes(line)
+
+
+def test_settings_that_differ_from_the_profile_are_named_once() -> None:
+    report = WebReport(
+        pps="absent",
+        wanted_rotor_hz=20.0,
+        rotor_hz=20.0,
+        returns="strongest",
+        fov_deg=(10, 350),
+        data_port=2369,
+    )
+    line = check_settings(examination(lidar(), web={"lidar": report}), "lidar")
+    assert line is not None and line.severity == "warning"
+    # The pulse has a line of its own.
+    wrong = ["settings.rotor_rate", "settings.fov_cut", "settings.data_port"]
+    assert codes(line) == ["settings.read", *wrong]
+
+
+def test_a_web_page_that_does_not_answer_is_no_fault_of_the_packets() -> None:
+    web = {"lidar": SourceError("http://192.168.1.201 does not answer", "Check the network.")}
+    line = check_settings(examination(lidar(), web=web), "lidar")
+    assert line is not None and line.severity == "warning" and codes(line) == ["settings.unknown"]

@@ -1,0 +1,334 @@
+"""Intrinsics from boards: the truth within its stated deviations, whatever the start and the bad pictures."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from tests.extrinsics.lens_views import BOARD, FISHEYE, WIDE, Scene, photograph, with_corners
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.results import ImageBoard
+from lce_rig.detect.image.search import find_image_board
+from lce_rig.lens.calibrate_lens import choose_model, estimate_intrinsics
+from lce_rig.lens.difference import certainty_of, compare_lenses
+from lce_rig.lens.lens_coverage import find_weaknesses, reach, tilts_deg
+from lce_rig.lens.lens_estimate import View
+from lce_rig.lens.models import MODELS, convert, model_of
+from lce_rig.rig import load_rig
+from lce_rig.validation.intrinsics_check import check_intrinsics, compare_with_given, explain
+
+RATIONAL = replace(WIDE, distortion=(0.3, -0.05, 0.001, 0.0002, 0.01, 0.6, -0.02, 0.03))
+LENSES = (replace(WIDE, distortion=WIDE.distortion[:4]), WIDE, RATIONAL, FISHEYE)
+RADTAN5 = MODELS["radtan5"]
+NEAR = Scene(distance_m=(0.7, 2.0), spread=(0.05, 0.95))
+
+
+def deviations(estimate, truth):
+    """How many standard deviations each parameter is off."""
+    return (estimate.model.vector(estimate.intrinsics) - estimate.model.vector(truth)) / estimate.sigma
+
+
+@pytest.fixture(scope="module")
+def views():
+    return photograph(16, 1, replace(NEAR, bow_m=(0.0012, -0.0006), aspect=0.001, print_sigma_m=7e-5))
+
+
+@pytest.fixture(scope="module")
+def estimate(views):
+    return estimate_intrinsics(views, BOARD, WIDE, RADTAN5)
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=[model_of(lens).name for lens in LENSES])
+def test_a_model_projects_as_the_camera_does_and_knows_its_derivatives(lens):
+    model, rng = model_of(lens), np.random.default_rng(0)
+    vector = model.vector(lens)
+    assert model.intrinsics(vector, lens.width_px, lens.height_px) == lens
+    points = rng.uniform([-0.6, -0.4, 0.9], [0.6, 0.4, 3], (50, 3))
+    pixels, by_point, by_parameter = model.project(vector, points)
+    assert np.allclose(pixels, lens.project(points)[0], atol=1e-10)
+    h = 1e-6
+    for columns, project, size in (
+        (by_point, lambda step: model.project(vector, points + step)[0], 3),
+        (by_parameter, lambda step: model.project(vector + step, points)[0], model.size),
+    ):
+        numeric = [(project(h * e) - project(-h * e)) / (2 * h) for e in np.eye(size)]
+        assert np.allclose(columns, np.stack(numeric, axis=-1), atol=1e-5)
+
+
+def test_a_lens_moves_to_a_larger_model_unchanged_and_to_another_nearly():
+    points = np.random.default_rng(0).uniform([-0.3, -0.3, 1], [0.3, 0.3, 2], (50, 3))
+    pixels, _ = WIDE.project(points)
+    for name, limit_px in (("radtan5", 1e-9), ("rational", 1e-9), ("equidistant", 0.6)):
+        moved, _, _ = MODELS[name].project(convert(WIDE, MODELS[name]), points)
+        assert np.abs(moved - pixels).max() < limit_px
+    with pytest.raises(ValueError, match="is no radtan5"):
+        RADTAN5.vector(FISHEYE)
+
+
+def test_lens_and_board_are_found_within_their_deviations(estimate):
+    assert np.abs(deviations(estimate, WIDE)).max() < 4
+    assert np.all(np.abs(estimate.shape - [0.0012, -0.0006, 0.001]) < 4 * estimate.shape_sigma)
+    assert estimate.sigma[0] < 0.005 * WIDE.fx_px
+    assert estimate.refused == {}
+    assert 0.06 < estimate.rms_px < estimate.held_out_rms_px < 0.1
+
+
+def test_stated_deviations_are_true():
+    scene = Scene(bow_m=(0.001, 0.0), aspect=-0.001, print_sigma_m=1e-4)
+    found = [
+        estimate_intrinsics(photograph(11, seed, scene), BOARD, WIDE, RADTAN5, n_folds=2)
+        for seed in range(10)
+    ]
+    nees = []
+    for one in found:
+        error = RADTAN5.vector(one.intrinsics) - RADTAN5.vector(WIDE)
+        nees.append(error @ np.linalg.solve(one.cov, error) / len(error))
+    # 10 means of chi2 / 9 scatter by sqrt(2 / (9 * 10)) = 0.15 about 1.
+    assert 0.6 < np.mean(nees) < 1.5
+    shapes = np.array([(one.shape - [0.001, 0, -0.001]) / one.shape_sigma for one in found])
+    assert 0.6 < np.mean(shapes**2) < 1.5
+
+
+def test_a_board_that_bends_anew_each_time_inflates_the_deviations():
+    nees = {}
+    for flutter_m in (0.0, 0.003):
+        scene = Scene(sigma_px=0.02, flutter_m=flutter_m)
+        found = [
+            estimate_intrinsics(photograph(12, seed, scene), BOARD, WIDE, RADTAN5, n_folds=2)
+            for seed in range(3)
+        ]
+        inflation = np.mean([one.inflation for one in found])
+        assert inflation < 1.2 if flutter_m == 0 else inflation > 1.4
+        nees[flutter_m] = np.mean([deviations(one, WIDE) ** 2 for one in found])
+    assert nees[0.003] < 3
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        replace(WIDE, fx_px=290.0, fy_px=290.0, distortion=()),
+        replace(WIDE, fx_px=900.0, fy_px=900.0),
+        replace(WIDE, cx_px=240.0, cy_px=320.0, distortion=(0.3, 0.1, 0.0, 0.0)),
+        Intrinsics(450.0, 450.0, 319.5, 239.5, 640, 480, "equidistant", (0.0,) * 4),
+    ],
+    ids=["a third too short, no distortion", "twice too long", "off centre", "another model"],
+)
+def test_a_rough_guess_leads_to_the_same_lens(views, estimate, start):
+    other = estimate_intrinsics(views, BOARD, start, RADTAN5, n_folds=2)
+    assert np.abs(deviations(other, estimate.intrinsics)).max() < 0.1
+    assert other.refused == {}
+
+
+def test_bad_pictures_are_named_and_do_no_harm(views):
+    rng = np.random.default_rng(2)
+    spoilt = list(views)
+    shaken = views[2].board.corners_px + 2 * rng.standard_normal((24, 2))
+    slipped = views[9].board.corners_px.copy()
+    slipped[:6] += [15, 4]
+    spoilt[2], spoilt[9] = with_corners(views[2], shaken), with_corners(views[9], slipped)
+    found = estimate_intrinsics(spoilt, BOARD, WIDE, RADTAN5, n_folds=2)
+    assert sorted(found.refused) == ["000002.frames", "000009.frames"]
+    refusal = found.refused["000009.frames"]
+    assert refusal.code == "calibrate.other_lens"
+    assert refusal.figure("median_px") < 0.1 < 1.0 < refusal.figure("rms_px")
+    assert np.abs(deviations(found, WIDE)).max() < 4
+
+
+def test_a_noisier_channel_counts_less_and_is_not_refused(views):
+    rng = np.random.default_rng(0)
+    noisy = [
+        replace(
+            with_corners(view, view.board.corners_px + 0.6 * rng.standard_normal((24, 2))), channel="events"
+        )
+        for view in views
+    ]
+    both = estimate_intrinsics([*views, *noisy], BOARD, WIDE, RADTAN5, n_folds=2)
+    frames = estimate_intrinsics(views, BOARD, WIDE, RADTAN5, n_folds=2)
+    assert both.refused == {}
+    assert np.all(both.sigma < 1.15 * frames.sigma)
+    assert np.abs(deviations(both, WIDE)).max() < 4
+
+
+def test_views_of_one_capture_are_left_out_together(views):
+    twins = [replace(view, channel=channel) for view in views for channel in ("a", "b")]
+    doubled = estimate_intrinsics(twins, BOARD, WIDE, RADTAN5, n_folds=4)
+    single = estimate_intrinsics(views, BOARD, WIDE, RADTAN5, n_folds=4)
+    assert doubled.held_out_rms_px == pytest.approx(single.held_out_rms_px, rel=0.05)
+    # The same corners twice are no more evidence than once.
+    assert np.all(doubled.sigma > 0.8 * single.sigma)
+
+
+def test_too_few_captures_are_refused_with_their_number(views):
+    with pytest.raises(NotEnoughDataError, match="in at least 4 captures, it is in 3"):
+        estimate_intrinsics(views[:3], BOARD, WIDE, RADTAN5)
+
+
+def test_parallel_boards_leave_the_focal_length_open():
+    # All in the middle and parallel to the picture: depth and focal length are one.
+    scene = Scene(tilt_deg=(0.0, 0.5), spread=(0.49, 0.51), sigma_px=0.3)
+    with pytest.raises(NotEnoughDataError, match="the focal length is known to"):
+        estimate_intrinsics(photograph(8, 0, scene), BOARD, WIDE, RADTAN5)
+
+
+@pytest.mark.parametrize(
+    ("lens", "wanted", "loser"),
+    [
+        (FISHEYE, "equidistant", "radtan4"),
+        pytest.param(LENSES[0], "radtan4", "equidistant", marks=pytest.mark.slow),
+    ],
+)
+def test_the_model_is_chosen_by_captures_left_out(lens, wanted, loser):
+    seen = photograph(9, 4, replace(NEAR, lens=lens, sigma_px=0.02))
+    start = Intrinsics(400.0, 400.0, 319.5, 239.5, 640, 480, "radtan", ())
+    found, choice = choose_model(seen, BOARD, start, n_folds=3)
+    assert choice.name == wanted == found.model.name
+    assert f"{wanted}: 0.0" in choice.reason
+    scores = {score.name: score for score in choice.scores}
+    assert len(scores) == 4
+    assert scores[wanted].is_as_good_as_the_best
+    assert not scores[loser].is_as_good_as_the_best
+    assert loser in choice.reason.partition("worse: ")[2]
+
+
+def test_a_lens_differs_nothing_from_itself_and_a_moved_centre_is_mostly_a_turn(estimate):
+    corners, cov = estimate.corners_px.reshape(-1, 2), estimate.cov
+    same = compare_lenses(WIDE, WIDE, corners, cov, RADTAN5)
+    assert same.max_px < 1e-6
+    assert np.linalg.norm(same.turn_rad) < 1e-9
+    moved = compare_lenses(WIDE, replace(WIDE, cx_px=WIDE.cx_px + 5), corners, cov, RADTAN5)
+    assert np.linalg.norm(moved.turn_rad) == pytest.approx(5 / 450, rel=0.15)
+    assert moved.rms_px < 1.2
+    longer = compare_lenses(WIDE, replace(WIDE, fx_px=459.0, fy_px=461.0), corners, cov, RADTAN5)
+    assert np.linalg.norm(longer.turn_rad) < 0.004
+    assert longer.rms_px > 1.5
+
+
+def test_a_lens_is_known_where_boards_were_seen_and_the_weak_places_are_named():
+    middle = estimate_intrinsics(
+        photograph(12, 5, Scene(spread=(0.42, 0.58), distance_m=(2.0, 3.0))), BOARD, WIDE, RADTAN5
+    )
+    certainty = certainty_of(middle.intrinsics, middle.corners_px.reshape(-1, 2), middle.cov, middle.model)
+    inside = certainty.sigma_px[certainty.is_covered].max()
+    assert inside < 1 < np.nanmax(certainty.sigma_px)
+    texts = find_weaknesses(middle, certainty)
+    assert any("hold the board into all four corners" in text for text in texts)
+    assert reach(middle) < 0.6
+
+
+def test_a_thorough_set_has_no_weakness():
+    scene = Scene(distance_m=(1.0, 4.0), spread=(0.0, 1.0), sigma_px=0.03)
+    full = estimate_intrinsics(photograph(30, 8, scene), BOARD, WIDE, RADTAN5, n_folds=5)
+    certainty = certainty_of(full.intrinsics, full.corners_px.reshape(-1, 2), full.cov, full.model)
+    assert find_weaknesses(full, certainty) == ()
+    assert reach(full) > 0.8
+
+
+def test_boards_that_face_the_camera_are_told_to_tilt():
+    scene = Scene(tilt_deg=(0.0, 4.0), spread=(0.35, 0.65), distance_m=(1.5, 2.5))
+    facing = estimate_intrinsics(photograph(14, 6, scene), BOARD, WIDE, MODELS["radtan4"], n_folds=2)
+    certainty = certainty_of(facing.intrinsics, facing.corners_px.reshape(-1, 2), facing.cov, facing.model)
+    texts = find_weaknesses(facing, certainty)
+    assert any("focal length and distance trade off" in text and "tilt the board" in text for text in texts)
+
+
+def test_a_board_whose_right_edge_is_far_is_tilted_to_the_right(estimate):
+    tilts = tilts_deg(estimate)
+    corners = np.array([[0.3, 0, 0], [-0.3, 0, 0], [0, 0.3, 0], [0, -0.3, 0]])
+    for T, tilt in zip(estimate.T_cam_board, tilts, strict=True):
+        depth = corners @ T[:3, :3].T @ (T[:3, 3] / np.linalg.norm(T[:3, 3]))
+        across = corners @ T[:3, :3].T
+        slope = np.linalg.lstsq(across[:, :2], depth, rcond=None)[0]
+        if np.linalg.norm(tilt) > 20 and np.linalg.norm(T[:2, 3]) < 0.3 * T[2, 3]:
+            assert slope @ tilt > 0
+
+
+def test_a_bent_board_and_a_stretched_print_are_named():
+    scene = Scene(bow_m=(0.004, 0.0), aspect=0.006, sigma_px=0.03)
+    bad = estimate_intrinsics(photograph(12, 7, scene), BOARD, WIDE, RADTAN5, n_folds=2)
+    certainty = certainty_of(bad.intrinsics, bad.corners_px.reshape(-1, 2), bad.cov, bad.model)
+    texts = " ".join(find_weaknesses(bad, certainty))
+    assert "its middle stands out 4.0 mm towards the viewer" in texts or "3.9 mm" in texts
+    assert "too long along the plate's width" in texts
+    assert np.abs(deviations(bad, WIDE)).max() < 4
+
+
+STALE = {
+    "two per cent longer": replace(WIDE, fx_px=1.02 * WIDE.fx_px, fy_px=1.02 * WIDE.fy_px),
+    "centre ten pixels off": replace(WIDE, cx_px=WIDE.cx_px + 8, cy_px=WIDE.cy_px - 6),
+    "no distortion": replace(WIDE, distortion=()),
+    "half the distortion": replace(WIDE, distortion=tuple(0.5 * k for k in WIDE.distortion)),
+}
+
+
+def test_intrinsics_that_are_right_pass(views, estimate):
+    check = check_intrinsics(views, WIDE, BOARD)
+    assert check.verdict() == "pass"
+    assert check.chance > 0.01
+    assert abs(check.focal_ratio - 1) < 4 * check.focal_sigma
+    assert check.displacement_px < 4 * check.displacement_sigma_px
+    assert compare_with_given(estimate, WIDE, BOARD)[0].verdict() == "pass"
+
+
+@pytest.mark.parametrize("kind", STALE)
+def test_stale_intrinsics_fail_with_their_figures(views, kind):
+    check = check_intrinsics(views, STALE[kind], BOARD)
+    assert check.verdict() == "fail"
+    assert check.rms_px > check.possible_px
+    found = explain(check)
+    assert (found.code, found.severity) == ("verdict.intrinsics", "error")
+    assert found.figures["displacement_px"] == check.displacement_px
+    if kind == "two per cent longer":
+        assert check.focal_ratio == pytest.approx(1 / 1.02, abs=4 * check.focal_sigma)
+        assert found.action == "refocused"
+    if kind == "centre ten pixels off":
+        assert check.turn_deg == pytest.approx(np.degrees(10 / 450), rel=0.25)
+        assert found.figures["is_turned"] and found.figures["turn_deg"] == check.turn_deg
+
+
+def test_a_lens_that_draws_nothing_where_boards_are_seen_fails(views):
+    folded = replace(WIDE, distortion=(-60.0, 0.0, 0.0, 0.0))
+    check = check_intrinsics(views, folded, BOARD)
+    assert check.verdict() == "fail"
+    assert not np.isfinite(explain(check).figure("displacement_px"))
+
+
+def test_a_slight_difference_is_marginal_and_a_lower_target_makes_it_fail(views):
+    slight = replace(WIDE, fx_px=1.007 * WIDE.fx_px, fy_px=1.007 * WIDE.fy_px)
+    check = check_intrinsics(views, slight, BOARD)
+    assert check.verdict() == "marginal"
+    assert explain(check).severity == "warning"
+    assert check.verdict(target_deg=0.05) == "fail"
+    assert check.verdict(target_deg=1.0) == "pass"
+
+
+def test_captures_that_fit_no_lens_say_nothing_about_it(views):
+    assert check_intrinsics(views[:3], WIDE, BOARD) is None
+
+
+@pytest.mark.dataset
+@pytest.mark.parametrize(
+    ("recording", "profile", "worst_focal_error"),
+    [("rlfs01", "rlfs", 0.003), ("sss_noise15mm", "sss", 0.001), ("rles01_lf", "rles", 0.01)],
+)
+def test_published_intrinsics_of_recordings_pass_and_stale_ones_do_not(
+    recordings, recording, profile, worst_focal_error
+):
+    rig = load_rig(profile)
+    (camera,) = rig.cameras.values()
+    lens, board = camera.to_intrinsics(), rig.board.to_board()
+    seen = []
+    for path in sorted((recordings / recording / "img").iterdir()):
+        image = Image("cam", "frames", None, cv2.imread(str(path)))
+        found = find_image_board(image, board, lens)
+        if isinstance(found, ImageBoard):
+            seen.append(View(path.stem, "frames", found))
+    check = check_intrinsics(seen, lens, board)
+    assert check.verdict() == "pass"
+    assert abs(check.focal_ratio - 1) < worst_focal_error
+    assert check.possible_px < 0.06
+    longer = check_intrinsics(seen, replace(lens, fx_px=1.02 * lens.fx_px, fy_px=1.02 * lens.fy_px), board)
+    assert longer.verdict() != "pass"
+    assert longer.focal_ratio == pytest.approx(check.focal_ratio / 1.02, rel=1e-3)
