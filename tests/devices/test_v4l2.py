@@ -86,8 +86,8 @@ STRUCTURES = {
     "v4l2_buffer": abi.Buffer,
     "v4l2_query_ext_ctrl": abi.ControlQuery,
     "v4l2_querymenu": abi.MenuQuery,
-    "v4l2_ext_control": abi.Control,
-    "v4l2_ext_controls": abi.Controls,
+    "v4l2_ext_control": abi.V4l2Control,
+    "v4l2_ext_controls": abi.V4l2Controls,
 }
 NUMBERS = {
     "VIDIOC_QUERYCAP": abi.QUERY_CAPABILITY,
@@ -128,8 +128,8 @@ OFFSETS = {
     "v4l2_streamparm, parm.capture.timeperframe": abi.CaptureParameters.numerator.offset,
     "v4l2_query_ext_ctrl, minimum": abi.ControlQuery.minimum.offset,
     "v4l2_query_ext_ctrl, flags": abi.ControlQuery.flags.offset,
-    "v4l2_ext_control, value64": abi.Control.value.offset,
-    "v4l2_ext_controls, controls": abi.Controls.controls.offset,
+    "v4l2_ext_control, value64": abi.V4l2Control.value.offset,
+    "v4l2_ext_controls, controls": abi.V4l2Controls.controls.offset,
     "v4l2_frmsizeenum, discrete": abi.FrameSize.sizes.offset,
     "v4l2_querymenu, name": abi.MenuQuery.item.offset,
 }

@@ -30,7 +30,7 @@ from lce_rig.rig import Rig
 # References:
 #     https://gitlab.com/inivation/dv/dv-processing/-/blob/master/include/dv-processing/data/frame_base.hpp
 
-# Places in dv's table Frame; 1 and 2 are of the read-out.
+# Places in dv's table Aedat4Image; 1 and 2 are of the read-out.
 _TIMESTAMP, _EXPOSURE_START, _EXPOSURE_END, _FORMAT, _WIDTH, _HEIGHT, _PIXELS, _EXPOSURE = (
     0,
     3,
@@ -46,7 +46,7 @@ _CHANNELS = {0: 1, 16: 3, 24: 4}
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class Aedat4Image:
     """One image of a file.
 
     Attributes:
@@ -68,7 +68,7 @@ class Aedat4Frames:
         self._file = file
         self._number = number
 
-    def first(self) -> Frame | None:
+    def first(self) -> Aedat4Image | None:
         """Decode the first frame that is whole; None where there is none."""
         return next(self.frames(Findings()), None)
 
@@ -76,7 +76,7 @@ class Aedat4Frames:
         """Count the frames, damaged ones too, without decoding them."""
         return self._file.n_packets(self._number)
 
-    def frames(self, findings: Findings) -> Iterator[Frame]:
+    def frames(self, findings: Findings) -> Iterator[Aedat4Image]:
         """Yield the frames as they lie in the file; damaged ones are skipped and counted."""
         for where, table in self._file.packets(self._number, findings):
             try:
@@ -98,7 +98,7 @@ class Aedat4Frames:
             return None
 
 
-def decode_frame(table: bytes) -> Frame:
+def decode_frame(table: bytes) -> Aedat4Image:
     """Decode one packet.
 
     Raises:
@@ -115,7 +115,7 @@ def decode_frame(table: bytes) -> Frame:
         mid_ns = stamp_us * NS_PER_US + exposure_us * NS_PER_US // 2
     if abs(mid_ns) >= limits.MAX_TIME_NS:
         raise ValueError("its timestamp is beyond any clock")
-    return Frame(mid_ns, exposure_us * NS_PER_US, _pixels(table))
+    return Aedat4Image(mid_ns, exposure_us * NS_PER_US, _pixels(table))
 
 
 def _pixels(table: bytes) -> NDArray[np.uint8]:

@@ -249,7 +249,7 @@ class EventRecording:
         self._findings = Findings()
         self._assumed: list[str] = []
         self._span_ns: tuple[int, int] | None = None
-        self._window = _Window(self)
+        self._window = _TimeWindow(self)
         if not any(len(stretch) for stretch in self._stretches(self._findings)):
             said = "; ".join(self._findings.lines())
             raise NoEventsError(f"{path} holds no events" + (f": {said}" if said else ""))
@@ -402,7 +402,7 @@ class EventRecording:
         return stretch.select(is_on)
 
 
-class _Window:
+class _TimeWindow:
     """The ranges of the last window, and the pass through the recording that continues there."""
 
     def __init__(self, recording: EventRecording) -> None:

@@ -77,7 +77,7 @@ class Hdf5Events:
             SourceError: they are compressed by a filter that is not installed, or damaged.
         """
         with _open(self._path) as file:
-            columns = [_Column(file["events"][name]) for name in _COLUMNS]
+            columns = [_Hdf5Column(file["events"][name]) for name in _COLUMNS]
             for begin in range(0, self._n_events, _BLOCK_EVENTS):
                 end = min(begin + _BLOCK_EVENTS, self._n_events)
                 try:
@@ -104,7 +104,7 @@ class Hdf5Events:
         return EventColumns(t_ns, x.astype(np.uint16), y.astype(np.uint16), polarity > 0)
 
 
-class _Column:
+class _Hdf5Column:
     """A column of events, read in ranges.
 
     HDF5 takes what memory a deflated chunk unpacks to, however much more that is than it should. Chunks large

@@ -12,7 +12,7 @@ from lce_rig.core.limits import read_file
 from lce_rig.recordings.folder import cloud_file, image_file
 from lce_rig.recordings.folder.cloud import to_scan
 from lce_rig.recordings.folder.file_pairs import Pairing, natural_order, pair_names, parse_times
-from lce_rig.recordings.protocol import Pair, PairMethod, SourceOptions
+from lce_rig.recordings.protocol import PairMethod, RecordedPair, SourceOptions
 from lce_rig.recordings.sensor_choice import choose_camera, choose_lidar
 from lce_rig.rig import LidarSettings, Rig
 
@@ -157,7 +157,7 @@ class PairOnDisk:
                 raise SourceError(f"{path}: {error}") from None
         return digest.hexdigest()
 
-    def read(self) -> Pair:
+    def read(self) -> RecordedPair:
         """Decode all files.
 
         Raises:
@@ -170,7 +170,7 @@ class PairOnDisk:
         if reading.n_not_finite or reading.n_zero_range:
             n_dropped = reading.n_not_finite + reading.n_zero_range
             notes.append(f"{self.cloud_path.name}: {n_dropped} points without a return left out")
-        return Pair(self.label, self.key(), images, (reading.scan,), tuple(notes))
+        return RecordedPair(self.label, self.key(), images, (reading.scan,), tuple(notes))
 
 
 class FolderRecording:

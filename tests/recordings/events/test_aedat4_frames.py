@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lce_rig.recordings.events.aedat4_file import Aedat4File
-from lce_rig.recordings.events.camera_file import Aedat4Frames, Frame, decode_frame
+from lce_rig.recordings.events.camera_file import Aedat4Frames, Aedat4Image, decode_frame
 from lce_rig.recordings.events.stream import Findings
 from tests.recordings.events.aedat4_files import RawFrame, flatbuffer, write_davis
 from tests.recordings.events.encoders import random_events
@@ -19,7 +19,7 @@ GREY = RNG.integers(0, 256, (260, 346), dtype=np.uint8)
 COLOUR = RNG.integers(0, 256, (260, 346, 3), dtype=np.uint8)
 
 
-def read(path: Path, findings: Findings | None = None) -> list[Frame]:
+def read(path: Path, findings: Findings | None = None) -> list[Aedat4Image]:
     file = Aedat4File(path)
     number = file.first_stream("FRME")
     assert number is not None
