@@ -19,7 +19,7 @@ from lce_rig.core import limits
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings import open_recording
-from lce_rig.recordings.events.stream import Findings, join
+from lce_rig.recordings.events.stream import DamageCounts, join
 from lce_rig.recordings.events.word_codec import EVT3, WordDecoder
 from lce_rig.recordings.protocol import ContinuousRecording
 from lce_rig.recordings.ros.bag_file import BagFile
@@ -431,7 +431,7 @@ def test_a_packet_that_holds_more_events_than_any_camera_sends_is_left_out(tmp_p
     words = np.array([0x8000, 0x6001, 0x0005, 0x2007], "<u2").tobytes()
     sizes = 1, limits.MAX_PACKET_BYTES // 8 + 1, 1
     messages = [("/davis/events", T0_NS + k, packet_message(words * n)) for k, n in enumerate(sizes)]
-    findings = Findings()
+    findings = DamageCounts()
     events = list(BagEvents(write_packet_bag(tmp_path / "a.bag", messages), None).stretches(findings))
     assert sum(map(len, events)) == 2
     assert "at most 17 MB are read" in findings.lines()[0]

@@ -13,7 +13,7 @@ from lce_rig.core.data import Image, Sample, Stream
 from lce_rig.recordings.events import open_events
 from lce_rig.recordings.events.aedat4_file import Aedat4File, add_broken, field_at, vector_at
 from lce_rig.recordings.events.choice import CameraEvents
-from lce_rig.recordings.events.stream import NS_PER_US, Findings, NoEventsError
+from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, NoEventsError
 from lce_rig.recordings.fingerprint import fingerprint
 from lce_rig.recordings.merging import merge_by_time
 from lce_rig.recordings.protocol import SourceOptions, Span
@@ -70,13 +70,13 @@ class Aedat4Frames:
 
     def first(self) -> Aedat4Image | None:
         """Decode the first frame that is whole; None where there is none."""
-        return next(self.frames(Findings()), None)
+        return next(self.frames(DamageCounts()), None)
 
     def count(self) -> int:
         """Count the frames, damaged ones too, without decoding them."""
         return self._file.n_packets(self._number)
 
-    def frames(self, findings: Findings) -> Iterator[Aedat4Image]:
+    def frames(self, findings: DamageCounts) -> Iterator[Aedat4Image]:
         """Yield the frames as they lie in the file; damaged ones are skipped and counted."""
         for where, table in self._file.packets(self._number, findings):
             try:
@@ -178,7 +178,7 @@ class EventCameraFile:
             SourceError: after all that can be read, where the events' clock was set back.
         """
         parts: list[Iterator[Sample]] = []
-        findings = Findings()
+        findings = DamageCounts()
         if self._events is not None:
             parts.append(self._events.samples())
         if self._frames is not None:
@@ -222,7 +222,7 @@ class EventCameraFile:
         self.notes.append(f"{self.path.name}: {self._camera}.{channel} {_meaning(first.exposure_ns)}")
         return frames
 
-    def _images(self, frames: Aedat4Frames, findings: Findings) -> Iterator[Sample]:
+    def _images(self, frames: Aedat4Frames, findings: DamageCounts) -> Iterator[Sample]:
         last_ns: int | None = None
         for frame in frames.frames(findings):
             if last_ns is not None and frame.mid_exposure_ns <= last_ns:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core import limits, unpacking
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import EventColumns, Findings, open_recorded, to_ns
+from lce_rig.recordings.events.stream import DamageCounts, EventColumns, open_recorded, to_ns
 
 _BLOCK_EVENTS = 1 << 20
 _COLUMNS = ("t", "x", "y", "p")
@@ -70,7 +70,7 @@ class Hdf5Events:
         self.resolution_px = (width, height) if width and height else None
         self._offset_us = _integer(file, "t_offset") or _integer(events, "t_offset") or 0
 
-    def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         """Yield the events a million at a time.
 
         Raises:
@@ -90,7 +90,7 @@ class Hdf5Events:
                         return
                     raise _unreadable(self._path, file, error) from None
 
-    def _to_columns(self, block: list[NDArray[Any]], findings: Findings) -> EventColumns:
+    def _to_columns(self, block: list[NDArray[Any]], findings: DamageCounts) -> EventColumns:
         t_us, x, y, polarity = block
         if t_us.dtype.kind == "f":
             is_whole = np.floor(t_us) == t_us

@@ -17,7 +17,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.event_file import encode_events
 from lce_rig.recordings.events import open_events
 from lce_rig.recordings.events.camera_file import decode_frame
-from lce_rig.recordings.events.stream import EventColumns, Findings, parse_size, to_ns
+from lce_rig.recordings.events.stream import DamageCounts, EventColumns, parse_size, to_ns
 from lce_rig.recordings.events.text import TextEvents
 from tests.recordings.events import encoders
 from tests.recordings.events.aedat4_files import STREAM, XML, RawFrame, flatbuffer, frame_packet
@@ -264,7 +264,7 @@ def test_one_long_word_among_many_short_ones_takes_no_memory(tmp_path: Path) -> 
     (tmp_path / "a.txt").write_bytes(
         b"346 260\n" + b"1 1 1 1\n" * 9999 + b"1" * 4000 + b" 1 1 1\n0.1 1 1 1\n"
     )
-    findings = Findings()
+    findings = DamageCounts()
     assert sum(map(len, TextEvents(tmp_path / "a.txt").stretches(findings))) == 10_000
     assert findings.counts == {"broken lines left out": 1}
 

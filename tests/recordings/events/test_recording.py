@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.events.event_recording import REORDER_NS, EventRecording
-from lce_rig.recordings.events.stream import EventColumns, Findings
+from lce_rig.recordings.events.stream import DamageCounts, EventColumns
 from tests.recordings.events.encoders import random_events
 
 PATH = Path("recording.test")
@@ -27,7 +27,7 @@ class ListedStream:
         self.notes: list[str] = []
         self._stretches = stretches
 
-    def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         yield from self._stretches
 
 
@@ -160,7 +160,7 @@ def test_windows_that_go_forward_are_read_in_one_pass() -> None:
     class CountedStream(ListedStream):
         n_read = 0
 
-        def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+        def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
             for stretch in self._stretches:
                 self.n_read += 1
                 yield stretch
