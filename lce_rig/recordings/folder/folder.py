@@ -62,9 +62,7 @@ def list_pictures_by_camera(folder: Path, cameras: Collection[str]) -> dict[str,
     for place in (*above, folder):
         folders = _folders(place)
         found = {
-            name: files
-            for name in cameras
-            if name in folders and (files := _files(folders[name], SUFFIXES))
+            name: files for name in cameras if name in folders and (files := _files(folders[name], SUFFIXES))
         }
         if found:
             return found
