@@ -29,7 +29,7 @@ from lce_rig.devices.sync_board.lines.messages import (
 from lce_rig.devices.sync_board.lines.sentence import write_sentence
 from lce_rig.rig.sync_settings import SyncSettings
 
-FIRMWARE = Path(__file__).parents[3] / "scripts" / "firmware"
+FIRMWARE = Path(__file__).parents[2] / "scripts" / "firmware"
 STRICT = [
     "-std=c++11",
     "-Wall",

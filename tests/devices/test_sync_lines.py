@@ -198,7 +198,7 @@ def test_a_line_without_an_end_is_cut_off_and_the_next_one_read():
 
 
 def test_every_example_of_the_protocol_is_understood_and_every_sentence_described():
-    text = (Path(__file__).parents[3] / "docs" / "sync-protocol.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "sync-protocol.md").read_text(encoding="utf-8")
     said = [line.strip()[2:].encode() for line in text.splitlines() if line.startswith("    < ")]
     asked = [line.strip()[2:].encode() for line in text.splitlines() if line.startswith("    > ")]
     reader = LineReader(Lce1())

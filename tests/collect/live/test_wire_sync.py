@@ -22,7 +22,7 @@ from lce_rig.rig.sync_settings import SyncSettings, TriggerSettings
 from lce_rig.session import Session
 from tests.collect.live.sent import check_sent, check_whole, read_sent
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "sources" / "live"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "devices"))
 from fake_board import FakeBoard
 
 PERIOD_NS = 100_000_000
