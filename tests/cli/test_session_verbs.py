@@ -111,10 +111,12 @@ def test_verify_refuses_an_extrinsic_that_the_captures_contradict(lce_rig, calib
     result = read(path)
     result["pairs"][0]["T_cam_lidar"][2][3] += 0.12
     path.write_text(json.dumps(result))
-    outcome = lce_rig("verify", calibrated_few)
+    outcome = lce_rig("verify", calibrated_few, "--json")
     assert outcome.code == 7
-    assert "contradict the extrinsic of davis.frames and lidar" in outcome.err
-    assert "limit 30 mm" in outcome.err
+    doubts = json.loads(outcome.out)["pairs"][0]["doubts"]
+    assert {"code": "verdict.plane_residual", "limit_m": 0.03} in [
+        {"code": doubt["code"], "limit_m": doubt["figures"].get("limit_m")} for doubt in doubts
+    ]
 
 
 def test_verify_refuses_the_result_of_another_rig(lce_rig, calibrated):
