@@ -19,7 +19,7 @@ import pytest
 from lce_rig.core.findings import Finding
 from lce_rig.rig import dump_rig
 from lce_rig.simulate.vlp16_packets import Vlp16Clock
-from lce_rig.words import Phrase, rendering, sentence
+from lce_rig.words import sentence
 from tests.doctor.attached import Attached, attach, picture_of, scan_of
 from tests.doctor.observed import make_rig
 
@@ -98,16 +98,6 @@ def test_warnings_alone_exit_with_0(lce_rig, tmp_path):
 BUSY = {("computer", "disk"), *((name, "stream") for name in ("lidar", "cam")), ("cam", "pulses")}
 BUSY |= {("sync", "pulses"), ("sync", "clock"), ("rig", "clocks"), ("rig", "sync")}
 """Lines that depend on how busy the computer is, and on what the board has been told before."""
-
-
-@pytest.fixture
-def mute(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every rendered text is its code alone."""
-    told = {
-        code: Phrase(code, code, dict.fromkeys(phrase.actions or (), code))
-        for code, phrase in rendering.phrases().items()
-    }
-    monkeypatch.setattr(rendering, "phrases", lambda: told)
 
 
 def judged(lce_rig, path: Path, n_lines: int) -> tuple[int, dict[tuple[str, str], tuple[str, list[str]]]]:
