@@ -27,4 +27,10 @@ def main(first: str, second: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
+    try:
+        main(*sys.argv[1:])
+    except lce.LceRigError as error:
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_code)
