@@ -57,17 +57,16 @@ def test_sound_calibrations_spread_as_their_covariance_says():
 def test_agreement_is_said_in_one_sentence_with_both_figures():
     compared = compare_calibrations(sessions(3, 0))
     deg, mm = compared.max_rotation_deg, 1000 * compared.max_translation_m
-    assert compared.sentence() == (
-        f"The three calibrations of cam and lidar agree: they differ by at most {deg:.2g} deg and "
-        f"{mm:.2g} mm, as their stated uncertainties predict."
-    )
+    assert compared.agrees
+    said = compared.sentence()
+    assert all(part in said for part in ("three", compared.sensors, f"{deg:.2g} deg", f"{mm:.2g} mm"))
     assert compared.max_rotation_deg == max(pair.rotation_deg for pair in compared.differences)
 
 
 def test_generous_uncertainties_are_called_so():
-    assert (
-        "less than their stated uncertainties predict" in compare_calibrations(sessions(4, 1, 0.2)).sentence()
-    )
+    generous, honest = compare_calibrations(sessions(4, 1, 0.2)), compare_calibrations(sessions(3, 0))
+    assert generous.agrees and "less than" in generous.sentence()
+    assert honest.agrees and "less than" not in honest.sentence()
 
 
 def test_uncertainties_that_are_too_small_are_found_out():
@@ -76,10 +75,7 @@ def test_uncertainties_that_are_too_small_are_found_out():
     assert compared.ratio == pytest.approx(4, rel=0.4)
     assert compared.odd_one is None
     text = compared.sentence()
-    assert text.startswith("The four calibrations of cam and lidar do not agree: they differ by up to")
-    assert (
-        f"{compared.ratio:.1f} times more than their stated uncertainties predict. Use none of them" in text
-    )
+    assert "four" in text and f"{compared.ratio:.1f} times" in text and "Use none" in text
 
 
 def test_the_one_that_stands_apart_is_named():
@@ -88,7 +84,7 @@ def test_the_one_that_stands_apart_is_named():
     compared = compare_calibrations(three | {"day2": replace(three["day2"], T_cam_lidar=moved)})
     assert not compared.agrees
     assert compared.odd_one == "day2"
-    assert "Without day2 the others agree" in compared.sentence()
+    assert "Without day2" in compared.sentence()
     worst = max(compared.differences, key=lambda pair: pair.distance)
     assert "day2" in (worst.first, worst.second)
 
