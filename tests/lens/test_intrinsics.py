@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from tests.extrinsics.lens_views import BOARD, FISHEYE, WIDE, Scene, photograph, with_corners
+from tests.lens.lens_views import BOARD, FISHEYE, WIDE, Scene, photograph, with_corners
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
