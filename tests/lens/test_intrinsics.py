@@ -5,7 +5,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from tests.lens.lens_views import BOARD, FISHEYE, WIDE, Scene, photograph, with_corners
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
@@ -19,6 +18,7 @@ from lce_rig.lens.lens_estimate import View
 from lce_rig.lens.models import MODELS, convert, model_of
 from lce_rig.rig import load_rig
 from lce_rig.validation.intrinsics_check import check_intrinsics, compare_with_given, explain
+from tests.lens.lens_views import BOARD, FISHEYE, WIDE, Scene, photograph, with_corners
 
 RATIONAL = replace(WIDE, distortion=(0.3, -0.05, 0.001, 0.0002, 0.01, 0.6, -0.02, 0.03))
 LENSES = (replace(WIDE, distortion=WIDE.distortion[:4]), WIDE, RATIONAL, FISHEYE)
