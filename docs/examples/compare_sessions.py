@@ -12,7 +12,7 @@ def main(first: str, second: str) -> None:
     """Print how far the two results differ, and how well the first fits the captures of the second."""
     compared = lce.repeat([first, second])
     for comparison in compared.comparisons:
-        print(f"{comparison.sensors}: {'agree' if comparison.agrees else 'disagree'}")
+        print(f"{comparison.camera} and {comparison.lidar}: {'agree' if comparison.agrees else 'disagree'}")
         for two in comparison.differences:
             apart = f"{two.rotation_deg:.3f} deg, {1000 * two.translation_m:.1f} mm"
             print(f"  {two.first} and {two.second}: {apart} (probability {two.p:.2f})")
@@ -26,4 +26,10 @@ def main(first: str, second: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
+    try:
+        main(*sys.argv[1:])
+    except lce.LceRigError as error:
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_code)

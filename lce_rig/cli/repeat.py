@@ -7,8 +7,10 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import json_option
+from lce_rig.words import as_line, describe, recommend, sentence
 
 if TYPE_CHECKING:
+    from lce_rig.pipeline.comparison import Repeat
     from lce_rig.validation.repeatability import Repeatability
 
 
@@ -32,12 +34,11 @@ def repeat(sessions: tuple[Path, ...], as_json: bool) -> None:
         compared = compare(sessions, progress=progress)
     for name in compared.calibrated:
         show.note(f"{name} held no result: calibrated for this comparison, not written")
-    for remark in compared.remarks:
-        show.warn(remark)
+    for finding in compared.findings:
+        if finding.severity != "error":
+            show.warn(sentence(finding))
     if as_json:
-        pairs = [_document(comparison) for comparison in compared.comparisons]
-        document = {"format_version": 1, "rig": compared.rig, "failed": list(compared.failed), "pairs": pairs}
-        show.print_json(document)
+        show.print_json(_document(compared))
     else:
         for comparison in compared.comparisons:
             show.print_table(_deviations(comparison))
@@ -45,18 +46,17 @@ def repeat(sessions: tuple[Path, ...], as_json: bool) -> None:
             show.print_lines(_summary(comparison))
     if compared.failed:
         raise ResultRefusedError(
-            f"the calibration of {', '.join(compared.failed)} failed by itself",
-            "Its reasons stand in what `lce-rig calibrate` says.",
+            "; ".join(describe(finding) for finding in compared.failed), recommend(compared.failed[0])
         )
     refused = [comparison for comparison in compared.comparisons if not comparison.agrees]
     if refused:
-        raise ResultRefusedError(f"the calibrations of {', '.join(c.sensors for c in refused)} disagree")
+        raise ResultRefusedError(f"the calibrations of {', '.join(map(_sensors, refused))} disagree")
 
 
 def _deviations(comparison: "Repeatability") -> Any:
     import numpy as np
 
-    table = show.plain_table(f"{comparison.sensors}: from the mean")
+    table = show.plain_table(f"{_sensors(comparison)}: from the mean")
     table.add_column("session")
     for title in ("x mm", "y mm", "z mm", "about x deg", "about y deg", "about z deg"):
         table.add_column(title, justify="right")
@@ -88,7 +88,7 @@ def _summary(comparison: "Repeatability") -> list[str]:
         f"chi2     {c.chi2:.1f} with {c.dof} degrees of freedom, chance {c.p:.2g}",
     ]
     colour = "green" if c.agrees else "red"
-    return [*lines, f"[{colour}]{show.escape(c.sentence())}[/]"]
+    return [*lines, f"[{colour}]{show.escape(as_line(sentence(c.finding)))}[/]"]
 
 
 def _scatter(comparison: "Repeatability") -> str:
@@ -101,13 +101,32 @@ def _scatter(comparison: "Repeatability") -> str:
     )
 
 
-def _document(comparison: "Repeatability") -> dict[str, Any]:
+def _sensors(comparison: "Repeatability") -> str:
+    return f"{comparison.camera} and {comparison.lidar}"
+
+
+def _document(compared: "Repeat") -> dict[str, Any]:
+    from lce_rig.words import as_json
+
+    return {
+        "format_version": 2,
+        "rig": compared.rig,
+        "calibrated": list(compared.calibrated),
+        "findings": [as_json(finding) for finding in compared.findings],
+        "pairs": [_pair(comparison) for comparison in compared.comparisons],
+    }
+
+
+def _pair(comparison: "Repeatability") -> dict[str, Any]:
+    from lce_rig.words import as_json
+
     c = comparison
     return {
-        "sensors": c.sensors,
+        "camera": c.camera,
+        "lidar": c.lidar,
         "sessions": list(c.names),
         "agrees": c.agrees,
-        "sentence": c.sentence(),
+        "finding": as_json(c.finding),
         "T_cam_lidar": c.T_cam_lidar.tolist(),
         "deviations": c.deviations.tolist(),
         "spread_rotation_deg": c.spread_rotation_deg,

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 
-from lce_rig.collect.refusal_counts import Tally
+from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.detect.finder import BoardFinder, ImageSearch
@@ -14,7 +14,7 @@ ImageKey = tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class BoardDetection:
     """The board in one frame.
 
     Attributes:
@@ -40,19 +40,19 @@ class Sighting:
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class CaptureMoment:
     """A sighting worth a capture.
 
     Attributes:
         figures: how still or how fast the board was, by name; kept with the capture.
     """
 
-    sighting: Sighting
+    sighting: BoardDetection
     figures: dict[str, float]
 
 
 @dataclass
-class BoardWatcher:
+class BoardTracker:
     """Finds the board frame by frame, near where it was, so that a long recording is searched quickly.
 
     Attributes:
@@ -66,7 +66,7 @@ class BoardWatcher:
 
     rig: Rig
     search_interval_s: float
-    refusals: Tally = field(default_factory=Tally)
+    refusals: RefusalCounts = field(default_factory=RefusalCounts)
     thorough_interval_s: float = 0.0
     rescan_interval_s: float = 0.0
     _seen: dict[ImageKey, ImageBoard] = field(default_factory=dict)
@@ -78,7 +78,7 @@ class BoardWatcher:
     def __post_init__(self) -> None:
         self.finder = BoardFinder(self.rig)
 
-    def sight(self, frame: Frame) -> Sighting:
+    def sight(self, frame: Frame) -> BoardDetection:
         """Find the board in every picture and scan of a frame."""
         images: dict[ImageKey, ImageBoard] = {}
         unseen: dict[ImageKey, Refusal] = {}
@@ -109,9 +109,9 @@ class BoardWatcher:
             self.refusals.add(Refusal("image.none"))
         elif not lidars:
             self.refusals.add(Refusal("lidar.none"))
-        return Sighting(frame, images, lidars, unseen, unscanned, unfit)
+        return BoardDetection(frame, images, lidars, unseen, unscanned, unfit)
 
-    def confirm(self, moment: Moment) -> Moment | Refusal:
+    def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
         """Search the frame of a moment without a prior, as `check` does: what is captured can be used later.
 
         Returns:
@@ -130,7 +130,7 @@ class BoardWatcher:
         for found, refused in ((usable, images), (lidars, scans)):
             if not found:
                 return next(why for why in refused.values() if isinstance(why, Refusal))
-        return replace(moment, sighting=Sighting(sighting.frame, usable, lidars))
+        return replace(moment, sighting=BoardDetection(sighting.frame, usable, lidars))
 
     def _find_in_image(self, image: Image, key: ImageKey, time_ns: int) -> ImageSearch | None:
         last = self._seen.pop(key, None)

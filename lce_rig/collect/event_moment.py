@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import ImageKey, Moment, Sighting
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey
 from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
@@ -48,8 +48,8 @@ class MotionOptions:
 
 
 def judge_sighting(
-    sighting: Sighting, around: Sequence[Sighting], rig: Rig, options: MotionOptions
-) -> Moment | Refusal | None:
+    sighting: BoardDetection, around: Sequence[BoardDetection], rig: Rig, options: MotionOptions
+) -> CaptureMoment | Refusal | None:
     """Say whether a sighting is worth a capture.
 
     Args:
@@ -71,17 +71,17 @@ def judge_sighting(
     if not sighting.lidars:
         return None
     judged = [_judge_camera(key, sighting, around, cuts[key[0]], rig, options) for key in watched]
-    return next((found for found in judged if isinstance(found, Moment)), judged[0])
+    return next((found for found in judged if isinstance(found, CaptureMoment)), judged[0])
 
 
 def _judge_camera(
     key: ImageKey,
-    sighting: Sighting,
-    around: Sequence[Sighting],
+    sighting: BoardDetection,
+    around: Sequence[BoardDetection],
     cut: EventCut,
     rig: Rig,
     options: MotionOptions,
-) -> Moment | Refusal | None:
+) -> CaptureMoment | Refusal | None:
     if key in sighting.unfit:
         return sighting.unfit[key]
     motion = _follow(key, around)
@@ -103,10 +103,10 @@ def _judge_camera(
         if lamps is not None:
             return lamps
     figures = {"speed_mps": speed_mps, "unsteady_m": unsteady_m, "events_px": events_px}
-    return Moment(sighting, {name: round(value, 5) for name, value in figures.items()})
+    return CaptureMoment(sighting, {name: round(value, 5) for name, value in figures.items()})
 
 
-def _follow(key: ImageKey, around: Sequence[Sighting]) -> tuple[float, float] | None:
+def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, float] | None:
     """Fit a straight and steady way to the plate's middle: speed in m/s, and the rms distance from it in m.
 
     The middle is well known even where the tilt is not. None where the board was seen too seldom.
@@ -122,7 +122,7 @@ def _follow(key: ImageKey, around: Sequence[Sighting]) -> tuple[float, float] | 
     return float(np.linalg.norm(velocity)), float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
 
 
-def _events_before(key: ImageKey, sighting: Sighting, cut: EventCut, rig: Rig) -> tuple[Events, int]:
+def _events_before(key: ImageKey, sighting: BoardDetection, cut: EventCut, rig: Rig) -> tuple[Events, int]:
     """Cut out the second of events before the board's picture; also give its time on their clock."""
     image = next(i for i in sighting.frame.images if (i.sensor, i.channel) == key)
     # Frames and events of one camera may have clocks, or delays, of their own.
@@ -131,14 +131,16 @@ def _events_before(key: ImageKey, sighting: Sighting, cut: EventCut, rig: Rig) -
     return cut.events.between(stamp_ns - MEMORY_NS, stamp_ns), stamp_ns
 
 
-def _events_on_board(key: ImageKey, sighting: Sighting, recent: Events, stamp_ns: int, rig: Rig) -> float:
+def _events_on_board(
+    key: ImageKey, sighting: BoardDetection, recent: Events, stamp_ns: int, rig: Rig
+) -> float:
     """Count the events a pixel of the board in the second before its picture."""
     camera, board = rig.cameras[key[0]], sighting.images[key]
     outline = outline_px(board.T_cam_board, rig.board.to_board(), camera.to_intrinsics())
     return event_figures(recent, stamp_ns, outline)["events_px"]
 
 
-def _explain_unseen(sighting: Sighting, cuts: Mapping[str, EventCut], rig: Rig) -> Refusal | None:
+def _explain_unseen(sighting: BoardDetection, cuts: Mapping[str, EventCut], rig: Rig) -> Refusal | None:
     """Say what keeps the board from being seen in pictures that were made of events."""
     for (camera, channel), refusal in sorted(sighting.unseen.items()):
         if rig.cameras[camera].channels[channel].kind == "events" and camera in cuts:

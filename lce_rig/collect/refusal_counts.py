@@ -7,7 +7,7 @@ from lce_rig.core.results import Refusal
 
 
 @dataclass
-class Tally:
+class RefusalCounts:
     """Refusals counted by code and advice; those that differ in their figures only are one."""
 
     _counts: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -19,7 +19,7 @@ class Tally:
         self._counts[kind] += n
         self._examples.setdefault(kind, refusal)
 
-    def update(self, other: "Tally") -> None:
+    def update(self, other: "RefusalCounts") -> None:
         """Count what another tally has counted as well."""
         for refusal, n in other.counts():
             self.add(refusal, n)

@@ -23,7 +23,7 @@ _SAME_PRESS_S = 0.1
 _SCREEN_AS_BEFORE = b"\x1b[?1049l\x1b[?25h"
 
 
-class _Watch:
+class _InterruptWatch:
     """Ends the process where Ctrl-C has not, after a grace or at the second press."""
 
     def __init__(self) -> None:
@@ -70,7 +70,7 @@ class _Watch:
         os._exit(EXIT_INTERRUPTED)
 
 
-_watch: _Watch | None = None
+_watch: _InterruptWatch | None = None
 
 
 def watch_for_interrupts() -> None:
@@ -84,7 +84,7 @@ def watch_for_interrupts() -> None:
         sys.unraisablehook = _without_interrupts(sys.unraisablehook)
         # Python's last steps go without handlers, and Ctrl-C would hide how the program went.
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
-        _watch = _Watch()
+        _watch = _InterruptWatch()
 
 
 def interrupt_no_more() -> None:

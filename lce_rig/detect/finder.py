@@ -13,8 +13,7 @@ from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.detect.events.search import find_in_reconstruction
 from lce_rig.detect.image.search import find_image_board, region_around
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.detect.lidar.search import find_lidar_boards
-from lce_rig.detect.lidar.track import track_lidar_board
+from lce_rig.detect.lidar.search import find_lidar_boards, track_lidar_board
 from lce_rig.detect.limits_met import gate_image_board, gate_lidar_boards
 from lce_rig.rig import Rig
 

@@ -9,8 +9,8 @@ from lce_rig.core.data import Image, Pulse
 from lce_rig.core.findings import Figure, Finding, Severity
 from lce_rig.devices.sync_board.lines import DIALECTS
 from lce_rig.doctor.line import Check, problems_of
-from lce_rig.doctor.observing import Observation
-from lce_rig.doctor.sensor_report import Examination
+from lce_rig.doctor.observing import ObservedSensor
+from lce_rig.doctor.sensor_report import SensorReport
 from lce_rig.doctor.sensor_sources import driver_of
 from lce_rig.rig.sync_settings import BOARD, PPS_LINE
 from lce_rig.timing.clock import ClockModel
@@ -26,7 +26,7 @@ _MAX_OFF_RATE = 0.02
 _ROOM, _MAX_UNLIKE = 2, 0.01
 
 
-def check_pulses_sent(exam: Examination) -> Check | None:
+def check_pulses_sent(exam: SensorReport) -> Check | None:
     """Count the board's pulses by line, and compare their rates with the profile."""
     board, sync = exam.seen[BOARD], exam.rig.sync
     if board.status is None or sync is None or not DIALECTS[sync.type]().has_triggers:
@@ -37,7 +37,7 @@ def check_pulses_sent(exam: Examination) -> Check | None:
     return Check.of(BOARD, "pulses", *lines, lost, *problems_of(board.status, "stream"))
 
 
-def _judge_line(board: Observation, line: str, expected_hz: float) -> Finding:
+def _judge_line(board: ObservedSensor, line: str, expected_hz: float) -> Finding:
     rate_hz = _rate_hz(board, line)
     figures: dict[str, Figure] = {"line": line, "rate_hz": rate_hz, "expected_hz": expected_hz}
     action = "pps" if line == PPS_LINE else ""
@@ -51,7 +51,7 @@ def _judge_line(board: Observation, line: str, expected_hz: float) -> Finding:
     return Finding("pulses.line_none", severity, figures=figures, action=action)
 
 
-def check_frames_of_pulses(exam: Examination, sensor: str) -> Check | None:
+def check_frames_of_pulses(exam: SensorReport, sensor: str) -> Check | None:
     """See whether each pulse made a frame of a triggered camera."""
     sync, board, seen = exam.rig.sync, exam.seen.get(BOARD), exam.seen[sensor]
     is_triggered = sync is not None and sensor in sync.triggers and driver_of(exam.rig, sensor) != "davis"
@@ -70,7 +70,7 @@ def check_frames_of_pulses(exam: Examination, sensor: str) -> Check | None:
     return Check.of(sensor, "pulses", counts, Finding("pulses.counted_only", "note"), unequal)
 
 
-def _by_matching(matcher: TriggerMatcher, board: Observation, seen: Observation) -> Iterator[Finding]:
+def _by_matching(matcher: TriggerMatcher, board: ObservedSensor, seen: ObservedSensor) -> Iterator[Finding]:
     """Match frames to pulses by their numbers, and give what comes of it."""
     pulses = [pulse for pulse in board.pulses if pulse.sensor == seen.sensor]
     delays_ms = np.array([_delay_ms(each, board) for each in _matched(matcher, pulses, seen.frames)])
@@ -88,7 +88,7 @@ def _by_matching(matcher: TriggerMatcher, board: Observation, seen: Observation)
         yield Finding("pulses.missed", figures=counts)
 
 
-def _rate_hz(board: Observation, line: str) -> float:
+def _rate_hz(board: ObservedSensor, line: str) -> float:
     """Measure how many pulses of a line were sent a second, by the board's clock; lost lines count."""
     stamps_ns = [pulse.stamp_ns for pulse in board.pulses if pulse.sensor == line]
     if len(stamps_ns) < 2 or stamps_ns[-1] <= stamps_ns[0] or board.status is None:
@@ -97,7 +97,7 @@ def _rate_hz(board: Observation, line: str) -> float:
     return 1e9 * (len(stamps_ns) - 1 + n_lost) / (stamps_ns[-1] - stamps_ns[0])
 
 
-def _in_common(seen: Observation, board: Observation, line: str, are_numbered: bool) -> tuple[int, int]:
+def _in_common(seen: ObservedSensor, board: ObservedSensor, line: str, are_numbered: bool) -> tuple[int, int]:
     """Count frames and pulses while both came; by their running numbers, so that lost ones count."""
     frames = [(image.host_ns or 0, image.count) for image in seen.frames]
     pulses = [
@@ -127,7 +127,7 @@ def _matched(matcher: TriggerMatcher, pulses: list[Pulse], frames: list[Image]) 
             yield from matcher.take_image(sample)
 
 
-def _delay_ms(matched: TriggeredImage, board: Observation) -> float:
+def _delay_ms(matched: TriggeredImage, board: ObservedSensor) -> float:
     assert board.host_clock is not None and matched.image.stamp_ns is not None
     return (matched.image.stamp_ns - board.host_clock.convert(matched.pulse_ns)) * 1e-6
 
@@ -137,7 +137,7 @@ _MAX_DRIFT_PPM = 200.0
 _STREAMS = ("scans", "events", "frames")
 
 
-def check_clock(exam: Examination, sensor: str) -> Check | None:
+def check_clock(exam: SensorReport, sensor: str) -> Check | None:
     """Say what a camera's or sync board's stamps are tied to."""
     status = exam.seen[sensor].status
     if status is None:
@@ -146,7 +146,7 @@ def check_clock(exam: Examination, sensor: str) -> Check | None:
     return Check.of(sensor, "clock", state, *problems_of(status, "clock"))
 
 
-def check_edges(exam: Examination, sensor: str) -> Check | None:
+def check_edges(exam: SensorReport, sensor: str) -> Check | None:
     """Fit the clock of a camera that sees the board's pulses to them."""
     if not _sees_edges(exam, sensor):
         return None
@@ -162,7 +162,7 @@ def check_edges(exam: Examination, sensor: str) -> Check | None:
     return Check.of(sensor, "edges", Finding("edges.fitted", "note", figures=figures))
 
 
-def check_offsets(exam: Examination) -> Check | None:
+def check_offsets(exam: SensorReport) -> Check | None:
     """Measure every stream's offset and drift against this computer's clock, by when its samples arrive."""
     offsets, strays = list[Finding](), list[Finding]()
     for sensor, seen in exam.seen.items():
@@ -184,7 +184,7 @@ def check_offsets(exam: Examination) -> Check | None:
     return None if is_empty else Check.of(_RIG, "clocks", *offsets, *strays)
 
 
-def check_sync(exam: Examination) -> Check | None:
+def check_sync(exam: SensorReport) -> Check | None:
     """Judge whether boards may move while they are captured; absent sensors are left out of it."""
     rig, verdict = exam.rig, tie(exam).verdict()
     absent = [sensor for sensor, seen in exam.seen.items() if not seen.has_opened]
@@ -201,7 +201,7 @@ def check_sync(exam: Examination) -> Check | None:
     return Check.of(_RIG, "sync", judged, *named)
 
 
-def tie(exam: Examination) -> RigClock:
+def tie(exam: SensorReport) -> RigClock:
     """Put every sensor that can be onto the rig's clock, as `collect` does with the same samples."""
     board = exam.seen.get(BOARD)
     has_board = board is not None and board.status is not None
@@ -219,11 +219,11 @@ def tie(exam: Examination) -> RigClock:
     return clock
 
 
-def _is_utc(seen: Observation) -> bool:
+def _is_utc(seen: ObservedSensor) -> bool:
     return seen.status is not None and seen.status.clock is not None and seen.status.clock.is_utc
 
 
-def _promises(exam: Examination) -> list[str]:
+def _promises(exam: SensorReport) -> list[str]:
     """List how the profile says that clocks are tied, stream by stream."""
     found: list[str] = [lidar.timestamps.sync for lidar in exam.rig.lidars.values()]
     for camera in exam.rig.cameras.values():
@@ -231,13 +231,13 @@ def _promises(exam: Examination) -> list[str]:
     return found
 
 
-def _sees_edges(exam: Examination, sensor: str) -> bool:
+def _sees_edges(exam: SensorReport, sensor: str) -> bool:
     board, seen = exam.seen.get(BOARD), exam.seen[sensor]
     is_davis = driver_of(exam.rig, sensor) == "davis"
     return is_davis and seen.status is not None and board is not None and board.status is not None
 
 
-def _by_arrivals(exam: Examination, seen: Observation) -> ClockModel | None:
+def _by_arrivals(exam: SensorReport, seen: ObservedSensor) -> ClockModel | None:
     """Fit this computer's time on a sensor's clock; None of stamps that are arrivals themselves."""
     stream = next((name for name in _STREAMS if name in seen.stamps), None)
     if stream is None or seen.status is None or driver_of(exam.rig, seen.sensor) == "command":
@@ -251,7 +251,7 @@ def _by_arrivals(exam: Examination, seen: Observation) -> ClockModel | None:
     return fit_arrivals(stamps[first:], arrivals[first:], "arrivals")
 
 
-def _offset_ms(seen: Observation, model: ClockModel) -> float | None:
+def _offset_ms(seen: ObservedSensor, model: ClockModel) -> float | None:
     """Give by how much stamps are ahead of this computer's clock; what samples take to arrive is in it.
 
     A LiDAR's scan arrives a revolution after its stamp, which its driver has taken off; None for a board,

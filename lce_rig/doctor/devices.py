@@ -12,8 +12,8 @@ from lce_rig.detect.events.event_limits import events_problem
 from lce_rig.detect.image.quality import strongest_edge_px
 from lce_rig.devices.vlp16.web import VelodyneWeb, WebReport, find_problems
 from lce_rig.doctor.line import Check, problems_of
-from lce_rig.doctor.observing import Observation
-from lce_rig.doctor.sensor_report import Examination
+from lce_rig.doctor.observing import ObservedSensor
+from lce_rig.doctor.sensor_report import SensorReport
 from lce_rig.doctor.sensor_sources import driver_of
 from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import join_events
@@ -32,7 +32,7 @@ def read_web(rig: Rig, lidar: str, port: int = 80) -> WebReport | SourceError:
         return error
 
 
-def check_settings(exam: Examination, sensor: str) -> Check | None:
+def check_settings(exam: SensorReport, sensor: str) -> Check | None:
     """Compare what the web page says with the profile."""
     report = exam.web.get(sensor)
     if report is None:
@@ -56,7 +56,7 @@ def check_settings(exam: Examination, sensor: str) -> Check | None:
     return Check.of(sensor, "settings", Finding("settings.read", "note", figures=figures), *others)
 
 
-def check_pulse(exam: Examination, sensor: str) -> Check | None:
+def check_pulse(exam: SensorReport, sensor: str) -> Check | None:
     """Say whether the sensor is locked to pulses and knows UTC, and whose time its scans are stamped with."""
     seen, report, lidar = exam.seen[sensor], exam.web.get(sensor), exam.rig.lidars[sensor]
     if seen.status is None or seen.status.clock is None:
@@ -81,7 +81,7 @@ _DARK_GREY, _FLAT_GREY = 50.0, 3.0
 _MAX_EDGE_PX = 6.0
 
 
-def check_picture(exam: Examination, sensor: str) -> Check | None:
+def check_picture(exam: SensorReport, sensor: str) -> Check | None:
     """Judge the exposure and sharpness of the last image."""
     images = exam.seen[sensor].images
     if not images:
@@ -103,7 +103,7 @@ def check_picture(exam: Examination, sensor: str) -> Check | None:
     return Check.of(sensor, "picture", Finding("exposure.grey", "note", figures=figures), wrong)
 
 
-def check_events(exam: Examination, sensor: str) -> Check | None:
+def check_events(exam: SensorReport, sensor: str) -> Check | None:
     """Judge the last second of events: lamps that flicker, hot pixels, too few."""
     seen = exam.seen[sensor]
     if not seen.events:
@@ -114,7 +114,7 @@ def check_events(exam: Examination, sensor: str) -> Check | None:
     return Check.of(sensor, "events", found)
 
 
-def check_board(exam: Examination, sensor: str) -> Check | None:
+def check_board(exam: SensorReport, sensor: str) -> Check | None:
     """Say whether the sensor sees the board now."""
     found = [board for (name, _), board in exam.boards.items() if name == sensor]
     if not found:
@@ -131,7 +131,7 @@ _STOPPED_S = 1.0
 _US_PER_S = 1e6
 
 
-def check_device(exam: Examination, sensor: str) -> Check:
+def check_device(exam: SensorReport, sensor: str) -> Check:
     """Say what answers, or why nothing does."""
     seen = exam.seen[sensor]
     if seen.failure is not None:
@@ -150,7 +150,7 @@ def check_device(exam: Examination, sensor: str) -> Check:
     return Check.of(sensor, "device", answers, *problems_of(seen.status, "device"))
 
 
-def check_stream(exam: Examination, sensor: str) -> Check | None:
+def check_stream(exam: SensorReport, sensor: str) -> Check | None:
     """Compare a LiDAR's or camera's rates with the profile, and count what was lost."""
     seen, rig = exam.seen[sensor], exam.rig
     if seen.status is None:
@@ -181,7 +181,7 @@ def wanted_rate_hz(rig: Rig, sensor: str) -> float | None:
     return driver.frame_rate_hz
 
 
-def rate_hz(seen: Observation, stream: str) -> float:
+def rate_hz(seen: ObservedSensor, stream: str) -> float:
     """Measure how many a second came; 0 where fewer than two did.
 
     A LiDAR's is its rotor's speed, by its own clock: scans arrive late on a busy computer.
@@ -194,7 +194,7 @@ def rate_hz(seen: Observation, stream: str) -> float:
     return 1e9 * (len(arrivals) - 1) / span_ns if span_ns > 0 else 0.0
 
 
-def _rate(rig: Rig, seen: Observation, stream: str) -> Finding:
+def _rate(rig: Rig, seen: ObservedSensor, stream: str) -> Finding:
     now_hz, expected_hz = rate_hz(seen, stream), wanted_rate_hz(rig, seen.sensor)
     figures: dict[str, Figure] = {"stream": stream, "rate_hz": now_hz, "expected_hz": expected_hz}
     if now_hz == 0:
@@ -210,14 +210,14 @@ def _rate(rig: Rig, seen: Observation, stream: str) -> Finding:
     return Finding("stream.rate_off", "warning", figures=figures, action=action)
 
 
-def _event_rate(seen: Observation) -> Finding:
+def _event_rate(seen: ObservedSensor) -> Finding:
     if not seen.n_events:
         return Finding("stream.no_events")
     figures = {"events_per_s": seen.n_events / max(seen.watched_s, 1e-9)}
     return Finding("stream.events", "note", figures=figures)
 
 
-def _losses(seen: Observation, n_came: int, *, has_named_cause: bool) -> Finding:
+def _losses(seen: ObservedSensor, n_came: int, *, has_named_cause: bool) -> Finding:
     """Count what was lost on the way and by this computer."""
     status = seen.status
     assert status is not None

@@ -33,14 +33,14 @@ from lce_rig.doctor.devices import (
     check_stream,
     read_web,
 )
-from lce_rig.doctor.observing import Observation, observe
-from lce_rig.doctor.sensor_report import Examination
+from lce_rig.doctor.observing import ObservedSensor, observe
+from lce_rig.doctor.sensor_report import SensorReport
 from lce_rig.doctor.sensor_sources import driver_of, sensors, source_of
 from lce_rig.rig import Rig
 from lce_rig.rig.sync_settings import BOARD
 from lce_rig.timing.event_buffer import join_events
 
-SensorCheck = Callable[[Examination, str], Check | None]
+SensorCheck = Callable[[SensorReport, str], Check | None]
 
 LIDAR_CHECKS: tuple[SensorCheck, ...] = (check_device, check_settings, check_stream, check_pulse, check_board)
 CAMERA_CHECKS: tuple[SensorCheck, ...] = (
@@ -58,7 +58,7 @@ SYNC_CHECKS: tuple[SensorCheck, ...] = (
     lambda exam, _sensor: check_pulses_sent(exam),
     check_clock,
 )
-RIG_CHECKS: tuple[Callable[[Examination], Check | None], ...] = (check_offsets, check_sync)
+RIG_CHECKS: tuple[Callable[[SensorReport], Check | None], ...] = (check_offsets, check_sync)
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def examine(rig: Rig, options: DoctorOptions | None = None) -> list[Check]:
             [lambda: computer.extend(_applying(COMPUTER_CHECKS, rig, options.folder))],
         )
         web: dict[str, WebReport | SourceError] = {name: answer.result() for name, answer in asked.items()}
-    exam = Examination(rig, seen, web, look_for_boards(rig, seen))
+    exam = SensorReport(rig, seen, web, look_for_boards(rig, seen))
     checks = list(computer)
     for names, table in (
         (list(rig.lidars), LIDAR_CHECKS),
@@ -119,7 +119,7 @@ def _applying(table: tuple[Callable[..., Check | None], ...], *arguments: object
     return [line for line in (check(*arguments) for check in table) if line is not None]
 
 
-def look_for_boards(rig: Rig, seen: Mapping[str, Observation]) -> dict[tuple[str, str], Finding]:
+def look_for_boards(rig: Rig, seen: Mapping[str, ObservedSensor]) -> dict[tuple[str, str], Finding]:
     """Look for the board in each sensor's last sample; in events only where a camera has no pictures."""
     sights: dict[tuple[str, str], Finding] = {}
     for sensor, observation in seen.items():
@@ -132,7 +132,7 @@ def look_for_boards(rig: Rig, seen: Mapping[str, Observation]) -> dict[tuple[str
     return sights
 
 
-def _sight_in_scan(rig: Rig, seen: Observation) -> Finding:
+def _sight_in_scan(rig: Rig, seen: ObservedSensor) -> Finding:
     assert seen.scan is not None
     found = BoardFinder(rig).scan(seen.scan)
     if isinstance(found, Refusal):
@@ -153,7 +153,7 @@ def _sight_in_picture(rig: Rig, image: Image) -> Finding:
     return Finding("board.in_image", "note", figures={name: found.quality[name] for name in names})
 
 
-def _sight_in_events(rig: Rig, seen: Observation) -> Finding:
+def _sight_in_events(rig: Rig, seen: ObservedSensor) -> Finding:
     camera = rig.cameras[seen.sensor]
     channel = camera.first_channel("events") or "events"
     events = join_events(list(seen.events))

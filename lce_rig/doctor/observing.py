@@ -25,7 +25,7 @@ _NO_PIXELS = np.zeros((1, 1), dtype=np.uint8)
 
 
 @dataclass
-class Observation:
+class ObservedSensor:
     """What was seen of one sensor.
 
     Attributes:
@@ -99,7 +99,7 @@ def observe(
     sources: Mapping[str, Callable[[], LiveSource]],
     duration_s: float,
     meanwhile: Sequence[Callable[[], None]] = (),
-) -> dict[str, Observation]:
+) -> dict[str, ObservedSensor]:
     """Open every sensor and watch it.
 
     Sensors that take their time to open are waited for, 3 s beyond the duration at most, and then watched
@@ -154,12 +154,12 @@ class _Watch:
         self.stop = threading.Event()
         self.opened_s: float | None = None
         self.is_over = False
-        self._seen = Observation(sensor)
+        self._seen = ObservedSensor(sensor)
         self._make = make
         self._thread = threading.Thread(target=self._run, name=f"watch {sensor}", daemon=True)
         self._thread.start()
 
-    def result(self, timeout_s: float) -> Observation:
+    def result(self, timeout_s: float) -> ObservedSensor:
         """Wait for the sensor to close, and give what was seen."""
         self._thread.join(max(timeout_s, _POLL_S))
         if self._thread.is_alive() and self._seen.failure is None:

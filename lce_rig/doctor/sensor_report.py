@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices.vlp16.web import WebReport
-from lce_rig.doctor.observing import Observation
+from lce_rig.doctor.observing import ObservedSensor
 from lce_rig.rig import Rig
 
 
 @dataclass(frozen=True, eq=False)
-class Examination:
+class SensorReport:
     """What is known of a rig's sensors.
 
     Attributes:
@@ -23,6 +23,6 @@ class Examination:
     """
 
     rig: Rig
-    seen: Mapping[str, Observation]
+    seen: Mapping[str, ObservedSensor]
     web: Mapping[str, WebReport | SourceError]
     boards: Mapping[tuple[str, str], Finding]

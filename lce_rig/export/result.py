@@ -52,7 +52,7 @@ _NotNegative = Annotated[float, Field(ge=0, le=1e100)]
 _Count = Annotated[int, Field(ge=0, le=10**9)]
 
 
-class _Record(BaseModel):
+class _SavedRecord(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
 
 
@@ -69,7 +69,7 @@ def _read_figure(value: Any) -> Figure:
 _Figures = Annotated[dict[str, Any], AfterValidator(_check_figures)]
 
 
-class RefusalRecord(_Record):
+class RefusalRecord(_SavedRecord):
     """The reason for refusing a capture; files of earlier versions hold stage, cause and action only."""
 
     stage: Literal["read", "image", "lidar", "pair", "calibrate"]
@@ -89,7 +89,7 @@ class RefusalRecord(_Record):
         return Refusal(f"{self.stage}.text", figures={"text": self.cause, "advice": self.action})
 
 
-class FindingRecord(_Record):
+class FindingRecord(_SavedRecord):
     """One reason of a verdict, or a note."""
 
     code: str
@@ -109,14 +109,14 @@ class FindingRecord(_Record):
         return Finding("verdict.text", self.severity, figures={"text": self.text})
 
 
-class CertificateRecord(_Record):
+class CertificateRecord(_SavedRecord):
     """Proof of optimality; gap is null where there is no bound."""
 
     is_optimal: bool
     gap: float | None
 
 
-class ChannelRecord(_Record):
+class ChannelRecord(_SavedRecord):
     """The result of one channel alone; time offsets are null if nothing moved."""
 
     channel: str
@@ -130,7 +130,7 @@ class ChannelRecord(_Record):
     time_offset_sigma_s: _NotNegative | None = None
 
 
-class UncertaintyRecord(_Record):
+class UncertaintyRecord(_SavedRecord):
     """The covariance as the error of a point at a distance, in the image's centre and worst corner."""
 
     distance_m: Annotated[float, Field(gt=0)]
@@ -140,7 +140,7 @@ class UncertaintyRecord(_Record):
     corner_m: _NotNegative
 
 
-class OtherCameraRecord(_Record):
+class OtherCameraRecord(_SavedRecord):
     """The pose of a camera relative to another one; cov is null if they were not estimated together."""
 
     camera: str
@@ -153,7 +153,7 @@ class OtherCameraRecord(_Record):
     board_rms_m: _NotNegative
 
 
-class PairRecord(_Record):
+class PairRecord(_SavedRecord):
     """One camera and one LiDAR; figures that could not be computed are null."""
 
     camera: str
@@ -199,7 +199,7 @@ class PairRecord(_Record):
         return self
 
 
-class ResultRecord(_Record):
+class ResultRecord(_SavedRecord):
     """The whole file."""
 
     format_version: Literal[1]

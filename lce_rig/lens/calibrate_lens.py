@@ -11,8 +11,8 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
-from lce_rig.lens.fit import N_MODES, Setup, State, corners_of, fit, reduced, refine_poses, residuals_px
-from lce_rig.lens.lens_estimate import IntrinsicsEstimate, View
+from lce_rig.lens.fit import N_MODES, LensState, Setup, corners_of, fit, reduced, refine_poses, residuals_px
+from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import MODELS, LensModel, convert, model_of
 from lce_rig.solvers.pnp import solve_planar_pose
 
@@ -31,7 +31,7 @@ _MAX_FOCAL_SIGMA = 0.1
 
 
 def estimate_intrinsics(
-    views: Sequence[View],
+    views: Sequence[BoardView],
     board: Board,
     start: Intrinsics,
     model: LensModel,
@@ -57,7 +57,7 @@ def estimate_intrinsics(
     setup = Setup.of(np.array([view.board.corners_px for view in views]), board, model)
     starts = np.array([view.board.T_cam_board for view in views])
     channels = np.array([view.channel for view in views])
-    state = State(convert(start, model), np.zeros(len(setup.shapes)), starts)
+    state = LensState(convert(start, model), np.zeros(len(setup.shapes)), starts)
     kept = np.ones(len(views), dtype=bool)
     for rounds_left in reversed(range(_ROUNDS)):
         fitted, weights = _fit_weighted(setup.select(kept), state.select(kept), channels[kept])
@@ -75,7 +75,7 @@ def estimate_intrinsics(
     return _estimate(setup.select(kept), fitted, weights, used, refused, start, n_folds)
 
 
-def distances_under(intrinsics: Intrinsics, views: Sequence[View], board: Board) -> Array:
+def distances_under(intrinsics: Intrinsics, views: Sequence[BoardView], board: Board) -> Array:
     """Measure how well given intrinsics fit: only poses and the board's shape are fitted.
 
     Returns:
@@ -85,11 +85,11 @@ def distances_under(intrinsics: Intrinsics, views: Sequence[View], board: Board)
     corners = np.array([view.board.corners_px for view in views])
     setup = replace(Setup.of(corners, board, model), is_lens_free=False)
     poses = np.array([view.board.T_cam_board for view in views])
-    start = refine_poses(setup, State(model.vector(intrinsics), np.zeros(len(setup.shapes)), poses))
+    start = refine_poses(setup, LensState(model.vector(intrinsics), np.zeros(len(setup.shapes)), poses))
     return _distances(setup, fit(setup, start, np.ones(len(views))))
 
 
-def _require_captures(views: Sequence[View]) -> None:
+def _require_captures(views: Sequence[BoardView]) -> None:
     n = len({view.capture for view in views})
     if n < MIN_CAPTURES:
         raise NotEnoughDataError(
@@ -98,7 +98,7 @@ def _require_captures(views: Sequence[View]) -> None:
         )
 
 
-def _fit_weighted(setup: Setup, state: State, channels: NDArray[np.str_]) -> tuple[State, Array]:
+def _fit_weighted(setup: Setup, state: LensState, channels: NDArray[np.str_]) -> tuple[LensState, Array]:
     """Fit and weigh in turn; weights (K,) are 1 / px^2."""
     state = refine_poses(setup, state)
     weights = _weights(setup, state, channels)
@@ -113,7 +113,7 @@ def _fit_weighted(setup: Setup, state: State, channels: NDArray[np.str_]) -> tup
     return fit(setup, state, weights), weights
 
 
-def _posed_anew(setup: Setup, poses: Array, fitted: State, size: Intrinsics) -> Array:
+def _posed_anew(setup: Setup, poses: Array, fitted: LensState, size: Intrinsics) -> Array:
     """Solve for poses (K, 4, 4) without a start; those given stay where corners fit no pose."""
     lens = setup.model.intrinsics(fitted.lens, size.width_px, size.height_px)
     solved = [solve_planar_pose(corners, setup.corners_board, lens) for corners in setup.corners_px]
@@ -122,7 +122,7 @@ def _posed_anew(setup: Setup, poses: Array, fitted: State, size: Intrinsics) -> 
     ).reshape(-1, 4, 4)
 
 
-def _variances(setup: Setup, state: State) -> Array:
+def _variances(setup: Setup, state: LensState) -> Array:
     residuals = residuals_px(setup, state).reshape(len(setup.corners_px), -1)
     # A start that draws nothing at some board: it gets no weight in this round.
     variances = np.sum(residuals**2, axis=1) / (residuals.shape[1] - 6)
@@ -134,20 +134,20 @@ def _usual(variances: Array, channels: NDArray[np.str_]) -> Array:
     return np.array([np.median(variances[channels == name]) for name in channels])
 
 
-def _weights(setup: Setup, state: State, channels: NDArray[np.str_]) -> Array:
+def _weights(setup: Setup, state: LensState, channels: NDArray[np.str_]) -> Array:
     variances = _variances(setup, state)
     dof = 2 * setup.corners_px.shape[1] - 6
     usual = _usual(variances, channels)
     return np.asarray((dof + _PRIOR_DOF) / (dof * variances + _PRIOR_DOF * usual + 1e-12))
 
 
-def _fitting(setup: Setup, state: State, channels: NDArray[np.str_]) -> NDArray[np.bool_]:
+def _fitting(setup: Setup, state: LensState, channels: NDArray[np.str_]) -> NDArray[np.bool_]:
     """Tell which boards fit about as well as their channel's usually do (K,)."""
     variances = _variances(setup, state)
     return np.asarray(variances <= _BAD**2 * _usual(variances, channels))
 
 
-def _refusals(distances_px: Array, kept: NDArray[np.bool_], views: Sequence[View]) -> dict[str, Refusal]:
+def _refusals(distances_px: Array, kept: NDArray[np.bool_], views: Sequence[BoardView]) -> dict[str, Refusal]:
     """Say of each view that was left out how far its corners are from where the others' lens puts them."""
     usual = float(np.median(distances_px[kept]))
     return {
@@ -157,16 +157,16 @@ def _refusals(distances_px: Array, kept: NDArray[np.bool_], views: Sequence[View
     }
 
 
-def _distances(setup: Setup, state: State) -> Array:
+def _distances(setup: Setup, state: LensState) -> Array:
     """Rms distance (K,) of each board's corners from their prediction, px."""
     return np.asarray(np.sqrt(np.mean(np.sum(residuals_px(setup, state) ** 2, axis=2), axis=1)))
 
 
 def _estimate(
     setup: Setup,
-    state: State,
+    state: LensState,
     weights: Array,
-    views: tuple[View, ...],
+    views: tuple[BoardView, ...],
     refused: Mapping[str, Refusal],
     start: Intrinsics,
     n_folds: int,
@@ -199,7 +199,7 @@ def _estimate(
 
 
 def _covariance(
-    setup: Setup, state: State, weights: Array, captures: NDArray[np.intp]
+    setup: Setup, state: LensState, weights: Array, captures: NDArray[np.intp]
 ) -> tuple[Array, float]:
     """Compute the covariance (Q, Q) of lens and shape, inflated to what the captures' scatter shows.
 
@@ -234,7 +234,9 @@ def _covariance(
     return inflation**2 * cov * np.outer(scale, scale), inflation
 
 
-def _held_out(setup: Setup, state: State, weights: Array, captures: NDArray[np.intp], n_folds: int) -> Array:
+def _held_out(
+    setup: Setup, state: LensState, weights: Array, captures: NDArray[np.intp], n_folds: int
+) -> Array:
     """Rms distance (K,) of each board's corners under a lens and shape fitted to the other folds."""
     distances = np.empty(len(captures))
     n = min(n_folds, int(captures.max()) + 1)
@@ -288,7 +290,7 @@ class Choice:
 
 
 def choose_model(
-    views: Sequence[View], board: Board, start: Intrinsics, *, n_folds: int = N_FOLDS
+    views: Sequence[BoardView], board: Board, start: Intrinsics, *, n_folds: int = N_FOLDS
 ) -> tuple[IntrinsicsEstimate, Choice]:
     """Fit every model and choose one by its error on captures that were left out.
 

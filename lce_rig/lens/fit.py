@@ -85,7 +85,7 @@ class Setup:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class LensState:
     """Values of every unknown.
 
     Attributes:
@@ -98,11 +98,11 @@ class State:
     shape: Array
     T_cam_board: Array
 
-    def with_poses(self, T_cam_board: Array) -> "State":
+    def with_poses(self, T_cam_board: Array) -> "LensState":
         """Exchange the poses."""
         return replace(self, T_cam_board=T_cam_board)
 
-    def select(self, keep: NDArray[np.bool_]) -> "State":
+    def select(self, keep: NDArray[np.bool_]) -> "LensState":
         """Keep some boards (K,)."""
         return self.with_poses(self.T_cam_board[keep])
 
@@ -117,12 +117,12 @@ def corners_of(setup: Setup, shape: Array) -> Array:
     return np.asarray(setup.corners_board + np.tensordot(shape, setup.shapes, axes=1))
 
 
-def residuals_px(setup: Setup, state: State) -> Array:
+def residuals_px(setup: Setup, state: LensState) -> Array:
     """Compute predicted minus measured corners (K, N, 2)."""
     return _project(setup, state)[0]
 
 
-def _project(setup: Setup, state: State) -> tuple[Array, Array, Array, Array]:
+def _project(setup: Setup, state: LensState) -> tuple[Array, Array, Array, Array]:
     """Compute residuals (K, N, 2), derivatives by point and lens, and the corners turned into the camera."""
     T = state.T_cam_board
     turned = corners_of(setup, state.shape) @ np.swapaxes(T[:, :3, :3], 1, 2)
@@ -130,14 +130,14 @@ def _project(setup: Setup, state: State) -> tuple[Array, Array, Array, Array]:
     return pixels - setup.corners_px, by_point, by_lens, turned
 
 
-def _by_pose(setup: Setup, state: State) -> tuple[Array, Array]:
+def _by_pose(setup: Setup, state: LensState) -> tuple[Array, Array]:
     """Compute residuals (K, 2 N) and their derivative (K, 2 N, 6) by the tangent of each pose."""
     residuals, by_point, _, turned = _project(setup, state)
     J = np.concatenate([by_point, -by_point @ skew(turned)], axis=-1)
     return residuals.reshape(len(J), -1), J.reshape(len(J), -1, 6)
 
 
-def linearise(setup: Setup, state: State) -> tuple[Array, Array, Array]:
+def linearise(setup: Setup, state: LensState) -> tuple[Array, Array, Array]:
     """Compute residuals and derivatives.
 
     Returns:
@@ -153,7 +153,7 @@ def linearise(setup: Setup, state: State) -> tuple[Array, Array, Array]:
     return residuals.reshape(K, -1), G.reshape(K, -1, G.shape[-1]), J.reshape(K, -1, 6)
 
 
-def refine_poses(setup: Setup, state: State, *, tries_mirror: bool = True) -> State:
+def refine_poses(setup: Setup, state: LensState, *, tries_mirror: bool = True) -> LensState:
     """Fit every board's pose to a given lens and shape.
 
     This is `solvers.pnp.solve_planar_pose` for all boards at once, where a start is known.
@@ -173,7 +173,7 @@ def refine_poses(setup: Setup, state: State, *, tries_mirror: bool = True) -> St
     return state.with_poses(np.where(is_better[:, None, None], second, first))
 
 
-def _descend(setup: Setup, state: State) -> tuple[Array, Array]:
+def _descend(setup: Setup, state: LensState) -> tuple[Array, Array]:
     """Levenberg-Marquardt on each pose by itself; poses (K, 4, 4) and costs (K,) px^2."""
     damping = np.full(len(state.T_cam_board), 1e-4)
     T = state.T_cam_board
@@ -197,7 +197,7 @@ def _descend(setup: Setup, state: State) -> tuple[Array, Array]:
     return T, cost
 
 
-def fit(setup: Setup, start: State, weights: Array) -> State:
+def fit(setup: Setup, start: LensState, weights: Array) -> LensState:
     """Minimise sum_k w_k |r_k|^2 + priors over lens, shape and poses, by Levenberg-Marquardt.
 
     Args:
@@ -211,7 +211,7 @@ def fit(setup: Setup, start: State, weights: Array) -> State:
     P = setup.model.size
     for _ in range(_MAX_STEPS):
         step, pose_steps = _step(setup, state, weights, damping, linear)
-        candidate = State(
+        candidate = LensState(
             state.lens + step[:P], state.shape + step[P:], perturb(state.T_cam_board, pose_steps)
         )
         new_cost = _cost(setup, candidate, residuals_px(setup, candidate), weights)
@@ -228,7 +228,7 @@ def fit(setup: Setup, start: State, weights: Array) -> State:
     return state
 
 
-def reduced(setup: Setup, state: State, weights: Array) -> tuple[Array, Array]:
+def reduced(setup: Setup, state: LensState, weights: Array) -> tuple[Array, Array]:
     """Compute what each board says about lens and shape once its pose is eliminated.
 
     Returns:
@@ -243,7 +243,7 @@ def reduced(setup: Setup, state: State, weights: Array) -> tuple[Array, Array]:
 
 
 def _step(
-    setup: Setup, state: State, weights: Array, damping: float, linear: tuple[Array, Array, Array]
+    setup: Setup, state: LensState, weights: Array, damping: float, linear: tuple[Array, Array, Array]
 ) -> tuple[Array, Array]:
     """Solve the damped normal equations by the Schur complement of the poses.
 
@@ -275,7 +275,7 @@ def solve_scaled(H: Array, right: Array) -> Array:
     return np.asarray((np.linalg.solve(scaled, (right.T * scale).T).T * scale).T)
 
 
-def _cost(setup: Setup, state: State, residuals: Array, weights: Array) -> float:
+def _cost(setup: Setup, state: LensState, residuals: Array, weights: Array) -> float:
     squares = np.sum(residuals.reshape(len(weights), -1) ** 2, axis=1)
     return float(_finite(weights @ squares + setup.information @ state.shared**2))
 

@@ -12,7 +12,7 @@ from lce_rig.lens.models import LensModel
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class BoardView:
     """The board in one picture.
 
     Attributes:
@@ -60,7 +60,7 @@ class IntrinsicsEstimate:
     shape: Array
     shape_sigma: Array
     print_rms_m: float
-    views: tuple[View, ...]
+    views: tuple[BoardView, ...]
     T_cam_board: Array
     residuals_px: Array
     held_out_px: Array

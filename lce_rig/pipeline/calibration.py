@@ -29,14 +29,14 @@ from lce_rig.extrinsics.likelihood.calibrate_together import TogetherEstimate, c
 from lce_rig.extrinsics.metrics import error_to_reference
 from lce_rig.extrinsics.relative_pose import relative_pose
 from lce_rig.extrinsics.shared_scans import take_apart
-from lce_rig.lens.lens_estimate import View
+from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.result_files import Result
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.validation.camera_pairs import CameraPair, doubt_cameras, relate
 from lce_rig.validation.reach import point_uncertainties
-from lce_rig.validation.validate import Examination, examine
+from lce_rig.validation.validate import Validation, validate
 from lce_rig.validation.verdict import judge
 from lce_rig.words import sentence
 
@@ -318,7 +318,7 @@ def _from_all_cameras(
 def _other_camera(
     sensors: Sequence[_Sensors],
     estimates: Sequence[CalibrationEstimate],
-    checked: Sequence[Examination],
+    checked: Sequence[Validation],
     k: int,
     link: _Link,
     joint: Mapping[int, TogetherEstimate],
@@ -348,7 +348,7 @@ def _other_camera(
 
 def _examine(
     rig: Rig, detections: Detections, sensors: _Sensors, estimate: CalibrationEstimate
-) -> Examination:
+) -> Validation:
     """Check an estimate on its own captures and images."""
     used = sorted(take_apart(estimate.used))
     channels = {channel.channel for channel in estimate.channels}
@@ -357,9 +357,9 @@ def _examine(
         for pair in sensors.pairs:
             image = detections.images[pair.camera, pair.channel].get(name)
             if pair.channel in channels and isinstance(image, ImageBoard):
-                views.append(View(name, pair.channel, image))
+                views.append(BoardView(name, pair.channel, image))
     lens = rig.cameras[sensors.camera].to_intrinsics()
-    return examine(estimate, rig, rig.lidars[sensors.lidar], lens, views)
+    return validate(estimate, rig, rig.lidars[sensors.lidar], lens, views)
 
 
 def _judged(
@@ -367,7 +367,7 @@ def _judged(
     detections: Detections,
     sensors: _Sensors,
     estimate: CalibrationEstimate,
-    examination: Examination,
+    examination: Validation,
     between_cameras: Sequence[Finding],
     others: tuple[OtherCamera, ...],
 ) -> Calibration:

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
+from lce_rig.core.findings import Finding
 from lce_rig.core.results import Calibration
 from lce_rig.export.result import read_result
 from lce_rig.pipeline.calibration import calibrate
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.session import Session
-from lce_rig.session.identity import differing_keys
+from lce_rig.session.identity import DifferingKey, differing_keys
 from lce_rig.session.session import CALIBRATION
 from lce_rig.validation.repeatability import Repeatability, compare_calibrations
 
@@ -31,15 +32,18 @@ class Repeat:
         rig: its name.
         comparisons: one for each camera and LiDAR that at least two sessions calibrate.
         calibrated: names of the sessions that held no result and were calibrated for this.
-        remarks: what else the reader should know.
-        failed: sessions whose own calibration must not be used, with the sensors.
+        findings: errors name sessions whose own calibration must not be used, warnings what else to know.
     """
 
     rig: str
     comparisons: tuple[Repeatability, ...]
     calibrated: tuple[str, ...]
-    remarks: tuple[str, ...]
-    failed: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def failed(self) -> tuple[Finding, ...]:
+        """Calibrations that must not be used, by session and sensors."""
+        return tuple(finding for finding in self.findings if finding.severity == "error")
 
 
 def repeat(folders: Sequence[Path | str], *, progress: Progress = silent) -> Repeat:
@@ -66,7 +70,7 @@ def repeat(folders: Sequence[Path | str], *, progress: Progress = silent) -> Rep
     _require_independent(sessions)
     results: dict[str, list[Calibration]] = {}
     calibrated: list[str] = []
-    troubles: list[str] = []
+    troubles: list[Finding] = []
     for done, (name, session) in enumerate(sessions.items(), start=1):
         if (session.path / CALIBRATION / RESULT).exists():
             results[name] = _read_calibrations(session)
@@ -83,13 +87,13 @@ def repeat(folders: Sequence[Path | str], *, progress: Progress = silent) -> Rep
             "\n".join(_calibrated_sensors(name, own) for name, own in results.items()),
         )
     failed = [
-        f"{name} ({c.camera} and {c.lidar})"
+        Finding("repeat.failed", "error", name, {"camera": c.camera, "lidar": c.lidar})
         for name, own in results.items()
         for c in own
         if c.verdict == "fail"
     ]
-    remarks = (*_board_remarks(sessions), *troubles, *lonely)
-    return Repeat(rig, comparisons, tuple(calibrated), remarks, tuple(failed))
+    findings = (*_other_boards(sessions), *troubles, *lonely, *failed)
+    return Repeat(rig, comparisons, tuple(calibrated), findings)
 
 
 def _require_different(paths: Sequence[Path]) -> None:
@@ -113,17 +117,17 @@ def _require_one_rig(sessions: dict[str, Session]) -> None:
                 f"{first_name} is of rig {first.rig.name!r}, {name} of rig {session.rig.name!r}",
                 "Only sessions of one rig can be compared.",
             )
-        keys = [text for text in differing_keys(first.rig, session.rig) if _is_of_sensors(text)]
+        keys = [key for key in differing_keys(first.rig, session.rig) if _is_of_sensors(key)]
         if keys:
             raise SessionError(
-                f"{first_name} and {name} were made with different sensors: {'; '.join(keys[:4])}",
+                f"{first_name} and {name} were made with different sensors: {'; '.join(map(str, keys[:4]))}",
                 "Put the same intrinsics into both (rig.yaml of the session) and calibrate again.",
             )
 
 
-def _is_of_sensors(difference: str) -> bool:
-    """Tell whether a difference between profiles, "cameras.cam.frame a there, b here", moves extrinsics."""
-    block, *keys = difference.split(" ")[0].split(".")
+def _is_of_sensors(difference: DifferingKey) -> bool:
+    """Tell whether a difference between profiles moves extrinsics."""
+    block, *keys = difference.path
     return block in ("cameras", "lidars") and not _SAME_SENSORS.isdisjoint(keys)
 
 
@@ -146,16 +150,16 @@ def _require_independent(sessions: dict[str, Session]) -> None:
             )
 
 
-def _board_remarks(sessions: dict[str, Session]) -> list[str]:
+def _other_boards(sessions: dict[str, Session]) -> list[Finding]:
     (first_name, first), *others = sessions.items()
     return [
-        f"{first_name} and {name} were taken with different boards"
+        Finding("repeat.other_board", "warning", name, {"first": first_name})
         for name, session in others
         if session.rig.board != first.rig.board
     ]
 
 
-def _calibrate(name: str, session: Session) -> tuple[list[Calibration], list[str]]:
+def _calibrate(name: str, session: Session) -> tuple[list[Calibration], list[Finding]]:
     """Calibrate a session; and say which of its sensors could not be, and why.
 
     Raises:
@@ -165,7 +169,10 @@ def _calibrate(name: str, session: Session) -> tuple[list[Calibration], list[str
         result = calibrate(session)
     except NotEnoughDataError as error:
         raise NotEnoughDataError(f"{name}: {error.what}", error.hint) from None
-    return list(result.pairs), [f"{name}: {shortage}" for shortage in result.shortages]
+    return list(result.pairs), [
+        Finding("repeat.not_calibrated", "warning", name, {"what": shortage.what, "hint": shortage.hint})
+        for shortage in result.shortages
+    ]
 
 
 def _calibrated_sensors(name: str, calibrations: Sequence[Calibration]) -> str:
@@ -190,7 +197,7 @@ def _read_calibrations(session: Session) -> list[Calibration]:
     return list(saved.pairs)
 
 
-def _comparisons(results: dict[str, list[Calibration]]) -> tuple[tuple[Repeatability, ...], list[str]]:
+def _comparisons(results: dict[str, list[Calibration]]) -> tuple[tuple[Repeatability, ...], list[Finding]]:
     """Compare camera by camera and LiDAR by LiDAR; and say what only one session calibrates."""
     groups: dict[tuple[str, str], dict[str, Calibration]] = {}
     for name, calibrations in results.items():
@@ -204,7 +211,7 @@ def _comparisons(results: dict[str, list[Calibration]]) -> tuple[tuple[Repeatabi
             group[name] = calibration
     comparisons = [compare_calibrations(group) for _, group in sorted(groups.items()) if len(group) > 1]
     lonely = [
-        f"{camera} and {lidar} are calibrated in {next(iter(group))} only"
+        Finding("repeat.only_one", "warning", next(iter(group)), {"camera": camera, "lidar": lidar})
         for (camera, lidar), group in sorted(groups.items())
         if len(group) == 1
     ]

@@ -17,7 +17,7 @@ from lce_rig.detect.image.search import crop_to_intrinsics
 from lce_rig.lens.calibrate_lens import MIN_CAPTURES, Choice, choose_model, estimate_intrinsics
 from lce_rig.lens.difference import LensCertainty, LensDifference, certainty_of
 from lce_rig.lens.lens_coverage import find_weaknesses
-from lce_rig.lens.lens_estimate import IntrinsicsEstimate, View
+from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import MODELS, model_of
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.rig import Rig
@@ -250,7 +250,7 @@ def _fit(
     found: Mapping[Key, ImageDetection], rig: Rig, start: Intrinsics, model: str | None
 ) -> tuple[IntrinsicsEstimate, Choice | None]:
     views = [
-        View(capture, channel, board)
+        BoardView(capture, channel, board)
         for (capture, channel), board in sorted(found.items())
         if isinstance(board, ImageBoard)
     ]

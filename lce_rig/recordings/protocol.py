@@ -35,7 +35,7 @@ class SourceOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class RecordedPair:
     """The samples of one board placement.
 
     Attributes:
@@ -63,7 +63,7 @@ class PairFiles(Protocol):
         """Fingerprint the files without decoding them."""
         ...
 
-    def read(self) -> Pair:
+    def read(self) -> RecordedPair:
         """Decode the files; SourceError names the one that cannot be read."""
         ...
 

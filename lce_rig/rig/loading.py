@@ -24,7 +24,7 @@ _MOST_SHOWN = 100
 
 
 @dataclass(frozen=True)
-class _Problem:
+class _InvalidKey:
     path: KeyPath
     what: str
     # The key that was probably meant by an unknown one: it need not be reported missing as well.
@@ -51,22 +51,22 @@ def explain(error: ValidationError, document: Document) -> ProfileError:
     return ProfileError(what, "\n".join([*sentences, *([f"and {n_more} more"] if n_more else [])]))
 
 
-def _problem(detail: ErrorDetails) -> _Problem:
+def _problem(detail: ErrorDetails) -> _InvalidKey:
     path = tuple(part for part in detail["loc"] if part != "[key]")
     kind, given, context = detail["type"], detail["input"], detail.get("ctx", {})
     if kind == "extra_forbidden":
         return _unknown_key(path)
     if kind == "missing" and isinstance(path[-1], int):
-        return _Problem(path[:-1], f"{_shown(given)} has too few values")
+        return _InvalidKey(path[:-1], f"{_shown(given)} has too few values")
     if kind == "missing":
-        return _Problem(path, "is missing")
+        return _InvalidKey(path, "is missing")
     if kind == "profile":
-        return _Problem((*path, *_parts(context["key"])), context["what"])
+        return _InvalidKey((*path, *_parts(context["key"])), context["what"])
     if kind == "string_pattern_mismatch":
-        return _Problem(path, f"{_shown(given)}: {PATTERNS[context['pattern']]}")
+        return _InvalidKey(path, f"{_shown(given)}: {PATTERNS[context['pattern']]}")
     if "controls" in path[:-2]:
         # The last part names a member of the union that the value was tried as.
-        return _Problem(path[:-1], "must be a text, a number, true or false")
+        return _InvalidKey(path[:-1], "must be a text, a number, true or false")
     what = detail["msg"].replace("Input should", "must").replace("Tuple should", "must")
     what = (
         what.replace("a valid i", "an i")
@@ -74,7 +74,7 @@ def _problem(detail: ErrorDetails) -> _Problem:
         .replace("List should", "must")
         .replace(" after validation", "")
     )
-    return _Problem(path, f"{what}; {_shown(given)} given")
+    return _InvalidKey(path, f"{what}; {_shown(given)} given")
 
 
 def _parts(key: str) -> KeyPath:
@@ -86,18 +86,18 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 40 else text[:37] + "..."
 
 
-def _unknown_key(path: KeyPath) -> _Problem:
+def _unknown_key(path: KeyPath) -> _InvalidKey:
     key = str(path[-1])
     valid = valid_keys(path[:-1])
     # A forgotten unit is the likeliest slip: for difflib, fx is as close to fy_px as to fx_px.
     nearest = [name for name in valid if name.startswith(f"{key}_")]
     nearest = nearest or difflib.get_close_matches(key, valid, n=1)
     if nearest:
-        return _Problem(path, f"unknown key; did you mean {nearest[0]}?", (*path[:-1], nearest[0]))
+        return _InvalidKey(path, f"unknown key; did you mean {nearest[0]}?", (*path[:-1], nearest[0]))
     elsewhere = [block for block, name in all_keys() if name == key]
     if elsewhere:
-        return _Problem(path, f"unknown key here; it belongs into {elsewhere[0] or 'the top level'}")
-    return _Problem(path, f"unknown key; known are {', '.join(valid)}")
+        return _InvalidKey(path, f"unknown key here; it belongs into {elsewhere[0] or 'the top level'}")
+    return _InvalidKey(path, f"unknown key; known are {', '.join(valid)}")
 
 
 def valid_keys(path: KeyPath) -> list[str]:

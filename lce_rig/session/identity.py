@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -57,17 +58,38 @@ def read_marker(path: Path) -> dict[str, Any]:
     return marker
 
 
-def differing_keys(theirs: Rig, ours: Rig) -> list[str]:
+@dataclass(frozen=True)
+class DifferingKey:
+    """A key in which two profiles differ.
+
+    Attributes:
+        path: of the key, such as ("cameras", "davis", "frame").
+        theirs, ours: its values, "absent" where a profile does not have it.
+    """
+
+    path: tuple[str, ...]
+    theirs: Any
+    ours: Any
+
+    def __str__(self) -> str:
+        return f"{'.'.join(self.path)} {self.theirs} there, {self.ours} here"
+
+
+def differing_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
     """List the keys in which two profiles differ, with both values.
 
     The description may differ, and how attached sensors are reached: a camera is /dev/video2 today.
     """
     a, b = (_flatten(yaml.safe_load(dump_rig(rig))) for rig in (theirs, ours))
-    keys = sorted(key for key in a.keys() | b.keys() if a.get(key) != b.get(key) and not _MAY_DIFFER(key))
-    return [f"{key} {a.get(key, 'absent')} there, {b.get(key, 'absent')} here" for key in keys]
+    paths = sorted(path for path in a.keys() | b.keys() if a.get(path) != b.get(path))
+    return [
+        DifferingKey(path, a.get(path, "absent"), b.get(path, "absent"))
+        for path in paths
+        if not _MAY_DIFFER(".".join(path))
+    ]
 
 
-def _flatten(value: Any, prefix: str = "") -> dict[str, Any]:
+def _flatten(value: Any, path: tuple[str, ...] = ()) -> dict[tuple[str, ...], Any]:
     if not isinstance(value, dict):
-        return {prefix.removesuffix("."): value}
-    return {k: v for key, inner in value.items() for k, v in _flatten(inner, f"{prefix}{key}.").items()}
+        return {path: value}
+    return {k: v for key, inner in value.items() for k, v in _flatten(inner, (*path, str(key))).items()}

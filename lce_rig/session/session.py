@@ -163,7 +163,7 @@ class Session:
         differing = differing_keys(session.rig, rig)
         if differing:
             session.close()
-            shown = "; ".join(differing[:5]) + (
+            shown = "; ".join(map(str, differing[:5])) + (
                 f"; and {len(differing) - 5} more" if len(differing) > 5 else ""
             )
             raise SessionError(

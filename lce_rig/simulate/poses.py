@@ -25,7 +25,7 @@ _SPREAD = (1 / 1.2207440846057596) ** np.arange(1, 4)
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CameraView:
     """A camera and a LiDAR; the board must be visible to both."""
 
     camera: str
@@ -37,7 +37,7 @@ class View:
 
 
 def place_board(
-    view: View,
+    view: CameraView,
     board: Board,
     room: Room,
     options: SimulationOptions,
@@ -87,7 +87,7 @@ def place_board(
 
 
 def _candidate(
-    view: View, options: SimulationOptions, where: Array, rng: np.random.Generator
+    view: CameraView, options: SimulationOptions, where: Array, rng: np.random.Generator
 ) -> Array | None:
     """Put the board's centre at a place in the image and turn it about facing the camera."""
     # Evenly over the disc of all tilts: strong tilts constrain the extrinsics most.
@@ -109,7 +109,7 @@ def _candidate(
     return pose(facing @ turns[0] @ turns[1], centre)
 
 
-def _is_in_picture(view: View, board: Board, T_world_board: Array) -> bool:
+def _is_in_picture(view: CameraView, board: Board, T_world_board: Array) -> bool:
     pattern = board.corners()
     middle = pattern.mean(axis=0)
     # The outer squares reach one square beyond the inner corners.
@@ -123,12 +123,12 @@ def _is_in_picture(view: View, board: Board, T_world_board: Array) -> bool:
     return bool(np.all(is_seen & (np.linalg.norm(offset, axis=-1) < 0.97 * lens_reach(lens))))
 
 
-def can_be_held(view: View, board: Board, room: Room, T_world_board: Array) -> bool:
+def can_be_held(view: CameraView, board: Board, room: Room, T_world_board: Array) -> bool:
     """Return whether a person can hold the board there, and the camera and the LiDAR see all of it."""
     return _is_in_picture(view, board, T_world_board) and _stands_free(view, board, room, T_world_board)
 
 
-def _stands_free(view: View, board: Board, room: Room, T_world_board: Array) -> bool:
+def _stands_free(view: CameraView, board: Board, room: Room, T_world_board: Array) -> bool:
     centre, normal = T_world_board[:3, 3], T_world_board[:3, 2]
     if abs(normal[2]) > 0.7:
         return False  # nobody holds a board flat
@@ -144,7 +144,7 @@ def _stands_free(view: View, board: Board, room: Room, T_world_board: Array) -> 
     return not any(room.raycaster.is_blocked(outline, eye).any() for eye in eyes)
 
 
-def seen_share(view: View, board: Board, T_world_board: Array) -> float:
+def seen_share(view: CameraView, board: Board, T_world_board: Array) -> float:
     """Measure the fraction of the plate's height within the LiDAR's vertical field, 0..1."""
     outline = transform(invert(view.T_world_lidar) @ T_world_board, board.outline())
     elevation = np.arctan2(outline[:, 2], np.hypot(outline[:, 0], outline[:, 1]))
@@ -155,7 +155,7 @@ def seen_share(view: View, board: Board, T_world_board: Array) -> float:
     return float(np.clip(seen / (top - bottom), 0.0, 1.0))
 
 
-def count_rings(view: View, board: Board, T_world_board: Array) -> int:
+def count_rings(view: CameraView, board: Board, T_world_board: Array) -> int:
     """Count the LiDAR's rings with at least a few returns from the board."""
     scene = Scene(Raycaster(()), (), board, T_world_board)
     outline = transform(invert(view.T_world_lidar) @ T_world_board, board.outline())

@@ -14,7 +14,7 @@ from lce_rig.simulate.backdrop import Backdrop, build_backdrop
 from lce_rig.simulate.event_camera import EventPixels, draw_pixels
 from lce_rig.simulate.lidar import VLP16, LidarModel
 from lce_rig.simulate.options import SimulationOptions
-from lce_rig.simulate.poses import View, place_board
+from lce_rig.simulate.poses import CameraView, place_board
 from lce_rig.simulate.room import Room, build_room
 
 LIDAR_MODELS = {"vlp16": VLP16}
@@ -57,7 +57,7 @@ class Stage:
     models: Mapping[str, LidarModel]
     laser_bias_m: Mapping[str, Array]
     pixels: Mapping[str, EventPixels]
-    views: list[View]
+    views: list[CameraView]
 
     @property
     def framed(self) -> list[str]:
@@ -136,7 +136,9 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
         if options.motion == "moving" and rig.cameras[name].first_channel("events")
     }
     views = [
-        View(camera, lenses[camera], T_world_sensor[camera], lidar, models[lidar], T_world_sensor[lidar])
+        CameraView(
+            camera, lenses[camera], T_world_sensor[camera], lidar, models[lidar], T_world_sensor[lidar]
+        )
         for camera in cameras
         for lidar in rig.lidars
     ]

@@ -17,7 +17,7 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
 from lce_rig.lens.difference import LensDifference, compare_lenses
-from lce_rig.lens.lens_estimate import IntrinsicsEstimate, View
+from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import model_of
 from lce_rig.validation.weighing import Verdict, doubt
 
@@ -104,7 +104,7 @@ class IntrinsicsCheck:
 
 
 def check_intrinsics(
-    image_boards: Sequence[View], intrinsics: Intrinsics, board: Board
+    image_boards: Sequence[BoardView], intrinsics: Intrinsics, board: Board
 ) -> IntrinsicsCheck | None:
     """Hold intrinsics against the corners of the boards that were seen with them.
 

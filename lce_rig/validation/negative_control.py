@@ -25,7 +25,7 @@ _SURE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Control:
+class NegativeControl:
     """What moving the result does to the residuals of captures left out.
 
     Attributes:
@@ -47,7 +47,7 @@ def run_control(
     expansion: Quadratics,
     target: CalibrationSettings,
     n_sigmas: float,
-) -> Control:
+) -> NegativeControl:
     """Move an extrinsic both ways along the axes of its covariance, and judge it on captures left out.
 
     Each capture is judged under the extrinsic that the captures of the other placements give.
@@ -83,10 +83,12 @@ def run_control(
     )
     usual = float(np.median(costs[:, 0]))
     increase = (costs[:, 1:] - costs[:, :1]) / max(usual, 1e-12)
-    return Control(moves, increase.mean(axis=0), increase.std(axis=0, ddof=1) / np.sqrt(len(observations)))
+    return NegativeControl(
+        moves, increase.mean(axis=0), increase.std(axis=0, ddof=1) / np.sqrt(len(observations))
+    )
 
 
-def doubt_control(control: Control) -> list[Finding]:
+def doubt_control(control: NegativeControl) -> list[Finding]:
     """Doubt a result that captures left out do not tell from a bad one."""
     worst = int(np.argmin(control.worse / control.worse_sigma))
     if control.worse[worst] > 0:

@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, difference, log_so3
 from lce_rig.core.results import Calibration
 from lce_rig.extrinsics.mean_pose import mean_pose
@@ -14,7 +15,6 @@ from lce_rig.extrinsics.mean_pose import mean_pose
 _CHANCE = 0.01
 # Where chance spreads sound calibrations farther this often, the stated uncertainties are generous.
 _GENEROUS = 0.95
-_COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Repeatability:
 
     Attributes:
         names: of the sessions.
-        sensors: what is calibrated, in words.
+        camera, lidar: what is calibrated.
         T_cam_lidar: (4, 4) mean, all sessions alike.
         deviations: (K, 6) tangents from the mean to each, translation m, rotation rad.
         spread_rotation_deg, spread_translation_m: standard deviation of one calibration, from these.
@@ -57,7 +57,8 @@ class Repeatability:
     """
 
     names: tuple[str, ...]
-    sensors: str
+    camera: str
+    lidar: str
     T_cam_lidar: Array
     deviations: Array
     spread_rotation_deg: float
@@ -92,22 +93,23 @@ class Repeatability:
         """Largest distance between two of them."""
         return max(pair.translation_m for pair in self.differences)
 
-    def sentence(self) -> str:
-        """Say whether they agree, for somebody who signs for it."""
-        n = len(self.names)
-        count = _COUNTS[n] if n < len(_COUNTS) else str(n)
-        apart = f"{self.max_rotation_deg:.2g} deg and {1000 * self.max_translation_m:.2g} mm"
-        who = f"The {count} calibrations of {self.sensors}"
+    @property
+    def finding(self) -> Finding:
+        """Whether they agree, "repeat.agree" or "repeat.disagree", for somebody who signs for it."""
+        figures: dict[str, Figure] = {
+            "camera": self.camera,
+            "lidar": self.lidar,
+            "n_sessions": len(self.names),
+            "rotation_deg": self.max_rotation_deg,
+            "translation_m": self.max_translation_m,
+            "p": self.p,
+        }
         if self.agrees:
-            how = "less than" if self.p > _GENEROUS else "as"
-            return f"{who} agree: they differ by at most {apart}, {how} their stated uncertainties predict."
-        text = (
-            f"{who} do not agree: they differ by up to {apart}, {self.ratio:.1f} times more than their "
-            "stated uncertainties predict"
-        )
-        if self.odd_one is not None:
-            return f"{text}. Without {self.odd_one} the others agree: find out what is wrong with it."
-        return f"{text}. Use none of them before the cause is known."
+            figures["is_generous"] = self.p > _GENEROUS
+            return Finding("repeat.agree", "note", figures=figures)
+        figures |= {"ratio": self.ratio, "odd_one": self.odd_one}
+        action = "" if self.odd_one is None else "odd_one"
+        return Finding("repeat.disagree", "error", figures=figures, action=action)
 
 
 def compare_calibrations(calibrations: Mapping[str, Calibration]) -> Repeatability:
@@ -136,7 +138,8 @@ def compare_calibrations(calibrations: Mapping[str, Calibration]) -> Repeatabili
     spread = np.sum(deviations**2, axis=0) / (len(names) - 1)
     return Repeatability(
         names=names,
-        sensors=f"{first.camera} and {first.lidar}",
+        camera=first.camera,
+        lidar=first.lidar,
         T_cam_lidar=mean,
         deviations=deviations,
         spread_rotation_deg=float(np.degrees(np.sqrt(spread[3:].sum()))),

@@ -14,7 +14,7 @@ from lce_rig.validation.intrinsics_check import explain
 from lce_rig.validation.negative_control import doubt_control
 from lce_rig.validation.nuisances import doubt_nuisances
 from lce_rig.validation.split_consistency import doubt_halves
-from lce_rig.validation.validate import Examination
+from lce_rig.validation.validate import Validation
 from lce_rig.validation.weighing import SURPRISING_CHI2, Verdict, doubt, verdict_of
 
 # A side of the plate counts as measured below this deviation; 5 % of it is more than the beam's spot.
@@ -23,7 +23,7 @@ PLATE_KNOWN_M, PLATE_FAIL = 0.03, 0.05
 
 def judge(
     estimate: CalibrationEstimate,
-    examination: Examination,
+    examination: Validation,
     rig: Rig,
     camera: str,
     lidar: str,
@@ -67,20 +67,20 @@ def judge(
     return verdict_of(doubts), ranked(doubts)
 
 
-def _intrinsics(examination: Examination, rig: Rig) -> list[Finding]:
+def _intrinsics(examination: Validation, rig: Rig) -> list[Finding]:
     check, target_deg = examination.intrinsics, rig.calibration.target_sigma_deg
     if check is None or check.verdict(target_deg) == "pass":
         return []
     return [explain(check, target_deg)]
 
 
-def _shared(examination: Examination, rig: Rig, lidar: str) -> list[Finding]:
+def _shared(examination: Validation, rig: Rig, lidar: str) -> list[Finding]:
     if examination.nuisances is None:
         return []
     return doubt_nuisances(examination.nuisances, rig.board.to_board(), rig.lidars[lidar], rig.verdict)
 
 
-def _control(examination: Examination) -> list[Finding]:
+def _control(examination: Validation) -> list[Finding]:
     return [] if examination.control is None else doubt_control(examination.control)
 
 

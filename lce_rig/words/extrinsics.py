@@ -1,4 +1,4 @@
-"""Why an extrinsic is doubted: the reasons of a verdict, and its notes."""
+"""Why an extrinsic is doubted: the reasons of a verdict, its notes, the comparison with other sessions."""
 
 import math
 
@@ -92,6 +92,20 @@ def _plate(finding: Finding) -> str:
     return (
         f"plate {finding.figures['side']} {measured_m:.3f} m in the scans, {profile_m:.3f} m in the profile: "
         f"{percent:.1f} % {size}"
+    )
+
+
+def _agree(finding: Finding) -> str:
+    """The {n_sessions} calibrations of {camera} and {lidar} agree: {rotation_deg}, {translation_m} apart.
+
+    {p} is the chance to differ more; {is_generous}: the standard deviations predict more than is seen.
+    """
+    q = finding.figures
+    how = "less than" if q["is_generous"] else "as"
+    apart = f"{finding.figure('rotation_deg'):.3f} deg and {1000 * finding.figure('translation_m'):.1f} mm"
+    return (
+        f"the {q['n_sessions']} calibrations of {q['camera']} and {q['lidar']} agree: "
+        f"they differ by at most {apart}, {how} their standard deviations predict"
     )
 
 
@@ -202,4 +216,18 @@ PHRASES: dict[str, Phrase] = {
         "check whether a camera has moved, and the intrinsics",
     ),
     "verdict.widened": Phrase(_widened),
+    "repeat.agree": Phrase(_agree),
+    "repeat.disagree": Phrase(
+        "the {n_sessions} calibrations of {camera} and {lidar} disagree: they differ by up to "
+        "{rotation_deg:3deg} and {translation_m:1mm}, {ratio:.1f} times as much as predicted",
+        "use none of them before the cause is known",
+        {"odd_one": "find out what is wrong with {odd_one}, without it the others agree"},
+    ),
+    "repeat.failed": Phrase(
+        "the calibration of {subject} ({camera} and {lidar}) failed by itself",
+        "see its reasons with `lce-rig calibrate`",
+    ),
+    "repeat.not_calibrated": Phrase("{subject}: {what}", "{hint}"),
+    "repeat.only_one": Phrase("{camera} and {lidar} are calibrated in {subject} only"),
+    "repeat.other_board": Phrase("{first} and {subject} were taken with different boards"),
 }

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.tables import print_head, print_row
-from lce_rig.collect.guidance import HeldPose, Novelty, Person, View, build_pose, model_sensors
+from lce_rig.collect.guidance import HeldPose, Novelty, Person, SensorPlace, build_pose, model_sensors
 from lce_rig.collect.live.guide import Guide, make_guides
 from lce_rig.core.geometry import Array, rotation_angle
 from lce_rig.rig import Rig, load_rig
@@ -136,12 +136,12 @@ def follow_guide(
     return walk
 
 
-def first_view(rig: Rig) -> View:
+def first_view(rig: Rig) -> SensorPlace:
     """Look through a rig's first camera as its drawing has it."""
     camera, lidar = next(iter(rig.cameras)), next(iter(rig.lidars))
     nominal = rig.nominal(camera, lidar)
     assert nominal is not None
-    return View.upright(model_sensors(rig, camera, lidar), nominal.to_matrix())
+    return SensorPlace.upright(model_sensors(rig, camera, lidar), nominal.to_matrix())
 
 
 def _ask(guide: Guide, present: Array, walk: Followed) -> None:

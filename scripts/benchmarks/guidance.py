@@ -14,7 +14,7 @@ from lce_rig.collect.guidance import (
     HeldPose,
     Person,
     Planner,
-    View,
+    SensorPlace,
     build_pose,
     combine,
     model_sensors,
@@ -165,7 +165,7 @@ def guided_session(name: str, seed: int, n_captures: int, person: Person | None 
     camera, lidar = next(iter(rig.cameras)), next(iter(rig.lidars))
     nominal = rig.nominal(camera, lidar)
     assert nominal is not None
-    view = View.upright(model_sensors(rig, camera, lidar), nominal.to_matrix())
+    view = SensorPlace.upright(model_sensors(rig, camera, lidar), nominal.to_matrix())
     planner = Planner(view)
     stage = set_stage(rig, seed, SimulationOptions.for_rig(name))
     rng = stage.rng(_PERSON)

@@ -10,7 +10,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, exp_so3, pose, transform
 from lce_rig.core.results import ImageBoard
-from lce_rig.lens.lens_estimate import View
+from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.rig import load_rig
 from lce_rig.solvers.pnp import solve_planar_pose
 from lce_rig.validation.intrinsics_check import check_intrinsics
@@ -60,17 +60,17 @@ def _kinds(lens: Intrinsics) -> dict[str, Intrinsics]:
     }
 
 
-def _verdicts(sessions: list[list[View]], given: Intrinsics, board: Board) -> str:
+def _verdicts(sessions: list[list[BoardView]], given: Intrinsics, board: Board) -> str:
     checks = [check_intrinsics(views, given, board) for views in sessions]
     counts = Counter("unknown" if check is None else check.verdict() for check in checks)
     return " / ".join(str(counts[verdict]) for verdict in ("pass", "marginal", "fail"))
 
 
-def _photograph(lens: Intrinsics, board: Board, n: int, sigma_px: float, seed: int) -> list[View]:
+def _photograph(lens: Intrinsics, board: Board, n: int, sigma_px: float, seed: int) -> list[BoardView]:
     """Hold a board that is bowed by 0.6 mm, 0.06 % too wide and badly printed n times before a lens."""
     rng = np.random.default_rng(seed)
     corners = imperfect_corners(board, rng)
-    views: list[View] = []
+    views: list[BoardView] = []
     while len(views) < n:
         ray = lens.unproject(rng.uniform(0.1, 0.9, 2) * [lens.width_px, lens.height_px])
         tilt, angle = np.radians(rng.uniform(10, 45)), rng.uniform(0, 2 * np.pi)
@@ -85,7 +85,7 @@ def _photograph(lens: Intrinsics, board: Board, n: int, sigma_px: float, seed: i
         if solved is not None:
             start = solved.T_cam_board
             found = ImageBoard(pixels, start, solved.cov, None, np.inf, False, 0.0, solved.sigma_px)
-            views.append(View(f"{len(views):06d}", "frames", found))
+            views.append(BoardView(f"{len(views):06d}", "frames", found))
     return views
 
 

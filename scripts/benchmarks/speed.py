@@ -30,7 +30,7 @@ def bench_speed() -> None:
 
 
 def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
-    from lce_rig.detect.lidar.track import track_lidar_board
+    from lce_rig.detect.lidar.search import track_lidar_board
     from lce_rig.session import Session
 
     session = Session.open(path)

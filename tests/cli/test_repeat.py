@@ -49,15 +49,23 @@ def made(tmp_path):
     return make
 
 
-def test_sessions_that_agree_are_said_to_in_one_sentence(lce_rig, made):
+def compared(lce_rig, *sessions, code=0):
+    """Give what --json prints."""
+    outcome = lce_rig("repeat", *sessions, "--json")
+    assert outcome.code == code, outcome.err
+    return json.loads(outcome.out)
+
+
+def test_sessions_that_agree_end_with_a_line_that_says_so(lce_rig, made):
     a = made("monday", [0.001, 0, 0, 0, 0.001, 0])
     b = made("tuesday", [0, 0.002, 0, 0.001, 0, 0])
     c = made("wednesday", [0, 0, -0.002, 0, 0, 0.001])
     outcome = lce_rig("repeat", a, b, c)
     assert outcome.code == 0, outcome.err
-    assert outcome.out.splitlines()[-1].startswith("The three calibrations of davis and lidar agree")
-    assert "12 degrees of freedom" in outcome.out
     assert sum(line.startswith(("monday", "tuesday", "wednesday")) for line in outcome.out.splitlines()) == 6
+    (pair,) = compared(lce_rig, a, b, c)["pairs"]
+    assert (pair["dof"], pair["finding"]["code"]) == (12, "repeat.agree")
+    assert pair["finding"]["text"][1:] in outcome.out.splitlines()[-1]
 
 
 def test_sessions_that_disagree_exit_with_7_and_the_odd_one_is_named(lce_rig, made):
@@ -71,9 +79,10 @@ def test_sessions_that_disagree_exit_with_7_and_the_odd_one_is_named(lce_rig, ma
     document = json.loads(outcome.out)["pairs"][0]
     assert not document["agrees"]
     assert document["odd_one"] == "moved"
-    assert "Without moved the others agree" in document["sentence"]
+    found = document["finding"]
+    assert (found["code"], found["severity"], found["action_code"]) == ("repeat.disagree", "error", "odd_one")
+    assert found["figures"]["odd_one"] == "moved"
     assert len(document["differences"]) == 3
-    assert "disagree" in outcome.err
 
 
 def test_a_session_alone_or_twice_is_a_usage_error(lce_rig, made):
@@ -115,15 +124,16 @@ def test_other_rigs_and_other_lenses_are_refused_and_another_board_is_remarked(l
     assert outcome.code == 4
     assert "cameras.davis.intrinsics.fx_px" in outcome.err
     board = made("board", [0.001] * 6, set_value(RLES, "board.width_m", "0.81"))
-    outcome = lce_rig("repeat", a, board)
-    assert outcome.code == 0
-    assert "monday and board were taken with different boards" in outcome.err
+    (found,) = compared(lce_rig, a, board)["findings"]
+    assert (found["code"], found["subject"]) == ("repeat.other_board", "board")
+    assert found["figures"] == {"first": "monday"}
 
 
 def test_a_calibration_that_failed_by_itself_is_not_vouched_for(lce_rig, made):
-    outcome = lce_rig("repeat", made("monday", [0] * 6), made("bad", [0] * 6, verdict="fail"))
-    assert outcome.code == 7
-    assert "the calibration of bad (davis and lidar) failed by itself" in outcome.err
+    sessions = made("monday", [0] * 6), made("bad", [0] * 6, verdict="fail")
+    (found,) = compared(lce_rig, *sessions, code=7)["findings"]
+    assert (found["code"], found["severity"], found["subject"]) == ("repeat.failed", "error", "bad")
+    assert found["figures"] == {"camera": "davis", "lidar": "lidar"}
 
 
 def test_sensors_of_one_session_only_leave_nothing_to_compare(lce_rig, made):
@@ -170,8 +180,7 @@ def test_sessions_without_a_result_are_calibrated_and_left_as_they_are(lce_rig, 
         for k in range(half, 16, 2):
             shutil.rmtree(copy / "captures" / f"{k:06d}")
         halves.append(copy)
-    outcome = lce_rig("repeat", *halves)
-    assert outcome.code == 0, outcome.err
-    assert "half1 held no result: calibrated for this comparison, not written" in outcome.err
-    assert "The two calibrations of davis and lidar agree" in outcome.out
+    document = compared(lce_rig, *halves)
+    assert document["calibrated"] == ["half0", "half1"]
+    assert document["pairs"][0]["finding"]["code"] == "repeat.agree"
     assert not (halves[0] / "calibration").exists()

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import Sighting
+from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.rig import Rig
@@ -50,7 +50,7 @@ def watch(
     channel: str = "frames",
     is_seen: Callable[[float], bool] = lambda _time_s: True,
     has_lidar: bool = True,
-) -> list[Sighting]:
+) -> list[BoardDetection]:
     """Sight a board at (x, y) m, three metres away, once a scan; the middle of the first sweep is 0.05 s."""
     buffer = EventBuffer(rig)
     for packet in stream:
@@ -67,7 +67,7 @@ def watch(
         events = buffer.cut(time_ns - half_ns - BEFORE_NS, time_ns + half_ns + AFTER_NS)
         boards = {("davis", channel): board_at(*way(time_s))} if is_seen(time_s) else {}
         lidars = {"lidar": [plate()]} if boards and has_lidar else {}
-        found.append(Sighting(Frame(time_ns, images, (scan,), events), boards, lidars))
+        found.append(BoardDetection(Frame(time_ns, images, (scan,), events), boards, lidars))
     return found
 
 

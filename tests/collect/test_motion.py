@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.collect.board_tracker import Moment, Sighting
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
 from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.offline.slow_motion import _Neighbours, find_moving_moments
 from lce_rig.collect.placement_dedupe import Placements
-from lce_rig.collect.refusal_counts import Tally
+from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig, load_rig
 from lce_rig.timing.scan_pairing import Frame
@@ -27,17 +27,17 @@ def rig() -> Rig:
     return load_rig("rles")
 
 
-def choose(sightings: Iterable[Sighting], rig: Rig) -> tuple[list[Moment], dict[str, int]]:
-    tally = Tally()
+def choose(sightings: Iterable[BoardDetection], rig: Rig) -> tuple[list[CaptureMoment], dict[str, int]]:
+    tally = RefusalCounts()
     moments = find_moving_moments(sightings, rig, MotionOptions(), Placements(0.15, 10.0), tally)
     return list(moments), tally.by_code()
 
 
-def times_s(moments: list[Moment]) -> list[float]:
+def times_s(moments: list[CaptureMoment]) -> list[float]:
     return [round((m.sighting.frame.time_ns - T0_NS) / S, 2) for m in moments]
 
 
-def places_m(moments: list[Moment]) -> list[float]:
+def places_m(moments: list[CaptureMoment]) -> list[float]:
     return [float(m.sighting.images["davis", "frames"].T_cam_board[0, 3]) for m in moments]
 
 
@@ -126,7 +126,7 @@ def test_the_moments_are_the_same_however_often_they_are_sought(rig: Rig) -> Non
     first, again = (times_s(choose(sightings, rig)[0]) for _ in range(2))
     assert first == again and first
     # Whoever stops early has had the first of them.
-    moments = find_moving_moments(sightings, rig, MotionOptions(), Placements(0.15, 10.0), Tally())
+    moments = find_moving_moments(sightings, rig, MotionOptions(), Placements(0.15, 10.0), RefusalCounts())
     assert times_s([next(moments)]) == first[:1]
 
 
@@ -138,7 +138,7 @@ def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rig:
         (event_stream([(-1.3, 3.0, 0.3)]), "image.still_scene"),
     ]:
         sightings = watch(rig, lambda _t: (0.0, 0.0), 1.0, stream, channel="events", is_seen=lambda _t: False)
-        told = [Sighting(s.frame, {}, {}, {("davis", "events"): unseen}) for s in sightings]
+        told = [BoardDetection(s.frame, {}, {}, {("davis", "events"): unseen}) for s in sightings]
         moments, refused = choose(told, rig)
         assert moments == [] and list(refused) == [code]
 
@@ -149,7 +149,7 @@ def test_every_sighting_is_judged_once_with_all_that_lie_within_half_a_window(
 ) -> None:
     times_ms = np.cumsum(steps)
     times_ms[set_back:] -= 100_000
-    sightings = [Sighting(Frame(int(t) * 10**6, (), ()), {}, {}) for t in times_ms]
+    sightings = [BoardDetection(Frame(int(t) * 10**6, (), ()), {}, {}) for t in times_ms]
     neighbours = _Neighbours(0.5)
     found = [each for sighting in sightings for each in neighbours.take(sighting)]
     found.extend(neighbours.finish())

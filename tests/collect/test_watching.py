@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import BoardWatcher, Moment, Sighting
+from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
 from lce_rig.collect.offline.stillness import StillnessOptions, find_still_moments
 from lce_rig.core.geometry import transform
 from lce_rig.core.results import Refusal
@@ -16,12 +16,12 @@ from tests.collect.live.replay import placements, rig
 T0_NS = 1_700_000_000_000_000_000
 
 
-def see(watcher: BoardWatcher, k: int, time_s: float) -> Sighting:
+def see(watcher: BoardTracker, k: int, time_s: float) -> BoardDetection:
     capture = placements()[k]
     return watcher.sight(Frame(T0_NS + round(time_s * 1e9), capture.images[:1], capture.scans))
 
 
-def nearest_m(sighting: Sighting, k: int) -> float:
+def nearest_m(sighting: BoardDetection, k: int) -> float:
     """Tell how far the nearest candidate lies from where the picture has the board."""
     (image,) = sighting.images.values()
     nominal = rig().nominal("davis", "lidar")
@@ -34,13 +34,13 @@ def nearest_m(sighting: Sighting, k: int) -> float:
 
 
 def test_a_board_that_jumps_is_found_in_the_scan_long_before_the_next_search_is_due() -> None:
-    watcher = BoardWatcher(rig(), 0.3, thorough_interval_s=0.0, rescan_interval_s=1000.0)
+    watcher = BoardTracker(rig(), 0.3, thorough_interval_s=0.0, rescan_interval_s=1000.0)
     for k, time_s in ((0, 0.0), (0, 0.1), (0, 0.5), (1, 0.9), (1, 1.0), (2, 1.4)):
         assert nearest_m(see(watcher, k, time_s), k) < 0.3, (k, time_s)
 
 
 def test_a_board_that_was_out_of_sight_is_searched_for_at_once() -> None:
-    watcher = BoardWatcher(rig(), 0.3, thorough_interval_s=0.0, rescan_interval_s=1000.0)
+    watcher = BoardTracker(rig(), 0.3, thorough_interval_s=0.0, rescan_interval_s=1000.0)
     assert nearest_m(see(watcher, 0, 0.0), 0) < 0.3
     capture = placements()[0]
     blank = replace(capture.images[0], pixels=np.full_like(capture.images[0].pixels, 90))
@@ -55,7 +55,7 @@ def strict(**limits: float) -> Rig:
 
 
 def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> None:
-    watcher = BoardWatcher(strict(min_square_px=1000.0), 0.3)
+    watcher = BoardTracker(strict(min_square_px=1000.0), 0.3)
     seen = [see(watcher, 0, 0.1 * k) for k in range(30)]
     assert all(("davis", "frames") in each.images for each in seen)
     assert not any(each.is_usable for each in seen)
@@ -66,7 +66,7 @@ def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> 
 
 
 def test_candidates_beyond_the_profiles_limits_are_no_board_in_the_scan() -> None:
-    watcher = BoardWatcher(strict(min_points=100_000), 0.3)
+    watcher = BoardTracker(strict(min_points=100_000), 0.3)
     sighting = see(watcher, 0, 0.0)
     assert sighting.images and not sighting.lidars and not sighting.is_usable
     assert sighting.unscanned["lidar"].figures["min_points"] == 100_000
@@ -75,7 +75,7 @@ def test_candidates_beyond_the_profiles_limits_are_no_board_in_the_scan() -> Non
 def test_live_and_offline_take_the_same_boards() -> None:
     for limits in ({}, {"max_distance_m": 3.0}, {"max_tilt_deg": 20.0}, {"min_rings": 8}):
         profile = strict(**limits)
-        finder, watcher = BoardFinder(profile), BoardWatcher(profile, 0.0)
+        finder, watcher = BoardFinder(profile), BoardTracker(profile, 0.0)
         for k, capture in enumerate(placements()):
             sighting = see(watcher, k, float(k))
             image, scan = finder.image(capture.images[0]), finder.scan(capture.scans[0])
@@ -86,15 +86,15 @@ def test_live_and_offline_take_the_same_boards() -> None:
 
 
 def test_a_moment_is_confirmed_by_the_search_that_check_makes() -> None:
-    watcher = BoardWatcher(rig(), 0.3)
+    watcher = BoardTracker(rig(), 0.3)
     for time_s in (0.0, 0.1, 0.2):
         sighting = see(watcher, 0, time_s)
-    confirmed = watcher.confirm(Moment(sighting, {"motion_m": 0.001}))
-    assert isinstance(confirmed, Moment) and confirmed.figures == {"motion_m": 0.001}
+    confirmed = watcher.confirm(CaptureMoment(sighting, {"motion_m": 0.001}))
+    assert isinstance(confirmed, CaptureMoment) and confirmed.figures == {"motion_m": 0.001}
     whole = watcher.finder.image(placements()[0].images[0])
     assert not isinstance(whole, Refusal)
     assert np.array_equal(confirmed.sighting.images["davis", "frames"].corners_px, whole.corners_px)
     blank = replace(sighting.frame.images[0], pixels=np.full_like(sighting.frame.images[0].pixels, 90))
     gone = replace(sighting, frame=replace(sighting.frame, images=(blank,)))
-    refused = watcher.confirm(Moment(gone, {}))
+    refused = watcher.confirm(CaptureMoment(gone, {}))
     assert isinstance(refused, Refusal) and refused.stage == "image"

@@ -16,8 +16,7 @@ from lce_rig.core.data import Scan
 from lce_rig.core.geometry import invert, pose
 from lce_rig.core.pcd import decode_pcd
 from lce_rig.core.results import Refusal
-from lce_rig.detect.lidar.search import find_lidar_boards
-from lce_rig.detect.lidar.track import track_lidar_board
+from lce_rig.detect.lidar.search import find_lidar_boards, track_lidar_board
 from lce_rig.recordings.folder.cloud import rings_from_elevation
 
 pytestmark = pytest.mark.dataset

@@ -5,8 +5,7 @@ from scans import BOARD, board_plate, cast, person, place, room
 
 from lce_rig.core.results import LidarBoard, Refusal
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.detect.lidar.search import find_lidar_boards
-from lce_rig.detect.lidar.track import track_lidar_board
+from lce_rig.detect.lidar.search import find_lidar_boards, track_lidar_board
 
 BEAM = Beam(0.0, 0.0)
 

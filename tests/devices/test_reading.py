@@ -10,6 +10,8 @@ from lce_rig.core.errors import SourceError
 from lce_rig.devices.protocol import SourceStatus
 from lce_rig.devices.reading import AttachedSensors, LiveSource, RateMeter
 
+HINT = "Check the plug."
+
 
 def pulse(count: int) -> Pulse:
     return Pulse("cam", count, count, 0)
@@ -21,7 +23,7 @@ class Script(LiveSource):
     def __init__(
         self, *entries: list[Pulse] | Exception, name: str = "s", n_slots: int = 9, silence_s: float = 5.0
     ) -> None:
-        super().__init__(name, f"sensor {name!r}", n_slots, silence_s, "Check the plug.")
+        super().__init__(name, f"sensor {name!r}", n_slots, silence_s, HINT)
         self.entries = list(entries)
         self.is_open = False
 
@@ -61,7 +63,7 @@ def test_samples_come_in_order_and_then_the_reason_of_the_end() -> None:
 def test_nothing_for_too_long_is_an_error_with_a_hint() -> None:
     with Script(silence_s=0.1) as source, pytest.raises(SourceError) as caught:
         counts(source)
-    assert caught.value.hint == "Check the plug."
+    assert caught.value.hint == HINT
 
 
 def test_stopping_ends_the_samples_without_error() -> None:

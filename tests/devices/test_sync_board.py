@@ -48,7 +48,7 @@ def test_pulses_come_one_by_one_with_the_boards_own_stamps():
         assert all(pulse.host_ns > fake.host_ns(pulse.stamp_ns) for pulse in pulses)
         status = board.status()
     assert status.n_lost == 0 and status.figures["n_resets"] == 0
-    assert status.rate_hz > 50 and status.device == "fake, firmware 1.0, LCE1"
+    assert status.rate_hz > 50 and status.device.split(", ") == ["fake", "firmware 1.0", "LCE1"]
 
 
 def test_its_clock_is_tied_to_the_computers_by_asking():
@@ -169,7 +169,7 @@ def test_boards_of_others_give_pulses_and_a_clock(kind):
         model = board.host_clock
         assert_tells_the_time(model, fake)
         if kind == "tline":
-            assert "GO" in fake.commands and "arrivals of pulses" in model.origin
+            assert "GO" in fake.commands and "arrivals" in model.origin
 
 
 def test_plain_nmea_tells_the_second_and_no_pulses():

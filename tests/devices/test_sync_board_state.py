@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lce_rig.devices.sync_board.board_report import BoardView, clock_state, figures, problems
 from lce_rig.devices.sync_board.board_state import Arrival, BoardState, RunningNumber, Verdict
 from lce_rig.devices.sync_board.lines import LineReader
 from lce_rig.devices.sync_board.lines.lce1 import Lce1
@@ -18,7 +19,6 @@ from lce_rig.devices.sync_board.lines.messages import (
     TriggerEdge,
 )
 from lce_rig.devices.sync_board.lines.nmea import Nmea
-from lce_rig.devices.sync_board.report import BoardView, clock_state, figures, problems
 from lce_rig.words import sentence
 
 S = 1_000_000_000

@@ -15,10 +15,9 @@ import pytest
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.vlp16.driver import Vlp16Source
+from lce_rig.devices.vlp16.driver import Reception, Vlp16Source, to_status
 from lce_rig.devices.vlp16.packet_recorder import PcapRecorder
 from lce_rig.devices.vlp16.socket import N_AT_ONCE, UdpPort
-from lce_rig.devices.vlp16.status import Reception, to_status
 from lce_rig.recordings.protocol import SourceOptions
 from lce_rig.recordings.velodyne.datagrams import Datagram
 from lce_rig.recordings.velodyne.pcap import PcapRecording

@@ -9,8 +9,8 @@ from lce_rig.core.data import Image, Pulse, Scan
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.doctor import Check
-from lce_rig.doctor.observing import Observation
-from lce_rig.doctor.sensor_report import Examination
+from lce_rig.doctor.observing import ObservedSensor
+from lce_rig.doctor.sensor_report import SensorReport
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 
@@ -48,9 +48,9 @@ def make_rig(**changes: Any) -> Rig:
 
 
 def examination(
-    *seen: Observation, rig: Rig | None = None, web: Mapping[str, Any] | None = None
-) -> Examination:
-    return Examination(rig or make_rig(), {each.sensor: each for each in seen}, web or {}, {})
+    *seen: ObservedSensor, rig: Rig | None = None, web: Mapping[str, Any] | None = None
+) -> SensorReport:
+    return SensorReport(rig or make_rig(), {each.sensor: each for each in seen}, web or {}, {})
 
 
 def codes(line: Check | None) -> list[str]:
@@ -59,9 +59,9 @@ def codes(line: Check | None) -> list[str]:
     return [found.code for found in line.findings]
 
 
-def lidar(rate_hz: float = 10.0, duration_s: float = 5.0, **status: Any) -> Observation:
+def lidar(rate_hz: float = 10.0, duration_s: float = 5.0, **status: Any) -> ObservedSensor:
     """A LiDAR whose scans come on time."""
-    seen = Observation("lidar", SourceStatus("lidar", **status), watched_s=duration_s)
+    seen = ObservedSensor("lidar", SourceStatus("lidar", **status), watched_s=duration_s)
     seen.ended_ns = START_NS + round(duration_s * S)
     nothing = np.zeros(0, np.float32)
     for stamp_ns in range(START_NS, seen.ended_ns, round(S / rate_hz)):
@@ -73,9 +73,9 @@ def lidar(rate_hz: float = 10.0, duration_s: float = 5.0, **status: Any) -> Obse
 
 def camera(
     rate_hz: float = 20.0, duration_s: float = 5.0, delay_s: float = 0.015, **status: Any
-) -> Observation:
+) -> ObservedSensor:
     """A camera whose pictures follow each beginning of a period."""
-    seen = Observation("cam", SourceStatus("cam", **status), watched_s=duration_s)
+    seen = ObservedSensor("cam", SourceStatus("cam", **status), watched_s=duration_s)
     seen.ended_ns = START_NS + round(duration_s * S)
     for number, begin_ns in enumerate(range(START_NS, seen.ended_ns, round(S / rate_hz))):
         stamp_ns = begin_ns + round(delay_s * S)
@@ -85,9 +85,9 @@ def camera(
 
 def sync_board(
     rate_hz: float = 20.0, duration_s: float = 5.0, line: str = "cam", drift: float = 40e-6, **status: Any
-) -> Observation:
+) -> ObservedSensor:
     """A board whose clock runs too fast by `drift`, and whose pulses begin with each period."""
-    seen = Observation("sync", SourceStatus("sync", **status), watched_s=duration_s)
+    seen = ObservedSensor("sync", SourceStatus("sync", **status), watched_s=duration_s)
     seen.ended_ns = START_NS + round(duration_s * S)
     for number, host_ns in enumerate(range(START_NS, seen.ended_ns, round(S / rate_hz))):
         stamp_ns = BOARD_NS + round((1 + drift) * (host_ns - START_NS))

@@ -14,7 +14,7 @@ from lce_rig.devices.opening import edge_cameras
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.doctor.clocks import check_clock, check_edges, check_offsets, check_sync, tie
-from lce_rig.doctor.observing import Observation
+from lce_rig.doctor.observing import ObservedSensor
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.rig_clock import RigClock
@@ -22,7 +22,7 @@ from lce_rig.timing.rig_clock import RigClock
 from .observed import LOCKED, START_NS, S, camera, codes, examination, lidar, make_rig, sync_board
 
 
-def with_utc(board: Observation) -> Observation:
+def with_utc(board: ObservedSensor) -> ObservedSensor:
     """The board knows UTC, which the computer has exactly."""
     assert board.host_clock is not None
     return replace(board, utc_clock=board.host_clock)
@@ -40,7 +40,7 @@ def davis_rig() -> Rig:
     return Rig.model_validate(document)
 
 
-def davis(drift: float = -25e-6, offset_ns: int = 3_000_000, n: int = 20, **status: Any) -> Observation:
+def davis(drift: float = -25e-6, offset_ns: int = 3_000_000, n: int = 20, **status: Any) -> ObservedSensor:
     """A camera that sees each of the board's pulses, by a clock of its own."""
     seen = camera(**status)
     for number in range(n):
@@ -130,7 +130,7 @@ def test_still_boards_are_no_fault_where_the_profile_promises_nothing() -> None:
 
 
 def test_absent_sensors_are_left_out_of_the_verdict() -> None:
-    absent = Observation("cam", failure=SourceError("it is not there"))
+    absent = ObservedSensor("cam", failure=SourceError("it is not there"))
     assert check_sync(examination(lidar(clock=LOCKED), absent, with_utc(sync_board()))) is None
 
 
@@ -154,7 +154,7 @@ def test_doubts_of_a_driver_about_its_clock_stand_in_its_line() -> None:
 class Replayed(LiveSource):
     """A device that sends what was observed of one."""
 
-    def __init__(self, seen: Observation) -> None:
+    def __init__(self, seen: ObservedSensor) -> None:
         super().__init__(seen.sensor, seen.sensor, 4096, 60.0)
         self.host_clock, self.utc_clock = seen.host_clock, seen.utc_clock
         self._seen = seen

@@ -6,7 +6,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices.vlp16.web import WebReport
 from lce_rig.doctor.devices import check_device, check_stream, wanted_rate_hz
-from lce_rig.doctor.observing import Observation
+from lce_rig.doctor.observing import ObservedSensor
 from lce_rig.doctor.sensor_sources import driver_of, sensors, source_of
 from lce_rig.rig import Rig, load_rig
 
@@ -14,7 +14,9 @@ from .observed import S, camera, codes, examination, lidar, make_rig
 
 
 def test_what_does_not_open_is_red_with_what_to_check() -> None:
-    seen = Observation("cam", failure=SourceError("camera 'cam': /dev/video0 is busy", "fuser -v names it."))
+    seen = ObservedSensor(
+        "cam", failure=SourceError("camera 'cam': /dev/video0 is busy", "fuser -v names it.")
+    )
     line = check_device(examination(seen), "cam")
     assert line.severity == "error" and codes(line) == ["sensor.failed"]
     assert "/dev/video0" in str(line.figures["what"]) and "fuser" in str(line.figures["hint"])

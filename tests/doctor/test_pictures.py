@@ -8,7 +8,7 @@ from lce_rig.core.data import Events, Image
 from lce_rig.core.findings import Finding
 from lce_rig.core.results import Refusal
 from lce_rig.doctor.devices import check_board, check_events, check_picture
-from lce_rig.doctor.sensor_report import Examination
+from lce_rig.doctor.sensor_report import SensorReport
 
 from .observed import START_NS, S, camera, codes, examination, make_rig
 
@@ -80,7 +80,7 @@ def test_the_board_is_green_where_any_channel_sees_it() -> None:
 
     def line(*sights: Finding):
         boards = {("cam", f"channel{n}"): sight for n, sight in enumerate(sights)}
-        return check_board(Examination(make_rig(), {}, {}, boards), "cam")
+        return check_board(SensorReport(make_rig(), {}, {}, boards), "cam")
 
     assert line() is None
     both, none = line(unseen, seen), line(unseen)

@@ -8,7 +8,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import exp_so3, perturb, pose, transform
 from lce_rig.core.results import ImageBoard
-from lce_rig.lens.lens_estimate import View
+from lce_rig.lens.lens_estimate import BoardView
 
 BOARD = Board(cols=6, rows=4, square_m=0.1, width_m=0.8, height_m=0.6)
 WIDE = Intrinsics(450.0, 452.0, 322.0, 236.0, 640, 480, "radtan", (-0.35, 0.16, 0.0007, -0.0004, -0.03))
@@ -30,14 +30,14 @@ class Scene:
     flutter_m: float = 0.0
 
 
-def photograph(n: int, seed: int, scene: Scene | None = None, board: Board = BOARD) -> list[View]:
+def photograph(n: int, seed: int, scene: Scene | None = None, board: Board = BOARD) -> list[BoardView]:
     """Hold a board n times before a lens; starting poses are some centimetres and degrees off."""
     scene = scene or Scene()
     rng = np.random.default_rng(seed)
     printed = bent(board, scene, rng)
     x, y = board.corners()[:, :2].T
     size = np.array([scene.lens.width_px, scene.lens.height_px])
-    views: list[View] = []
+    views: list[BoardView] = []
     while len(views) < n:
         ray = scene.lens.unproject(rng.uniform(*scene.spread, 2) * size)
         tilt, angle = np.radians(rng.uniform(*scene.tilt_deg)), rng.uniform(0, 2 * np.pi)
@@ -54,7 +54,7 @@ def photograph(n: int, seed: int, scene: Scene | None = None, board: Board = BOA
         pixels = pixels + scene.sigma_px * rng.standard_normal(pixels.shape)
         start = perturb(T, np.r_[0.03 * rng.standard_normal(3), 0.05 * rng.standard_normal(3)])
         found = ImageBoard(pixels, start, np.eye(6), None, np.inf, False, 0.0, 0.0)
-        views.append(View(f"{len(views):06d}", "frames", found))
+        views.append(BoardView(f"{len(views):06d}", "frames", found))
     return views
 
 
@@ -69,6 +69,6 @@ def bent(board: Board, scene: Scene, rng: np.random.Generator) -> np.ndarray:
     return corners
 
 
-def with_corners(view: View, corners_px: np.ndarray) -> View:
+def with_corners(view: BoardView, corners_px: np.ndarray) -> BoardView:
     """Exchange a view's corners."""
     return replace(view, board=replace(view.board, corners_px=corners_px))

@@ -14,7 +14,7 @@ from lce_rig.detect.image.search import find_image_board
 from lce_rig.lens.calibrate_lens import choose_model, estimate_intrinsics
 from lce_rig.lens.difference import certainty_of, compare_lenses
 from lce_rig.lens.lens_coverage import find_weaknesses, reach, tilts_deg
-from lce_rig.lens.lens_estimate import View
+from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.lens.models import MODELS, convert, model_of
 from lce_rig.rig import load_rig
 from lce_rig.validation.intrinsics_check import check_intrinsics, compare_with_given, explain
@@ -324,7 +324,7 @@ def test_published_intrinsics_of_recordings_pass_and_stale_ones_do_not(
         image = Image("cam", "frames", None, cv2.imread(str(path)))
         found = find_image_board(image, board, lens)
         if isinstance(found, ImageBoard):
-            seen.append(View(path.stem, "frames", found))
+            seen.append(BoardView(path.stem, "frames", found))
     check = check_intrinsics(seen, lens, board)
     assert check.verdict() == "pass"
     assert abs(check.focal_ratio - 1) < worst_focal_error

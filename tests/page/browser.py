@@ -168,6 +168,11 @@ class Page(Line):
         """Give the text of the element with this id."""
         return str(self.evaluate(f"document.getElementById({element!r})?.innerText ?? ''"))
 
+    def each(self, selector: str, name: str = "id") -> list[str]:
+        """Give a property of every element that a selector finds."""
+        found = f"[...document.querySelectorAll({selector!r})].map((each) => each[{name!r}])"
+        return [str(value) for value in self.evaluate(found)]
+
     def wait_until(self, expression: str, timeout_s: float = 40.0) -> None:
         """Wait until an expression is true."""
         deadline = time.monotonic() + timeout_s

@@ -67,8 +67,9 @@ def test_the_voice_reads_settled_instructions_once_and_is_quiet_while_the_board_
     page.tap("speech")
     for distance in range(8):
         stand(f"0.{9 - distance} m closer", "moving", 0.1)
-    stand("one step left", "moving", 2.0)
+    instruction = "one step left"
+    stand(instruction, "moving", 2.0)
     stand("hold still", "holding", 1.2)
     page.wait_until(has_text("headline", "hold still"))
-    assert page.evaluate("window.said") == ["one step left"]
+    assert page.evaluate("window.said") == [instruction]
     assert not page.complaints

@@ -9,7 +9,7 @@ import pytest
 from lce_rig.core.findings import worst
 from lce_rig.doctor import Check
 from lce_rig.doctor.examine import DoctorOptions, examine, look_for_boards
-from lce_rig.doctor.observing import Observation
+from lce_rig.doctor.observing import ObservedSensor
 from lce_rig.rig import Rig
 from lce_rig.simulate.vlp16_packets import Vlp16Clock
 from lce_rig.words import recommend
@@ -158,7 +158,7 @@ def test_a_camera_of_events_alone_sees_the_board_while_it_moves() -> None:
     }
     board = {"inner_corners": (6, 4), "square_m": 0.07, "width_m": 0.546, "height_m": 0.406}
     rig = make_rig(sync=None, board=board, cameras={"cam": camera})
-    seen = Observation("cam")
+    seen = ObservedSensor("cam")
     seen.take(replace(board_events(Motion(), 1.4, threshold=0.6), sensor="cam"))
     sight = look_for_boards(rig, {"cam": seen})["cam", "events"]
     assert sight.code == "board.in_events"

@@ -19,12 +19,13 @@ from lce_rig.core import limits
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings import open_recording
-from lce_rig.recordings.events.stream import Findings, join
+from lce_rig.recordings.events.stream import DamageCounts, join
 from lce_rig.recordings.events.word_codec import EVT3, WordDecoder
 from lce_rig.recordings.protocol import ContinuousRecording
 from lce_rig.recordings.ros.bag_file import BagFile
 from lce_rig.recordings.ros.event_messages import BagEvents, PacketDecoder, parse_packet
 from lce_rig.rig import Rig
+from tests.notes import has_note
 
 from .events.bags import write_packet_bag
 
@@ -132,7 +133,7 @@ def test_an_mcap_chunk_that_unpacks_to_a_quarter_of_a_gigabyte_costs_that_chunk_
     n_read, what = read_damaged(write_mcap(tmp_path / "a.mcap", *chunks))
     assert n_read == 2
     assert ("declares" in what) is (n_declared > limits.MAX_CHUNK_BYTES)
-    assert ("unpacks to more than 1 MB" in what) is (n_declared < limits.MAX_CHUNK_BYTES)
+    assert has_note([what], "unpacks to", "1 MB") is (n_declared < limits.MAX_CHUNK_BYTES)
 
 
 @pytest.mark.parametrize("n_declared", [HUGE, 1 << 20])
@@ -147,7 +148,7 @@ def test_a_ros1_chunk_that_unpacks_to_more_than_it_may_costs_that_chunk_only(
         write_ros1(tmp_path / "a.bag", ros1_chunk(ros1_message(0)), bomb, ros1_chunk(ros1_message(2)))
     )
     assert n_read == 2
-    assert "2 places, the first: it has no index" in what
+    assert has_note([what], "2 places", "no index")
 
 
 @pytest.mark.parametrize("n_each", [100, 3000])
@@ -169,7 +170,7 @@ def test_chunks_that_are_each_allowed_are_not_in_any_number(
     packer = zstd_compressor()
     chunk = mcap_chunk(0, packer.compress(raw) + packer.flush(), "zstd", len(raw))
     n_read, what = read_damaged(write_mcap(tmp_path / "a.mcap", *[chunk] * 20))
-    assert 2 <= n_read < 10 and "unpack to more than a recording of this size can hold" in what
+    assert 2 <= n_read < 10 and has_note([what], "unpack to", "this size")
 
 
 PEAK = """
@@ -206,7 +207,7 @@ def test_a_chunk_as_large_as_any_may_be_takes_less_than_half_a_gigabyte(tmp_path
     path = write_mcap(tmp_path / "a.mcap", mcap_chunk(0, packed, "lz4", n_bytes, crc32(raw)))
     del raw
     said, peak = peak_mb(path)
-    assert "no single topic with clouds" in said or "no topic" in said
+    assert "single topic" in said or "no topic" in said
     assert peak < 500
 
 
@@ -220,7 +221,7 @@ def test_lengths_beyond_the_file_are_not_taken(tmp_path: Path, place: int) -> No
     ][place]
     n_read, what = read_damaged(write_mcap(tmp_path / "a.mcap", mcap_chunk(0, mcap_message(0)), tail))
     assert n_read == 1
-    assert "ends within a record" in what or "ends behind its record" in what
+    assert "ends within" in what or "ends behind" in what
 
 
 def indexed_mcap(path: Path, chunks: list[bytes], index: Callable[[list[int]], list[int]]) -> Path:
@@ -244,13 +245,13 @@ def test_an_index_that_names_a_chunk_a_thousand_times_is_not_believed(tmp_path: 
     whole = BagFile(indexed_mcap(tmp_path / "whole.mcap", chunks, lambda places: places))
     assert len(list(whole.messages({CAM}))) == 3 and whole.damage == ""
     n_read, what = read_damaged(indexed_mcap(tmp_path / "a.mcap", chunks, lambda places: places * 1000))
-    assert n_read == 3 and "names a chunk twice" in what
+    assert n_read == 3 and "chunk twice" in what
 
 
 def test_one_broken_chunk_of_an_indexed_bag_costs_no_other(tmp_path: Path) -> None:
     chunks = [mcap_chunk(k, mcap_message(k), crc=crc32(mcap_message(k)) ^ (k == 1)) for k in range(5)]
     n_read, what = read_damaged(indexed_mcap(tmp_path / "a.mcap", chunks, lambda places: places))
-    assert n_read == 4 and "a chunk's checksum is wrong" in what
+    assert n_read == 4 and "checksum" in what
 
 
 def test_more_topics_than_any_robot_has_are_refused(tmp_path: Path) -> None:
@@ -301,7 +302,7 @@ def test_a_compressed_message_of_a_database_that_unpacks_to_a_quarter_of_a_gigab
     rows = [(k, 1, T0_NS + k, zeros(zstd_compressor) if k == 1 else small) for k in range(3)]
     path = database(tmp_path / "a.db3", PLAIN, rows)
     assert [m.data for m in _until_damage(BagFile(path))] == [MESSAGE, MESSAGE]
-    assert "unpacks to more than 134 MB" in read_damaged(path)[1]
+    assert has_note([read_damaged(path)[1]], "unpacks to", "134 MB")
 
 
 def _until_damage(bag: BagFile) -> Iterator[Any]:
@@ -362,7 +363,7 @@ def test_a_piece_of_a_bag_that_metadata_lists_and_that_is_not_there_is_told(tmp_
     listed = "  relative_file_paths:\n    - a_0.db3\n    - a_1.db3\n"
     (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n{listed}")
     n_read, what = read_damaged(folder)
-    assert n_read == 1 and "metadata.yaml lists 'a_1.db3', which is not there" in what
+    assert n_read == 1 and has_note([what], "metadata.yaml", "'a_1.db3'", "not there")
 
 
 def test_clouds_and_pictures_of_absurd_sizes_are_left_out_and_the_others_read(
@@ -394,9 +395,8 @@ def test_clouds_and_pictures_of_absurd_sizes_are_left_out_and_the_others_read(
     samples = list(recording.samples())
     images = sum(isinstance(sample, Image) for sample in samples)
     assert (images, sum(isinstance(sample, Scan) for sample in samples)) == (4, 2)
-    said = " ".join(recording.notes)
-    assert "4 could not be decoded (it declares 257 fields a point" in said
-    assert "2 could not be decoded (it declares 4294967295x4294967295 pixels" in said
+    assert has_note(recording.notes, LIDAR, "4 could not", "257 fields")
+    assert has_note(recording.notes, CAM, "2 could not", "4294967295x4294967295")
 
 
 @pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3", ".pcap", ".pcapng"])
@@ -418,7 +418,7 @@ def test_a_pipe_beside_the_pieces_of_a_bag_costs_nothing_else(tmp_path: Path, ri
     bag = BagFile(folder)
     assert len(bag.fingerprint()) == 64
     n_read, what = read_damaged(folder)
-    assert n_read == 1 and "a_1.mcap: it is a pipe or device" in what
+    assert n_read == 1 and has_note([what], "a_1.mcap", "or device")
 
 
 def packet_message(payload: bytes) -> bytes:
@@ -431,10 +431,10 @@ def test_a_packet_that_holds_more_events_than_any_camera_sends_is_left_out(tmp_p
     words = np.array([0x8000, 0x6001, 0x0005, 0x2007], "<u2").tobytes()
     sizes = 1, limits.MAX_PACKET_BYTES // 8 + 1, 1
     messages = [("/davis/events", T0_NS + k, packet_message(words * n)) for k, n in enumerate(sizes)]
-    findings = Findings()
+    findings = DamageCounts()
     events = list(BagEvents(write_packet_bag(tmp_path / "a.bag", messages), None).stretches(findings))
     assert sum(map(len, events)) == 2
-    assert "at most 17 MB are read" in findings.lines()[0]
+    assert "17 MB" in findings.lines()[0]
 
 
 def test_a_packet_whose_words_hold_many_events_each_is_decoded_in_pieces() -> None:

@@ -14,6 +14,7 @@ from lce_rig.recordings import SourceOptions, open_recording
 from lce_rig.recordings.events.aedat4_writer import Aedat4Writer, write_aedat4
 from lce_rig.recordings.protocol import ContinuousRecording
 from lce_rig.rig import Rig, load_rig
+from tests.notes import has_note
 from tests.recordings.events import encoders
 from tests.recordings.events.aedat4_files import RawFrame, write_davis
 from tests.recordings.events.encoders import listed, random_events
@@ -53,23 +54,20 @@ def test_a_davis_file_gives_its_events_and_its_frames_at_mid_exposure(tmp_path: 
     assert [(i.sensor, i.channel) for i in images] == [("davis", "frames")] * 5
     assert [i.stamp_ns for i in images] == [(T0_US + 40_000 * k + 4000) * 1000 for k in range(5)]
     assert all(np.array_equal(i.pixels, GREY) for i in images)
-    assert (
-        "a.aedat4: davis.frames stamped at the middle of the exposure, 8.0 ms in the first frame"
-        in recording.notes
-    )
+    assert has_note(recording.notes, "a.aedat4", "davis.frames", "middle", "8.0 ms")
     assert recording.streams[EVENT_STREAM] == (int(EVENTS.t_ns[0]), int(EVENTS.t_ns[-1]))
     assert recording.streams[FRAME_STREAM] == (images[0].stamp_ns, images[-1].stamp_ns)
 
 
 def test_an_exposure_that_the_file_does_not_tell_is_said(tmp_path: Path, rig: Rig) -> None:
     recording = opened(write_davis(tmp_path / "a.aedat4", PIECES, [RawFrame(T0_US, 0, GREY)]), rig)
-    assert any("carries no exposure" in note for note in recording.notes)
+    assert has_note(recording.notes, "no exposure")
 
 
 def test_frames_alone_are_a_recording_too(tmp_path: Path, rig: Rig) -> None:
     recording = opened(write_davis(tmp_path / "a.aedat4", [], FRAMES), rig)
     assert set(recording.streams) == {FRAME_STREAM} and len(images_of(recording)) == 5
-    assert any("holds no stream of events" in note for note in recording.notes)
+    assert has_note(recording.notes, "no stream")
 
 
 def test_frames_of_a_camera_without_such_a_channel_are_left_out_and_it_is_said(
@@ -82,7 +80,7 @@ def test_frames_of_a_camera_without_such_a_channel_are_left_out_and_it_is_said(
         rig.model_copy(update={"cameras": {"davis": only_events}}),
     )
     assert images_of(recording) == [] and events_of(recording) == listed(EVENTS)
-    assert any("frames left out; davis has no channel of kind frames" in note for note in recording.notes)
+    assert has_note(recording.notes, "frames left", "davis", "no channel")
 
 
 def test_frames_out_of_order_are_left_out_and_counted(tmp_path: Path, rig: Rig) -> None:
@@ -91,7 +89,7 @@ def test_frames_out_of_order_are_left_out_and_counted(tmp_path: Path, rig: Rig) 
     )
     recording = opened(path, rig)
     assert len(images_of(recording)) == 2
-    assert "a.aedat4: frames: 1 out of order left out" in recording.notes
+    assert has_note(recording.notes, "a.aedat4", "frames: 1 out")
 
 
 def write_dsec(path: Path) -> None:
@@ -146,7 +144,7 @@ def test_the_first_of_several_event_cameras_is_taken_and_it_is_said(tmp_path: Pa
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
     davis = rig.cameras["davis"]
     both = rig.model_copy(update={"cameras": {"davis": davis, "right": davis}})
-    assert "events taken as camera davis" in opened(tmp_path / "a.aedat4", both).notes
+    assert has_note(opened(tmp_path / "a.aedat4", both).notes, "events taken", "camera davis")
     right = opened(tmp_path / "a.aedat4", both, camera="right")
     assert {s.sensor for s in right.samples()} == {"right"} and next(iter(right.streams)).sensor == "right"
 
@@ -157,7 +155,7 @@ def test_a_file_that_ends_in_a_packet_gives_what_comes_before(tmp_path: Path, ri
     recording = opened(tmp_path / "torn.aedat4", rig)
     found, images = events_of(recording), images_of(recording)
     assert 0 < len(found) < len(EVENTS) and found == listed(EVENTS)[: len(found)] and 1 <= len(images) < 5
-    assert any("torn ends of the file left out" in note for note in recording.notes)
+    assert has_note(recording.notes, "1 torn ends")
     assert recording.streams[EVENT_STREAM] == (int(EVENTS.t_ns[0]), int(EVENTS.t_ns[len(found) - 1]))
 
 

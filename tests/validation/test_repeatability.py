@@ -1,4 +1,4 @@
-"""Repeated calibrations: sound ones agree, an odd one is named, and the sentence says by how much."""
+"""Repeated calibrations: sound ones agree, an odd one is named, and the finding says by how much."""
 
 from dataclasses import replace
 
@@ -54,19 +54,22 @@ def test_sound_calibrations_spread_as_their_covariance_says():
     assert spread == pytest.approx(np.mean([one.claimed_translation_m**2 for one in compared]), rel=0.15)
 
 
-def test_agreement_is_said_in_one_sentence_with_both_figures():
+def test_agreement_is_a_note_with_both_figures():
     compared = compare_calibrations(sessions(3, 0))
-    deg, mm = compared.max_rotation_deg, 1000 * compared.max_translation_m
-    assert compared.agrees
-    said = compared.sentence()
-    assert all(part in said for part in ("three", compared.sensors, f"{deg:.2g} deg", f"{mm:.2g} mm"))
+    found = compared.finding
+    assert (found.code, found.severity) == ("repeat.agree", "note")
+    assert (found.figures["camera"], found.figures["lidar"], found.figures["n_sessions"]) == (
+        "cam",
+        "lidar",
+        3,
+    )
+    assert found.figure("translation_m") == compared.max_translation_m
+    assert not found.figures["is_generous"]
     assert compared.max_rotation_deg == max(pair.rotation_deg for pair in compared.differences)
 
 
 def test_generous_uncertainties_are_called_so():
-    generous, honest = compare_calibrations(sessions(4, 1, 0.2)), compare_calibrations(sessions(3, 0))
-    assert generous.agrees and "less than" in generous.sentence()
-    assert honest.agrees and "less than" not in honest.sentence()
+    assert compare_calibrations(sessions(4, 1, 0.2)).finding.figures["is_generous"]
 
 
 def test_uncertainties_that_are_too_small_are_found_out():
@@ -74,8 +77,8 @@ def test_uncertainties_that_are_too_small_are_found_out():
     assert not compared.agrees
     assert compared.ratio == pytest.approx(4, rel=0.4)
     assert compared.odd_one is None
-    text = compared.sentence()
-    assert "four" in text and f"{compared.ratio:.1f} times" in text and "Use none" in text
+    assert (compared.finding.code, compared.finding.action) == ("repeat.disagree", "")
+    assert compared.finding.figure("ratio") == compared.ratio
 
 
 def test_the_one_that_stands_apart_is_named():
@@ -84,7 +87,7 @@ def test_the_one_that_stands_apart_is_named():
     compared = compare_calibrations(three | {"day2": replace(three["day2"], T_cam_lidar=moved)})
     assert not compared.agrees
     assert compared.odd_one == "day2"
-    assert "Without day2" in compared.sentence()
+    assert (compared.finding.action, compared.finding.figures["odd_one"]) == ("odd_one", "day2")
     worst = max(compared.differences, key=lambda pair: pair.distance)
     assert "day2" in (worst.first, worst.second)
 

@@ -10,9 +10,9 @@ from lce_rig.core.geometry import perturb
 from lce_rig.core.results import Certificate, Refusal
 from lce_rig.extrinsics import EstimateSettings, fit_extrinsic
 from lce_rig.extrinsics.report import NO_CERTIFICATE
-from lce_rig.lens.lens_estimate import View
+from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.rig import load_rig
-from lce_rig.validation.validate import examine
+from lce_rig.validation.validate import validate
 from lce_rig.validation.verdict import judge
 from tests.extrinsics.boards import BOARD, CAMERA, simulate
 
@@ -26,8 +26,8 @@ def estimate():
 
 @functools.cache
 def examined(estimate, lens=CAMERA):
-    views = [View(name, "frames", seen.image) for name, seen in estimate.observations.items()]
-    return examine(estimate, RIG, RIG.lidars["lidar"], lens, views)
+    views = [BoardView(name, "frames", seen.image) for name, seen in estimate.observations.items()]
+    return validate(estimate, RIG, RIG.lidars["lidar"], lens, views)
 
 
 @pytest.fixture(scope="module")

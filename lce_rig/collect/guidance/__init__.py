@@ -1,6 +1,6 @@
 """Where to hold the board next, and how well the extrinsic is going to be known."""
 
-from lce_rig.collect.guidance.candidates import View, is_reachable, spread_candidates
+from lce_rig.collect.guidance.candidates import SensorPlace, is_reachable, spread_candidates
 from lce_rig.collect.guidance.coverage import Coverage, measure_coverage
 from lce_rig.collect.guidance.evidence import Evidence, weigh_placements
 from lce_rig.collect.guidance.instructions import (
@@ -30,7 +30,7 @@ __all__ = [
     "Planner",
     "Precision",
     "SensorModel",
-    "View",
+    "SensorPlace",
     "build_pose",
     "combine",
     "describe_pose",

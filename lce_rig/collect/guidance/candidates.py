@@ -28,7 +28,7 @@ _SPREAD = (1 / 1.2207440846057596) ** np.arange(1, 4)
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class SensorPlace:
     """Where the camera, the LiDAR and the ground are.
 
     Attributes:
@@ -42,12 +42,12 @@ class View:
     up: Array
 
     @classmethod
-    def upright(cls, model: SensorModel, T_cam_lidar: Array) -> "View":
+    def upright(cls, model: SensorModel, T_cam_lidar: Array) -> "SensorPlace":
         """Take the LiDAR's z axis for the vertical, as spinning LiDARs stand upright."""
         return cls(model, T_cam_lidar, np.asarray(T_cam_lidar[:3, 2]))
 
 
-def spread_candidates(view: View, n_places: int = 60, n_tilts: int = 8) -> Array:
+def spread_candidates(view: SensorPlace, n_places: int = 60, n_tilts: int = 8) -> Array:
     """Lay out poses T_cam_board (N, 4, 4) that both sensors see, evenly over everything that is reachable.
 
     Args:
@@ -73,7 +73,7 @@ def spread_candidates(view: View, n_places: int = 60, n_tilts: int = 8) -> Array
     return poses[is_reachable(view, poses)]
 
 
-def face_camera(view: View, rays: Array, distance_m: Array, tilt_rad: Array, roll_rad: Array) -> Array:
+def face_camera(view: SensorPlace, rays: Array, distance_m: Array, tilt_rad: Array, roll_rad: Array) -> Array:
     """Build T_cam_board (N, 4, 4) of boards that look at the camera, tilted and rolled.
 
     Args:
@@ -90,14 +90,14 @@ def face_camera(view: View, rays: Array, distance_m: Array, tilt_rad: Array, rol
     return pose(facing @ exp_so3(turns) @ exp_so3(rolls), distance_m[:, None] * rays)
 
 
-def facing_axes(view: View, rays: Array) -> Array:
+def facing_axes(view: SensorPlace, rays: Array) -> Array:
     """Build the axes (N, 3, 3) of boards that face the camera: level to the right, upwards, towards it."""
     right = np.cross(view.up, -rays)
     right /= np.maximum(np.linalg.norm(right, axis=1, keepdims=True), 1e-9)
     return np.stack([right, np.cross(-rays, right), -rays], axis=-1)
 
 
-def is_reachable(view: View, T_cam_board: Array) -> NDArray[np.bool_]:
+def is_reachable(view: SensorPlace, T_cam_board: Array) -> NDArray[np.bool_]:
     """Find which poses (N, 4, 4) a person can hold and both sensors see, (N,)."""
     model, limits = view.model, view.model.limits
     centre, normal = T_cam_board[:, :3, 3], T_cam_board[:, :3, 2]

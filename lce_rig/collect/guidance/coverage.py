@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.collect.guidance.candidates import DIAMOND_DEG, View
+from lce_rig.collect.guidance.candidates import DIAMOND_DEG, SensorPlace
 from lce_rig.collect.guidance.instructions import describe_pose
 from lce_rig.core.geometry import Array
 
@@ -34,7 +34,7 @@ class Coverage:
     roll: float
 
 
-def measure_coverage(view: View, held: Array, reachable: Array) -> Coverage:
+def measure_coverage(view: SensorPlace, held: Array, reachable: Array) -> Coverage:
     """Measure the coverage of captures.
 
     Args:
@@ -61,7 +61,7 @@ def measure_coverage(view: View, held: Array, reachable: Array) -> Coverage:
     )
 
 
-def _places(view: View, T_cam_board: Array) -> Array:
+def _places(view: SensorPlace, T_cam_board: Array) -> Array:
     """Where board centres lie in the image, px, and how far away they are, as a logarithm, (N, 3)."""
     centre = T_cam_board[:, :3, 3]
     pixels, _ = view.model.lens.project(centre)

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from lce_rig.collect.guidance.candidates import View, face_camera, facing_axes
+from lce_rig.collect.guidance.candidates import SensorPlace, face_camera, facing_axes
 from lce_rig.core.geometry import Array, exp_so3
 
 Kind = Literal["sideways", "nearer", "height", "tilt", "turn", "roll"]
@@ -65,7 +65,7 @@ class HeldPose:
     roll_deg: float
 
 
-def describe_pose(view: View, T_cam_board: Array) -> HeldPose:
+def describe_pose(view: SensorPlace, T_cam_board: Array) -> HeldPose:
     """Take a pose T_cam_board (4, 4) apart."""
     centre = T_cam_board[:3, 3]
     right, ahead = _level_axes(view)
@@ -87,7 +87,7 @@ def describe_pose(view: View, T_cam_board: Array) -> HeldPose:
     )
 
 
-def build_pose(view: View, held: HeldPose) -> Array:
+def build_pose(view: SensorPlace, held: HeldPose) -> Array:
     """Put T_cam_board (4, 4) together, the inverse of `describe_pose`."""
     right, ahead = _level_axes(view)
     centre = held.right_m * right + held.ahead_m * ahead + held.up_m * view.up
@@ -104,7 +104,7 @@ def build_pose(view: View, held: HeldPose) -> Array:
     return np.asarray(poses[0])
 
 
-def instruct(view: View, present: Array, wanted: Array) -> list[Instruction]:
+def instruct(view: SensorPlace, present: Array, wanted: Array) -> list[Instruction]:
     """Say what to do, largest first, at most `MOST_AT_ONCE`; empty where the board is there.
 
     Args:
@@ -122,13 +122,13 @@ def say(instructions: Sequence[Instruction]) -> str:
     return ", ".join(each.text for each in instructions) or "hold still"
 
 
-def is_there(view: View, present: Array, wanted: Array) -> bool:
+def is_there(view: SensorPlace, present: Array, wanted: Array) -> bool:
     """Return whether a board (4, 4) is as near to where it should be as people can hold it."""
     changes = _changes(view, present, wanted)
     return all(abs(amount) <= THERE * DEAD_BANDS[kind] for kind, amount in changes.items())
 
 
-def _changes(view: View, present: Array, wanted: Array) -> dict[Kind, float]:
+def _changes(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, float]:
     """Compute the signed changes by kind, m and deg, as `Instruction.amount`."""
     now, then = describe_pose(view, present), describe_pose(view, wanted)
     # A pattern looks the same from either end.
@@ -174,7 +174,7 @@ def _angle(size_deg: float) -> str:
     return "a little " if size_deg < 15 else "far " if size_deg > 45 else ""
 
 
-def _level_axes(view: View) -> tuple[Array, Array]:
+def _level_axes(view: SensorPlace) -> tuple[Array, Array]:
     """Build the level directions to the camera's right and ahead of it, frame camera."""
     right = np.cross(np.array([0.0, 0.0, 1.0]), view.up)
     right /= max(float(np.linalg.norm(right)), 1e-9)

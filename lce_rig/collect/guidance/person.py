@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.collect.guidance.candidates import View
+from lce_rig.collect.guidance.candidates import SensorPlace
 from lce_rig.collect.guidance.instructions import HeldPose, build_pose, describe_pose, instruct
 from lce_rig.core.geometry import Array, exp_so3, pose
 
@@ -32,7 +32,7 @@ class Person:
     turn_sigma_deg: float = 8.0
     ignored_share: float = 0.2
 
-    def follow(self, view: View, present: Array, wanted: Array, rng: np.random.Generator) -> Array:
+    def follow(self, view: SensorPlace, present: Array, wanted: Array, rng: np.random.Generator) -> Array:
         """Move a board T_cam_board (4, 4) to where it is wanted, more or less."""
         aim = describe_pose(view, wanted)
         instructions = instruct(view, present, wanted)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.collect.guidance.candidates import View, spread_candidates
+from lce_rig.collect.guidance.candidates import SensorPlace, spread_candidates
 from lce_rig.collect.guidance.evidence import Evidence, weigh_placements
 from lce_rig.collect.guidance.instructions import instruct, is_there, say
 from lce_rig.collect.guidance.precision import Precision, combine, combine_with_each, shortfall, sigmas
@@ -70,7 +70,7 @@ class Planner:
         n_places: how many places of the board's centre are considered, with eight tilts each.
     """
 
-    def __init__(self, view: View, novelty: Novelty | None = None, n_places: int = 400) -> None:
+    def __init__(self, view: SensorPlace, novelty: Novelty | None = None, n_places: int = 400) -> None:
         self.view = view
         self.novelty = novelty or Novelty()
         poses = spread_candidates(view, n_places)

@@ -2,14 +2,14 @@
 
 from typing import Protocol
 
-from lce_rig.collect.board_tracker import Moment, Sighting
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
 from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.narration import Narration, narrate_moving, narrate_still
 from lce_rig.collect.offline.slow_motion import MotionGate
 from lce_rig.collect.offline.stillness import StillnessGate, StillnessOptions
 from lce_rig.collect.placement_dedupe import Placements
-from lce_rig.collect.refusal_counts import Tally
+from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
@@ -22,7 +22,7 @@ LIVE_PATIENCE_S = 0.7
 class LiveGate(Protocol):
     """Decides on moments as sightings come."""
 
-    def take(self, sighting: Sighting) -> list[Moment]:
+    def take(self, sighting: BoardDetection) -> list[CaptureMoment]:
         """Take the next sighting, and give the moments that are worth a capture by how the board moves."""
         ...
 
@@ -30,7 +30,7 @@ class LiveGate(Protocol):
         """Say what to do with a board that is seen at (4, 4)."""
         ...
 
-    def events_of(self, moment: Moment) -> tuple[EventCut, ...]:
+    def events_of(self, moment: CaptureMoment) -> tuple[EventCut, ...]:
         """Give the events of a moment that its capture keeps."""
         ...
 
@@ -47,7 +47,7 @@ class StillBoards:
         self._is_judged = self._is_decided = False
         self._refusal: Refusal | None = None
 
-    def take(self, sighting: Sighting) -> list[Moment]:
+    def take(self, sighting: BoardDetection) -> list[CaptureMoment]:
         """Take the next sighting; a board that is moved on before its time is not captured."""
         moment = self._gate.take(sighting)
         if self._gate.motion_m > self._max_motion_m:
@@ -70,7 +70,7 @@ class StillBoards:
             return narrate_still(guide, present, None, self._hold_s, None)
         return narrate_still(guide, present, held_s, self._hold_s, self._refusal)
 
-    def events_of(self, moment: Moment) -> tuple[EventCut, ...]:
+    def events_of(self, moment: CaptureMoment) -> tuple[EventCut, ...]:
         """Give none: a board that stands still makes no events of use."""
         return ()
 
@@ -80,9 +80,9 @@ class SlowBoards:
 
     def __init__(self, rig: Rig, novelty: Placements) -> None:
         self._options = MotionOptions(patience_s=LIVE_PATIENCE_S)
-        self._gate = MotionGate(rig, self._options, novelty, Tally())
+        self._gate = MotionGate(rig, self._options, novelty, RefusalCounts())
 
-    def take(self, sighting: Sighting) -> list[Moment]:
+    def take(self, sighting: BoardDetection) -> list[CaptureMoment]:
         """Take the next sighting."""
         return self._gate.take(sighting)
 
@@ -90,6 +90,6 @@ class SlowBoards:
         """Say what to do with a board that is seen at (4, 4)."""
         return narrate_moving(guide, present, self._gate.judged, self._options)
 
-    def events_of(self, moment: Moment) -> tuple[EventCut, ...]:
+    def events_of(self, moment: CaptureMoment) -> tuple[EventCut, ...]:
         """Give all of them."""
         return moment.sighting.frame.events

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 
-from lce_rig.collect.board_tracker import ImageKey, Moment
+from lce_rig.collect.board_tracker import CaptureMoment, ImageKey
 from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.offline.stored_events import StoredEvents
 from lce_rig.collect.placement_dedupe import board_figures
@@ -30,7 +30,7 @@ class Task:
         asked_s: time.monotonic() when it was decided on.
     """
 
-    moment: Moment
+    moment: CaptureMoment
     images: Sequence[Image]
     events: Sequence[EventCut]
     meta: Mapping[str, object]
@@ -52,7 +52,7 @@ class Kept:
     latency_s: float
 
 
-class Keeper:
+class CaptureWriter:
     """Writes captures one after the other; open while its `with` block lasts.
 
     What is being written when the block ends is finished first.
@@ -75,7 +75,7 @@ class Keeper:
         self._is_closing = False
         self._thread = threading.Thread(target=self._run, name="keep captures", daemon=True)
 
-    def __enter__(self) -> "Keeper":
+    def __enter__(self) -> "CaptureWriter":
         self._thread.start()
         return self
 

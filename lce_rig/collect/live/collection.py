@@ -1,7 +1,7 @@
 """The live loop: see the board in the newest frame, say where it goes, capture it when it is there.
 
 Threads: one reads each sensor into one queue (`AttachedSensors`), one pairs (`FrameFeed`), one writes
-captures (`Keeper`); this loop alone decides and tells the views. Processes: one looks for the board
+captures (`CaptureWriter`); this loop alone decides and tells the views. Processes: one looks for the board
 (`BoardSearch`), one calibrates what was captured (`Learning`).
 """
 
@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
-from lce_rig.collect.board_tracker import BoardWatcher, Moment, Sighting
+from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
 from lce_rig.collect.live.capture_triggers import LiveGate, SlowBoards, StillBoards
-from lce_rig.collect.live.capture_writer import Keeper, Task
+from lce_rig.collect.live.capture_writer import CaptureWriter, Task
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
 from lce_rig.collect.live.learning import Learning
@@ -44,26 +44,26 @@ RESCAN_S = 1.0
 
 
 class BoardSearch(Worker):
-    """A `BoardWatcher` in its process; frames' events, which it has no use for, stay here."""
+    """A `BoardTracker` in its process; frames' events, which it has no use for, stay here."""
 
     def __init__(self, rig: Rig, search_interval_s: float) -> None:
-        """Prepare; see `BoardWatcher`."""
+        """Prepare; see `BoardTracker`."""
         super().__init__("search for the board", _Search, rig, search_interval_s)
 
-    def sight(self, frame: Frame) -> Sighting:
+    def sight(self, frame: Frame) -> BoardDetection:
         """Find the board in every picture and scan of a frame.
 
         Raises:
             LceRigError: the profile cannot be used.
         """
-        sighting: Sighting = self.call("sight", replace(frame, events=()))
+        sighting: BoardDetection = self.call("sight", replace(frame, events=()))
         return replace(sighting, frame=frame)
 
-    def confirm(self, moment: Moment) -> Moment | Refusal:
-        """Search the frame of a moment as `check` does; see `BoardWatcher.confirm`."""
+    def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
+        """Search the frame of a moment as `check` does; see `BoardTracker.confirm`."""
         frame = moment.sighting.frame
         bare = replace(moment.sighting, frame=replace(frame, events=()))
-        found: Moment | Refusal = self.call("confirm", replace(moment, sighting=bare))
+        found: CaptureMoment | Refusal = self.call("confirm", replace(moment, sighting=bare))
         if isinstance(found, Refusal):
             return found
         return replace(found, sighting=replace(found.sighting, frame=frame))
@@ -73,21 +73,21 @@ class _Search:
     """What runs there: what was searched is not sent back."""
 
     def __init__(self, rig: Rig, search_interval_s: float) -> None:
-        self._watcher = BoardWatcher(
+        self._watcher = BoardTracker(
             rig, search_interval_s, thorough_interval_s=THOROUGH_S, rescan_interval_s=RESCAN_S
         )
 
-    def sight(self, frame: Frame) -> Sighting:
+    def sight(self, frame: Frame) -> BoardDetection:
         return _without_samples(self._watcher.sight(frame))
 
-    def confirm(self, moment: Moment) -> Moment | Refusal:
+    def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
         found = self._watcher.confirm(moment)
-        if isinstance(found, Moment):
+        if isinstance(found, CaptureMoment):
             return replace(found, sighting=_without_samples(found.sighting))
         return found
 
 
-def _without_samples(sighting: Sighting) -> Sighting:
+def _without_samples(sighting: BoardDetection) -> BoardDetection:
     return replace(sighting, frame=replace(sighting.frame, images=(), scans=()))
 
 
@@ -131,7 +131,7 @@ def collect_live(
         clock = RigClock(rig, has_board=board is not None, edge_cameras=edge_cameras(rig))
         with (
             Learning(rig, guides) as learning,
-            Keeper(session, learning) as keeper,
+            CaptureWriter(session, learning) as keeper,
             FrameFeed(rig, sensors, clock, board, None if recorder is None else recorder.put) as feed,
         ):
             loop = _Loop(
@@ -169,7 +169,7 @@ def _count_in(capture: Capture, session: Session, guides: Sequence[Guide]) -> No
             guide.add(capture.name, poses[guide.key])
 
 
-def _time_s(sighting: Sighting) -> float:
+def _time_s(sighting: BoardDetection) -> float:
     """Tell the sensors' time: patience is measured by what they have seen, however slow this computer is."""
     return sighting.frame.time_ns * 1e-9
 
@@ -184,7 +184,7 @@ class _Loop:
         feed: FrameFeed,
         search: BoardSearch,
         learning: Learning,
-        keeper: Keeper,
+        keeper: CaptureWriter,
         guides: Sequence[Guide],
         show: Callable[[LiveState], None],
         recorder: SampleRecorder | None,
@@ -204,7 +204,7 @@ class _Loop:
         self._n_asked = 0
         self._captured_s = self._began_s
         self._monitor = Monitor(session, options, sensors, clock)
-        self._last: Sighting | None = None
+        self._last: BoardDetection | None = None
 
     def run(self, keys: Callable[[], Key | None]) -> LiveReport:
         """Go on until something ends it."""
@@ -259,7 +259,7 @@ class _Loop:
             error="" if report.error is None else report.error.what,
         )
 
-    def _see(self, sighting: Sighting) -> None:
+    def _see(self, sighting: BoardDetection) -> None:
         """Look for a moment in a sighting, and put into words what goes on."""
         self._last = sighting
         self._monitor.see(sighting)
@@ -277,7 +277,7 @@ class _Loop:
             narration = self._decide(moment, narration)
         self._monitor.narrate(narration, guide, present)
 
-    def _decide(self, moment: Moment, narration: Narration) -> Narration:
+    def _decide(self, moment: CaptureMoment, narration: Narration) -> Narration:
         """Capture a moment, unless it adds nothing."""
         sighting = moment.sighting
         guide = self._seeing_guide(sighting)
@@ -290,7 +290,7 @@ class _Loop:
         refusal = guide.adds_nothing(present)
         if refusal is None:
             confirmed = self._search.confirm(moment)
-            if isinstance(confirmed, Moment):
+            if isinstance(confirmed, CaptureMoment):
                 self._capture(confirmed)
                 return Narration("saving", "captured")
             refusal = confirmed
@@ -299,7 +299,7 @@ class _Loop:
         guide.plan(present, _time_s(sighting))
         return narrate_refused(guide, present, refusal)
 
-    def _capture(self, moment: Moment) -> None:
+    def _capture(self, moment: CaptureMoment) -> None:
         sighting, gate = moment.sighting, self._find_gate()
         frame = sighting.frame
         pairs = [pair.to_meta() for pair in pair_times(frame, self._rig, self._clock.common)]
@@ -325,13 +325,13 @@ class _Loop:
         if key == "capture" and guide is not None and self._last is not None:
             self._capture_by_hand(self._last)
 
-    def _capture_by_hand(self, sighting: Sighting) -> None:
+    def _capture_by_hand(self, sighting: BoardDetection) -> None:
         """Capture what is seen now, however it moves."""
         if self._seeing_guide(sighting) is None:
             self._monitor.cue("refused", "not captured: not every sensor sees the board")
             return
-        confirmed = self._search.confirm(Moment(sighting, {"by_hand": 1.0}))
-        if isinstance(confirmed, Moment):
+        confirmed = self._search.confirm(CaptureMoment(sighting, {"by_hand": 1.0}))
+        if isinstance(confirmed, CaptureMoment):
             self._capture(confirmed)
         else:
             self._monitor.cue("refused", f"not captured: {sentence(confirmed)}")
@@ -373,7 +373,7 @@ class _Loop:
             is_enough, has_ended = self._is_enough(), ending is not None
             self._show(self._monitor.state(self._n_captures, is_enough=is_enough, has_ended=has_ended))
 
-    def _active_guide(self, sighting: Sighting) -> Guide:
+    def _active_guide(self, sighting: BoardDetection) -> Guide:
         """Choose whose words are said: of the guides whose camera sees the board that of fewest captures.
 
         Where they all have enough, the board goes before a camera whose guide has not.
@@ -384,7 +384,7 @@ class _Loop:
             return min(seeing, key=lambda guide: (guide.is_enough, guide.n_held))
         return min(seeing or self._guides, key=lambda guide: guide.n_held)
 
-    def _seeing_guide(self, sighting: Sighting) -> Guide | None:
+    def _seeing_guide(self, sighting: BoardDetection) -> Guide | None:
         """Choose who judges a placement: of the guides whose sensors see it that of fewest captures."""
         return min((g for g in self._guides if g.sees(sighting)), key=lambda g: g.n_held, default=None)
 

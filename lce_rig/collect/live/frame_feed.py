@@ -7,7 +7,7 @@ from types import TracebackType
 from typing import Protocol, runtime_checkable
 
 from lce_rig.collect.event_pictures import with_event_pictures
-from lce_rig.collect.refusal_counts import Tally
+from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.data import Sample
 from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.devices.protocol import Mailbox
@@ -126,7 +126,7 @@ class FrameFeed:
         }
         if not cameras:
             return self._samples()
-        return with_event_pictures(self._samples(), self._rig, cameras, Tally())
+        return with_event_pictures(self._samples(), self._rig, cameras, RefusalCounts())
 
     def _refresh_clock(self) -> None:
         """Let the clock take what sensors and board know, and the board's lines run as it needs them."""

@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import ImageKey, Sighting
+from lce_rig.collect.board_tracker import BoardDetection, ImageKey
 from lce_rig.collect.guidance import (
     Coverage,
     Guidance,
     Instruction,
     Planner,
     SensorModel,
-    View,
+    SensorPlace,
     instruct,
     is_there,
     measure_coverage,
@@ -82,7 +82,7 @@ class Guide:
                 f"the profile has no nominal extrinsic of {key[0]} and {lidar}"
             )
         else:
-            self._planner = Planner(View.upright(self._model, nominal.to_matrix()))
+            self._planner = Planner(SensorPlace.upright(self._model, nominal.to_matrix()))
 
     @property
     def n_held(self) -> int:
@@ -109,11 +109,11 @@ class Guide:
         """Where the board should go, T_cam_board (4, 4); None where nothing new can be reached."""
         return None if self.guidance is None else self.guidance.T_cam_board
 
-    def sees(self, sighting: Sighting) -> bool:
+    def sees(self, sighting: BoardDetection) -> bool:
         """Tell whether both of its sensors see the board in a sighting as the profile's limits want it."""
         return self.key in sighting.images.keys() - sighting.unfit.keys() and self.lidar in sighting.lidars
 
-    def locate(self, sighting: Sighting) -> Array | None:
+    def locate(self, sighting: BoardDetection) -> Array | None:
         """Give T_cam_board (4, 4) as its camera sees it; None where it does not."""
         board = sighting.images.get(self.key)
         return None if board is None else board.T_cam_board
@@ -129,7 +129,7 @@ class Guide:
         if self._model is None:
             return None
         errors = self._model.errors.learned(learned.plane_rms_m, learned.edge_rms_m, learned.n_captures)
-        return Planner(View.upright(self._model.with_errors(errors), learned.T_cam_lidar))
+        return Planner(SensorPlace.upright(self._model.with_errors(errors), learned.T_cam_lidar))
 
     def adopt(self, planner: Planner) -> None:
         """Take a planner from `prepare`."""

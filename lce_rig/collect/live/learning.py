@@ -7,7 +7,7 @@ from types import TracebackType
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import Sighting
+from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.collect.guidance import Planner
 from lce_rig.collect.live.guide import Guide, Learned, make_guides
 from lce_rig.collect.live.worker import Worker
@@ -48,7 +48,7 @@ class Learning:
         self._worker.__exit__(None, None, None)
         self._thread.join()
 
-    def show(self, name: str, sighting: Sighting) -> None:
+    def show(self, name: str, sighting: BoardDetection) -> None:
         """Take what a capture shows; returns at once."""
         with self._changed:
             for k, guide in enumerate(self._guides):

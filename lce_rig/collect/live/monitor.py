@@ -5,7 +5,7 @@ from collections import deque
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import Sighting
+from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.narration import Narration, image_figures, scan_figures, stream_name
 from lce_rig.collect.live.options import LiveOptions
@@ -53,13 +53,13 @@ class Monitor:
         self._narration = Narration("starting", _WAIT)
         self._guide: Guide | None = None
         self._drawing: Drawing | None = None
-        self._sighting: Sighting | None = None
+        self._sighting: BoardDetection | None = None
         self._seen_s = 0.0
         self._ticks_left: int | None = None
         self._lost: frozenset[str] = frozenset()
         self._was_enough = False
 
-    def see(self, sighting: Sighting) -> None:
+    def see(self, sighting: BoardDetection) -> None:
         """Take a sighting, and remember why streams do not show the board."""
         self._sighting, self._seen_s = sighting, time.monotonic()
         for key, why in sighting.unseen.items():

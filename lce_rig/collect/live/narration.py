@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from lce_rig.collect.board_tracker import ImageKey, Moment, Sighting
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey
 from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.guidance import say
 from lce_rig.collect.live.guide import Guide
@@ -30,7 +30,7 @@ class Narration:
     hold_s: float | None = None
 
 
-def narrate_unseen(sighting: Sighting, guide: Guide, reasons: dict[str, Refusal]) -> Narration:
+def narrate_unseen(sighting: BoardDetection, guide: Guide, reasons: dict[str, Refusal]) -> Narration:
     """Say what keeps a board out of sight.
 
     Args:
@@ -77,13 +77,13 @@ def narrate_refused(guide: Guide, present: Array, refusal: Refusal) -> Narration
 
 
 def narrate_moving(
-    guide: Guide, present: Array, judged: Moment | Refusal | None, options: MotionOptions
+    guide: Guide, present: Array, judged: CaptureMoment | Refusal | None, options: MotionOptions
 ) -> Narration:
     """Say where a board goes that has to move slowly to be captured."""
     headline = _next(guide, present, f"move it slowly, about {100 * options.best_speed_mps:.0f} cm/s")
     if isinstance(judged, Refusal):
         return Narration("moving", headline, sentence(judged))
-    if isinstance(judged, Moment) and guide.is_there(present):
+    if isinstance(judged, CaptureMoment) and guide.is_there(present):
         return Narration("holding", "good: go on slowly", f"{judged.figures['speed_mps']:.2f} m/s")
     return Narration("moving", headline, guide.problem)
 

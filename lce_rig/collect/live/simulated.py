@@ -16,7 +16,7 @@ from types import TracebackType
 
 import numpy as np
 
-from lce_rig.collect.guidance import HeldPose, Person, View, build_pose, model_sensors
+from lce_rig.collect.guidance import HeldPose, Person, SensorPlace, build_pose, model_sensors
 from lce_rig.collect.live.state import LiveState
 from lce_rig.collect.live.worker import start_without_interrupts
 from lce_rig.core.data import Image, Scan
@@ -269,7 +269,7 @@ class SimulatedRig:
                 self.pace.turn()
 
 
-def _view(rig: Rig, camera: str) -> View:
+def _view(rig: Rig, camera: str) -> SensorPlace:
     """Look through a camera as the drawing has it: people do not know the true extrinsic."""
     lidar = next(iter(rig.lidars))
     nominal = rig.nominal(camera, lidar)
@@ -278,10 +278,12 @@ def _view(rig: Rig, camera: str) -> View:
             f"rig {rig.name!r} has no nominal extrinsic of {camera} and {lidar}, which its simulation needs",
             "Add it under nominal_extrinsics.",
         )
-    return View.upright(model_sensors(rig, camera, lidar), nominal.to_matrix())
+    return SensorPlace.upright(model_sensors(rig, camera, lidar), nominal.to_matrix())
 
 
-def _simulate(connection: Connection, rig: Rig, seed: int, person: Person, views: Mapping[str, View]) -> None:
+def _simulate(
+    connection: Connection, rig: Rig, seed: int, person: Person, views: Mapping[str, SensorPlace]
+) -> None:
     """Run the simulation until the other end is gone."""
     try:
         scene = LiveScene(rig, seed, SimulationOptions.for_rig(rig.name))
@@ -318,7 +320,7 @@ def _simulate(connection: Connection, rig: Rig, seed: int, person: Person, views
 class Walker:
     """Carries the board to where it is wanted, as far as the room lets it."""
 
-    def __init__(self, scene: LiveScene, person: Person, views: Mapping[str, View]) -> None:
+    def __init__(self, scene: LiveScene, person: Person, views: Mapping[str, SensorPlace]) -> None:
         self._scene = scene
         self._person = person
         self._views = views

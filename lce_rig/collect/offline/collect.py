@@ -3,14 +3,14 @@
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from lce_rig.collect.board_tracker import BoardWatcher, ImageKey, Moment
+from lce_rig.collect.board_tracker import BoardTracker, CaptureMoment, ImageKey
 from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.collect.offline.slow_motion import find_moving_moments
 from lce_rig.collect.offline.stillness import StillnessOptions, find_still_moments
 from lce_rig.collect.offline.stored_events import StoredEvents
 from lce_rig.collect.placement_dedupe import Placements, board_figures, known_placements
-from lce_rig.collect.refusal_counts import Tally
+from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.results import Refusal
@@ -48,7 +48,7 @@ class MomentSearch:
     min_move_m: float
     min_turn_deg: float
     _pairing: PairingCounts = field(default_factory=PairingCounts)
-    _tally: Tally = field(default_factory=Tally)
+    _tally: RefusalCounts = field(default_factory=RefusalCounts)
 
     @property
     def has_events(self) -> bool:
@@ -65,7 +65,7 @@ class MomentSearch:
             if stream.kind == "events" and stream.sensor not in with_pictures
         )
 
-    def moments(self, samples: Iterable[Sample]) -> Iterator[Moment]:
+    def moments(self, samples: Iterable[Sample]) -> Iterator[CaptureMoment]:
         """Yield the moments of a stream, as `find_still_moments` or `find_moving_moments` define them.
 
         Raises:
@@ -77,7 +77,7 @@ class MomentSearch:
             samples = with_event_pictures(samples, self.rig, cameras, self._tally)
         stillness = self.stillness or StillnessOptions(max_motion_m=self.rig.quality.max_motion_m)
         interval_s = self.motion.search_interval_s if self.has_events else stillness.search_interval_s
-        watcher = BoardWatcher(self.rig, interval_s, self._tally, _THOROUGH_S)
+        watcher = BoardTracker(self.rig, interval_s, self._tally, _THOROUGH_S)
         frames = pair_by_time(samples, self.rig, self._pairing)
         sightings = (watcher.sight(frame) for frame in frames)
         if self.has_events:
@@ -92,16 +92,16 @@ class MomentSearch:
             else:
                 yield confirmed
 
-    def kept_images(self, moment: Moment) -> list[Image]:
+    def kept_images(self, moment: CaptureMoment) -> list[Image]:
         """List the pictures of a moment that its capture keeps: all but those that its events give again."""
         images = moment.sighting.frame.images
         return [image for image in images if (image.sensor, image.channel) not in self.reconstructed]
 
-    def counts(self) -> Tally:
+    def counts(self) -> RefusalCounts:
         """Count what became no moment so far."""
         # Why a picture could not be made of events is in the tally.
         n_alone = 0 if self.reconstructed else self._pairing.n_alone
-        total = Tally()
+        total = RefusalCounts()
         total.add(Refusal("read.no_image_at_scan"), n_alone)
         total.update(self._tally)
         return total
@@ -161,7 +161,7 @@ class CollectReport:
     n_resumed: int = 0
     duplicates: dict[str, str] = field(default_factory=dict)
     refused: dict[str, Refusal] = field(default_factory=dict)
-    counts: Tally = field(default_factory=Tally)
+    counts: RefusalCounts = field(default_factory=RefusalCounts)
     notes: list[str] = field(default_factory=list)
     errors: list[SourceError] = field(default_factory=list)
     n_missing: int = 0
@@ -310,7 +310,7 @@ class _Collector:
         return self._store(key, files.label, pair.images, pair.scans, {})
 
     def _take_moment(
-        self, recording_key: str, moment: Moment, images: Sequence[Image], known: Placements
+        self, recording_key: str, moment: CaptureMoment, images: Sequence[Image], known: Placements
     ) -> None:
         frame, boards = moment.sighting.frame, moment.sighting.images
         stamps = [scan.stamp_ns for scan in frame.scans] + [image.stamp_ns for image in images]

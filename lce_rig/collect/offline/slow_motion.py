@@ -10,10 +10,10 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import Moment, Sighting
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
 from lce_rig.collect.event_moment import MotionOptions, judge_sighting
 from lce_rig.collect.placement_dedupe import Placements
-from lce_rig.collect.refusal_counts import Tally
+from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
 
@@ -22,8 +22,12 @@ _UNSTEADY_M = 0.01
 
 
 def find_moving_moments(
-    sightings: Iterable[Sighting], rig: Rig, options: MotionOptions, taken: Placements, tally: Tally
-) -> Iterator[Moment]:
+    sightings: Iterable[BoardDetection],
+    rig: Rig,
+    options: MotionOptions,
+    taken: Placements,
+    tally: RefusalCounts,
+) -> Iterator[CaptureMoment]:
     """Yield the best moment of every place that the board passes, each place once.
 
     Which they are depends on the recording alone, so that a second run finds the same.
@@ -49,30 +53,30 @@ class MotionGate:
             no camera of events saw the board.
     """
 
-    def __init__(self, rig: Rig, options: MotionOptions, taken: Placements, tally: Tally) -> None:
+    def __init__(self, rig: Rig, options: MotionOptions, taken: Placements, tally: RefusalCounts) -> None:
         """Begin without sightings; for the arguments see `find_moving_moments`."""
-        self.judged: Moment | Refusal | None = None
+        self.judged: CaptureMoment | Refusal | None = None
         self._rig = rig
         self._options = options
         self._tally = tally
         self._neighbours = _Neighbours(options.window_s)
         self._chooser = _Chooser(options, taken)
 
-    def take(self, sighting: Sighting) -> list[Moment]:
+    def take(self, sighting: BoardDetection) -> list[CaptureMoment]:
         """Take the next sighting, and give the moments that nothing better can follow."""
         return self._judge(self._neighbours.take(sighting))
 
-    def finish(self) -> list[Moment]:
+    def finish(self) -> list[CaptureMoment]:
         """Give what is left when nothing more comes."""
         return [*self._judge(self._neighbours.finish()), *self._chooser.finish()]
 
-    def _judge(self, sightings: Iterable[tuple[Sighting, list[Sighting]]]) -> list[Moment]:
-        moments: list[Moment] = []
+    def _judge(self, sightings: Iterable[tuple[BoardDetection, list[BoardDetection]]]) -> list[CaptureMoment]:
+        moments: list[CaptureMoment] = []
         for sighting, around in sightings:
             self.judged = judge_sighting(sighting, around, self._rig, self._options)
             if isinstance(self.judged, Refusal):
                 self._tally.add(self.judged)
-            moment = self.judged if isinstance(self.judged, Moment) else None
+            moment = self.judged if isinstance(self.judged, CaptureMoment) else None
             moments.extend(self._chooser.take(sighting.frame.time_ns, moment))
         return moments
 
@@ -83,26 +87,26 @@ class _Chooser:
     def __init__(self, options: MotionOptions, taken: Placements) -> None:
         self._options = options
         self._taken = taken
-        self._pending: deque[Moment] = deque()
+        self._pending: deque[CaptureMoment] = deque()
 
-    def take(self, now_ns: int, moment: Moment | None) -> Iterator[Moment]:
+    def take(self, now_ns: int, moment: CaptureMoment | None) -> Iterator[CaptureMoment]:
         """Take the moment at a time, where there is one, and yield those that nothing better came after."""
         while self._pending and not self._is_young(self._pending[0], now_ns):
             yield from self._decide_oldest()
         if moment is not None and self._taken.find_like(moment.sighting.images) is None:
             self._pending.append(moment)
 
-    def finish(self) -> Iterator[Moment]:
+    def finish(self) -> Iterator[CaptureMoment]:
         """Yield what is left when the recording has ended."""
         while self._pending:
             yield from self._decide_oldest()
 
-    def _decide_oldest(self) -> Iterator[Moment]:
+    def _decide_oldest(self) -> Iterator[CaptureMoment]:
         """Give up the oldest moment, unless it stands when the best of all are taken first, one a place."""
         oldest = self._pending.popleft()
         if self._taken.find_like(oldest.sighting.images) is not None:
             return
-        kept: list[Moment] = []
+        kept: list[CaptureMoment] = []
         for moment in sorted((oldest, *self._pending), key=self._badness):
             boards = moment.sighting.images
             if any(self._taken.are_alike(boards, other.sighting.images) for other in kept):
@@ -113,10 +117,10 @@ class _Chooser:
                 return
             kept.append(moment)
 
-    def _is_young(self, moment: Moment, now_ns: int) -> bool:
+    def _is_young(self, moment: CaptureMoment, now_ns: int) -> bool:
         return 0 <= now_ns - moment.sighting.frame.time_ns < self._options.patience_s * 1e9
 
-    def _badness(self, moment: Moment) -> tuple[bool, float]:
+    def _badness(self, moment: CaptureMoment) -> tuple[bool, float]:
         is_short = any(cut.missing_ns > 0 for cut in moment.sighting.frame.events)
         speed_ratio = max(moment.figures["speed_mps"], 1e-3) / self._options.best_speed_mps
         return is_short, abs(float(np.log(speed_ratio))) + moment.figures["unsteady_m"] / _UNSTEADY_M
@@ -127,10 +131,10 @@ class _Neighbours:
 
     def __init__(self, window_s: float) -> None:
         self._half_ns = round(window_s * 0.5e9)
-        self._near: deque[Sighting] = deque()
+        self._near: deque[BoardDetection] = deque()
         self._n_waiting = 0
 
-    def take(self, sighting: Sighting) -> Iterator[tuple[Sighting, list[Sighting]]]:
+    def take(self, sighting: BoardDetection) -> Iterator[tuple[BoardDetection, list[BoardDetection]]]:
         """Take the next sighting, and give those whose neighbours are complete."""
         near, now_ns = self._near, sighting.frame.time_ns
         if near and now_ns <= near[-1].frame.time_ns:
@@ -145,13 +149,13 @@ class _Neighbours:
         while near[-max(self._n_waiting, 1)].frame.time_ns - near[0].frame.time_ns > self._half_ns:
             near.popleft()
 
-    def finish(self) -> Iterator[tuple[Sighting, list[Sighting]]]:
+    def finish(self) -> Iterator[tuple[BoardDetection, list[BoardDetection]]]:
         """Give those that still wait, and forget all."""
         for place in range(len(self._near) - self._n_waiting, len(self._near)):
             yield self._near[place], self._around(self._near[place])
         self._near.clear()
         self._n_waiting = 0
 
-    def _around(self, sighting: Sighting) -> list[Sighting]:
+    def _around(self, sighting: BoardDetection) -> list[BoardDetection]:
         time_ns = sighting.frame.time_ns
         return [other for other in self._near if abs(other.frame.time_ns - time_ns) <= self._half_ns]

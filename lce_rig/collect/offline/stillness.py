@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import Moment, Sighting
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard
@@ -30,8 +30,8 @@ class StillnessOptions:
 
 
 def find_still_moments(
-    sightings: Iterable[Sighting], board: Board, options: StillnessOptions
-) -> Iterator[Moment]:
+    sightings: Iterable[BoardDetection], board: Board, options: StillnessOptions
+) -> Iterator[CaptureMoment]:
     """Yield the stillest moment of every stretch in which the board stands still."""
     gate = StillnessGate(board, options)
     for sighting in sightings:
@@ -59,12 +59,12 @@ class StillnessGate:
         self.held_s: float | None = None
         self._board = board
         self._options = options
-        self._window: deque[Sighting] = deque()
-        self._best: Moment | None = None
+        self._window: deque[BoardDetection] = deque()
+        self._best: CaptureMoment | None = None
         self._best_m = np.inf
         self._since_ns = 0
 
-    def take(self, sighting: Sighting) -> Moment | None:
+    def take(self, sighting: BoardDetection) -> CaptureMoment | None:
         """Take the next sighting, and give the moment of a stretch that has ended with it."""
         options, now_ns = self._options, sighting.frame.time_ns
         self.motion_m = self._measure(sighting)
@@ -73,19 +73,19 @@ class StillnessGate:
             self._since_ns = now_ns if self._best is None else self._since_ns
             if self._best is None or self.motion_m < self._best_m:
                 middle = self._window[len(self._window) // 2]
-                self._best = Moment(middle, {"motion_m": round(self.motion_m, 6)})
+                self._best = CaptureMoment(middle, {"motion_m": round(self.motion_m, 6)})
                 self._best_m = self.motion_m
         self.held_s = (now_ns - self._since_ns) * 1e-9 if is_still else None
         if self._best is not None and (not is_still or now_ns - self._since_ns > options.dwell_s * 1e9):
             return self.finish()
         return None
 
-    def finish(self) -> Moment | None:
+    def finish(self) -> CaptureMoment | None:
         """Give the moment of the stretch that lasts, where there is one, and end it."""
         best, self._best, self.held_s = self._best, None, None
         return best
 
-    def _measure(self, sighting: Sighting) -> float:
+    def _measure(self, sighting: BoardDetection) -> float:
         """Put a sighting into the window and measure how far the board moved in it."""
         window, options = self._window, self._options
         is_seen = sighting.is_usable
@@ -99,19 +99,19 @@ class StillnessGate:
         return _motion_m(window, self._board, options.max_motion_m) if is_full else np.inf
 
 
-def _is_gap(window: deque[Sighting], sighting: Sighting, options: StillnessOptions) -> bool:
+def _is_gap(window: deque[BoardDetection], sighting: BoardDetection, options: StillnessOptions) -> bool:
     return bool(window) and not 0 < sighting.frame.time_ns - window[-1].frame.time_ns < options.window_s * 1e9
 
 
-def _span_s(window: deque[Sighting]) -> float:
+def _span_s(window: deque[BoardDetection]) -> float:
     return (window[-1].frame.time_ns - window[0].frame.time_ns) * 1e-9
 
 
-def _step_s(window: deque[Sighting]) -> float:
+def _step_s(window: deque[BoardDetection]) -> float:
     return (window[1].frame.time_ns - window[0].frame.time_ns) * 1e-9
 
 
-def _motion_m(window: deque[Sighting], board: Board, max_motion_m: float) -> float:
+def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) -> float:
     """Measure how far the board moved within a window.
 
     Corners tell of motion across the line of sight much better than poses do; planes tell of motion along it.

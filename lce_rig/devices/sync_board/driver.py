@@ -13,11 +13,11 @@ from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.protocol import SourceStatus
 from lce_rig.devices.reading import LiveSource
+from lce_rig.devices.sync_board.board_report import BoardView, clock_state, device_words, figures, problems
 from lce_rig.devices.sync_board.board_state import Arrival, BoardState
 from lce_rig.devices.sync_board.lines import DIALECTS, LineReader
 from lce_rig.devices.sync_board.lines.lce1 import VERSION
 from lce_rig.devices.sync_board.lines.messages import Hello
-from lce_rig.devices.sync_board.report import BoardView, clock_state, device_words, figures, problems
 from lce_rig.rig.sync_settings import BOARD, SyncSettings
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 

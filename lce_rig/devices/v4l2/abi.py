@@ -38,7 +38,7 @@ NEXT_CONTROL = 0x8000_0000
 CONTROL_DISABLED, CONTROL_READ_ONLY, CONTROL_INACTIVE = 0x1, 0x4, 0x10
 INTEGER, BOOLEAN, MENU, BUTTON, INTEGER64, BITMASK, INTEGER_MENU = 1, 2, 3, 4, 5, 8, 9
 EXPOSURE_ABSOLUTE_ID = 0x009A_0902
-"""Control of the exposure, in units of 100 us."""
+"""V4l2Control of the exposure, in units of 100 us."""
 
 DISCRETE_SIZES = 1
 
@@ -209,7 +209,7 @@ class _ControlUnion(Union):
     _fields_ = (("value", c_int32), ("value64", c_int64), ("pointer", c_void_p))
 
 
-class Control(Structure):
+class V4l2Control(Structure):
     """The value of one setting."""
 
     _pack_ = 1
@@ -217,7 +217,7 @@ class Control(Structure):
     _fields_ = (("id", c_uint32), ("size", c_uint32), ("reserved2", c_uint32), ("value", _ControlUnion))
 
 
-class Controls(Structure):
+class V4l2Controls(Structure):
     """The values of several settings."""
 
     _fields_ = (
@@ -226,7 +226,7 @@ class Controls(Structure):
         ("error_idx", c_uint32),
         ("request_fd", c_int32),
         ("reserved", c_uint32),
-        ("controls", POINTER(Control)),
+        ("controls", POINTER(V4l2Control)),
     )
 
 
@@ -246,7 +246,7 @@ STREAM_ON = _code(_WRITE, 18, c_int32)
 STREAM_OFF = _code(_WRITE, 19, c_int32)
 SET_PARAMETERS = _code(_BOTH, 22, CaptureParameters)
 QUERY_MENU = _code(_BOTH, 37, MenuQuery)
-GET_CONTROLS = _code(_BOTH, 71, Controls)
-SET_CONTROLS = _code(_BOTH, 72, Controls)
+GET_CONTROLS = _code(_BOTH, 71, V4l2Controls)
+SET_CONTROLS = _code(_BOTH, 72, V4l2Controls)
 ENUMERATE_SIZES = _code(_BOTH, 74, FrameSize)
 QUERY_CONTROL = _code(_BOTH, 103, ControlQuery)

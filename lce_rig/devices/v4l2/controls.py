@@ -80,8 +80,8 @@ def apply_controls(device: VideoDevice, sensor: str, wanted: Mapping[str, Value]
 
 def read_control(device: VideoDevice, info: ControlInfo) -> int | None:
     """Read one setting; None where the device does not say."""
-    control = abi.Control(id=info.id)
-    if not device.grants(abi.GET_CONTROLS, abi.Controls(count=1, controls=pointer(control))):
+    control = abi.V4l2Control(id=info.id)
+    if not device.grants(abi.GET_CONTROLS, abi.V4l2Controls(count=1, controls=pointer(control))):
         return None
     return int(control.value.value64 if info.type == abi.INTEGER64 else control.value.value)
 
@@ -102,13 +102,13 @@ def read_exposure_us(device: VideoDevice, known: Mapping[str, ControlInfo]) -> f
 
 
 def _set(device: VideoDevice, sensor: str, name: str, info: ControlInfo, value: int) -> None:
-    control = abi.Control(id=info.id)
+    control = abi.V4l2Control(id=info.id)
     if info.type == abi.INTEGER64:
         control.value.value64 = value
     else:
         control.value.value = value
     try:
-        device.ioctl(abi.SET_CONTROLS, abi.Controls(count=1, controls=pointer(control)))
+        device.ioctl(abi.SET_CONTROLS, abi.V4l2Controls(count=1, controls=pointer(control)))
     except OSError as error:
         hint = "Remove it from driver.controls, or see `v4l2-ctl --list-ctrls-menus`."
         if info.flags & abi.CONTROL_READ_ONLY:

@@ -7,8 +7,8 @@ import numpy as np
 
 from lce_rig.recordings.events.aedat4_file import MAGIC, Aedat4File, add_broken, read_header, vector_at
 from lce_rig.recordings.events.stream import (
+    DamageCounts,
     EventColumns,
-    Findings,
     NoEventsError,
     join_small,
     parse_size,
@@ -41,7 +41,7 @@ class Aedat4Events:
         _, attributes = self._file.header.streams[number]
         self.resolution_px = parse_size(attributes.get("sizeX", ""), attributes.get("sizeY", ""))
 
-    def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         """Yield the events, some packets at a time."""
         yield from join_small(self._packets(findings), _STRETCH_EVENTS)
 
@@ -52,10 +52,10 @@ class Aedat4Events:
             last = None if table is None else _decode_packet(table)
         except Exception:  # As below.
             return None
-        first = next((packet for packet in self._packets(Findings()) if len(packet)), None)
+        first = next((packet for packet in self._packets(DamageCounts()) if len(packet)), None)
         return int(last.t_ns[-1]) - int(first.t_ns[0]) if first is not None and last else None
 
-    def _packets(self, findings: Findings) -> Iterator[EventColumns]:
+    def _packets(self, findings: DamageCounts) -> Iterator[EventColumns]:
         for where, table in self._file.packets(self._number, findings):
             try:
                 events = _decode_packet(table)

@@ -18,7 +18,7 @@ from typing import BinaryIO
 
 from lce_rig.core import limits, unpacking
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import Findings, open_recorded
+from lce_rig.recordings.events.stream import DamageCounts, open_recorded
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 _LZ4_MAGIC, _ZSTD_MAGIC = b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd"
@@ -91,7 +91,7 @@ class Aedat4File:
             self.notes.append(f"{self.path.name}: {what} of stream {numbers[0]}, the first of {len(numbers)}")
         return numbers[0] if numbers else None
 
-    def packets(self, stream: int, findings: Findings) -> Iterator[tuple[str, bytes]]:
+    def packets(self, stream: int, findings: DamageCounts) -> Iterator[tuple[str, bytes]]:
         """Yield the packets of a stream as flatbuffers, with their place; damaged ones are skipped."""
         with open_recorded(self.path) as file:
             for place in self._places(file, findings):
@@ -106,12 +106,12 @@ class Aedat4File:
     def n_packets(self, stream: int) -> int:
         """Count the packets of a stream; only their heads are read."""
         with open_recorded(self.path) as file:
-            return sum(place.stream == stream for place in self._places(file, Findings()))
+            return sum(place.stream == stream for place in self._places(file, DamageCounts()))
 
     def last_packet(self, stream: int) -> bytes | None:
         """Read the last whole packet of a stream, not those before it; None where there is none."""
         with open_recorded(self.path) as file:
-            places = [place for place in self._places(file, Findings()) if place.stream == stream]
+            places = [place for place in self._places(file, DamageCounts()) if place.stream == stream]
             for place in reversed(places):
                 file.seek(place.at)
                 try:
@@ -120,7 +120,7 @@ class Aedat4File:
                     continue
         return None
 
-    def _places(self, file: BinaryIO, findings: Findings) -> Iterator[PacketPlace]:
+    def _places(self, file: BinaryIO, findings: DamageCounts) -> Iterator[PacketPlace]:
         n_bytes = self.path.stat().st_size
         end = min(self.header.end or n_bytes, n_bytes)
         position, n_packets = self.header.begin, 0
@@ -197,7 +197,7 @@ def vector_at(table: bytes, index: int) -> tuple[int, int]:
     return at + 4, int(length)
 
 
-def add_broken(findings: Findings, where: str, error: Exception) -> None:
+def add_broken(findings: DamageCounts, where: str, error: Exception) -> None:
     """Count a packet that cannot be decoded."""
     findings.add("broken packets left out", f"{where}: {str(error) or type(error).__name__}")
 

@@ -13,7 +13,7 @@ from lce_rig.core.data import Image, Sample, Stream
 from lce_rig.recordings.events import open_events
 from lce_rig.recordings.events.aedat4_file import Aedat4File, add_broken, field_at, vector_at
 from lce_rig.recordings.events.choice import CameraEvents
-from lce_rig.recordings.events.stream import NS_PER_US, Findings, NoEventsError
+from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, NoEventsError
 from lce_rig.recordings.fingerprint import fingerprint
 from lce_rig.recordings.merging import merge_by_time
 from lce_rig.recordings.protocol import SourceOptions, Span
@@ -30,7 +30,7 @@ from lce_rig.rig import Rig
 # References:
 #     https://gitlab.com/inivation/dv/dv-processing/-/blob/master/include/dv-processing/data/frame_base.hpp
 
-# Places in dv's table Frame; 1 and 2 are of the read-out.
+# Places in dv's table Aedat4Image; 1 and 2 are of the read-out.
 _TIMESTAMP, _EXPOSURE_START, _EXPOSURE_END, _FORMAT, _WIDTH, _HEIGHT, _PIXELS, _EXPOSURE = (
     0,
     3,
@@ -46,7 +46,7 @@ _CHANNELS = {0: 1, 16: 3, 24: 4}
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class Aedat4Image:
     """One image of a file.
 
     Attributes:
@@ -68,15 +68,15 @@ class Aedat4Frames:
         self._file = file
         self._number = number
 
-    def first(self) -> Frame | None:
+    def first(self) -> Aedat4Image | None:
         """Decode the first frame that is whole; None where there is none."""
-        return next(self.frames(Findings()), None)
+        return next(self.frames(DamageCounts()), None)
 
     def count(self) -> int:
         """Count the frames, damaged ones too, without decoding them."""
         return self._file.n_packets(self._number)
 
-    def frames(self, findings: Findings) -> Iterator[Frame]:
+    def frames(self, findings: DamageCounts) -> Iterator[Aedat4Image]:
         """Yield the frames as they lie in the file; damaged ones are skipped and counted."""
         for where, table in self._file.packets(self._number, findings):
             try:
@@ -98,7 +98,7 @@ class Aedat4Frames:
             return None
 
 
-def decode_frame(table: bytes) -> Frame:
+def decode_frame(table: bytes) -> Aedat4Image:
     """Decode one packet.
 
     Raises:
@@ -115,7 +115,7 @@ def decode_frame(table: bytes) -> Frame:
         mid_ns = stamp_us * NS_PER_US + exposure_us * NS_PER_US // 2
     if abs(mid_ns) >= limits.MAX_TIME_NS:
         raise ValueError("its timestamp is beyond any clock")
-    return Frame(mid_ns, exposure_us * NS_PER_US, _pixels(table))
+    return Aedat4Image(mid_ns, exposure_us * NS_PER_US, _pixels(table))
 
 
 def _pixels(table: bytes) -> NDArray[np.uint8]:
@@ -178,7 +178,7 @@ class EventCameraFile:
             SourceError: after all that can be read, where the events' clock was set back.
         """
         parts: list[Iterator[Sample]] = []
-        findings = Findings()
+        findings = DamageCounts()
         if self._events is not None:
             parts.append(self._events.samples())
         if self._frames is not None:
@@ -222,7 +222,7 @@ class EventCameraFile:
         self.notes.append(f"{self.path.name}: {self._camera}.{channel} {_meaning(first.exposure_ns)}")
         return frames
 
-    def _images(self, frames: Aedat4Frames, findings: Findings) -> Iterator[Sample]:
+    def _images(self, frames: Aedat4Frames, findings: DamageCounts) -> Iterator[Sample]:
         last_ns: int | None = None
         for frame in frames.frames(findings):
             if last_ns is not None and frame.mid_exposure_ns <= last_ns:

@@ -13,9 +13,9 @@ from lce_rig.core.errors import SourceError
 from lce_rig.recordings.events.stream import (
     NO_EVENTS,
     NS_PER_US,
+    DamageCounts,
     EventColumns,
     EventStream,
-    Findings,
     KnowsItsLength,
     NoEventsError,
     join,
@@ -41,7 +41,7 @@ _MAX_DAMAGED_SHARE = 0.25
 
 
 def in_time_order(
-    path: Path, stretches: Iterator[EventColumns], findings: Findings
+    path: Path, stretches: Iterator[EventColumns], findings: DamageCounts
 ) -> Iterator[EventColumns]:
     """Yield stretches whose timestamps never decrease, within and from one to the next.
 
@@ -60,7 +60,7 @@ def in_time_order(
         yield sorter.held
 
 
-def _on_any_clock(stretch: EventColumns, findings: Findings) -> EventColumns:
+def _on_any_clock(stretch: EventColumns, findings: DamageCounts) -> EventColumns:
     """Leave out timestamps so far from zero that their differences overflow."""
     t_ns = stretch.t_ns
     limit = limits.MAX_TIME_NS
@@ -78,7 +78,7 @@ class _Sorter:
         held: ordered events that have not been yielded.
     """
 
-    def __init__(self, path: Path, findings: Findings) -> None:
+    def __init__(self, path: Path, findings: DamageCounts) -> None:
         self.held: EventColumns | None = None
         self._path = path
         self._findings = findings
@@ -157,7 +157,7 @@ class _Clock:
         self._shift_ns = 0
         self._n_wraps = 0
 
-    def unwrap(self, stretch: EventColumns, findings: Findings) -> EventColumns:
+    def unwrap(self, stretch: EventColumns, findings: DamageCounts) -> EventColumns:
         """Undo the wraps of the next stretch.
 
         Raises:
@@ -246,10 +246,10 @@ class EventRecording:
         self.path = path
         self.sensor = sensor
         self._stream = stream
-        self._findings = Findings()
+        self._findings = DamageCounts()
         self._assumed: list[str] = []
         self._span_ns: tuple[int, int] | None = None
-        self._window = _Window(self)
+        self._window = _TimeWindow(self)
         if not any(len(stretch) for stretch in self._stretches(self._findings)):
             said = "; ".join(self._findings.lines())
             raise NoEventsError(f"{path} holds no events" + (f": {said}" if said else ""))
@@ -316,7 +316,7 @@ class EventRecording:
         Raises:
             SourceError: the timestamps run back for good, or events lie off the sensor.
         """
-        findings = Findings()
+        findings = DamageCounts()
         first_ns = last_ns = None
         try:
             for stretch in in_time_order(self.path, self._stretches(findings), findings):
@@ -338,7 +338,7 @@ class EventRecording:
         """
         return self._window.read(start_ns, end_ns)
 
-    def _stretches(self, findings: Findings) -> Iterator[EventColumns]:
+    def _stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         """Read the stream; a disk that fails is an error the user can repair."""
         try:
             yield from self._stream.stretches(findings)
@@ -373,7 +373,7 @@ class EventRecording:
         if profile_px or file_px:
             return profile_px or file_px or (0, 0)
         width = height = 0
-        for stretch in self._stretches(Findings()):
+        for stretch in self._stretches(DamageCounts()):
             if len(stretch):
                 width = max(width, int(stretch.x.max()) + 1)
                 height = max(height, int(stretch.y.max()) + 1)
@@ -385,7 +385,7 @@ class EventRecording:
         self._assumed.append(f"declares no resolution; {width}x{height}, the extent of its events, is taken")
         return width, height
 
-    def _on_sensor(self, stretch: EventColumns, findings: Findings) -> EventColumns:
+    def _on_sensor(self, stretch: EventColumns, findings: DamageCounts) -> EventColumns:
         width, height = self.resolution_px
         right, bottom = int(stretch.x.max()), int(stretch.y.max())
         if right < width and bottom < height:
@@ -402,7 +402,7 @@ class EventRecording:
         return stretch.select(is_on)
 
 
-class _Window:
+class _TimeWindow:
     """The ranges of the last window, and the pass through the recording that continues there."""
 
     def __init__(self, recording: EventRecording) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core import limits, unpacking
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import EventColumns, Findings, open_recorded, to_ns
+from lce_rig.recordings.events.stream import DamageCounts, EventColumns, open_recorded, to_ns
 
 _BLOCK_EVENTS = 1 << 20
 _COLUMNS = ("t", "x", "y", "p")
@@ -70,14 +70,14 @@ class Hdf5Events:
         self.resolution_px = (width, height) if width and height else None
         self._offset_us = _integer(file, "t_offset") or _integer(events, "t_offset") or 0
 
-    def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         """Yield the events a million at a time.
 
         Raises:
             SourceError: they are compressed by a filter that is not installed, or damaged.
         """
         with _open(self._path) as file:
-            columns = [_Column(file["events"][name]) for name in _COLUMNS]
+            columns = [_Hdf5Column(file["events"][name]) for name in _COLUMNS]
             for begin in range(0, self._n_events, _BLOCK_EVENTS):
                 end = min(begin + _BLOCK_EVENTS, self._n_events)
                 try:
@@ -90,7 +90,7 @@ class Hdf5Events:
                         return
                     raise _unreadable(self._path, file, error) from None
 
-    def _to_columns(self, block: list[NDArray[Any]], findings: Findings) -> EventColumns:
+    def _to_columns(self, block: list[NDArray[Any]], findings: DamageCounts) -> EventColumns:
         t_us, x, y, polarity = block
         if t_us.dtype.kind == "f":
             is_whole = np.floor(t_us) == t_us
@@ -104,7 +104,7 @@ class Hdf5Events:
         return EventColumns(t_ns, x.astype(np.uint16), y.astype(np.uint16), polarity > 0)
 
 
-class _Column:
+class _Hdf5Column:
     """A column of events, read in ranges.
 
     HDF5 takes what memory a deflated chunk unpacks to, however much more that is than it should. Chunks large

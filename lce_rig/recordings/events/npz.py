@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lce_rig.core.errors import SourceError
 from lce_rig.core.event_file import EventArchive
-from lce_rig.recordings.events.stream import EventColumns, Findings, open_recorded
+from lce_rig.recordings.events.stream import DamageCounts, EventColumns, open_recorded
 
 _STRETCH_EVENTS = 1 << 20
 
@@ -25,7 +25,7 @@ class NpzEvents:
         with _archive(path) as archive:
             self.resolution_px = archive.resolution_px
 
-    def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         """Yield the events a million at a time.
 
         Raises:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lce_rig.core import limits
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.events.counter import WrappingCounter
-from lce_rig.recordings.events.stream import NS_PER_US, EventColumns, Findings, open_recorded, parse_size
+from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, EventColumns, open_recorded, parse_size
 from lce_rig.recordings.events.word_codec import EVT3, WordDecoder
 
 # Prophesee's EVT2 (32-bit words) and EVT2.1 (64-bit words, 32 pixels of a row each).
@@ -132,7 +132,7 @@ class PropheseeEvents:
                 f"{path.name}: its header's size {limits.describe(size)} is not a sensor's; ignored"
             )
 
-    def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         """Yield the events of the file, block by block."""
         dtype = np.dtype(_WORDS[self._version])
         decoder: Any = WordDecoder(EVT3) if self._version == "3" else Evt2Decoder(self._version == "21")

@@ -78,7 +78,7 @@ def join_small(stretches: Iterator[EventColumns], n_events: int) -> Iterator[Eve
 
 
 @dataclass
-class Findings:
+class DamageCounts:
     """Events skipped or repaired while reading: their number, and the first position.
 
     Attributes:
@@ -95,7 +95,7 @@ class Findings:
             self.first.setdefault(kind, where)
             self.counts[kind] = self.counts.get(kind, 0) + n
 
-    def merge(self, other: "Findings") -> None:
+    def merge(self, other: "DamageCounts") -> None:
         """Take over what a more complete pass over the same recording found."""
         for kind, count in other.counts.items():
             if count >= self.counts.get(kind, 0):
@@ -128,7 +128,7 @@ class EventStream(Protocol):
         """What was chosen or assumed on opening, in words."""
         ...
 
-    def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         """Yield the events from the beginning, as they lie in the file; may be called again and again.
 
         Raises:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core import limits, unpacking
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import EventColumns, Findings, open_recorded, parse_size, to_ns
+from lce_rig.recordings.events.stream import DamageCounts, EventColumns, open_recorded, parse_size, to_ns
 
 _BLOCK_BYTES = 1 << 18
 _N_COLUMNS = 4
@@ -53,7 +53,7 @@ class TextEvents:
             )
         self.resolution_px = parse_size(first[0].decode(), first[1].decode()) if self._has_size else None
 
-    def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         """Yield the events of some megabytes of text at a time."""
         with _open(self._path) as file:
             if self._has_size:
@@ -104,7 +104,7 @@ def _open(path: Path) -> Iterator[IO[bytes]]:
             yield member
 
 
-def _parse_block(block: bytes, first_line: int, findings: Findings) -> NDArray[np.float64]:
+def _parse_block(block: bytes, first_line: int, findings: DamageCounts) -> NDArray[np.float64]:
     """Parse whole lines; (N, 4). The fast way serves where every line is sound, as nearly always."""
     lines = block.splitlines()
     table = _parse_quickly(block, lines)

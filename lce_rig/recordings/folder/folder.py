@@ -9,10 +9,11 @@ from pathlib import Path
 from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError
 from lce_rig.core.limits import read_file
-from lce_rig.recordings.folder import cloud_file, image_file
 from lce_rig.recordings.folder.cloud import to_scan
+from lce_rig.recordings.folder.cloud_file import DECODERS, read_cloud
 from lce_rig.recordings.folder.file_pairs import Pairing, natural_order, pair_names, parse_times
-from lce_rig.recordings.protocol import Pair, PairMethod, SourceOptions
+from lce_rig.recordings.folder.image_file import SUFFIXES, read_image
+from lce_rig.recordings.protocol import PairMethod, RecordedPair, SourceOptions
 from lce_rig.recordings.sensor_choice import choose_camera, choose_lidar
 from lce_rig.rig import LidarSettings, Rig
 
@@ -39,7 +40,7 @@ def list_pictures(folder: Path, notes: list[str]) -> list[Path]:
     Raises:
         SourceError: there are none, or several folders have some and no name tells which is meant.
     """
-    return _list(folder, IMAGE_FOLDERS, image_file.SUFFIXES, "pictures", notes)
+    return _list(folder, IMAGE_FOLDERS, SUFFIXES, "pictures", notes)
 
 
 def list_clouds(folder: Path, notes: list[str]) -> list[Path]:
@@ -48,7 +49,7 @@ def list_clouds(folder: Path, notes: list[str]) -> list[Path]:
     Raises:
         SourceError: as `list_pictures`.
     """
-    return _list(folder, CLOUD_FOLDERS, frozenset(cloud_file.DECODERS), "clouds", notes)
+    return _list(folder, CLOUD_FOLDERS, frozenset(DECODERS), "clouds", notes)
 
 
 def list_pictures_by_camera(folder: Path, cameras: Collection[str]) -> dict[str, list[Path]]:
@@ -61,9 +62,7 @@ def list_pictures_by_camera(folder: Path, cameras: Collection[str]) -> dict[str,
     for place in (*above, folder):
         folders = _folders(place)
         found = {
-            name: files
-            for name in cameras
-            if name in folders and (files := _files(folders[name], image_file.SUFFIXES))
+            name: files for name in cameras if name in folders and (files := _files(folders[name], SUFFIXES))
         }
         if found:
             return found
@@ -122,7 +121,7 @@ class PictureOnDisk:
         Raises:
             SourceError: it is missing, empty, truncated or damaged.
         """
-        return Image(self.camera, self.channel, self.stamp_ns, image_file.read_image(self.path))
+        return Image(self.camera, self.channel, self.stamp_ns, read_image(self.path))
 
 
 @dataclass(frozen=True)
@@ -157,20 +156,20 @@ class PairOnDisk:
                 raise SourceError(f"{path}: {error}") from None
         return digest.hexdigest()
 
-    def read(self) -> Pair:
+    def read(self) -> RecordedPair:
         """Decode all files.
 
         Raises:
             SourceError: one is missing, empty, truncated or damaged.
         """
         images = tuple(picture.read() for picture in self.pictures)
-        cloud = cloud_file.read_cloud(self.cloud_path)
+        cloud = read_cloud(self.cloud_path)
         reading = to_scan(cloud, self.lidar, self.settings, str(self.cloud_path), self.cloud_stamp_ns)
         notes = list(reading.notes)
         if reading.n_not_finite or reading.n_zero_range:
             n_dropped = reading.n_not_finite + reading.n_zero_range
             notes.append(f"{self.cloud_path.name}: {n_dropped} points without a return left out")
-        return Pair(self.label, self.key(), images, (reading.scan,), tuple(notes))
+        return RecordedPair(self.label, self.key(), images, (reading.scan,), tuple(notes))
 
 
 class FolderRecording:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core import limits
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import NS_PER_US, EventColumns, Findings, seconds_in
+from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, EventColumns, seconds_in
 from lce_rig.recordings.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
 from lce_rig.recordings.ros.bag_file import BagFile, list_topics
 from lce_rig.recordings.ros.event_array import decode_event_array
@@ -145,7 +145,7 @@ class PacketDecoder:
                 yield EventColumns(events.t_ns, events.x, events.y, events.polarity, host_ns)
                 host_ns = None
 
-    def account(self, findings: Findings) -> None:
+    def account(self, findings: DamageCounts) -> None:
         """Say what was passed over, and what could not be decoded inside packets."""
         findings.add("packets of triggers passed over", n=self._n_trigger_packets)
         findings.add("events before the first stamp left out", n=self._evt3.n_untimed)
@@ -229,11 +229,11 @@ class BagEvents:
 
     def duration_ns(self) -> int | None:
         """Count from the receipt of the first message to that of the last."""
-        first = next((message for _, message in _messages(self._bag, self._topic, Findings())), None)
+        first = next((message for _, message in _messages(self._bag, self._topic, DamageCounts())), None)
         end_ns = self._bag.end_ns(self._topic)
         return None if first is None or end_ns is None else end_ns - first.log_ns
 
-    def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         """Yield the events, one or several messages at a time."""
         decoder = PacketDecoder()
         last_number: int | None = None
@@ -266,7 +266,7 @@ class BagEvents:
             raise ValueError(f"it is of {size[0]}x{size[1]} pixels")
 
     def _first_header(self) -> EventHeader | None:
-        for _, message in _messages(self._bag, self._topic, Findings()):
+        for _, message in _messages(self._bag, self._topic, DamageCounts()):
             try:
                 if self._is_array:
                     return decode_event_array(message.data, message.encoding)[0]
@@ -293,14 +293,14 @@ def read_triggers(path: Path, topic: str | None = None) -> Triggers:
 
 
 def _packets(bag: BagFile, topic: str) -> Iterator[EventPacket]:
-    for _, message in _messages(bag, topic, Findings()):
+    for _, message in _messages(bag, topic, DamageCounts()):
         try:
             yield parse_packet(message.data, message.encoding)
         except ValueError:
             continue
 
 
-def _messages(bag: BagFile, topic: str, findings: Findings) -> Iterator[tuple[int, RawMessage]]:
+def _messages(bag: BagFile, topic: str, findings: DamageCounts) -> Iterator[tuple[int, RawMessage]]:
     """Yield the messages of a topic with their number; where the bag is torn, that is said and all."""
     messages = bag.messages({topic})
     index = 0

@@ -193,7 +193,7 @@ _N_PROBED = 500
 
 
 @dataclass
-class _Stream:
+class _BagStream:
     """The messages of one topic so far."""
 
     last_ns: int | None = None
@@ -258,7 +258,7 @@ class BagRecording:
                 self.notes += [note for note in events.notes if note not in self.notes]
 
     def _messages(self) -> Iterator[Sample]:
-        streams = {topic: _Stream() for topic in self._targets}
+        streams = {topic: _BagStream() for topic in self._targets}
         try:
             for message in self._bag.messages(self._targets.keys()):
                 stream = streams[message.topic]
@@ -323,7 +323,7 @@ class BagRecording:
             pass  # It is said when everything in front of the damage has been read.
         return found
 
-    def _decode(self, message: RawMessage, stream: _Stream) -> Image | Scan | None:
+    def _decode(self, message: RawMessage, stream: _BagStream) -> Image | Scan | None:
         target = self._targets[message.topic]
         try:
             content = _deserialize(message)
@@ -339,7 +339,7 @@ class BagRecording:
             return None
 
     def _to_sample(
-        self, message: RawMessage, content: Any, target: Target, stamp_ns: int, stream: _Stream
+        self, message: RawMessage, content: Any, target: Target, stamp_ns: int, stream: _BagStream
     ) -> Image | Scan:
         if target.channel is not None:
             is_compressed = message.msgtype.endswith("CompressedImage")
@@ -356,7 +356,7 @@ class BagRecording:
         stream.counts["points without a return"] += n_dropped
         return reading.scan
 
-    def _summarise(self, streams: dict[str, _Stream]) -> None:
+    def _summarise(self, streams: dict[str, _BagStream]) -> None:
         for topic, stream in streams.items():
             for note in sorted(stream.notes):
                 self.notes.append(f"{topic}: {note}")
@@ -392,7 +392,7 @@ def _typestore(is_ros1: bool) -> Any:
     return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
 
 
-def _is_in_order(sample: Image | Scan, stream: _Stream) -> bool:
+def _is_in_order(sample: Image | Scan, stream: _BagStream) -> bool:
     """Return whether a sample's timestamp is later than its predecessor's; count it where it is not."""
     stamp_ns = sample.stamp_ns
     if stamp_ns is None or stream.last_ns is None or stamp_ns > stream.last_ns:

@@ -8,6 +8,7 @@ import numpy as np
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.findings import Figure, Finding
+from lce_rig.recordings.velodyne.driver_controls import read_controls
 from lce_rig.recordings.velodyne.packet import (
     BadPacketError,
     DataPacket,
@@ -18,7 +19,6 @@ from lce_rig.recordings.velodyne.packet import (
 )
 from lce_rig.recordings.velodyne.packet_order import OrderCounts, PacketOrder, Place
 from lce_rig.recordings.velodyne.points import Vlp16Decoder, keep_brighter
-from lce_rig.recordings.velodyne.settings import read_controls
 from lce_rig.rig import LidarSettings
 from lce_rig.timing.clock import resolve_hour
 

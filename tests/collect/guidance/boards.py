@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lce_rig.collect.guidance import SensorModel, View
+from lce_rig.collect.guidance import SensorModel, SensorPlace
 from lce_rig.collect.guidance.sensor_noise import ErrorModel
 from lce_rig.core.geometry import Array, invert
 from lce_rig.rig import QualitySettings
@@ -35,9 +35,9 @@ def model(errors: ErrorModel | None = None) -> SensorModel:
     )
 
 
-def view(errors: ErrorModel | None = None) -> View:
+def view(errors: ErrorModel | None = None) -> SensorPlace:
     """Look along the LiDAR's x axis."""
-    return View.upright(model(errors), T_FORWARD)
+    return SensorPlace.upright(model(errors), T_FORWARD)
 
 
 def placements(n: int, seed: int) -> Array:

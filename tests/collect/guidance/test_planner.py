@@ -8,7 +8,7 @@ import pytest
 from lce_rig.collect.guidance import (
     Novelty,
     Planner,
-    View,
+    SensorPlace,
     is_reachable,
     is_there,
     model_sensors,
@@ -103,10 +103,10 @@ def test_of_placements_nearly_as_good_the_nearest_is_taken(planner, guided):
 def test_it_is_enough_when_the_target_is_predicted_and_not_before(guided):
     modest = replace(model(), target_sigma_rad=np.radians(0.5), target_sigma_m=0.03)
     strict = replace(model(), target_sigma_rad=np.radians(0.02), target_sigma_m=0.001)
-    few = Planner(View.upright(modest, T_FORWARD), n_places=20)
+    few = Planner(SensorPlace.upright(modest, T_FORWARD), n_places=20)
     assert few.guide(guided).is_enough
     assert not few.guide(guided[:10]).is_enough
-    assert not Planner(View.upright(strict, T_FORWARD), n_places=20).guide(guided).is_enough
+    assert not Planner(SensorPlace.upright(strict, T_FORWARD), n_places=20).guide(guided).is_enough
 
 
 def test_a_capture_of_what_is_held_is_refused_and_says_where_to_go(planner, guided):
@@ -147,7 +147,7 @@ def test_the_shipped_rigs_can_be_guided():
         rig = load_rig(name)
         sensors = model_sensors(rig, camera, "lidar")
         nominal = rig.nominal(camera, "lidar").to_matrix()
-        assert Planner(View.upright(sensors, nominal), n_places=60).guide(NONE).T_cam_board is not None
+        assert Planner(SensorPlace.upright(sensors, nominal), n_places=60).guide(NONE).T_cam_board is not None
 
 
 def test_a_lidar_whose_beams_are_not_known_is_named():
@@ -199,7 +199,7 @@ def test_beyond_the_target_only_what_was_captured_is_refused():
     bold, crowd, present = crowded()
     assert bold.adds_nothing(crowd, present).code == "calibrate.little_gain"
     modest = replace(model(), target_sigma_rad=np.radians(20.0), target_sigma_m=1.0)
-    met = Planner(View.upright(modest, T_FORWARD), Novelty(0.001, 0.05), n_places=100)
+    met = Planner(SensorPlace.upright(modest, T_FORWARD), Novelty(0.001, 0.05), n_places=100)
     assert met.guide(crowd).is_enough
     assert met.adds_nothing(crowd, present) is None
     assert met.adds_nothing(crowd, crowd[2]).figures["capture"] == "3"

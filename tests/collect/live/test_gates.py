@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import Sighting
+from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.collect.live.capture_triggers import StillBoards
 from lce_rig.collect.live.guide import make_guides
 from lce_rig.core.geometry import Array
@@ -26,11 +26,11 @@ def boards(k: int = 0) -> tuple[ImageBoard, list[LidarBoard]]:
     return image, scan
 
 
-def sighting(step: int, shift_px: float = 0.0, k: int = 0) -> Sighting:
+def sighting(step: int, shift_px: float = 0.0, k: int = 0) -> BoardDetection:
     """Show a placement at a time, its corners shifted."""
     image, scan = boards(k)
     moved = replace(image, corners_px=image.corners_px + shift_px)
-    return Sighting(Frame(step * PERIOD_NS, (), ()), {KEY: moved}, {"lidar": scan})
+    return BoardDetection(Frame(step * PERIOD_NS, (), ()), {KEY: moved}, {"lidar": scan})
 
 
 def present() -> Array:

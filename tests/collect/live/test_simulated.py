@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lce_rig.collect.guidance import HeldPose, Person, View, build_pose, model_sensors
+from lce_rig.collect.guidance import HeldPose, Person, SensorPlace, build_pose, model_sensors
 from lce_rig.collect.live.simulated import WALK_MPS, Walker
 from lce_rig.core.geometry import Array, invert
 from lce_rig.simulate import SimulationOptions
@@ -17,13 +17,13 @@ def scene() -> LiveScene:
 
 
 @pytest.fixture
-def view() -> View:
+def view() -> SensorPlace:
     nominal = rig().nominal("davis", "lidar")
     assert nominal is not None
-    return View.upright(model_sensors(rig(), "davis", "lidar"), nominal.to_matrix())
+    return SensorPlace.upright(model_sensors(rig(), "davis", "lidar"), nominal.to_matrix())
 
 
-def walk(scene: LiveScene, view: View, wanted: HeldPose) -> tuple[Array, float]:
+def walk(scene: LiveScene, view: SensorPlace, wanted: HeldPose) -> tuple[Array, float]:
     """Stand in front, be sent somewhere and go: T_cam_board then, and how long it took."""
     T_world_cam = scene.stage.T_world_sensor["davis"]
     scene.hold(T_world_cam @ build_pose(view, HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0)))
@@ -36,7 +36,7 @@ def walk(scene: LiveScene, view: View, wanted: HeldPose) -> tuple[Array, float]:
     return invert(T_world_cam) @ scene.T_world_board, now_s - 100.0
 
 
-def test_the_person_walks_to_where_the_board_is_wanted(scene: LiveScene, view: View) -> None:
+def test_the_person_walks_to_where_the_board_is_wanted(scene: LiveScene, view: SensorPlace) -> None:
     reached, took_s = walk(scene, view, HeldPose(0.3, 3.0, 0.0, 10.0, 0.0, 45.0))
     wanted = build_pose(view, HeldPose(0.3, 3.0, 0.0, 10.0, 0.0, 45.0))
     assert np.linalg.norm(reached[:3, 3] - wanted[:3, 3]) < 0.15
@@ -44,7 +44,9 @@ def test_the_person_walks_to_where_the_board_is_wanted(scene: LiveScene, view: V
     assert took_s == pytest.approx(way_m / WALK_MPS, abs=0.4)
 
 
-def test_where_a_wall_is_in_the_way_the_person_goes_as_far_as_they_can(scene: LiveScene, view: View) -> None:
+def test_where_a_wall_is_in_the_way_the_person_goes_as_far_as_they_can(
+    scene: LiveScene, view: SensorPlace
+) -> None:
     reached, _ = walk(scene, view, HeldPose(0.0, 12.0, 0.0, 0.0, 0.0, 45.0))
     # The room ends nine metres ahead.
     assert 3.0 < reached[2, 3] < 9.0

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from lce_rig.recordings.events.aedat4_file import Aedat4File
-from lce_rig.recordings.events.camera_file import Aedat4Frames, Frame, decode_frame
-from lce_rig.recordings.events.stream import Findings
+from lce_rig.recordings.events.camera_file import Aedat4Frames, Aedat4Image, decode_frame
+from lce_rig.recordings.events.stream import DamageCounts
+from tests.notes import kinds
 from tests.recordings.events.aedat4_files import RawFrame, flatbuffer, write_davis
 from tests.recordings.events.encoders import random_events
 
@@ -19,11 +20,11 @@ GREY = RNG.integers(0, 256, (260, 346), dtype=np.uint8)
 COLOUR = RNG.integers(0, 256, (260, 346, 3), dtype=np.uint8)
 
 
-def read(path: Path, findings: Findings | None = None) -> list[Frame]:
+def read(path: Path, findings: DamageCounts | None = None) -> list[Aedat4Image]:
     file = Aedat4File(path)
     number = file.first_stream("FRME")
     assert number is not None
-    return list(Aedat4Frames(file, number).frames(findings or Findings()))
+    return list(Aedat4Frames(file, number).frames(findings or DamageCounts()))
 
 
 @pytest.mark.parametrize("style", ["dv", "dv-processing", "exposure only"])
@@ -87,9 +88,9 @@ def test_a_damaged_frame_costs_only_itself_and_is_counted(tmp_path: Path) -> Non
     second = [found.start() for found in re.finditer(b"FRME", data)][-2]
     data[second : second + 4] = b"????"
     path.write_bytes(data[:-100])
-    findings = Findings()
+    findings = DamageCounts()
     assert [f.mid_exposure_ns for f in read(path, findings)] == [(START_US + 4000) * 1000]
-    assert findings.counts == {"broken packets left out": 1, "torn ends of the file left out": 1}
+    assert kinds(findings.counts) == {"broken packets": 1, "torn ends": 1}
 
 
 def test_pictures_that_contradict_themselves_are_refused_by_what_is_wrong() -> None:

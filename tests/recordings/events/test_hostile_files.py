@@ -17,8 +17,9 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.event_file import encode_events
 from lce_rig.recordings.events import open_events
 from lce_rig.recordings.events.camera_file import decode_frame
-from lce_rig.recordings.events.stream import EventColumns, Findings, parse_size, to_ns
+from lce_rig.recordings.events.stream import DamageCounts, EventColumns, parse_size, to_ns
 from lce_rig.recordings.events.text import TextEvents
+from tests.notes import has_note, kinds
 from tests.recordings.events import encoders
 from tests.recordings.events.aedat4_files import STREAM, XML, RawFrame, flatbuffer, frame_packet
 from tests.recordings.events.encoders import listed, random_events
@@ -44,7 +45,7 @@ def test_a_pipe_or_device_in_place_of_a_file_is_refused_at_once(tmp_path: Path, 
     os.mkfifo(tmp_path / f"pipe.{suffix}")
     (tmp_path / f"zero.{suffix}").symlink_to("/dev/zero")
     for name in ("pipe", "zero"):
-        assert "pipe or device" in refusal(tmp_path / f"{name}.{suffix}")
+        assert "or device" in refusal(tmp_path / f"{name}.{suffix}")
 
 
 # HDF5
@@ -81,12 +82,12 @@ def test_links_out_of_an_hdf5_file_are_never_followed(tmp_path: Path) -> None:
         assert cause in refusal(write_h5(tmp_path / "a.h5", make))
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["events"] = h5py.ExternalLink(other, "/events")
-    assert "events is a link" in refusal(tmp_path / "a.h5")
+    assert has_note([refusal(tmp_path / "a.h5")], "events is", "a link")
     WRITERS["a.h5"](tmp_path / "a.h5", EVENTS)
     with h5py.File(tmp_path / "a.h5", "a") as file:
         del file["t_offset"]
         file["t_offset"] = h5py.ExternalLink(other, "/t_offset")
-    assert "t_offset is a link" in refusal(tmp_path / "a.h5")
+    assert has_note([refusal(tmp_path / "a.h5")], "t_offset is", "a link")
 
 
 @pytest.mark.parametrize(
@@ -133,7 +134,7 @@ def test_attributes_of_hdf5_that_are_no_numbers_are_refused_by_name(tmp_path: Pa
         WRITERS["a.h5"](tmp_path / "a.h5", EVENTS)
         with h5py.File(tmp_path / "a.h5", "a") as file:
             file.attrs["width"] = value
-        assert "width is no number" in refusal(tmp_path / "a.h5")
+        assert has_note([refusal(tmp_path / "a.h5")], "width is", "no number")
 
 
 @pytest.mark.parametrize("chunks", [None, (1 << 16,)])
@@ -141,7 +142,7 @@ def test_events_that_hdf5_declares_and_does_not_store_are_refused(
     tmp_path: Path, chunks: tuple[int, ...] | None
 ) -> None:
     path = write_h5(tmp_path / "a.h5", lambda f, name: f.create_dataset(name, (10**12,), "i8", chunks=chunks))
-    assert "declares 1e+12 events, and stores 0 MB" in refusal(path)
+    assert has_note([refusal(path)], "1e+12 events", "0 MB")
 
 
 def test_chunks_of_hdf5_larger_than_any_are_refused(tmp_path: Path) -> None:
@@ -159,7 +160,7 @@ def test_a_chunk_of_hdf5_that_unpacks_to_more_than_it_says_is_refused(tmp_path: 
         data = file.create_dataset(name, (1000,), "i8", chunks=(1000,), compression="gzip")
         data.id.write_direct_chunk((0,), bomb)
 
-    assert "unpacks to more than" in refusal(write_h5(tmp_path / "a.h5", make))
+    assert "unpacks to" in refusal(write_h5(tmp_path / "a.h5", make))
 
 
 @pytest.mark.parametrize(("dtype", "options"), [("<u4", {}), (">i8", {"shuffle": True, "fletcher32": True})])
@@ -204,7 +205,7 @@ def test_packets_that_unpack_to_more_than_a_camera_sends_are_refused(tmp_path: P
     else:
         packer = pytest.importorskip("backports.zstd").ZstdCompressor()
         parts = [*(packer.compress(piece) for _ in range(n_pieces)), packer.flush()]
-    assert "unpacks to more than" in refusal(aedat4(tmp_path / "a.aedat4", [b"".join(parts)]))
+    assert "unpacks to" in refusal(aedat4(tmp_path / "a.aedat4", [b"".join(parts)]))
 
 
 def test_entities_in_the_head_of_aedat4_are_not_expanded(tmp_path: Path) -> None:
@@ -215,12 +216,12 @@ def test_entities_in_the_head_of_aedat4_are_not_expanded(tmp_path: Path) -> None
 
 
 def test_heads_of_aedat4_that_are_deep_or_huge_are_refused(tmp_path: Path) -> None:
-    assert "its streams: none" in refusal(aedat4(tmp_path / "a.aedat4", [], b"<a>" * 9999 + b"</a>" * 9999))
+    assert "streams: none" in refusal(aedat4(tmp_path / "a.aedat4", [], b"<a>" * 9999 + b"</a>" * 9999))
     (tmp_path / "b.aedat4").write_bytes(b"#!AER-DAT4.0\r\n" + struct.pack("<I", 1 << 30))
     os.truncate(tmp_path / "b.aedat4", 1 << 31)
     assert "declares 1074 MB" in refusal(tmp_path / "b.aedat4")
     long = XML.format(streams=STREAM.format(number="9" * 5000, kind="EVTS", name="", width=1, height=1))
-    assert "has no number" in refusal(aedat4(tmp_path / "c.aedat4", [], long.encode()))
+    assert "no number" in refusal(aedat4(tmp_path / "c.aedat4", [], long.encode()))
 
 
 def test_zeros_behind_the_packets_of_aedat4_are_a_torn_end_and_no_packets(tmp_path: Path) -> None:
@@ -251,22 +252,22 @@ def test_lines_that_never_end_cost_the_rest_of_the_text_alone(tmp_path: Path) ->
         file.write(b"1" * (20 << 20))
     recording = open_events(tmp_path / "a.txt")
     assert everything(recording) == listed(EVENTS)
-    assert any("line 2002: it is longer than 4096 bytes" in note for note in recording.notes)
+    assert has_note(recording.notes, "line 2002", "4096 bytes")
 
 
 @pytest.mark.parametrize("content", [b"1" * (1 << 22), b" " * (1 << 22), b"0.1 1 1 " + b"1" * 10**5 + b"\n"])
 def test_text_that_begins_with_an_endless_line_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.txt").write_bytes(content)
-    assert "neither a size nor an event" in refusal(tmp_path / "a.txt")
+    assert "neither a size" in refusal(tmp_path / "a.txt")
 
 
 def test_one_long_word_among_many_short_ones_takes_no_memory(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_bytes(
         b"346 260\n" + b"1 1 1 1\n" * 9999 + b"1" * 4000 + b" 1 1 1\n0.1 1 1 1\n"
     )
-    findings = Findings()
+    findings = DamageCounts()
     assert sum(map(len, TextEvents(tmp_path / "a.txt").stretches(findings))) == 10_000
-    assert findings.counts == {"broken lines left out": 1}
+    assert kinds(findings.counts) == {"broken lines": 1}
 
 
 @pytest.mark.parametrize("word", [b"nan", b"inf", b"1e300", b"1e999", b"-1e300", b"1" * 200, b"\xff\x00"])
@@ -280,7 +281,7 @@ def test_times_in_text_that_are_on_no_clock_are_left_out(tmp_path: Path, word: b
 def test_a_zip_whose_text_is_far_longer_than_text_packs_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr("events.txt", b"346 260\n" + b"1" * (40 << 20))
-    assert "'events.txt' declares 42 MB" in refusal(tmp_path / "a.zip")
+    assert has_note([refusal(tmp_path / "a.zip")], "'events.txt'", "42 MB")
     write_zip(tmp_path / "b.zip", EVENTS)
     assert everything(open_events(tmp_path / "b.zip")) == listed(EVENTS)
 
@@ -290,7 +291,7 @@ def test_other_archives_than_deflated_ones_are_refused(tmp_path: Path) -> None:
         with zipfile.ZipFile(tmp_path / name, "w", method) as archive:
             for member in ["t.txt"] if name == "a.zip" else ["t.npy", "x.npy", "y.npy", "p.npy"]:
                 archive.writestr(member, b"346 260\n1 1 1 1\n")
-        assert "not by deflate" in refusal(tmp_path / name)
+        assert "by deflate" in refusal(tmp_path / name)
 
 
 def test_an_npz_without_a_size_takes_the_extent_and_one_with_it_its_own(tmp_path: Path) -> None:
@@ -315,12 +316,12 @@ def test_a_size_in_a_raw_header_that_no_sensor_has_is_left_aside_and_said(tmp_pa
     (tmp_path / "a.raw").write_bytes(head + encoders.evt3(truth))
     recording = open_events(tmp_path / "a.raw", resolution=(346, 260))
     assert everything(recording) == truth
-    assert any("is not a sensor's; ignored" in note for note in recording.notes)
+    assert has_note(recording.notes, "sensor's; ignored")
 
 
 def test_a_raw_header_without_an_end_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.raw").write_bytes(b"% evt 3.0\n" + b"% a b\n" * (1 << 17))
-    assert "its header is longer than 256 kB" in refusal(tmp_path / "a.raw")
+    assert has_note([refusal(tmp_path / "a.raw")], "header", "256 kB")
 
 
 # Time and resolution
@@ -356,7 +357,7 @@ def test_stamps_at_the_ends_of_64_bits_are_left_out_and_the_others_kept() -> Non
     zeros = np.zeros(1000, np.uint16)
     recording = record(EventColumns(t_ns, zeros, zeros, zeros > 0))
     assert stamps_us(recording) == [i for i in range(1000) if i not in (100, 200, 300, 400)]
-    assert any("4 events with stamps beyond any clock" in note for note in recording.notes)
+    assert has_note(recording.notes, "4 events", "any clock")
 
 
 def test_a_clock_that_wraps_at_every_event_is_refused() -> None:
@@ -375,14 +376,14 @@ def test_more_events_than_a_camera_sends_that_stay_mixed_are_refused(monkeypatch
 
 def test_an_extent_beyond_any_sensor_is_refused(tmp_path: Path) -> None:
     write_h5(tmp_path / "a.h5", lambda f, name: f.create_dataset(name, data=np.array([0, 65_000])))
-    assert "reach column 65000, row 65000" in refusal(tmp_path / "a.h5")
+    assert has_note([refusal(tmp_path / "a.h5")], "column 65000", "row 65000")
 
 
 def test_a_recording_whose_every_stamp_is_beyond_any_clock_says_so(tmp_path: Path) -> None:
     data = io.BytesIO()
     np.savez(data, t=np.array([1 << 62]), x=[1], y=[1], p=[1])
     (tmp_path / "a.npz").write_bytes(data.getvalue())
-    assert "times beyond any clock" in refusal(tmp_path / "a.npz")
+    assert "any clock" in refusal(tmp_path / "a.npz")
     zeros = np.zeros(3, np.uint16)
     recording = record(EventColumns(np.full(3, T_MAX), zeros, zeros, zeros > 0))
     with pytest.raises(SourceError, match="could be put in order: 3 events with stamps beyond"):

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.events.event_recording import REORDER_NS, EventRecording
-from lce_rig.recordings.events.stream import EventColumns, Findings
+from lce_rig.recordings.events.stream import DamageCounts, EventColumns
+from tests.notes import has_note
 from tests.recordings.events.encoders import random_events
 
 PATH = Path("recording.test")
@@ -27,7 +28,7 @@ class ListedStream:
         self.notes: list[str] = []
         self._stretches = stretches
 
-    def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         yield from self._stretches
 
 
@@ -85,7 +86,7 @@ def test_a_clock_that_was_set_back_is_refused_with_figures_after_what_is_sound()
     with pytest.raises(SourceError, match=r"run back by 5\.999 s") as caught:
         for stretch in record(columns(first[:500]), columns(first[500:]), columns(second)):
             delivered += stretch.t_ns.tolist()
-    assert "split the recording" in caught.value.hint
+    assert "split" in caught.value.hint
     assert delivered == (first * 1000).tolist()
 
 
@@ -93,7 +94,7 @@ def test_events_before_the_clock_is_set_at_the_start_are_left_out_and_counted() 
     before, after = 10**12 + np.arange(200) * 1000, np.arange(1000) * 1000
     recording = record(columns(before), columns(after[:400]), columns(after[400:]))
     assert stamps_us(recording) == after.tolist()
-    assert any("200 events before the clock was set left out" in note for note in recording.notes)
+    assert has_note(recording.notes, "200 events", "before")
     assert recording.duration_s == pytest.approx(0.999)
     assert recording.start_ns == 0
 
@@ -106,7 +107,7 @@ def test_a_single_stray_stamp_is_left_out_and_counted(stray_us: int, at: int) ->
     t_us[at] += stray_us
     recording = record(columns(t_us[:500]), columns(t_us[500:]))
     assert stamps_us(recording) == np.delete(truth, at).tolist()
-    assert any("1 events with stray stamps left out" in note for note in recording.notes)
+    assert has_note(recording.notes, "1 events", "stray")
 
 
 def test_a_damaged_stretch_between_sound_ones_is_left_out_and_counted() -> None:
@@ -115,7 +116,7 @@ def test_a_damaged_stretch_between_sound_ones_is_left_out_and_counted() -> None:
     t_us[600:700] += 10**9
     recording = record(columns(t_us[:500]), columns(t_us[500:]))
     assert stamps_us(recording) == np.delete(truth, np.arange(600, 700)).tolist()
-    assert any("100 events with stray stamps left out" in note for note in recording.notes)
+    assert has_note(recording.notes, "100 events", "stray")
 
 
 def test_events_off_the_sensor_are_left_out_when_few_and_refused_when_many() -> None:
@@ -124,7 +125,7 @@ def test_events_off_the_sensor_are_left_out_when_few_and_refused_when_many() -> 
     few[7], many[::2] = 2000, 400
     recording = record(replace(stretch, x=few))
     assert sum(map(len, recording)) == 999
-    assert any("1 events off the sensor left out (first: column 2000" in note for note in recording.notes)
+    assert has_note(recording.notes, "1 events", "off", "column 2000")
     with pytest.raises(SourceError, match=r"500 of 1000 events lie off.*346x260"):
         list(record(replace(stretch, x=many)))
 
@@ -160,7 +161,7 @@ def test_windows_that_go_forward_are_read_in_one_pass() -> None:
     class CountedStream(ListedStream):
         n_read = 0
 
-        def stretches(self, findings: Findings) -> Iterator[EventColumns]:
+        def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
             for stretch in self._stretches:
                 self.n_read += 1
                 yield stretch

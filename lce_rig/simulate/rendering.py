@@ -116,7 +116,7 @@ def _paint_mirror_images(radiance: Array, scene: Scene, backdrop: Backdrop) -> N
 
 
 @dataclass(frozen=True, eq=False)
-class _Window:
+class _ImageWindow:
     """The part of an image that board and carrier can cover, h by w pixels.
 
     Attributes:
@@ -136,7 +136,7 @@ def _paint_moving(radiance: Array, scene: Scene, backdrop: Backdrop, n_subpixels
     if rows.stop <= rows.start or cols.stop <= cols.start:
         return
     corners = backdrop.corner_rays[rows.start : rows.stop + 1, cols.start : cols.stop + 1]
-    window = _Window(corners, radiance[rows, cols].copy(), backdrop.range_m[rows, cols])
+    window = _ImageWindow(corners, radiance[rows, cols].copy(), backdrop.range_m[rows, cols])
     label, colour, light = _look_through_centres(scene, backdrop, window)
     painted = np.where((label >= 0)[..., None], colour * light, window.backdrop)
 
@@ -154,7 +154,7 @@ def _paint_moving(radiance: Array, scene: Scene, backdrop: Backdrop, n_subpixels
 
 
 def _look_through_centres(
-    scene: Scene, backdrop: Backdrop, window: _Window
+    scene: Scene, backdrop: Backdrop, window: _ImageWindow
 ) -> tuple[NDArray[np.int32], Array, Array]:
     """Cast one ray a pixel: label (h, w) of what is seen, -1 the backdrop; its colour and light (h, w, 3)."""
     shape = window.backdrop.shape
@@ -175,7 +175,7 @@ def _look_through_centres(
 def _look_through(
     scene: Scene,
     origin: Array,
-    window: _Window,
+    window: _ImageWindow,
     lights: tuple[Array, Array],
     pixels: tuple[NDArray[np.intp], NDArray[np.intp]],
     rays: Array,
