@@ -14,7 +14,7 @@ def test_one_board_that_the_lidar_missed_is_no_contradiction():
 
 def test_many_boards_that_are_not_where_the_extrinsic_puts_them_are_one():
     (doubt,) = contradictions(GOOD, RIG, n_elsewhere=10, n_seen=30)
-    assert doubt.startswith("in 10 of 30 captures")
+    assert "10 of 30" in doubt
 
 
 def test_large_residuals_are_named_with_their_limit():
@@ -23,6 +23,5 @@ def test_large_residuals_are_named_with_their_limit():
 
 
 def test_a_session_without_boards_cannot_agree():
-    assert contradictions(None, RIG, n_elsewhere=0, n_seen=0) == (
-        "no capture shows the board to both sensors",
-    )
+    (doubt,) = contradictions(None, RIG, n_elsewhere=0, n_seen=0)
+    assert "no capture" in doubt
