@@ -27,6 +27,16 @@ Refused captures have `stage` and `cause` in place of `severity` and `text`; the
 `read`, `image`, `lidar`, `pair` (camera and LiDAR disagree) or `calibrate`. Codes that end in `.text` come
 from results of earlier versions, which held words only.
 
+| command | prints with `--json` |
+|---|---|
+| `check` | what was detected in each capture, or its refusal |
+| `calibrate` | the content of result.json, with `findings` and `captures_refused` of each camera and LiDAR |
+| `verify` | residuals of each capture; `doubts`: findings by which captures contradict the extrinsics |
+| `repeat` | `findings` on the sessions; for each camera and LiDAR figures and a `finding`, the verdict |
+| `doctor` | each check with its `findings` ([more](doctor.md)) |
+
+Exit codes are the same with and without `--json`.
+
 `scripts/findings_page.py` writes this page from the tables in `lce_rig/words/`.
 """
 

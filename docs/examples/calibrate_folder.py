@@ -28,10 +28,13 @@ def main(rig_name: str, folder: str, session_folder: str) -> None:
         print(shortage)
     written = result.write()
     print(f"{len(written.files)} files in {written.files[0].parent}")
-    lce.verify(session, result).write()
+    overlays = lce.verify(session, result).write()
+    print(f"overlays: {', '.join(str(each.contact_sheet) for each in overlays)}")
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 4:
+        sys.exit(__doc__)
     try:
         main(*sys.argv[1:])
     except lce.LceRigError as error:

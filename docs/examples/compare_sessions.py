@@ -19,11 +19,18 @@ def main(first: str, second: str) -> None:
     result = lce.calibrate(lce.Session.open(first))
     verification = lce.verify(lce.Session.open(second), result)
     for check in verification.checks:
-        print(f"{check.pair} on the captures of {second}: {'; '.join(check.doubts) or 'no contradiction'}")
+        doubts = "; ".join(map(lce.describe, check.doubts))
+        print(f"{check.pair} on the captures of {second}: {doubts or 'no contradiction'}")
         for residual in check.residuals:
             plane_mm, edge_mm = 1000 * residual.plane_mean_m, 1000 * residual.edge_mean_m
             print(f"  {residual.capture}: planes {plane_mm:.1f} mm, edges {edge_mm:.1f} mm")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
+    try:
+        main(*sys.argv[1:])
+    except lce.LceRigError as error:
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_code)

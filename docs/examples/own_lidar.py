@@ -51,4 +51,10 @@ def main(rig_name: str, folder: str, session_folder: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    if len(sys.argv) != 4:
+        sys.exit(__doc__)
+    try:
+        main(*sys.argv[1:])
+    except lce.LceRigError as error:
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_code)

@@ -7,6 +7,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import event_image_option, json_option, session_argument
+from lce_rig.words import describe
 
 
 @click.command()
@@ -41,7 +42,7 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
         checks = verification.write(output, progress=progress)
     if as_json:
         show.print_json(
-            {"format_version": 1, "rig": opened.rig.name, "pairs": [c.document() for c in checks]}
+            {"format_version": 2, "rig": opened.rig.name, "pairs": [c.document() for c in checks]}
         )
     else:
         for checked in checks:
@@ -55,7 +56,9 @@ def verify(session: Path, result: Path | None, output: Path | None, as_json: boo
         raise ResultRefusedError(
             f"the captures of {session} contradict the extrinsic of "
             + " and that of ".join(str(checked.pair) for checked in contradicted),
-            "\n".join(f"{checked.pair}: {doubt}" for checked in contradicted for doubt in checked.doubts),
+            "\n".join(
+                f"{checked.pair}: {describe(doubt)}" for checked in contradicted for doubt in checked.doubts
+            ),
         )
 
 
@@ -81,7 +84,7 @@ def _summary(checked: Any) -> list[str]:
             f"together {1000 * m.mge_m:.1f} mm; corners {m.reprojection_px:.2f} px"
         )
     lines.append(f"verdict of the calibration: {checked.calibration.verdict}")
-    lines.append(f"these captures: {'; '.join(checked.doubts) or 'agree'}")
+    lines.append(f"these captures: {'; '.join(map(describe, checked.doubts)) or 'agree'}")
     if checked.contact_sheet is not None:
         lines.append(f"pictures: {show.escape(str(checked.contact_sheet))}")
     return lines

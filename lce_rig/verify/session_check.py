@@ -11,6 +11,7 @@ import numpy as np
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SessionError
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import Calibration, CaptureResidual, ImageBoard, LidarBoard, Metrics, Observation
 from lce_rig.detect.detection import Detections, Pair
@@ -27,7 +28,7 @@ from lce_rig.verify.canvas import Picture
 from lce_rig.verify.event_picture import CameraView
 from lce_rig.verify.overlay import camera_part, draw_overlay
 from lce_rig.verify.overlay_files import write_overlays
-from lce_rig.words import describe
+from lce_rig.words import as_json
 
 # Boards that moved between picture and sweep, brought together as the calibration brought them.
 
@@ -169,7 +170,7 @@ class SessionCheck:
 
     pair: Pair
     calibration: Calibration
-    doubts: tuple[str, ...]
+    doubts: tuple[Finding, ...]
     residuals: tuple[CaptureResidual, ...]
     metrics: Metrics | None
     meetings: Mapping[str, Meeting]
@@ -192,7 +193,7 @@ class SessionCheck:
             "channel": self.pair.channel,
             "lidar": self.pair.lidar,
             "verdict": self.calibration.verdict,
-            "doubts": list(self.doubts),
+            "doubts": [as_json(doubt) for doubt in self.doubts],
             "metrics": None
             if self.metrics is None
             else {**asdict(self.metrics), "mge_m": self.metrics.mge_m},
@@ -273,8 +274,8 @@ def draw_check(
     return replace(check, pictures=tuple(files[:-1]), contact_sheet=files[-1] if files else None)
 
 
-def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: int) -> tuple[str, ...]:
-    """Say where captures contradict an extrinsic: large residuals, or no board where it should be.
+def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: int) -> tuple[Finding, ...]:
+    """Find where captures contradict an extrinsic: large residuals, or no board where it should be.
 
     Args:
         metrics: of the captures in which both sensors see the board in one place; None without any.
@@ -283,15 +284,12 @@ def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: 
             LiDAR missed among other things of its size is no contradiction, many are.
         n_seen: captures in which both sensors saw something.
     """
-    beyond = [] if metrics is None else residuals_beyond(metrics, rig.quality)
-    doubts = [describe(finding) for finding in beyond]
+    doubts = [] if metrics is None else residuals_beyond(metrics, rig.quality)
     if 4 * n_elsewhere > n_seen:
-        text = (
-            f"in {n_elsewhere} of {n_seen} captures nothing in the scan is where the extrinsic puts the board"
-        )
-        doubts.append(text)
+        figures = {"n_elsewhere": n_elsewhere, "n_captures": n_seen}
+        doubts.append(Finding("verify.elsewhere", "error", figures=figures))
     if n_seen == 0:
-        doubts.append("no capture shows the board to both sensors")
+        doubts.append(Finding("verify.unseen", "error"))
     return tuple(doubts)
 
 

@@ -1,4 +1,4 @@
-"""Why an extrinsic is doubted: the reasons of a verdict, its notes, the comparison with other sessions."""
+"""Why an extrinsic is doubted: the reasons of a verdict, its notes, other captures, other sessions."""
 
 import math
 
@@ -216,6 +216,10 @@ PHRASES: dict[str, Phrase] = {
         "check whether a camera has moved, and the intrinsics",
     ),
     "verdict.widened": Phrase(_widened),
+    "verify.elsewhere": Phrase(
+        "in {n_elsewhere} of {n_captures} captures nothing in the scan is where the extrinsics put the board"
+    ),
+    "verify.unseen": Phrase("no capture shows the board to both sensors"),
     "repeat.agree": Phrase(_agree),
     "repeat.disagree": Phrase(
         "the {n_sessions} calibrations of {camera} and {lidar} disagree: they differ by up to "

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from lce_rig.cli.main import run
+from lce_rig.words import Phrase, rendering
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,16 @@ def lce_rig(capsys):
         return Outcome(code, captured.out, captured.err)
 
     return call
+
+
+@pytest.fixture
+def mute(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every rendered text is its code alone."""
+    told = {
+        code: Phrase(code, code, dict.fromkeys(phrase.actions or (), code))
+        for code, phrase in rendering.phrases().items()
+    }
+    monkeypatch.setattr(rendering, "phrases", lambda: told)
 
 
 @pytest.fixture(scope="session")

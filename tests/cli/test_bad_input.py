@@ -42,24 +42,23 @@ def test_inner_corners_counted_wrongly_are_named_with_what_is_seen(lce_rig, sess
     assert "8x5" in outcome.err and "9x6" in outcome.err
 
 
-@pytest.mark.parametrize(("square_m", "measured"), [(0.064, "6[78]"), (0.072, "6[78]")])
-def test_squares_of_the_wrong_size_fail_and_the_right_size_is_told(lce_rig, session, square_m, measured):
+@pytest.mark.parametrize(("square_m", "measured_m"), [(0.064, 0.068), (0.072, 0.068)])
+def test_squares_of_the_wrong_size_fail_and_the_right_size_is_told(lce_rig, session, square_m, measured_m):
     edit_profile(session, board__square_m=square_m)
     outcome = lce_rig("calibrate", session)
     assert outcome.code in (6, 7)
     if outcome.code == 7:
-        import re
-
-        assert re.search(
-            rf"squares measure {measured}\.\d mm instead of {1000 * square_m:.1f} mm", outcome.out
-        )
+        (pair,) = json.loads((session / "calibration" / "result.json").read_text())["pairs"]
+        (scale,) = (each["figures"] for each in pair["findings"] if each["code"] == "verdict.scale")
+        assert scale["profile_square_m"] == square_m
+        assert scale["square_m"] == pytest.approx(measured_m, abs=0.001)
 
 
 def test_width_and_height_swapped_are_found_in_the_profile_already(lce_rig, session):
     edit_profile(session, board__width_m=0.6, board__height_m=0.8)
     outcome = lce_rig("calibrate", session)
     assert outcome.code == 4
-    assert "does not fit on a plate 0.6 x 0.8 m" in outcome.err
+    assert "0.6 x 0.8 m" in outcome.err
 
 
 def test_intrinsics_of_another_resolution_are_named_with_both_sizes(lce_rig, session):
@@ -89,10 +88,10 @@ def test_pictures_without_a_board_say_so(lce_rig, session, tmp_path):
             writer.add_capture([grey], [capture.scan("lidar")], {"source": capture.name})
     outcome = lce_rig("calibrate", tmp_path / "empty")
     assert outcome.code == 6
-    assert "in 0 of 3 captures" in outcome.err
+    assert "0 of 3" in outcome.err
     outcome = lce_rig("check", tmp_path / "empty")
     assert outcome.code == 6
-    assert "0 of 3 captures can be used" in outcome.out
+    assert "0 of 3 captures" in outcome.out
 
 
 def test_a_session_whose_captures_are_all_damaged_names_the_damage(lce_rig, session):
@@ -131,8 +130,8 @@ def test_a_manifest_that_points_outside_the_session_is_refused(lce_rig, session,
     manifest.write_text(json.dumps(document))
     outcome = lce_rig("check", session)
     assert outcome.code == 0
-    assert "000002: read:" in outcome.out
-    assert "outside the capture's folder" in outcome.out
+    (refused,) = (line for line in outcome.out.splitlines() if "000002: read:" in line)
+    assert "outside" in refused and "secret.png" in refused
 
 
 @pytest.mark.parametrize(
@@ -148,7 +147,7 @@ def test_a_capture_with_a_bad_manifest_is_refused_alone(lce_rig, session, change
     manifest.write_text(json.dumps(document))
     outcome = lce_rig("check", session)
     assert outcome.code == 0
-    assert "2 of 3 captures can be used" in outcome.out and "000002: read:" in outcome.out
+    assert "2 of 3 captures" in outcome.out and "000002: read:" in outcome.out
 
 
 @pytest.mark.parametrize(

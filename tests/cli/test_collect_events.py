@@ -46,11 +46,11 @@ def test_a_lidars_bag_and_a_davis_file_make_a_session_that_a_second_run_leaves_a
 ) -> None:
     outcome = collect(lce_rig, folder, tmp_path / "s", "lidar.bag", "davis.aedat4")
     assert outcome.code == 0, outcome.err
-    assert "1 capture (1 new)" in outcome.err and "s of davis.events" in outcome.err
+    assert "1 capture (1 new)" in outcome.err and "davis.events" in outcome.err
     (capture,) = Session.open(tmp_path / "s").captures
     assert capture.event_cameras == ["davis"] and capture.has_image("davis", "frames")
     again = collect(lce_rig, folder, tmp_path / "s", "davis.aedat4", "lidar.bag")
-    assert again.code == 0 and "1 capture (0 new, 1 known already)" in again.err
+    assert again.code == 0 and "(0 new, 1 known" in again.err
 
 
 @pytest.mark.parametrize(
@@ -77,5 +77,5 @@ def test_a_board_that_makes_no_events_gives_no_captures_and_the_reason(lce_rig, 
     bag(tmp_path / "few.bag", few)
     outcome = collect(lce_rig, tmp_path, tmp_path / "s", "few.bag")
     assert outcome.code == 6
-    assert "not captured:" in outcome.err and "move it sideways slowly, about 10 cm/s" in outcome.err
-    assert "no capture could be made of" in outcome.err and "The board must move slowly" in outcome.err
+    assert "few.bag" in outcome.err and "10 cm/s" in outcome.err
+    assert not Session.open(tmp_path / "s").captures

@@ -98,7 +98,7 @@ def test_debug_images_show_the_reconstruction_and_the_events(lce_rig, moving):
 def test_the_event_map_is_refused_where_the_network_is_not(lce_rig, moving):
     outcome = lce_rig("check", moving, "--event-image", "map")
     assert outcome.code == 0  # the frames still serve
-    assert "0 of 1 captures can be used" in outcome.out and "1 of 1 captures can be used" in outcome.out
+    assert "0 of 1 captures" in outcome.out and "1 of 1 captures" in outcome.out
 
 
 def test_verify_draws_the_lidar_and_the_events_for_each_channel(lce_rig, moving, tmp_path):
@@ -122,7 +122,7 @@ def test_verify_takes_the_channels_that_a_session_has(lce_rig, moving):
     words = ["verify", moving.parent / "frames", "--result", moving / "calibration" / "result.json"]
     outcome = lce_rig(*words)
     assert outcome.code == 0, outcome.err
-    assert "davis.frames and lidar" in outcome.out and "davis.events and lidar" not in outcome.out
+    assert "davis.frames" in outcome.out and "davis.events" not in outcome.out
 
 
 def test_rigs_show_and_check_know_how_pictures_are_made(lce_rig, tmp_path):
@@ -130,8 +130,8 @@ def test_rigs_show_and_check_know_how_pictures_are_made(lce_rig, tmp_path):
     block = "        kind: events\n        reconstruction: {model: mine.onnx, window_s: 0.05}\n"
     (tmp_path / "mine.yaml").write_text(text.replace("        kind: events\n", block, 1), encoding="utf-8")
     shown = lce_rig("rigs", "show", tmp_path / "mine.yaml")
-    assert "pictures from events" in shown.out and "50 ms" in shown.out and "mine.onnx" in shown.out
-    assert "pictures from events" not in lce_rig("rigs", "show", "rlfs").out
+    assert "from events" in shown.out and "50 ms" in shown.out and "mine.onnx" in shown.out
+    assert "from events" not in lce_rig("rigs", "show", "rlfs").out
     missing = lce_rig("rigs", "check", tmp_path / "mine.yaml")
     assert missing.code == 3
     for part in ("mine.yaml", "cameras.davis.channels.events.reconstruction.model", "no such file"):

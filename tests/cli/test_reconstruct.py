@@ -34,7 +34,7 @@ def test_pictures_and_their_stamps_are_written_and_the_warm_up_is_told(lce_rig, 
     pictures = sorted(path.name for path in (tmp_path / "out").glob("*.png"))
     assert len(pictures) == len(lines) - 1 > 3
     assert cv2.imread(str(tmp_path / "out" / pictures[0])).shape == (48, 64, 3)
-    assert "pictures left out" in outcome.err
+    assert "left out" in outcome.err
 
 
 def test_the_event_map_needs_no_warm_up(lce_rig, tmp_path):
@@ -82,7 +82,7 @@ def stamps(folder):
 def test_a_start_after_the_end_is_refused_with_the_recordings_length(lce_rig, tmp_path):
     outcome = lce_rig("reconstruct", recording(tmp_path / "a.npz"), "-o", tmp_path / "out", "--start", 60)
     assert outcome.code == 2
-    assert "ends 1.200 s after its first event" in outcome.err
+    assert "--start 60" in outcome.err and "1.200 s" in outcome.err
 
 
 def test_an_animation_is_written_beside_the_pictures(lce_rig, tmp_path):
@@ -110,11 +110,11 @@ def test_a_video_of_an_unknown_kind_is_refused_with_those_that_are_known(lce_rig
     ]
     outcome = lce_rig(*words)
     assert outcome.code == 5
-    assert ".mp4, .avi, .mkv" in outcome.err
+    assert all(kind in outcome.err for kind in (".mp4", ".avi", ".mkv"))
 
 
 def test_one_wild_stamp_does_not_ask_for_images_of_centuries(lce_rig, tmp_path):
     np.savez(tmp_path / "a.npz", t=[0, 1000, 10**15], x=[1, 2, 3], y=[1, 2, 3], p=[0, 1, 1])
     outcome = lce_rig("reconstruct", tmp_path / "a.npz", "-o", tmp_path / "out")
     assert outcome.code == 2
-    assert "maximum 1000000. Set --duration" in outcome.err
+    assert "maximum 1000000" in outcome.err and "--duration" in outcome.err

@@ -13,7 +13,7 @@ from lce_rig.rig import find_profile, load_rig
 def test_called_bare_it_lists_the_profiles(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["rigs"]) == 0
     out = capsys.readouterr().out
-    assert all(name in out for name in ("rlfs", "rles", "sss", "davis (frames, events)"))
+    assert all(name in out for name in ("rlfs", "rles", "sss", "(frames, events)"))
     assert run(["rigs", "list"]) == 0
     assert capsys.readouterr().out == out
 
@@ -49,10 +49,11 @@ def test_check_exits_by_what_it_finds(capsys: pytest.CaptureFixture[str], tmp_pa
     path = tmp_path / "mine.yaml"
     assert run(["rigs", "new", "mine", "--from", "sss", "-o", str(path)]) == 0
     assert run(["rigs", "check", str(path)]) == 0
-    assert "a valid profile of rig mine" in capsys.readouterr().out
+    assert str(path) in capsys.readouterr().out
     path.write_text(path.read_text(encoding="utf-8").replace("fx_px", "fx_pix"), encoding="utf-8")
     assert run(["rigs", "check", str(path)]) == 3
-    assert "cameras.cam.intrinsics.fx_pix: unknown key; did you mean fx_px?" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "cameras.cam.intrinsics.fx_pix:" in said and "fx_px?" in said
     assert run(["rigs", "check", str(path), "--json"]) == 3
     found = json.loads(capsys.readouterr().out)
     assert not found["is_valid"]
@@ -61,12 +62,10 @@ def test_check_exits_by_what_it_finds(capsys: pytest.CaptureFixture[str], tmp_pa
 
 def test_check_warns_of_what_is_rarely_meant(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
-    assert (
-        run(["rigs", "new", "mine", "--from", "sss", "--set", "board.inner_corners=[6, 8]", "-o", str(path)])
-        == 0
-    )
+    turned = ["--from", "sss", "--set", "board.inner_corners=[6, 8]"]
+    assert run(["rigs", "new", "mine", *turned, "-o", str(path)]) == 0
     assert run(["rigs", "check", str(path)]) == 0
-    assert "shorter side of the plate" in capsys.readouterr().err
+    assert "shorter side" in capsys.readouterr().err
 
 
 def test_new_writes_a_profile_and_never_over_another(
@@ -89,7 +88,7 @@ def test_a_full_disk_leaves_no_part_of_a_profile(capsys: pytest.CaptureFixture[s
         assert run(["rigs", "new", "mine", "-o", str(path)]) == 3
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert "cannot be written" in capsys.readouterr().err
+    assert str(path) in capsys.readouterr().err
     assert not path.exists()
     assert run(["rigs", "new", "mine", "-o", str(path)]) == 0
 

@@ -33,12 +33,11 @@ def cameras(session):
 def test_a_camera_without_result_exits_with_6_and_the_others_results_stand(lce_rig, with_second):
     outcome = lce_rig("calibrate", with_second)
     assert outcome.code == 6
-    assert "no extrinsic of camera right" in outcome.err
-    assert "No capture holds a picture of right and a scan." in outcome.err
-    assert "--camera davis" in outcome.err
+    assert "camera right" in outcome.err and "--camera davis" in outcome.err
     assert cameras(with_second) == ["davis"]
     urdf = (with_second / "calibration" / "rles.urdf").read_text()
-    assert "not in this file, for want of a result to use: right" in urdf
+    (comment,) = (line for line in urdf.splitlines() if "not in" in line)
+    assert "right" in comment and "davis" not in comment
 
 
 def test_the_camera_that_was_asked_for_is_calibrated_alone(lce_rig, with_second, calibrated_once):
@@ -51,7 +50,7 @@ def test_the_camera_that_was_asked_for_is_calibrated_alone(lce_rig, with_second,
     assert lce_rig("calibrate", with_second, "--camera", "right").code == 6
     outcome = lce_rig("calibrate", with_second, "--camera", "thermal")
     assert outcome.code == 2
-    assert "there is no camera 'thermal'; there is davis, right" in outcome.err
+    assert "'thermal'" in outcome.err and "davis, right" in outcome.err
 
 
 def test_a_reference_that_names_no_sensors_is_that_of_one_camera_only(lce_rig, with_second):
@@ -59,10 +58,11 @@ def test_a_reference_that_names_no_sensors_is_that_of_one_camera_only(lce_rig, w
     (with_second / "bare.json").write_text(json.dumps({"T_cam_lidar": truth["T_cam_lidar"]}))
     outcome = lce_rig("calibrate", with_second, "--reference", with_second / "bare.json")
     assert outcome.code == 2
-    assert "names no sensors, and there are several: davis, right" in outcome.err
+    assert "bare.json" in outcome.err and "davis, right" in outcome.err
     outcome = lce_rig("calibrate", with_second, "--camera", "davis", "--reference", with_second / "bare.json")
     assert outcome.code == 0
-    assert "reference    off by 0." in outcome.out
+    (line,) = (line for line in outcome.out.splitlines() if line.split()[:1] == ["reference"])
+    assert " 0." in line and "deg" in line
 
 
 def test_a_result_of_two_cameras_is_checked_on_captures_of_one(lce_rig, with_second, calibrated_once):
@@ -73,8 +73,9 @@ def test_a_result_of_two_cameras_is_checked_on_captures_of_one(lce_rig, with_sec
     (with_second / "deployed.json").write_text(json.dumps(document))
     outcome = lce_rig("verify", with_second, "--result", with_second / "deployed.json")
     assert outcome.code == 0, outcome.err
-    assert "holds no captures of right.frames and lidar: not checked" in outcome.err
-    assert "these captures: agree" in outcome.out
+    (warning,) = (line for line in outcome.err.splitlines() if "not checked" in line)
+    assert "right.frames" in warning
+    assert "captures: agree" in outcome.out
 
 
 def half_size(document):

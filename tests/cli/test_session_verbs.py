@@ -14,7 +14,7 @@ def test_check_shows_a_row_a_capture_and_counts_the_usable_ones(lce_rig, simulat
     outcome = lce_rig("check", simulated)
     assert outcome.code == 0
     assert sum(line.startswith("0000") for line in outcome.out.splitlines()) == 16
-    assert "16 of 16 captures can be used" in outcome.out
+    assert "16 of 16 captures" in outcome.out
 
 
 def test_check_gives_machines_every_figure_and_cause(lce_rig, simulated):
@@ -75,7 +75,7 @@ def test_a_reference_that_is_no_rigid_transform_exits_with_4(lce_rig, session, t
     (tmp_path / "bad.json").write_text('{"T_cam_lidar": [[1, 2], [3, 4]]}')
     outcome = lce_rig("calibrate", session, "--reference", tmp_path / "bad.json")
     assert outcome.code == 4
-    assert "bad.json: T_cam_lidar" in outcome.err
+    assert "bad.json" in outcome.err and "T_cam_lidar" in outcome.err
 
 
 def test_every_export_stands_beside_the_result(lce_rig, calibrated):
@@ -91,7 +91,7 @@ def test_verify_before_anything_was_calibrated_exits_with_4(lce_rig, session):
 def test_verify_draws_every_capture_and_one_sheet(lce_rig, calibrated):
     outcome = lce_rig("verify", calibrated)
     assert outcome.code == 0
-    assert "mean over captures" in outcome.out
+    assert "mean over" in outcome.out
     pictures = sorted(path.name for path in (calibrated / "calibration" / "overlays").iterdir())
     assert pictures == [*(f"{k:06d}.png" for k in range(16)), "contact_sheet.png"]
 
@@ -111,10 +111,12 @@ def test_verify_refuses_an_extrinsic_that_the_captures_contradict(lce_rig, calib
     result = read(path)
     result["pairs"][0]["T_cam_lidar"][2][3] += 0.12
     path.write_text(json.dumps(result))
-    outcome = lce_rig("verify", calibrated_few)
+    outcome = lce_rig("verify", calibrated_few, "--json")
     assert outcome.code == 7
-    assert "contradict the extrinsic of davis.frames and lidar" in outcome.err
-    assert "limit 30 mm" in outcome.err
+    doubts = json.loads(outcome.out)["pairs"][0]["doubts"]
+    assert {"code": "verdict.plane_residual", "limit_m": 0.03} in [
+        {"code": doubt["code"], "limit_m": doubt["figures"].get("limit_m")} for doubt in doubts
+    ]
 
 
 def test_verify_refuses_the_result_of_another_rig(lce_rig, calibrated):
@@ -136,7 +138,7 @@ def test_a_run_without_result_leaves_the_earlier_one_untouched_and_says_so(lce_r
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     outcome = lce_rig("calibrate", calibrated_few)
     assert outcome.code == 6
-    assert "calibration is unchanged: it holds the result of an earlier run" in outcome.err
+    assert f"{folder} is unchanged" in outcome.err.replace("\n", "")
     assert lce_rig("calibrate", calibrated_few, "--channels", "freams").code != 0
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
@@ -149,7 +151,7 @@ def test_another_result_moves_the_earlier_one_and_its_overlays_to_previous(lce_r
     assert "earlier result" not in again.err
     assert (folder / "overlays" / "contact_sheet.png").exists()
     outcome = lce_rig("calibrate", calibrated, "--seed", "5")
-    assert f"the earlier result is in {folder / 'previous'}" in outcome.err.replace("\n", "")
+    assert "earlier result" in outcome.err and str(folder / "previous") in outcome.err.replace("\n", "")
     kept = folder / "previous"
     assert {path.relative_to(kept): path.read_bytes() for path in kept.rglob("*") if path.is_file()} == before
     assert not (folder / "overlays").exists()
@@ -214,12 +216,13 @@ def test_a_nominal_extrinsic_far_off_fails_with_7_and_nothing_is_exported(lce_ri
     profile.write_text(turned)
     outcome = lce_rig("calibrate", session)
     assert outcome.code == 7
-    assert "from the nominal extrinsic" in outcome.out
-    assert read(session / "calibration" / "result.json")["pairs"][0]["verdict"] == "fail"
+    (pair,) = read(session / "calibration" / "result.json")["pairs"]
+    assert pair["verdict"] == "fail"
+    assert "verdict.far_from_nominal" in {finding["code"] for finding in pair["findings"]}
     assert not (session / "calibration" / "extrinsics.yaml").exists()
     assert lce_rig("verify", session).code == 7
     assert lce_rig("calibrate", session, "--force").code == 7
-    assert "NOT FOR USE" in (session / "calibration" / "extrinsics.yaml").read_text()
+    assert "NOT FOR" in (session / "calibration" / "extrinsics.yaml").read_text()
 
 
 def test_too_few_captures_exit_with_6_and_say_how_many_are_needed(lce_rig, session):
@@ -229,14 +232,14 @@ def test_too_few_captures_exit_with_6_and_say_how_many_are_needed(lce_rig, sessi
         shutil.rmtree(session / "captures" / f"{k:06d}")
     outcome = lce_rig("calibrate", session)
     assert outcome.code == 6
-    assert "in 4 of 4 captures, at least 6 are needed" in outcome.err
+    assert "4 of 4 captures" in outcome.err and "at least 6" in outcome.err
 
 
 def test_a_damaged_capture_is_named_and_the_others_still_count(lce_rig, session):
     (session / "captures" / "000004" / "lidar.pcd").write_bytes(b"# .PCD v0.7")
     outcome = lce_rig("check", session)
     assert outcome.code == 0
-    assert "15 of 16 captures can be used" in outcome.out
+    assert "15 of 16 captures" in outcome.out
     assert "000004: read:" in outcome.out
     assert "lidar.pcd" in outcome.out
 

@@ -189,7 +189,7 @@ def test_a_rig_of_events_alone_is_simulated_moving(lce_rig: Any, tmp_path: Path)
     assert (capture.image_keys, capture.event_cameras) == ([], ["davis"])
     outcome = lce_rig(*words, tmp_path / "t", "--motion", "still")
     assert outcome.code == 3
-    assert "only frames can be simulated" in outcome.err
+    assert "only frames" in outcome.err and not (tmp_path / "t").exists()
 
 
 def test_a_still_board_makes_no_events_and_help_says_so(lce_rig: Any, tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_a_still_board_makes_no_events_and_help_says_so(lce_rig: Any, tmp_path: 
     assert outcome.code == 0
     assert Session.open(tmp_path / "s").captures[0].event_cameras == []
     text = " ".join(lce_rig("simulate", "--help").out.split())
-    assert "Events are stored of a moving board only: a still one makes none" in text
+    assert "moving board" in text
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,14 @@
 """The report states uncertainty by axis and by distance, in 80 columns."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 
 from lce_rig.cli.calibrate import uncertainty_lines
 from lce_rig.core.results import Calibration, Certificate, Metrics, PointUncertainty
+
+WEAK = "translation along the camera's z axis (line of sight), sigma 104.9 mm"
 
 
 def calibration() -> Calibration:
@@ -24,15 +27,19 @@ def calibration() -> Calibration:
         captures_refused={},
         verdict="pass",
         reasons=(),
+        weak_direction=WEAK,
         uncertainty=tuple(PointUncertainty(d, 123.4, 0.123 * d, 134.5, 0.234 * d) for d in (5.0, 10.0, 20.0)),
     )
 
 
 def test_every_axis_and_distance_is_named_in_80_columns() -> None:
     lines = uncertainty_lines(calibration())
-    assert "known to     0.130 deg, 13.0 mm (1 sigma)" in lines[0]
-    assert "about x right 0.050, y down 0.120, z forward 0.010 deg" in lines[1]
-    assert "along x right 3.0, y down 4.0, z forward 12.0 mm" in lines[2]
+    assert "0.130 deg, 13.0 mm" in lines[0]
+    for line, figures in ((lines[1], (0.05, 0.12, 0.01)), (lines[2], (3, 4, 12))):
+        said = re.findall(r"(x right|y down|z forward) ([\d.]+)", line)
+        assert [axis for axis, _ in said] == ["x right", "y down", "z forward"]
+        assert tuple(float(value) for _, value in said) == figures
+    assert WEAK in lines[3]
     assert lines[4].split() == ["a", "point", "5", "m", "away", "10", "m", "away", "20", "m", "away"]
     assert "123.4 px, 61.5 cm" in lines[5]
     assert "134.5 px, 117.0 cm" in lines[6]

@@ -154,7 +154,7 @@ def test_a_file_that_ends_in_a_packet_gives_the_captures_before_its_end_and_says
     file.write_bytes(file.read_bytes()[: int(0.9 * file.stat().st_size)])
     _, report = run(tmp_path / "s", lidar, file)
     assert report.captured == ["000000"] and not report.errors
-    assert any("torn ends of the file left out" in note for note in report.notes)
+    assert any("torn ends" in note for note in report.notes)
 
 
 def test_clocks_that_do_not_overlap_are_an_error_before_anything_is_searched(tmp_path, lidar) -> None:
@@ -190,10 +190,7 @@ def test_captures_whose_events_begin_late_are_kept_and_counted(tmp_path) -> None
     session, report = run(tmp_path / "s", bag(tmp_path / "late.bag", late))
     assert report.captured == ["000000"]
     assert session.captures[0].events("davis").t_ns[0] >= start_ns
-    assert any(
-        note.startswith("davis: 1 captures with less than 1.2 s of events before their scan")
-        for note in report.notes
-    )
+    assert any(note.startswith("davis: 1 captures") and "1.2 s" in note for note in report.notes)
 
 
 def test_lamps_that_flicker_are_named_where_frames_make_a_capture_all_the_same(tmp_path) -> None:
@@ -203,9 +200,7 @@ def test_lamps_that_flicker_are_named_where_frames_make_a_capture_all_the_same(t
     ]
     _, report = run(tmp_path / "s", bag(tmp_path / "lit.bag", lit))
     assert report.captured == ["000000"]
-    assert any(
-        "davis: 1 captures: most events come from light that flickers at 100 Hz" in n for n in report.notes
-    )
+    assert any(note.startswith("davis: 1 captures") and "100 Hz" in note for note in report.notes)
 
 
 def test_without_events_the_same_rig_still_wants_the_board_to_stand(tmp_path) -> None:

@@ -64,7 +64,7 @@ def test_a_torn_bag_gives_the_captures_before_the_damage_and_an_error(tmp_path, 
         report = collect(session, [open_recording(bag, rig)])
     assert report.captured == ["000000"]
     (error,) = report.errors
-    assert "torn.bag is damaged" in error.what and "could be read" not in error.hint
+    assert "torn.bag" in error.what and "damaged" in error.what and "could be" not in error.hint
 
 
 def test_a_board_that_never_stands_still_is_never_captured(tmp_path, stage, paths, write_bag, rig):
@@ -84,7 +84,7 @@ def test_clocks_that_are_apart_are_said_and_bridged_by_the_profile(tmp_path, sta
     with Session.create(tmp_path / "apart", rig) as session:
         report = collect(session, [open_recording(bag, rig)])
     assert report.captured == [] and report.counts.by_code()["read.no_image_at_scan"] == 9
-    assert any("scans without a picture; the nearest was 2.2" in note for note in report.notes)
+    assert any(note.startswith("9 scans") and " 2.2" in note for note in report.notes)
     channel = rig.cameras["cam"].channels["frames"]
     stamps = channel.timestamps.model_copy(update={"expected_offset_s": -3.0})
     channels = {"frames": channel.model_copy(update={"timestamps": stamps})}

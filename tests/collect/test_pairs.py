@@ -48,7 +48,9 @@ def test_every_pair_becomes_a_capture_and_a_second_run_adds_none(tmp_path, folde
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, folder, rig)
     assert report.captured == [f"{k:06d}" for k in range(N_PAIRS)]
-    assert report.notes == ["recording: 5 pairs, paired by equal file names", "no time of each point"]
+    paired, untimed = report.notes
+    assert paired.startswith("recording: 5 pairs") and "names" in paired
+    assert "no time" in untimed
     with Session.resume(tmp_path / "s", rig) as session:
         again = run(session, folder, rig)
     assert (again.captured, again.n_resumed, again.duplicates) == ([], N_PAIRS, {})
@@ -70,9 +72,8 @@ def test_damaged_files_are_refused_with_their_cause_and_the_rest_is_captured(tmp
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, folder, rig)
     assert len(report.captured) == N_PAIRS - 2 and not report.errors
-    causes = {label: refusal.figures["what"] for label, refusal in report.refused.items()}
-    assert "00001.png: it is a truncated PNG" in causes["00001.png + 00001.pcd"]
-    assert "00002.pcd: it is truncated" in causes["00002.png + 00002.pcd"]
+    for torn, refusal in zip(("00001.png", "00002.pcd"), report.refused.values(), strict=True):
+        assert torn in refusal.figures["what"] and "truncated" in refusal.figures["what"]
     assert {refusal.stage for refusal in report.refused.values()} == {"read"}
 
 
@@ -90,7 +91,7 @@ def test_the_cap_is_kept_and_what_is_left_out_is_counted(tmp_path, folder, rig):
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, folder, rig, max_captures=2, target=3)
         assert len(session.captures) == 2 and report.n_missing == 1
-        assert "3 pairs left out: the session holds 2 captures, as wanted" in report.notes
+        assert any(note.startswith("3 pairs") and "2 captures" in note for note in report.notes)
         assert len(run(session, folder, rig, target=4).captured) == 2
         assert len(run(session, folder, rig).captured) == 1
 
@@ -99,7 +100,7 @@ def test_pictures_of_another_size_are_said(tmp_path, folder, rig):
     cv2.imwrite(str(folder / "img" / "00002.png"), np.zeros((480, 640), np.uint8))
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, folder, rig)
-    assert "camera cam: pictures of 640x480 where the profile says 640x360" in report.notes
+    assert any("cam:" in n and "640x480" in n and "640x360" in n for n in report.notes)
 
 
 def test_progress_tells_of_every_pair(tmp_path, folder, rig):
@@ -107,7 +108,7 @@ def test_progress_tells_of_every_pair(tmp_path, folder, rig):
     with Session.create(tmp_path / "s", rig) as session:
         collect(session, [open_recording(folder, rig)], progress=lambda *step: told.append(step))
     assert [(done, total) for done, total, _ in told] == [(k + 1, N_PAIRS) for k in range(N_PAIRS)]
-    assert told[0][2] == "00000.png + 00000.pcd captured as 000000"
+    assert "00000.png" in told[0][2] and told[0][2].endswith(" 000000")
 
 
 COLLECTOR = """
@@ -150,5 +151,5 @@ def test_a_recording_by_others_becomes_a_session(tmp_path, recordings):
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, recordings / "rlfs01", rig)
     assert len(report.captured) == 18 and not report.refused and not report.duplicates
-    assert "no ring field: rings told from elevations" in report.notes
+    assert any("ring field" in note and "elevations" in note for note in report.notes)
     assert Session.open(tmp_path / "s").captures[17].scan("lidar").ring.max() == 15

@@ -214,7 +214,7 @@ def test_a_lens_is_known_where_boards_were_seen_and_the_weak_places_are_named():
     inside = certainty.sigma_px[certainty.is_covered].max()
     assert inside < 1 < np.nanmax(certainty.sigma_px)
     texts = find_weaknesses(middle, certainty)
-    assert any("hold the board into all four corners" in text for text in texts)
+    assert any("four corners" in text for text in texts)
     assert reach(middle) < 0.6
 
 
@@ -231,7 +231,7 @@ def test_boards_that_face_the_camera_are_told_to_tilt():
     facing = estimate_intrinsics(photograph(14, 6, scene), BOARD, WIDE, MODELS["radtan4"], n_folds=2)
     certainty = certainty_of(facing.intrinsics, facing.corners_px.reshape(-1, 2), facing.cov, facing.model)
     texts = find_weaknesses(facing, certainty)
-    assert any("focal length and distance trade off" in text and "tilt the board" in text for text in texts)
+    assert any("focal length" in text and "tilt the" in text for text in texts)
 
 
 def test_a_board_whose_right_edge_is_far_is_tilted_to_the_right(estimate):
@@ -250,8 +250,8 @@ def test_a_bent_board_and_a_stretched_print_are_named():
     bad = estimate_intrinsics(photograph(12, 7, scene), BOARD, WIDE, RADTAN5, n_folds=2)
     certainty = certainty_of(bad.intrinsics, bad.corners_px.reshape(-1, 2), bad.cov, bad.model)
     texts = " ".join(find_weaknesses(bad, certainty))
-    assert "its middle stands out 4.0 mm towards the viewer" in texts or "3.9 mm" in texts
-    assert "too long along the plate's width" in texts
+    assert ("4.0 mm" in texts or "3.9 mm" in texts) and "towards" in texts
+    assert "too long" in texts and "plate's width" in texts
     assert np.abs(deviations(bad, WIDE)).max() < 4
 
 

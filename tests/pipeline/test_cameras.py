@@ -68,7 +68,8 @@ def test_cameras_that_share_boards_are_estimated_together_and_say_so(together):
         assert error @ np.linalg.solve(own.cov, error) < 25  # 0.9997 of chi square with 6 degrees
         assert own.sigma_rotation_deg < own.diagnostics["alone_sigma_rotation_deg"]
         (line,) = together_lines(own)
-        assert line.startswith(f"  together     with {other}; alone it is known to 0.0")
+        assert line.split()[0] == "together"
+        assert f"with {other};" in line and f"{own.diagnostics['alone_sigma_rotation_deg']:.3f} deg" in line
 
 
 def test_where_one_camera_sits_to_the_other_is_told_from_both_sides(together):
@@ -129,8 +130,7 @@ def test_cameras_without_a_common_board_stay_by_themselves(session):
     left, right = found.values()
     assert camera_lines(left, [left, right]) == []
     (line,) = camera_lines(right, [left, right])
-    assert "left and right" in line
-    assert "neither is held against the other" in line
+    assert "left" in line and "right" in line
 
 
 def test_the_camera_asked_for_is_calibrated_as_if_there_were_no_other(session):
@@ -144,9 +144,9 @@ def test_the_camera_asked_for_is_calibrated_as_if_there_were_no_other(session):
 def test_why_no_camera_could_be_calibrated_is_told_of_each(session):
     with pytest.raises(NotEnoughDataError) as caught:
         pipeline.calibrate_detections(RIG, detections(session, left=range(3), right=range(4)), PAPER)
-    assert "left.frames and lidar" in caught.value.what
-    assert "in 3 of 12 captures" in caught.value.what
-    assert "right.frames and lidar: the board was found by both sensors in 4 of 12" in caught.value.hint
+    assert "left.frames" in caught.value.what and "3 of 12" in caught.value.what
+    (other,) = (line for line in caught.value.hint.splitlines() if "right.frames" in line)
+    assert "4 of 12" in other
 
 
 @pytest.mark.parametrize("options", [ML, PAPER], ids=["ml", "paper"])
@@ -156,7 +156,8 @@ def test_a_nudged_camera_is_told_at_both_and_not_estimated_with_the_other(option
         assert own.verdict in ("marginal", "fail")
         assert own.estimated_with == ()
         (change,) = (each for each in own.findings if each.code == "verdict.camera_changed")
-        assert (change.subject, change.figures["capture"]) == ("left to right", "000006")
+        assert change.subject.split(" to ") == [LEFT, RIGHT]
+        assert change.figures["capture"] == "000006"
     # The left camera, which nobody touched, is what it is without the other.
     error = difference(found[LEFT].T_cam_lidar, TRUTH[LEFT])
     assert error @ np.linalg.solve(found[LEFT].cov, error) < 25
@@ -214,11 +215,11 @@ def test_the_report_states_each_two_cameras_once(together, by_paper):
     calibrations = list(together.values())
     assert camera_lines(calibrations[0], calibrations) == []
     text = "\n".join(camera_lines(calibrations[1], calibrations))
-    assert "left and right" in text
-    assert "T_right_left (p_right = R p_left + t)" in text
+    assert "left" in text and "right" in text
+    assert "T_right_left" in text
     assert "known to     0.00" in text
-    assert "each camera by itself" in text
+    assert "by itself" in text
     calibrations = list(by_paper.values())
     text = "\n".join(camera_lines(calibrations[1], calibrations))
     assert "known to" not in text
-    assert "pictures     differ by 0.0" in text
+    assert "differ by 0.0" in text

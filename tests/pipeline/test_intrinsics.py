@@ -109,9 +109,9 @@ def test_channels_share_the_lens_and_bad_pictures_are_named(pictures, tmp_path):
     assert both.refused["000003.frames"].stage == "read"
     assert both.refused["000008.events"].stage == "image"
     assert np.abs(sigmas_off(both)).max() < 4.5
-    with pytest.raises(NotEnoughDataError, match="the board is in 3 of 4 captures") as caught:
+    with pytest.raises(NotEnoughDataError, match="3 of 4 captures") as caught:
         measure_intrinsics(session, "davis", channels=["frames"])
-    assert "1 x capture 000003 is damaged" in caught.value.hint
+    assert "1 x " in caught.value.hint and "000003" in caught.value.hint
 
 
 def test_unknown_channels_and_models_are_usage_errors(session):
@@ -151,11 +151,11 @@ def test_another_run_keeps_the_earlier_files_what_is_the_users_and_other_cameras
     other = json.loads(first)["cameras"][0] | {"camera": "left"}
     both = json.loads(first) | {"cameras": [other]}
     (folder / "intrinsics.json").write_text(json.dumps(both))
-    (folder / "left.yaml").write_text("block of the other camera")
+    (folder / "left.yaml").write_text("left: block")
     write_intrinsics(session, [measured])
     cameras = json.loads((folder / "intrinsics.json").read_text())["cameras"]
     assert [each["camera"] for each in cameras] == ["davis", "left"]
-    assert (folder / "left.yaml").read_text() == "block of the other camera"
+    assert (folder / "left.yaml").read_text() == "left: block"
 
 
 def test_a_new_profile_keeps_the_comments_of_the_old_and_never_replaces_a_file(session, measured, tmp_path):
@@ -163,7 +163,7 @@ def test_a_new_profile_keeps_the_comments_of_the_old_and_never_replaces_a_file(s
     rig = load_rig(tmp_path / "new.yaml")
     assert rig.cameras["davis"].to_intrinsics() == final(measured)
     assert rig.board == RIG.board
-    assert "# measure it" in (tmp_path / "new.yaml").read_text()
+    assert "# measure it;" in (tmp_path / "new.yaml").read_text()
     with pytest.raises(UsageError, match="exists already"):
         save_profile(session, [measured], tmp_path / "new.yaml")
 

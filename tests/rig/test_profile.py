@@ -151,9 +151,8 @@ def test_each_mistake_is_named_with_its_line_and_key(old: str, new: str, key: st
 
 def test_pattern_that_is_larger_than_the_plate_is_refused_with_both_sizes() -> None:
     text = refusal(("width_m: 0.767", "width_m: 0.3"))
-    assert (
-        "pattern of 9x7 squares of 70 mm is 0.63 x 0.49 m and does not fit on a plate 0.3 x 0.626 m" in text
-    )
+    for size in ("9x7", "70 mm", "0.63 x 0.49 m", "0.3 x 0.626 m"):
+        assert size in text
     assert f"mine.yaml:{line_of('board:')}: board:" in text
 
 
@@ -167,18 +166,18 @@ def test_squares_counted_for_inner_corners_are_named() -> None:
     text = refusal(
         ("[8, 6]", "[9, 7]"), ("width_m: 0.767", "width_m: 0.64"), ("height_m: 0.626", "height_m: 0.5")
     )
-    assert "were squares counted where inner corners are wanted" in text
+    assert "squares counted" in text and "inner corners" in text
 
 
 def test_board_that_fits_both_ways_round_raises_a_doubt() -> None:
     turned = find_profile("sss").read_text(encoding="utf-8").replace("[8, 6]", "[6, 8]")
-    assert any("shorter side of the plate" in doubt for doubt in parse_rig(turned).doubts())
+    assert any("shorter side" in doubt for doubt in parse_rig(turned).doubts())
     assert not load_rig("sss").doubts()
 
 
 @pytest.mark.parametrize("size", ["[640, 360]", "[960, 540]", "[1920, 1080]", "[2560, 1440]"])
 def test_intrinsics_of_another_resolution_are_noticed(size: str) -> None:
-    assert "another resolution (about 1271x751)" in refusal(("[1280, 720]", size))
+    assert "(about 1271x751)" in refusal(("[1280, 720]", size))
 
 
 def test_all_problems_are_listed_at_once_in_the_files_order() -> None:
@@ -186,14 +185,14 @@ def test_all_problems_are_listed_at_once_in_the_files_order() -> None:
         ("square_m: 0.070", "square_m: 70"), ("fx_px: 897.4566", "fx: 897"), ("rate_hz: 10", "rate_hz: 0")
     )
     lines = text.splitlines()
-    assert lines[0] == "mine.yaml: 3 problems"
+    assert lines[0].split(": ") == ["mine.yaml", "3 problems"]
     assert [key in line for key, line in zip(("square_m", "rate_hz", "fx:"), lines[1:], strict=True)] == [
         True
     ] * 3
 
 
 def test_a_key_in_the_wrong_block_is_sent_to_the_right_one() -> None:
-    assert "it belongs into calibration" in refusal(("board:", "target_sigma_m: 0.02\nboard:"))
+    assert "into calibration" in refusal(("board:", "target_sigma_m: 0.02\nboard:"))
 
 
 def test_weights_in_profiles_of_earlier_sessions_change_nothing() -> None:
@@ -275,5 +274,8 @@ def test_what_a_copied_camera_shares_with_the_first_is_doubted() -> None:
     right = document["cameras"]["cam"] | {"frame": "right_link", "optical_frame": "right_optical"}
     document["cameras"]["right"] = right
     topic, device = Rig.model_validate(document).doubts()
-    assert topic.startswith("cameras.right.channels.frames.topic: /camera/image_raw is that of cameras.cam.")
-    assert device.startswith("cameras.right.driver.device: /dev/video0 is that of cameras.cam.driver.device")
+    for doubt, key, value in (
+        (topic, "channels.frames.topic", "/camera/image_raw"),
+        (device, "driver.device", "/dev/video0"),
+    ):
+        assert doubt.startswith(f"cameras.right.{key}: {value} ") and f" cameras.cam.{key}" in doubt

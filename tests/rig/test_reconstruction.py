@@ -70,12 +70,13 @@ def test_what_cannot_be_meant_is_named_with_its_line(block: str, said: str) -> N
     text = with_block(block)
     line = text[: text.index("reconstruction:")].count("\n") + 1
     message = refusal(text)
-    assert said in message and f"mine.yaml:{line}: cameras.davis.channels.events.reconstruction" in message
+    key = "cameras.davis.channels.events.reconstruction"
+    assert said in message and f"mine.yaml:{line}: {key}" in message
 
 
 def test_frames_are_not_reconstructed() -> None:
     message = refusal(with_block("{method: network}", "        kind: frames\n"))
-    assert "channels.frames.reconstruction: belongs to a channel of kind events" in message
+    assert "channels.frames.reconstruction:" in message and "kind events" in message
 
 
 def test_an_optional_block_is_one_block_to_the_explainer() -> None:

@@ -26,7 +26,7 @@ def test_a_board_needs_a_device_and_little_else():
     assert (sync.type, sync.device, sync.port_baud) == ("lce1", "/dev/ttyACM0", 115200)
     assert (sync.triggers["cam"].phase_us, sync.triggers["cam"].pulse_us) == (0, 100)
     assert parse_rig(RLFS).sync is None
-    assert "sync.device: is missing" in refusal("\nsync: {type: lce1}\n")
+    assert "sync.device:" in refusal("\nsync: {type: lce1}\n")
 
 
 def test_every_type_has_its_usual_speed_unless_told():

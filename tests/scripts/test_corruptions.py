@@ -150,8 +150,9 @@ def test_the_profile_alone_says_another_lens_or_print() -> None:
     larger = corrupted("plate of the profile 20 mm larger").rig.board
     assert larger.width_m - board.width_m == pytest.approx(0.02)
     assert larger.square_m == board.square_m
-    assert corrupted("squares of the profile -5 %").rig.board.square_m == pytest.approx(0.95 * board.square_m)
-    assert foreign(corrupted("squares of the profile -5 %")) == []
+    smaller = corrupted("squares of the profile -5 %")
+    assert smaller.rig.board.square_m == pytest.approx(0.95 * board.square_m)
+    assert foreign(smaller) == []
 
 
 def test_half_the_rings_are_lost() -> None:
@@ -165,7 +166,8 @@ def test_a_session_that_lacks_what_a_corruption_needs_is_skipped() -> None:
     skipped = [name for name in NAMES if KINDS[name].corrupt(recorded) is None]
     moving = [f"board moving, timestamps of images {late(offset_s)}" for offset_s in LATE_S]
     still = ["boards nearly parallel", "board always in one place"]
-    assert skipped == ["timestamps of images mixed up", *moving, *still]
+    mixed = "timestamps of images mixed up"
+    assert skipped == [mixed, *moving, *still]
 
 
 def outcome(verdict: str, in_sigmas: float, in_targets: float, unobservable: str = "") -> Outcome:
@@ -187,7 +189,15 @@ def test_wrong_results_that_pass_are_named_and_counted_by_whether_the_data_show_
     lines = capsys.readouterr().out.splitlines()
     assert "| paper | pass | 3 | 1 | 0 | 3.5 | 1 |" in lines
     assert "| paper | fail | 1 | 1 | 1 | 7.0 | 0 |" in lines
-    assert "| rlfs | x | paper | 0.10 / 1.0 | 3.5 | 0.5 | overconfident |" in lines
+    (overconfident,) = (line.split("|") for line in lines if "overconfident" in line)
+    assert [cell.strip() for cell in overconfident[1:-2]] == [
+        "rlfs",
+        "x",
+        "paper",
+        "0.10 / 1.0",
+        "3.5",
+        "0.5",
+    ]
     assert sum("another mounting" in line for line in lines) == 1
 
 
@@ -226,11 +236,11 @@ def test_a_sound_session_passes_and_a_corrupted_one_is_told_with_its_error() -> 
         assert "nominal" in o.reason
     assert {o.verdict for o in late_images} <= {"fail", "refused"}
     assert {o.verdict for o in other} == {"refused"}
-    assert all("corners" in o.reason or "board was found" in o.reason for o in other)
+    assert all("corners" in o.reason or "was found" in o.reason for o in other)
 
 
 def test_a_corruption_of_the_profile_that_cannot_be_loaded_is_refused_with_its_reason() -> None:
     small = replace(SESSION, images={}, scans={})
     (outcomes,) = judge_session(small, [KINDS[REFUSED]])
     assert {o.verdict for o in outcomes} == {"refused"}
-    assert all("outside the picture" in o.reason for o in outcomes)
+    assert all("outside" in o.reason for o in outcomes)

@@ -104,7 +104,7 @@ def test_a_refusal_in_words_is_right_but_not_of_sound_input(
 ) -> None:
     one_reader(monkeypatch, refuse)
     assert outcome_of(tmp_path).verdict == reader_cases.REFUSED
-    assert outcome_of(tmp_path, case=0).what == "a sound input is refused"
+    assert "sound input" in outcome_of(tmp_path, case=0).what
 
 
 def test_inner_parts_are_put_back_as_they_were() -> None:

@@ -14,15 +14,15 @@ def test_one_board_that_the_lidar_missed_is_no_contradiction():
 
 def test_many_boards_that_are_not_where_the_extrinsic_puts_them_are_one():
     (doubt,) = contradictions(GOOD, RIG, n_elsewhere=10, n_seen=30)
-    assert doubt.startswith("in 10 of 30 captures")
+    assert (doubt.code, doubt.figures) == ("verify.elsewhere", {"n_elsewhere": 10, "n_captures": 30})
 
 
 def test_large_residuals_are_named_with_their_limit():
     (doubt,) = contradictions(Metrics(0.05, 0.006, 0.1), RIG, n_elsewhere=0, n_seen=30)
-    assert "50 mm" in doubt and "30 mm" in doubt
+    assert doubt.code == "verdict.plane_residual"
+    assert doubt.figures == {"mean_m": 0.05, "limit_m": 0.03}
 
 
 def test_a_session_without_boards_cannot_agree():
-    assert contradictions(None, RIG, n_elsewhere=0, n_seen=0) == (
-        "no capture shows the board to both sensors",
-    )
+    (doubt,) = contradictions(None, RIG, n_elsewhere=0, n_seen=0)
+    assert (doubt.code, doubt.severity) == ("verify.unseen", "error")

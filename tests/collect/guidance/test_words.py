@@ -73,7 +73,7 @@ def test_at_most_three_are_said_largest_first():
     texts = words(right_m=2.0, ahead_m=2.2, up_m=0.3, tilt_deg=20.0, turn_deg=-40.0)
     assert len(texts) == 3
     assert texts[0] == "3 steps left"
-    assert texts[1] == "turn the right side towards the rig"
+    assert "right side" in texts[1] and "towards" in texts[1]
 
 
 def test_small_differences_are_not_mentioned():

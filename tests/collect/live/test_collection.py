@@ -1,6 +1,7 @@
 """The live loop from end to end, on simulated placements that are shown in real time."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -160,7 +161,8 @@ def test_a_run_that_nobody_looks_after_ends_when_nothing_new_is_shown(tmp_path: 
         report = collect_live(session, show.sources, options)
     assert report.ending == "exhausted" and not report.is_enough
     assert len(report.captured) == 1
-    assert any("no capture in the last" in note for note in report.notes)
+    (waited_s,) = (float(s) for note in report.notes for s in re.findall(r"last (\d+) s", note))
+    assert waited_s >= 3
 
 
 @pytest.fixture
@@ -188,7 +190,7 @@ def test_who_wants_more_than_enough_goes_on_being_guided_and_captured(met: Path)
     assert "enough" not in {state.phase for state in states}
     assert any(s.drawing is not None and s.drawing.wanted is not None for s in states)
     (said,) = {line.split(" ", 1)[1] for line in states[-1].log if "target" in line}
-    assert said == "the target is predicted to be met: going on to 14 captures"
+    assert said.endswith("14 captures")
 
 
 def test_who_wants_no_more_than_enough_is_done_at_once(met: Path) -> None:
@@ -212,4 +214,4 @@ def test_a_board_that_one_camera_has_seen_enough_of_is_sent_before_the_other(met
         options = replace(QUICK, n_wanted=None, idle_s=3.0)
         report = collect_live(session, show.sources, options, states.append)
     assert report.ending == "exhausted" and not report.is_enough
-    assert "show the board to right" in {state.headline for state in states}
+    assert any(state.headline.endswith("to right") for state in states)

@@ -96,7 +96,7 @@ def test_a_lidar_that_is_gone_for_a_minute_is_an_error_of_the_command(wire: Star
         rig.tell("pause 1000")
         assert collecting.wait(180) == 5
     assert len(errors(collecting.said)) == 1 and "lidar: " in errors(collecting.said)[0]
-    assert "ended: a sensor was lost" in collecting.said
+    assert journal_of(tmp_path / "session")[-1]["ending"] == "lost"
     check_whole(tmp_path / "session")
 
 
@@ -167,8 +167,8 @@ def test_a_full_disk_is_one_clear_error_and_spares_the_captures(wire: Start, tmp
         # From now on no file of that process grows beyond 100 kB.
         resource.prlimit(collecting.pid, resource.RLIMIT_FSIZE, (100_000, 100_000))
         assert collecting.wait() == 4
-    assert len(errors(collecting.said)) == 1 and "cannot be written" in errors(collecting.said)[0]
-    assert "Make room or choose another disk" in collecting.said and "Traceback" not in collecting.said
+    assert len(errors(collecting.said)) == 1 and str(session) in errors(collecting.said)[0]
+    assert "another disk" in collecting.said and "Traceback" not in collecting.said
     n_safe = len(check_whole(session))
     assert n_safe >= 1
     with Collecting(rig.profile, session, "--hold", "0", "--frames", str(n_safe + 1)) as again:
