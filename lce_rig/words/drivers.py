@@ -292,7 +292,7 @@ _PULSES: Mapping[str, Phrase] = {
             "see_lines": "see the lines of these sensors and of the sync board",
         },
     ),
-    "sync.no_board": Phrase("no sync board ties the cameras' clocks to the LiDAR's"),
+    "sync.no_board": Phrase("no sync board ties the cameras' clocks to the LiDAR's", actions={"named": ""}),
     "sync.none_in_profile": Phrase("{key} is none", actions={"named": ""}),
     "sync.not_tied": Phrase(
         "the clock of {subject} is not tied to the rig's", "run `lce-rig doctor`", {"named": ""}
