@@ -80,7 +80,7 @@ def describe(finding: Finding) -> str:
 def recommend(finding: Finding) -> str:
     """Say what to do; "" where nothing is to be done."""
     phrase = phrases()[finding.code]
-    chosen = (phrase.actions or {}).get(finding.action, phrase.action)
+    chosen = (phrase.actions or {})[finding.action] if finding.action else phrase.action
     return _render(chosen, finding)
 
 
