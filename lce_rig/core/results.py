@@ -136,16 +136,6 @@ class Certificate:
     gap: float
 
 
-@dataclass(frozen=True, eq=False)
-class PoseSolution:
-    """A pose estimate T (4, 4) with cov (6, 6), the cost at T and its certificate."""
-
-    T: Array
-    cov: Array
-    cost: float
-    certificate: Certificate
-
-
 @dataclass(frozen=True)
 class Metrics:
     """Errors of the extrinsics; docs/conventions.md defines them.

@@ -60,27 +60,14 @@ class SourceStatus:
     n_lost_by_line: Mapping[str, int] = field(default_factory=dict)
 
 
-class Mailbox(Generic[T]):
-    """A bounded queue from one reader thread to one taker; when full, the oldest is dropped and counted."""
+class Waiting(Generic[T]):
+    """What reader threads put in and one taker takes out, oldest first, until it is closed and empty."""
 
-    def __init__(self, n_slots: int) -> None:
-        self.n_dropped = 0
-        self.n_put = 0
+    def __init__(self) -> None:
         self._items: deque[T] = deque()
-        self._n_slots = n_slots
         self._is_closed = False
         self._error: SourceError | None = None
         self._changed = threading.Condition()
-
-    def put(self, item: T) -> None:
-        """Hand an item over; never blocks."""
-        with self._changed:
-            if len(self._items) >= self._n_slots:
-                self._items.popleft()
-                self.n_dropped += 1
-            self._items.append(item)
-            self.n_put += 1
-            self._changed.notify()
 
     def close(self, error: SourceError | None = None) -> None:
         """End the queue; what is in it can still be taken, then `error` is raised if there is one."""
@@ -98,10 +85,40 @@ class Mailbox(Generic[T]):
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._is_closed, timeout_s)
             if self._items:
-                return self._items.popleft()
+                return self._take_oldest()
             if self._error is not None:
                 raise self._error
             return None
+
+    @property
+    def is_ended(self) -> bool:
+        """Whether the queue was closed and everything taken."""
+        with self._changed:
+            return self._is_closed and not self._items
+
+    def _take_oldest(self) -> T:
+        """Take an item out; the lock is held."""
+        return self._items.popleft()
+
+
+class Mailbox(Waiting[T]):
+    """A bounded queue from one reader thread to one taker; when full, the oldest is dropped and counted."""
+
+    def __init__(self, n_slots: int) -> None:
+        super().__init__()
+        self.n_dropped = 0
+        self.n_put = 0
+        self._n_slots = n_slots
+
+    def put(self, item: T) -> None:
+        """Hand an item over; never blocks."""
+        with self._changed:
+            if len(self._items) >= self._n_slots:
+                self._items.popleft()
+                self.n_dropped += 1
+            self._items.append(item)
+            self.n_put += 1
+            self._changed.notify()
 
     def items(self, wait_s: float) -> Iterator[T]:
         """Yield items as they come until the queue has ended, looking every `wait_s`.
@@ -114,9 +131,3 @@ class Mailbox(Generic[T]):
             if item is not None:
                 yield item
         self.take(0)
-
-    @property
-    def is_ended(self) -> bool:
-        """Whether the queue was closed and everything taken."""
-        with self._changed:
-            return self._is_closed and not self._items

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.protocol import SourceStatus
+from lce_rig.devices.protocol import SourceStatus, Waiting
 
 _TAKE_S = 0.2
 _RATE_WINDOW_S = 3.0
@@ -56,7 +56,7 @@ class RateMeter:
             return n / max(max(last_s, now_s - typical_s) - first_s, 1e-9)
 
 
-class Inbox:
+class Inbox(Waiting[tuple[str, LiveSample]]):
     """The queue that readers feed and one taker empties; of each sensor the newest samples wait.
 
     Attributes:
@@ -64,13 +64,10 @@ class Inbox:
     """
 
     def __init__(self) -> None:
+        super().__init__()
         self.n_put: Counter[str] = Counter()
         self.n_dropped: Counter[str] = Counter()
-        self._waiting: deque[tuple[str, LiveSample]] = deque()
         self._n_waiting: Counter[str] = Counter()
-        self._is_closed = False
-        self._error: SourceError | None = None
-        self._changed = threading.Condition()
 
     def put(self, sensor: str, samples: Iterable[LiveSample], n_slots: int) -> None:
         """Hand samples over; never blocks.
@@ -84,43 +81,19 @@ class Inbox:
             for sample in samples:
                 if self._n_waiting[sensor] >= n_slots:
                     self._drop_oldest(sensor)
-                self._waiting.append((sensor, sample))
+                self._items.append((sensor, sample))
                 self._n_waiting[sensor] += 1
                 self.n_put[sensor] += 1
             self._changed.notify()
 
-    def close(self, error: SourceError | None = None) -> None:
-        """End the queue; what is in it can still be taken, then `error` is raised if there is one."""
-        with self._changed:
-            self._is_closed = True
-            self._error = self._error or error
-            self._changed.notify_all()
-
-    def take(self, timeout_s: float) -> tuple[str, LiveSample] | None:
-        """Take the oldest sample and its sensor; None where nothing came in time, or the queue has ended.
-
-        Raises:
-            SourceError: the reader failed, and all that it read before has been taken.
-        """
-        with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._is_closed, timeout_s)
-            if self._waiting:
-                sensor, sample = self._waiting.popleft()
-                self._n_waiting[sensor] -= 1
-                return sensor, sample
-            if self._error is not None:
-                raise self._error
-            return None
-
-    @property
-    def is_ended(self) -> bool:
-        """Whether the queue was closed and everything taken."""
-        with self._changed:
-            return self._is_closed and not self._waiting
+    def _take_oldest(self) -> tuple[str, LiveSample]:
+        sensor, sample = super()._take_oldest()
+        self._n_waiting[sensor] -= 1
+        return sensor, sample
 
     def _drop_oldest(self, sensor: str) -> None:
-        place = next(k for k, (name, _) in enumerate(self._waiting) if name == sensor)
-        del self._waiting[place]
+        place = next(k for k, (name, _) in enumerate(self._items) if name == sensor)
+        del self._items[place]
         self._n_waiting[sensor] -= 1
         self.n_dropped[sensor] += 1
 

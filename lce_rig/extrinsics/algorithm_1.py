@@ -30,6 +30,116 @@ from lce_rig.solvers.certificate import solve_globally
 from lce_rig.solvers.covariance import systematic_covariances
 from lce_rig.solvers.registration import eliminate_linear, linear_unknowns, rotation_from_directions
 
+# First phase of Algorithm 1: the extrinsic from the boards' planes alone.
+
+KEPT_SHARE = 0.9
+
+
+def solve_planes(features: Sequence[CaptureFeatures], problem: Problem) -> Array:
+    """Solve point-to-plane over all captures: T_cam_lidar (4, 4).
+
+    The start turns the LiDAR's normals onto the camera's; where its minimum is not certified the global one
+    is searched from everywhere.
+    """
+    R_start = rotation_from_directions(
+        np.array([f.normal for f in features]), np.array([f.lidar_normal for f in features])
+    )
+    n_ends = len(problem.edge_capture)
+    everything = np.ones((1, problem.n_captures))
+    no_edges = Weights(1.0, 0.0, problem.weights.shift_prior)
+    M = problem.moments(everything, np.zeros((1, n_ends), dtype=np.int8), no_edges)
+    Q, L = eliminate_linear(M)
+    R, _ = solve_globally(Q, R_start[None])
+    return pose(R[0], linear_unknowns(L, R)[0, :3])
+
+
+def drop_uncertain(features: Sequence[CaptureFeatures], T_cam_lidar: Array) -> list[NDArray[np.bool_]]:
+    """Mask the tenth of all plane terms with the largest propagated variance.
+
+    The distance n . (R p + t) + d of a point inherits sigma^2 = (R p + t)^T cov_n (R p + t) from the camera's
+    normal. No capture loses more than half of its points: the filter thins captures and does not select them.
+
+    Args:
+        features: of all captures.
+        T_cam_lidar: (4, 4) estimate.
+
+    Returns:
+        Per capture a mask of the points kept.
+    """
+    variances = []
+    for f in features:
+        points_cam = f.plane_points @ T_cam_lidar[:3, :3].T + T_cam_lidar[:3, 3]
+        variances.append(np.einsum("ni,ij,nj->n", points_cam, f.cov_normal, points_cam))
+    limit = np.quantile(np.concatenate(variances), KEPT_SHARE)
+    return [v <= max(limit, np.median(v)) for v in variances]
+
+
+# Captures that disagree with what the others predict, and the size of the errors of those that agree.
+
+_DEVIATIONS = 6.0
+_TIMES_MEDIAN = 3.0
+# A disagreement below this can be noise, however well the other captures agree.
+_FLOOR_M = 0.02
+_MAX_SHARE = 0.25
+_SIGMA_FLOOR_M = 0.001
+
+
+def reject_outliers(
+    features: Sequence[CaptureFeatures], problem: Problem, T_start: Array, parts: Algorithm1Parts
+) -> tuple[dict[str, Refusal], tuple[float, float]]:
+    """Refuse captures whose plane or edges lie far from where the other captures predict them, worst first.
+
+    Args:
+        features: of the captures in `problem`.
+        problem: their moments, weighted alike.
+        T_start: (4, 4) planar initialisation.
+        parts: of Algorithm 1; `reject_outliers` switches the refusal off.
+
+    Returns:
+        The refusals by capture; and the typical predicted plane and edge error of the captures kept, m.
+    """
+    kept = np.arange(problem.n_captures)
+    refusals: dict[str, Refusal] = {}
+    while True:
+        selection = np.zeros((len(kept), problem.n_captures))
+        selection[:, kept] = 1
+        selection[np.arange(len(kept)), kept] = 0
+        solutions = problem.solve(selection, T_start, parts.n_rounds)
+        plane, edge = (error[np.arange(len(kept)), kept] for error in problem.errors(solutions.x))
+        excess = np.maximum(_excess(plane), _excess(edge))
+        worst = int(np.argmax(excess))
+        n_refused = problem.n_captures - len(kept)
+        is_done = not parts.reject_outliers or excess[worst] <= 1 or len(kept) <= 4
+        if is_done or n_refused >= _MAX_SHARE * problem.n_captures:
+            return refusals, (_typical(plane), _typical(edge))
+        refusals[features[kept[worst]].capture] = _refusal(plane, edge, worst)
+        kept = np.delete(kept, worst)
+
+
+def _excess(errors: Array) -> Array:
+    """Divide errors (F,) by the largest that still passes for noise."""
+    median = float(np.median(errors))
+    deviation = 1.4826 * float(np.median(np.abs(errors - median)))
+    limit = max(median + _DEVIATIONS * deviation, _TIMES_MEDIAN * median, _FLOOR_M)
+    return errors / limit
+
+
+def _typical(errors: Array) -> float:
+    return max(float(np.median(errors)), _SIGMA_FLOOR_M)
+
+
+def _refusal(plane: Array, edge: Array, k: int) -> Refusal:
+    return Refusal(
+        "calibrate.outlier",
+        figures={
+            "plane_m": float(plane[k]),
+            "edges_m": float(edge[k]),
+            "plane_median_m": float(np.median(plane)),
+            "edges_median_m": float(np.median(edge)),
+        },
+    )
+
+
 # Second phase of Algorithm 1: many refinements on random subsets, judged on the captures they left out.
 
 MIN_SUBSET = 3
@@ -146,116 +256,6 @@ def _judge(
         spread_rotation_rad=np.sqrt(np.mean(angles**2, axis=1)),
         spread_translation_m=np.sqrt(np.mean(distances**2, axis=1)),
     )
-
-
-# Captures that disagree with what the others predict, and the size of the errors of those that agree.
-
-_DEVIATIONS = 6.0
-_TIMES_MEDIAN = 3.0
-# A disagreement below this can be noise, however well the other captures agree.
-_FLOOR_M = 0.02
-_MAX_SHARE = 0.25
-_SIGMA_FLOOR_M = 0.001
-
-
-def reject_outliers(
-    features: Sequence[CaptureFeatures], problem: Problem, T_start: Array, parts: Algorithm1Parts
-) -> tuple[dict[str, Refusal], tuple[float, float]]:
-    """Refuse captures whose plane or edges lie far from where the other captures predict them, worst first.
-
-    Args:
-        features: of the captures in `problem`.
-        problem: their moments, weighted alike.
-        T_start: (4, 4) planar initialisation.
-        parts: of Algorithm 1; `reject_outliers` switches the refusal off.
-
-    Returns:
-        The refusals by capture; and the typical predicted plane and edge error of the captures kept, m.
-    """
-    kept = np.arange(problem.n_captures)
-    refusals: dict[str, Refusal] = {}
-    while True:
-        selection = np.zeros((len(kept), problem.n_captures))
-        selection[:, kept] = 1
-        selection[np.arange(len(kept)), kept] = 0
-        solutions = problem.solve(selection, T_start, parts.n_rounds)
-        plane, edge = (error[np.arange(len(kept)), kept] for error in problem.errors(solutions.x))
-        excess = np.maximum(_excess(plane), _excess(edge))
-        worst = int(np.argmax(excess))
-        n_refused = problem.n_captures - len(kept)
-        is_done = not parts.reject_outliers or excess[worst] <= 1 or len(kept) <= 4
-        if is_done or n_refused >= _MAX_SHARE * problem.n_captures:
-            return refusals, (_typical(plane), _typical(edge))
-        refusals[features[kept[worst]].capture] = _refusal(plane, edge, worst)
-        kept = np.delete(kept, worst)
-
-
-def _excess(errors: Array) -> Array:
-    """Divide errors (F,) by the largest that still passes for noise."""
-    median = float(np.median(errors))
-    deviation = 1.4826 * float(np.median(np.abs(errors - median)))
-    limit = max(median + _DEVIATIONS * deviation, _TIMES_MEDIAN * median, _FLOOR_M)
-    return errors / limit
-
-
-def _typical(errors: Array) -> float:
-    return max(float(np.median(errors)), _SIGMA_FLOOR_M)
-
-
-def _refusal(plane: Array, edge: Array, k: int) -> Refusal:
-    return Refusal(
-        "calibrate.outlier",
-        figures={
-            "plane_m": float(plane[k]),
-            "edges_m": float(edge[k]),
-            "plane_median_m": float(np.median(plane)),
-            "edges_median_m": float(np.median(edge)),
-        },
-    )
-
-
-# First phase of Algorithm 1: the extrinsic from the boards' planes alone.
-
-KEPT_SHARE = 0.9
-
-
-def solve_planes(features: Sequence[CaptureFeatures], problem: Problem) -> Array:
-    """Solve point-to-plane over all captures: T_cam_lidar (4, 4).
-
-    The start turns the LiDAR's normals onto the camera's; where its minimum is not certified the global one
-    is searched from everywhere.
-    """
-    R_start = rotation_from_directions(
-        np.array([f.normal for f in features]), np.array([f.lidar_normal for f in features])
-    )
-    n_ends = len(problem.edge_capture)
-    everything = np.ones((1, problem.n_captures))
-    no_edges = Weights(1.0, 0.0, problem.weights.shift_prior)
-    M = problem.moments(everything, np.zeros((1, n_ends), dtype=np.int8), no_edges)
-    Q, L = eliminate_linear(M)
-    R, _ = solve_globally(Q, R_start[None])
-    return pose(R[0], linear_unknowns(L, R)[0, :3])
-
-
-def drop_uncertain(features: Sequence[CaptureFeatures], T_cam_lidar: Array) -> list[NDArray[np.bool_]]:
-    """Mask the tenth of all plane terms with the largest propagated variance.
-
-    The distance n . (R p + t) + d of a point inherits sigma^2 = (R p + t)^T cov_n (R p + t) from the camera's
-    normal. No capture loses more than half of its points: the filter thins captures and does not select them.
-
-    Args:
-        features: of all captures.
-        T_cam_lidar: (4, 4) estimate.
-
-    Returns:
-        Per capture a mask of the points kept.
-    """
-    variances = []
-    for f in features:
-        points_cam = f.plane_points @ T_cam_lidar[:3, :3].T + T_cam_lidar[:3, 3]
-        variances.append(np.einsum("ni,ij,nj->n", points_cam, f.cov_normal, points_cam))
-    limit = np.quantile(np.concatenate(variances), KEPT_SHARE)
-    return [v <= max(limit, np.median(v)) for v in variances]
 
 
 # Residuals that captures are first weighed by; weights are reported in units of it.

@@ -13,11 +13,10 @@ from types import TracebackType
 from aiohttp import WSMsgType, web
 
 from lce_rig.collect.live.state import LiveState
-from lce_rig.page import state_message as message
 from lce_rig.page.access import Gate, check_token, guarded, new_token
 from lce_rig.page.address import DEFAULT_PORT, LOOPBACK, is_loopback, links, listen
 from lce_rig.page.connections import REQUEST_S, Connections
-from lce_rig.page.state_message import Encoder
+from lce_rig.page.state_message import Encoder, Pixels, beat, to_json
 from lce_rig.page.troubles import Troubles
 
 # The newest state, handed from the thread that collects to those who watch.
@@ -57,8 +56,6 @@ class Feed:
         return True
 
 
-# The web application: the page's files, and the connection that feeds it.
-
 # One open page: told the newest state as fast as it can follow, and no faster.
 
 #: Between two updates.
@@ -79,7 +76,7 @@ class Viewer:
     are looked at. Nothing else is read from it.
     """
 
-    def __init__(self, socket: web.WebSocketResponse, feed: Feed, encoder: message.Encoder) -> None:
+    def __init__(self, socket: web.WebSocketResponse, feed: Feed, encoder: Encoder) -> None:
         self._socket = socket
         self._feed = feed
         self._encoder = encoder
@@ -88,7 +85,7 @@ class Viewer:
         self._is_looked_at = True
         self._state = 0
         self._delivered = 0
-        self._pixels: message.Pixels | None = None
+        self._pixels: Pixels | None = None
         self._has_room = asyncio.Event()
         self._has_room.set()
 
@@ -127,7 +124,7 @@ class Viewer:
                     await self._send_newest()
                     await asyncio.sleep(max(0.0, began_s + PERIOD_S - time.monotonic()))
                 else:
-                    await self._socket.send_str(message.beat(self._feed.age_s()))
+                    await self._socket.send_str(beat(self._feed.age_s()))
 
     async def _send_newest(self) -> None:
         newest = self._feed.newest()
@@ -144,7 +141,7 @@ class Viewer:
         self._n_sent += 1
         if self._n_sent - self._n_shown >= MAX_UNDER_WAY:
             self._has_room.clear()
-        await self._socket.send_str(message.to_json(state, self._n_sent, has_picture=jpeg is not None))
+        await self._socket.send_str(to_json(state, self._n_sent, has_picture=jpeg is not None))
         if jpeg is not None:
             await self._socket.send_bytes(jpeg)
 
@@ -170,6 +167,8 @@ class Viewer:
             self._has_room.set()
         return True
 
+
+# The web application: the page's files, and the connection that feeds it.
 
 #: A page that does not answer for so long is gone: a phone out of range says no goodbye.
 HEARTBEAT_S = 10.0

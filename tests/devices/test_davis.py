@@ -19,7 +19,7 @@ import pytest
 from lce_rig.core.data import Events, Image, LiveSample, Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.devices.davis import opened as davis_device
+from lce_rig.devices.davis import opened
 from lce_rig.devices.davis.driver import DavisSamples, DavisSource
 from lce_rig.devices.davis.opened import OpenedCamera, bias_of, number_of
 from lce_rig.rig import CameraSettings, load_rig
@@ -250,7 +250,7 @@ def test_without_a_camera_there_is_one_clear_error(device: str | None, name: str
 
 
 def test_every_call_to_a_camera_exists_in_dv_processing() -> None:
-    source = inspect.getsource(davis_device)
+    source = inspect.getsource(opened)
     new = source[source.index("def _set_up_new") : source.index("def _set_up_old")]
     called = set(re.findall(r"camera\.(\w+)", new)) | {
         "getCameraName",

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.v4l2 import abi as abi
+from lce_rig.devices.v4l2 import abi
 from lce_rig.devices.v4l2.driver import V4l2Source
 from lce_rig.rig import CameraSettings, load_rig
 from tests.notes import has_note

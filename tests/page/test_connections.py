@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 from lce_rig.page import Preview, connections
-from lce_rig.page import preview as viewer
+from lce_rig.page import preview as page_module
 from lce_rig.page.connections import MAX_CONNECTIONS, MAX_OF_ONE_PEER
 from lce_rig.page.preview import Server
 from tests.notes import has_note
@@ -106,7 +106,7 @@ def test_what_is_sent_half_ends_in_time_and_an_open_page_does_not(
 
 
 def test_a_page_that_shows_nothing_makes_way(preview: Preview, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer, "ANSWER_S", 0.3)
+    monkeypatch.setattr(page_module, "ANSWER_S", 0.3)
     with Watcher(preview.urls[0]) as asleep, Watcher(preview.urls[0]) as awake:
         asleep.watch()
         awake.watch()

@@ -10,7 +10,7 @@ import pytest
 
 from lce_rig.collect.live.state import Drawing
 from lce_rig.page import Preview
-from lce_rig.page import preview as server
+from lce_rig.page import preview as page_module
 from lce_rig.page.preview import MAX_UNDER_WAY
 from lce_rig.page.state_message import MAX_WIDTH_PX, encode_picture
 
@@ -145,8 +145,8 @@ def test_a_page_that_does_not_answer_delays_neither_the_collection_nor_other_pag
 
 
 def test_a_page_that_vanished_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "HEARTBEAT_S", 0.2)
-    monkeypatch.setattr(server, "MAX_VIEWERS", 1)
+    monkeypatch.setattr(page_module, "HEARTBEAT_S", 0.2)
+    monkeypatch.setattr(page_module, "MAX_VIEWERS", 1)
     with Preview(port=0) as preview, Watcher(preview.urls[0]) as watcher:
         preview.publish(state())
         host, port = preview.urls[0].removeprefix("http://").rstrip("/").split(":")

@@ -9,7 +9,7 @@ from difflib import get_close_matches
 
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.devices.v4l2 import abi as abi
+from lce_rig.devices.v4l2 import abi
 from lce_rig.devices.v4l2.video_device import VideoDevice
 
 Value = bool | int | float | str

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.devices.v4l2 import abi as abi
+from lce_rig.devices.v4l2 import abi
 from lce_rig.rig import DriverSettings
 
 # From the moment a driver stamps to the middle of the exposure, for the middle row of a picture.

@@ -11,7 +11,7 @@ from mmap import MAP_SHARED, PROT_READ, PROT_WRITE, mmap
 from pathlib import Path
 
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.v4l2 import abi as abi
+from lce_rig.devices.v4l2 import abi
 
 _US_NS = 1000
 _S_NS = 1_000_000_000

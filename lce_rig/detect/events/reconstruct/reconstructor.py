@@ -38,8 +38,6 @@ def too_late(stamp_ns: int, last_ns: int | None) -> Refusal:
     return Refusal("read.after_events", figures={"gap_s": 1e-9 * (stamp_ns - last_ns)})
 
 
-# Two ways from a window of events to a picture: the recurrent network and the event map.
-
 # From arbitrary scales to 8 bits, without flicker: intensities of the network, sums of polarities.
 
 _PERCENTILES = (1.0, 99.0)
@@ -102,6 +100,9 @@ class IntensityScale:
 def _bounds(picture: FloatArray) -> NDArray[np.float64]:
     # Every fourth pixel in each direction tells the percentiles well enough.
     return np.asarray(np.percentile(picture[::4, ::4], _PERCENTILES), dtype=np.float64)
+
+
+# Two ways from a window of events to a picture: the recurrent network and the event map.
 
 
 class EventImager(Protocol):
