@@ -110,6 +110,9 @@ _DEVICE: Mapping[str, Phrase] = {
         "if the image is slanted, let the command write JPEG (jpegenc)",
     ),
     "device.recording_stopped": Phrase("recording to {path} stopped: {cause}", "free some space"),
+    "device.recording_incomplete": Phrase(
+        "{n} samples missing in {path}: the disk is too slow", "record to a faster disk"
+    ),
     "device.board_silent": Phrase(
         "no message from the board for {silent_s:.0f} s", "check its cable and power, press its reset"
     ),

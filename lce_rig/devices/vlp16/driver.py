@@ -11,12 +11,12 @@ from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
+from lce_rig.devices.disk_writer import DiskWriter, Sink
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.vlp16.packet_recorder import PcapRecorder
 from lce_rig.devices.vlp16.socket import PACKET_COST_BYTES, UdpPort
 from lce_rig.devices.vlp16.web import VelodyneWeb, WebReport, find_problems
-from lce_rig.recordings.velodyne.datagrams import Datagram
+from lce_rig.recordings.velodyne.datagrams import Datagram, PcapWriter
 from lce_rig.recordings.velodyne.driver_controls import read_controls
 from lce_rig.recordings.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings
@@ -61,7 +61,7 @@ def to_status(
     settings: LidarSettings,
     stream: Vlp16Stream | None,
     reception: Reception,
-    recorder: PcapRecorder | None,
+    recorder: Sink[Datagram] | None,
 ) -> SourceStatus:
     """Gather everything as figures and findings."""
     if stream is None:
@@ -82,7 +82,7 @@ def to_status(
     if recorder is not None:
         figures["recorded_packets"] = float(recorder.n_written)
         figures["unrecorded_packets"] = float(recorder.n_dropped)
-        problems += [recorder.failure] if recorder.failure is not None else []
+        problems += recorder.findings()
     return SourceStatus(
         sensor,
         n_lost=losses.n("packet.lost"),
@@ -201,7 +201,6 @@ class Vlp16Source(LiveSource):
         *,
         silence_s: float = SILENCE_S,
         n_slots: int = N_SLOTS,
-        record_to: Path | None = None,
         web_port: int = 80,
     ) -> None:
         """Take the settings; nothing is opened yet.
@@ -211,27 +210,41 @@ class Vlp16Source(LiveSource):
             settings: its block of the profile.
             silence_s: without packets for so long, it is taken to be gone.
             n_slots: scans that wait for a slow taker; the oldest are dropped.
-            record_to: a pcap file for the raw packets; it must not exist.
             web_port: of the sensor's web server, which is asked when no packets come.
         """
         super().__init__(sensor, sensor, n_slots, silence_s)
         self._settings = settings
-        self._record_to = record_to
         self._web_port = web_port
         self._lock = threading.Lock()
         self._reception = Reception()
         self._stream: Vlp16Stream | None = None
-        self._recorder: PcapRecorder | None = None
+        self._recorder: Sink[Datagram] | None = None
         self._ports: tuple[UdpPort, ...] = ()
         self._early: list[Scan] = []
         self._n_lost_before = 0
+
+    def record_packets(self, folder: Path, disk: DiskWriter) -> bool:
+        """Have all packets written to SENSOR.pcap.
+
+        Raises:
+            SourceError: the file exists already, or cannot be made.
+        """
+        path = folder / f"{self.sensor}.pcap"
+        try:
+            writer = PcapWriter(path)
+        except FileExistsError:
+            raise SourceError(f"{path} exists already", "Move it away, or record elsewhere.") from None
+        except OSError as error:
+            raise SourceError(f"{path} cannot be written: {error.strerror}") from None
+        self._recorder = disk.add(path, writer.write, writer.close)
+        return True
 
     def open(self) -> None:
         """Open the ports and wait for the first packet.
 
         Raises:
             SourceError: no packets come, or those of another model; a port is held by another program;
-                velodyne-decoder is not installed; the recording cannot be made.
+                velodyne-decoder is not installed.
         """
         with self._lock:
             self._n_lost_before += self._stream.losses.n("packet.lost") if self._stream is not None else 0
@@ -240,8 +253,6 @@ class Vlp16Source(LiveSource):
         data = UdpPort(self._settings.driver.port or velodyne.DATA_PORT, f"{self.sensor}: data packets")
         self._ports = (data,)
         self._ports = data, UdpPort(position_port, f"{self.sensor}: position packets")
-        if self._record_to is not None and self._recorder is None:
-            self._recorder = PcapRecorder(self._record_to)
         self._early = []
         until_s = time.monotonic() + self._silence_s
         while not self._stream.n_data and not self.is_stopping:
@@ -274,13 +285,10 @@ class Vlp16Source(LiveSource):
         return scans
 
     def close(self) -> None:
-        """Close the ports; what is recorded goes on when they are opened again."""
+        """Close the ports."""
         for port in self._ports:
             port.close()
         self._ports = ()
-        if self._recorder is not None and self.is_stopping:
-            self._recorder.close()
-            self._recorder = None
 
     def explain_silence(self, *, has_sent: bool) -> SourceError:
         """Find the likeliest reason; the sensor's web page is asked."""
@@ -304,7 +312,7 @@ class Vlp16Source(LiveSource):
             self._reception.see_stranger(datagram.source)
             return None
         if self._recorder is not None:
-            self._recorder.put(datagram)
+            self._recorder.put(datagram, len(datagram.payload))
         with self._lock:
             if not is_data:
                 stream.push_position(datagram.payload, datagram.host_ns)
