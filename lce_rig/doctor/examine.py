@@ -137,7 +137,7 @@ def _sight_in_scan(rig: Rig, seen: ObservedSensor) -> Finding:
     if isinstance(found, Refusal):
         return found
     best = found[0].quality
-    figures = {name: best[name] for name in ("distance_m", "n_rings", "n_points")}
+    figures = {"distance_m": best.distance_m, "n_rings": best.n_rings, "n_points": best.n_points}
     return Finding("board.in_scan", "note", figures={**figures, "n_candidates": len(found)})
 
 
@@ -148,8 +148,8 @@ def _sight_in_picture(rig: Rig, image: Image) -> Finding:
         found = Refusal.of_error("image", error)
     if isinstance(found, Refusal):
         return found
-    names = ("distance_m", "n_corners", "corner_rms_px", "sharpness")
-    return Finding("board.in_image", "note", figures={name: found.quality[name] for name in names})
+    names, figures = ("distance_m", "n_corners", "corner_rms_px", "sharpness"), found.figures()
+    return Finding("board.in_image", "note", figures={name: figures[name] for name in names})
 
 
 def _sight_in_events(rig: Rig, seen: ObservedSensor) -> Finding:
@@ -172,4 +172,4 @@ def _sight_in_events(rig: Rig, seen: ObservedSensor) -> Finding:
         found = Refusal.of_error("image", error)
     if isinstance(found, Refusal):
         return found
-    return Finding("board.in_events", "note", figures={"distance_m": found.quality["distance_m"]})
+    return Finding("board.in_events", "note", figures={"distance_m": found.distance_m})

@@ -6,7 +6,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.backdrop import SHADOW_STEP_PX, Backdrop, beside_changes, pixel_rays, sub_rays
 from lce_rig.simulate.light import irradiance, reached
@@ -15,31 +14,6 @@ from lce_rig.simulate.scene import Hits, Scene
 
 SUBPIXELS = 5
 _GAMMA = 1 / 2.2
-
-
-def render_image(
-    scene: Scene,
-    backdrop: Backdrop,
-    noise: CameraNoise,
-    rng: np.random.Generator,
-    *,
-    sensor: str = "cam",
-    channel: str = "frames",
-    stamp_ns: int = 0,
-) -> Image:
-    """Render one image.
-
-    Args:
-        scene: the room of the backdrop, with the board and its carrier.
-        backdrop: the camera and its image of the static room.
-        noise: the camera's errors.
-        rng: source of the sensor's noise.
-        sensor: name in the rig profile.
-        channel: channel of that camera.
-        stamp_ns: device time of mid exposure.
-    """
-    radiance = render_radiance(scene, backdrop)
-    return Image(sensor, channel, stamp_ns, expose(radiance, noise, rng), stamp_ns)
 
 
 def render_radiance(scene: Scene, backdrop: Backdrop, n_subpixels: int = SUBPIXELS) -> Array:

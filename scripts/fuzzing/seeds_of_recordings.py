@@ -399,8 +399,9 @@ def pcapng(samples: Samples) -> list[Files]:
 
 
 def _datagrams(samples: Samples) -> list[Any]:
+    from wire.vlp16_packets import Vlp16Packets
+
     from lce_rig.recordings.velodyne.datagrams import Datagram
-    from lce_rig.simulate.vlp16_packets import Vlp16Packets
 
     packets = Vlp16Packets()
     sent = [packet for scan in samples.whole_scans for packet in packets.feed(scan)] + packets.finish()

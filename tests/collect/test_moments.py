@@ -1,6 +1,7 @@
 """A continuous recording is cut where the board stands still and differs from what is there."""
 
 import os
+import shutil
 
 import numpy as np
 import pytest
@@ -38,6 +39,14 @@ def test_two_stands_become_two_captures_and_the_way_between_none(collected, path
         assert capture.meta["motion_m"] < 0.005
         image, scan = capture.image("cam", "frames"), capture.scan("lidar")
         assert abs(image.stamp_ns - scan.stamp_ns - 50_000_000) < 1_000_000 and len(scan.points) == 28_800
+
+
+def test_a_rejected_placement_is_not_captured_again_from_its_recording(collected, bag, rig, tmp_path):
+    shutil.copytree(collected[0], tmp_path / "s")
+    with Session.resume(tmp_path / "s", rig) as session:
+        session.reject("000001")
+        report = collect(session, [open_recording(bag, rig)])
+    assert (report.captured, report.n_resumed, report.n_rejected, len(session.captures)) == ([], 1, 1, 1)
 
 
 def test_a_second_run_captures_nothing_again(collected, bag, rig):

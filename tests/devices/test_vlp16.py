@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from wire.vlp16_packets import SensorPacket, Vlp16Clock
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
@@ -23,7 +24,6 @@ from lce_rig.recordings.velodyne.pcap import PcapRecording
 from lce_rig.recordings.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.rig.sensors import DriverSettings
-from lce_rig.simulate.vlp16_packets import SensorPacket, Vlp16Clock
 from tests.recordings.vlp16_room import PERIOD_NS, T0_NS, packets_of, push, room_scans, settings
 
 HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"

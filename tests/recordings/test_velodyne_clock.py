@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from wire.vlp16_packets import SensorPacket, Vlp16Clock
 
 from lce_rig.rig.sensors import TimestampSettings
-from lce_rig.simulate.vlp16_packets import SensorPacket, Vlp16Clock
 
 from .vlp16_room import (
     HOUR_NS,

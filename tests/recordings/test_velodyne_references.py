@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wire.vlp16_packets import STREAMED_VLP16
 
 from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
@@ -13,7 +14,6 @@ from lce_rig.recordings.protocol import SourceOptions
 from lce_rig.recordings.velodyne.pcap import PcapFile, PcapRecording
 from lce_rig.recordings.velodyne.points import Vlp16Decoder, keep_brighter
 from lce_rig.rig import Rig
-from lce_rig.simulate.vlp16_packets import STREAMED_VLP16
 
 from .vlp16_room import (
     decode_by_manual,

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from wire.vlp16_packets import SensorPacket, Vlp16Clock
 
 from lce_rig.core import velodyne
-from lce_rig.simulate.vlp16_packets import SensorPacket, Vlp16Clock
 
 from .vlp16_room import (
     PERIOD_NS,

@@ -7,10 +7,14 @@ import pytest
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.rig import Rig
 from lce_rig.simulate.backdrop import Backdrop, build_backdrop
+from lce_rig.simulate.options import CameraNoise
+from lce_rig.simulate.rendering import expose, render_radiance
 from lce_rig.simulate.room import Room, build_room
+from lce_rig.simulate.scene import Scene
 
 FACING_LIDAR = np.array(
     [[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
@@ -83,3 +87,7 @@ LENSES = {
 @pytest.fixture(scope="session", params=sorted(LENSES))
 def backdrop(request: pytest.FixtureRequest, room: Room, T_world_cam: Array) -> Backdrop:
     return build_backdrop(room, T_world_cam, LENSES[request.param])
+
+
+def render_image(scene: Scene, backdrop: Backdrop, noise: CameraNoise, rng: np.random.Generator) -> Image:
+    return Image("cam", "frames", 0, expose(render_radiance(scene, backdrop), noise, rng))

@@ -1,6 +1,7 @@
 """Build a session from recordings, unattended: what is new becomes a capture, the rest is counted."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from lce_rig.collect.board_tracker import BoardTracker, CaptureMoment, ImageKey
@@ -9,9 +10,9 @@ from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.collect.offline.slow_motion import find_moving_moments
 from lce_rig.collect.offline.stillness import StillnessOptions, find_still_moments
 from lce_rig.collect.offline.stored_events import StoredEvents
-from lce_rig.collect.placement_dedupe import Placements, board_figures, known_placements
+from lce_rig.collect.placement_dedupe import Placements, board_figures, capture_poses, known_placements
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
-from lce_rig.core.errors import SessionError, SourceError
+from lce_rig.core.errors import LceRigError, SessionError, SourceError
 from lce_rig.core.losses import Losses
 from lce_rig.core.results import Refusal
 from lce_rig.recordings.joining import join_recordings, require_sensors
@@ -131,6 +132,7 @@ class CollectReport:
     Attributes:
         captured: names of the new captures.
         n_resumed: pairs and moments that an earlier run had captured already.
+        n_rejected: those whose captures were rejected since.
         duplicates: capture that holds the same data, by label.
         refused: why something became no capture, by label.
         counts: what kept moments of a continuous recording from becoming captures.
@@ -142,6 +144,7 @@ class CollectReport:
 
     captured: list[str] = field(default_factory=list)
     n_resumed: int = 0
+    n_rejected: int = 0
     duplicates: dict[str, str] = field(default_factory=dict)
     refused: dict[str, Refusal] = field(default_factory=dict)
     counts: Losses = field(default_factory=Losses)
@@ -194,6 +197,7 @@ class _Collector:
         self._options = options
         self._progress = progress
         self._stored = StoredEvents()
+        self._rejected = {capture.name: capture for capture in session.rejected}
         self._names_by_key = _known_keys(session)
         self._n_captures = len(session.captures)
 
@@ -234,6 +238,11 @@ class _Collector:
         require_sensors(recording)
         rig, options = self._session.rig, self._options
         known = known_placements(self._session, options.min_move_m, options.min_turn_deg)
+        # Where a capture of this recording was rejected, another moment of that placement is not wanted.
+        for key, name in self._names_by_key.items():
+            if name in self._rejected and key.startswith(f"{recording.key}:"):
+                with suppress(LceRigError):
+                    known.add_poses(name, capture_poses(self._rejected[name], self._session))
         search = MomentSearch(
             rig,
             frozenset(recording.streams),
@@ -272,6 +281,7 @@ class _Collector:
             "collected",
             captured=len(report.captured),
             resumed=report.n_resumed,
+            rejected=report.n_rejected,
             duplicates=report.duplicates,
             refused={label: describe(refusal) for label, refusal in report.refused.items()},
             counts=report.counts.by_code(),
@@ -284,8 +294,7 @@ class _Collector:
     def _take_pair(self, files: PairFiles) -> str:
         key = files.key()
         if key in self._names_by_key:
-            self.report.n_resumed += 1
-            return f"{files.label} is capture {self._names_by_key[key]} already"
+            return self._count_known(files.label, self._names_by_key[key])
         pair = files.read()
         self.note(pair.notes)
         self._note_sizes(pair.images)
@@ -299,7 +308,7 @@ class _Collector:
         key = f"{recording_key}:{'/'.join(str(stamp) for stamp in stamps)}"
         label = f"at {stamps[0]} ns"
         if key in self._names_by_key:
-            self.report.n_resumed += 1
+            self._count_known(label, self._names_by_key[key])
             return
         if known.find_like(boards) is not None:
             self.report.counts.add(Refusal("calibrate.same_placement"))
@@ -321,6 +330,8 @@ class _Collector:
         events: Sequence[Events] = (),
     ) -> str:
         duplicate = self._session.find_duplicate(images, scans, events)
+        if duplicate in self._rejected:
+            return self._count_known(label, duplicate)
         if duplicate is not None:
             self.report.duplicates[label] = duplicate
             return f"{label} is a duplicate of {duplicate}"
@@ -330,6 +341,14 @@ class _Collector:
         self._n_captures += 1
         self.report.captured.append(name)
         return f"{label} captured as {name}"
+
+    def _count_known(self, label: str, name: str) -> str:
+        """Count what an earlier run captured as this capture; rejected captures stay rejected."""
+        if name in self._rejected:
+            self.report.n_rejected += 1
+            return f"{label} is capture {name}, which is rejected"
+        self.report.n_resumed += 1
+        return f"{label} is capture {name} already"
 
     def _is_full(self) -> bool:
         limit = self._options.max_captures
@@ -367,8 +386,9 @@ def _until_torn(samples: Iterable[Sample], torn: list[SourceError]) -> Iterator[
 
 
 def _known_keys(session: Session) -> dict[str, str]:
+    """Name the captures, rejected ones included, by the key of what they were made from."""
     keys = {}
-    for capture in session.captures:
+    for capture in session.captures + session.rejected:
         try:
             source = capture.meta.get("source", {})
         except SessionError:

@@ -1,7 +1,7 @@
 """A bag written as samples arrive, on the topics of the rig's profile."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -29,26 +29,6 @@ _EVENT = {
     True: "uint16 x\nuint16 y\ntime ts\nbool polarity\n",
     False: "uint16 x\nuint16 y\nbuiltin_interfaces/Time ts\nbool polarity\n",
 }
-
-
-def write_event_bag(
-    path: Path, stretches: Iterable[Events], topic: str = "/dvs/events", frame_id: str = "event_camera"
-) -> None:
-    """Write a recording of events: as a ROS 1 bag where the path ends in .bag, else as a ROS 2 folder (mcap).
-
-    Raises:
-        FileExistsError: something is there already.
-    """
-    if path.exists():
-        raise FileExistsError(f"{path} exists already")
-    is_ros1 = path.suffix == ".bag"
-    with open_bag_writer(path) as writer:
-        connection = add_event_topic(writer, topic, is_ros1)
-        number = 0
-        for stretch in stretches:
-            for received_ns, message in event_messages(stretch, frame_id, is_ros1, number):
-                writer.write(connection, received_ns, message)
-                number += 1
 
 
 def open_bag_writer(path: Path) -> Any:

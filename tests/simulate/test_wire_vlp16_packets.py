@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from wire.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets, gprmc
 
 from lce_rig.core import velodyne
 from lce_rig.core.board import Board
@@ -16,7 +17,6 @@ from lce_rig.simulate.lidar import simulate_scan
 from lce_rig.simulate.options import LidarNoise
 from lce_rig.simulate.room import Room
 from lce_rig.simulate.scene import Scene
-from lce_rig.simulate.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets, gprmc
 from tests.recordings.vlp16_room import (
     T0_NS,
     largest_errors,
