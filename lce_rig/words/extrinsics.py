@@ -222,8 +222,7 @@ PHRASES: dict[str, Phrase] = {
     "verify.unseen": Phrase("no capture shows the board to both sensors"),
     "results.agree": Phrase(
         "the {n_sessions} results of {camera} and {lidar} agree: they differ by up to {rotation_deg:3deg} "
-        "and {translation_m:1mm}",
-        "compare another session, too: results of the same captures share errors",
+        "and {translation_m:1mm}; errors that they share do not show, as they are of the same captures",
     ),
     "results.disagree": Phrase(
         "{first} and {second} of {camera} and {lidar} disagree: results differ by up to {rotation_deg:3deg} "

@@ -151,7 +151,7 @@ def test_results_of_the_same_captures_are_not_accused_whatever_their_correlation
 
 
 def test_results_of_the_same_captures_that_differ_beyond_any_correlation_are_named():
-    far = perturb(TRUTH, 7 * ROOT @ np.eye(6)[0])
+    far = perturb(TRUTH, 12 * ROOT @ np.eye(6)[0])
     group = {"current": calibration(TRUTH), "ml": calibration(TRUTH), "events": calibration(far)}
     found = compare_calibrations(group, are_independent=False).finding
     assert (found.code, found.severity) == ("results.disagree", "error")
