@@ -244,6 +244,7 @@ def _tell(report: Any, session: Path, n_captures: int) -> None:
     if report.n_missing:
         show.warn(f"{report.n_missing} captures short of the target")
     new = f"{len(report.captured)} new" + (f", {report.n_resumed} known already" if report.n_resumed else "")
+    new += f", {report.n_rejected} rejected earlier" if report.n_rejected else ""
     show.note(f"{session}: {show.counted(n_captures, 'capture')} ({new})")
     for error in report.errors[:-1]:
         show.warn(str(error))

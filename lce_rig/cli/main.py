@@ -23,11 +23,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("lce_rig.cli.simulate", "Make a session of a simulated rig, with exact truth."),
     "collect": ("lce_rig.cli.collect", "Build a session, live and guided, or from recordings."),
     "reconstruct": ("lce_rig.cli.reconstruct", "Turn the events of a recording into pictures."),
+    "captures": ("lce_rig.cli.captures", "List the captures of a session; reject or restore some."),
     "check": ("lce_rig.cli.check", "Show what was detected in each capture, and why not."),
     "calibrate": ("lce_rig.cli.calibrate", "Estimate the extrinsics of a session."),
     "intrinsics": ("lce_rig.cli.intrinsics", "Measure the cameras' lenses from a session."),
     "verify": ("lce_rig.cli.verify", "Draw the LiDAR into the pictures and print residuals."),
-    "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of independent sessions."),
+    "results": ("lce_rig.cli.results", "List the results of a session with figures and verdicts."),
+    "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of sessions, or the results of one."),
 }
 EXIT_BUG = 70
 

@@ -10,11 +10,12 @@ import numpy as np
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, pose
 from lce_rig.core.results import Calibration
-from lce_rig.export.files import header, number, reads_back, write_atomically
+from lce_rig.export.files import header, number, reads_back
 from lce_rig.export.frames import RPY_BODY_OPTICAL, FrameTree, build_trees, check_tree, choose_channels
 from lce_rig.export.probes import check_pose
 from lce_rig.export.rotations import rotation_from_rpy, rpy
 from lce_rig.rig import Rig
+from lce_rig.session.durable import write_atomically
 
 
 def export_urdf(calibrations: Sequence[Calibration], rig: Rig, folder: Path) -> list[Path]:
