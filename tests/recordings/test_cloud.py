@@ -45,7 +45,7 @@ def test_a_point_on_the_axis_of_rotation_belongs_to_no_laser_and_is_dropped(room
 def test_a_cloud_without_a_valid_point_is_refused(room):
     cloud = room[:3].copy()
     cloud["x"] = np.nan
-    with pytest.raises(SourceError, match=r"here: the cloud has no valid point \(3 in all\)"):
+    with pytest.raises(SourceError, match=r"here: the point cloud has no valid point \(3 in all\)"):
         to_scan(cloud, "lidar", FIRST, "here")
     with pytest.raises(SourceError, match="no valid point"):
         to_scan(room[:0], "lidar", FIRST, "here")

@@ -24,7 +24,7 @@ EVENTS = replace(random_events(20_000, 3, start_us=T0_US, step_us=250), sensor="
 PIECES = [EVENTS.select(slice(k, k + 500)) for k in range(0, 20_000, 500)]
 GREY = np.random.default_rng(0).integers(0, 256, (260, 346), dtype=np.uint8)
 FRAMES = [RawFrame(T0_US + 40_000 * k, 8000, GREY) for k in range(5)]
-EVENT_STREAM, FRAME_STREAM = Stream("davis", "events", "events"), Stream("davis", "frames", "pictures")
+EVENT_STREAM, FRAME_STREAM = Stream("davis", "events", "events"), Stream("davis", "frames", "images")
 
 
 @pytest.fixture(scope="module")

@@ -89,17 +89,17 @@ def test_missing_folders_and_kinds_are_named(make_folder, rig, tmp_path):
     with pytest.raises(SourceError, match=r"recording/pcd: no clouds there"):
         open_recording(make_folder(clouds=[]), rig)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(SourceError, match="empty: no pictures there"):
+    with pytest.raises(SourceError, match="empty: no images found"):
         open_recording(tmp_path / "empty", rig)
     (tmp_path / "a.avi").touch()
-    with pytest.raises(SourceError, match=r"a\.avi is no recording this program reads"):
+    with pytest.raises(SourceError, match=r"a\.avi is not a recording"):
         open_recording(tmp_path / "a.avi", rig)
 
 
 def test_two_folders_of_clouds_without_telling_names_are_not_guessed(make_folder, rig):
     path = make_folder(names=("img", "one"))
     make_folder(names=("img", "two"))
-    with pytest.raises(SourceError, match="clouds lie in one, two: which"):
+    with pytest.raises(SourceError, match="point clouds lie in several folders: one, two"):
         open_recording(path, rig)
 
 
@@ -141,7 +141,7 @@ def test_one_of_several_cameras_can_be_read_by_itself(make_folder):
 
 def test_pictures_are_not_taken_for_those_of_a_camera_that_nobody_named(make_folder):
     path = make_folder()
-    with pytest.raises(SourceError, match="has cameras left, right: whose are these pictures") as caught:
+    with pytest.raises(SourceError, match="has cameras left, right: the images") as caught:
         open_recording(path, TWO)
     assert "--camera left" in caught.value.hint and "img/right/" in caught.value.hint
     (pair, _) = open_recording(path, TWO, SourceOptions(camera="right")).pairs

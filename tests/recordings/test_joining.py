@@ -19,12 +19,12 @@ from tests.notes import has_note
 S = 10**9
 T0_NS = 1_700_000_000 * S
 LIDAR = Stream("lidar", "", "scans")
-FRAMES, EVENTS = Stream("davis", "frames", "pictures"), Stream("davis", "events", "events")
+FRAMES, EVENTS = Stream("davis", "frames", "images"), Stream("davis", "events", "events")
 
 
 def sample(stream: Stream, time_s: float) -> Sample:
     stamp_ns = T0_NS + round(time_s * S)
-    if stream.kind == "pictures":
+    if stream.kind == "images":
         return Image(stream.sensor, stream.channel, stamp_ns, np.zeros((2, 2), np.uint8))
     if stream.kind == "scans":
         column = np.zeros(1, np.float32)
@@ -171,7 +171,7 @@ def test_what_lacks_a_lidar_or_a_camera_is_refused_with_what_to_give_as_well(rig
         SourceError, match=r"events\.aedat4: no scans.* holds events of davis\.events, pictures of"
     ):
         require_sensors(camera())
-    with pytest.raises(SourceError, match=r"lidar\.bag: no pictures and no events") as caught:
+    with pytest.raises(SourceError, match=r"lidar\.bag: no images and no events") as caught:
         require_sensors(lidar())
     assert re.findall(r"--from (\S+\w)", caught.value.hint) == ["lidar.bag", "events.aedat4"]
 

@@ -47,7 +47,7 @@ def test_different_counters_of_equal_number_are_paired_in_order():
 
 
 def test_nothing_is_paired_by_guesswork():
-    with pytest.raises(SourceError, match="3 pictures and 2 clouds cannot be paired"):
+    with pytest.raises(SourceError, match="3 images and 2 point clouds cannot be paired"):
         pair_names(["a1", "a2", "a3"], ["b1", "b2"])
     with pytest.raises(SourceError, match="as many pictures as clouds: there are 3 and 2"):
         pair_names(["a1", "a2", "a3"], ["b1", "b2"], "order")

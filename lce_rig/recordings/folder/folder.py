@@ -35,21 +35,21 @@ CLOUD_FOLDERS = (
 
 
 def list_pictures(folder: Path, notes: list[str]) -> list[Path]:
-    """List the images of one camera, in natural order; what was chosen between is noted.
+    """List the images of one camera, in natural order; choices are noted.
 
     Raises:
-        SourceError: there are none, or several folders have some and no name tells which is meant.
+        SourceError: there are none, or several folders have some and no name says which is meant.
     """
-    return _list(folder, IMAGE_FOLDERS, SUFFIXES, "pictures", notes)
+    return _list(folder, IMAGE_FOLDERS, SUFFIXES, "images", notes)
 
 
 def list_clouds(folder: Path, notes: list[str]) -> list[Path]:
-    """List the point clouds, in natural order; what was chosen between is noted.
+    """List the point clouds, in natural order; choices are noted.
 
     Raises:
         SourceError: as `list_pictures`.
     """
-    return _list(folder, CLOUD_FOLDERS, frozenset(DECODERS), "clouds", notes)
+    return _list(folder, CLOUD_FOLDERS, frozenset(DECODERS), "point clouds", notes)
 
 
 def list_pictures_by_camera(folder: Path, cameras: Collection[str]) -> dict[str, list[Path]]:
@@ -86,9 +86,9 @@ def _list(
         return next(iter(holding.values()))
     hint = f"Put them into {names[0]}/ below it; {', '.join(sorted(suffixes))} are read."
     if holding:
-        raise SourceError(f"{folder}: {what} lie in {', '.join(sorted(holding))}: which?", hint)
+        raise SourceError(f"{folder}: {what} lie in several folders: {', '.join(sorted(holding))}", hint)
     empty = next((name for name in names if name in folders), None)
-    raise SourceError(f"{folder}{'/' + empty if empty else ''}: no {what} there", hint)
+    raise SourceError(f"{folder}{'/' + empty if empty else ''}: no {what} found", hint)
 
 
 def _folders(folder: Path) -> dict[str, Path]:
@@ -164,7 +164,7 @@ class PairOnDisk:
         notes = list(reading.notes)
         if reading.n_not_finite or reading.n_zero_range:
             n_dropped = reading.n_not_finite + reading.n_zero_range
-            notes.append(f"{self.cloud_path.name}: {n_dropped} points without a return left out")
+            notes.append(f"{self.cloud_path.name}: {n_dropped} points without a return skipped")
         return RecordedPair(self.label, self.key(), images, (reading.scan,), tuple(notes))
 
 
@@ -181,7 +181,7 @@ class FolderRecording:
         """Find the files and pair them; nothing is decoded yet.
 
         Raises:
-            SourceError: no images, no point clouds, no way to pair them, or no telling whose images they are.
+            SourceError: no images, no point clouds, no way to pair them, or images whose camera is not known.
         """
         self.path = path
         self.notes: list[str] = []
@@ -226,7 +226,7 @@ class FolderRecording:
             return [self._of_camera(list_pictures(self.path, self.notes), None, is_alone=True)]
         if wanted in rig.cameras:
             if wanted not in found:
-                raise SourceError(f"{self.path}: pictures of {', '.join(found)} lie there, none of {wanted}")
+                raise SourceError(f"{self.path}: images of {', '.join(found)} found, none of {wanted}")
             found = {wanted: found[wanted]}
         return [self._of_camera(paths, camera, is_alone=len(found) == 1) for camera, paths in found.items()]
 

@@ -101,7 +101,7 @@ def test_links_out_of_an_hdf5_file_are_never_followed(tmp_path: Path) -> None:
         ("null", "not numbers"),
         ("2-D", "2 dimensions"),
         ("scalar", "0 dimensions"),
-        ("group", "is no dataset"),
+        ("group", "is not a dataset"),
         ("fractions", "not whole microseconds"),
         ("nan", "beyond any sensor"),
     ],
