@@ -323,7 +323,7 @@ class PcapRecording:
             models = ", ".join(f"{n} of {model}" for model, n in survey.others.most_common())
             raise SourceError(
                 f"{self.path}: holds packets of another LiDAR ({models}), not of a VLP-16",
-                "Only VLP-16 packets (Puck, Puck LITE) are read. Record another LiDAR's point clouds as a bag.",
+                "Only VLP-16 packets (Puck, Puck LITE) are read. Record another LiDAR's scans in a bag.",
             )
         raise SourceError(f"{self.path}: holds no packets of a VLP-16: {self._what_is_there(survey)}")
 
