@@ -204,7 +204,7 @@ def test_clocks_that_do_not_overlap_are_refused_with_how_far_they_lie_apart(tmp_
     moved = [replace(s, t_ns=s.t_ns + late_ns) if isinstance(s, Events) else s for s in given]
     path = record(tmp_path / "r.bag", rig, moved)
     with pytest.raises(
-        SourceError, match=r"events run from \d+\.\d+ to .* scans from .*: they lie 1234\.[4-7] s apart"
+        SourceError, match=r"events run from \d+\.\d+ to .* scans from .*: 1234\.[4-7] s apart"
     ) as caught:
         opened(path, rig)
     assert "cameras.davis.channels.events.timestamps.expected_offset_s" in caught.value.hint
@@ -254,7 +254,7 @@ def test_pictures_stamped_at_the_start_of_an_exposure_that_is_not_told_are_said(
     for profile, is_said in ((rig, False), (start, True)):
         recording = opened(path, profile)
         assert [s.stamp_ns for s in recording.samples() if isinstance(s, Image)] == [picture(0).stamp_ns]
-        assert has_note(recording.notes, "its start", "taken") == is_said
+        assert has_note(recording.notes, "its start", "used") == is_said
 
 
 @pytest.mark.dataset
