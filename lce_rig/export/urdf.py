@@ -37,8 +37,9 @@ def export_urdf(calibrations: Sequence[Calibration], rig: Rig, folder: Path) -> 
 
 def _text(tree: FrameTree, head: list[str], name: str) -> str:
     lines = ['<?xml version="1.0" encoding="utf-8"?>']
-    # A double hyphen would end an XML comment early.
-    lines += [f"<!-- {line.replace('--', '- -')} -->" for line in head]
+    # A double hyphen would end an XML comment early. ROS 2 reads a parameter's value as YAML, in which ": "
+    # makes a mapping: `robot_description:="$(cat rig.urdf)"` would be refused.
+    lines += [f"<!-- {line.replace('--', '- -').replace(': ', ' - ')} -->" for line in head]
     lines.append(f"<robot name={quoteattr(name)}>")
     lines += [f"  <link name={quoteattr(frame)}/>" for frame in tree.frames]
     for joint in tree.joints:
