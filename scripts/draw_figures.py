@@ -76,6 +76,7 @@ FIGURES: dict[str, Callable[[], None]] = {
 
 if __name__ == "__main__":
     mpl.use("Agg")
+    plt.rcParams["font.size"] = 13
     for name in sys.argv[1:] or FIGURES:
         FIGURES[name]()
         print(name)

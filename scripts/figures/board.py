@@ -13,7 +13,6 @@ INK, BLUE, RED = "#1c2733", "#2f5d8a", "#c2410c"
 
 def draw_board(rig: Rig) -> Any:
     """Draw plate and pattern twice: upright with dimensions, and as a diamond before the LiDAR's rings."""
-    plt.rcParams["font.size"] = 13
     figure, (left, right) = plt.subplots(1, 2, figsize=(12.6, 5.2), width_ratios=(1.65, 1))
     _draw_plate(left, rig)
     _draw_dimensions(left, rig)
