@@ -179,7 +179,7 @@ def _judge(path: Path) -> str:
     """Calibrate a session and compare it with the truth: verdicts and errors, or the exit code."""
     code, said = _run("calibrate", str(path), "--reference", str(path / "truth.json"))
     lines = [" ".join(line.split()) for line in said.splitlines()]
-    kept = [line for line in lines if line.endswith(_VERDICTS) or line.startswith(("known to", "reference"))]
+    kept = [line for line in lines if line.endswith(_VERDICTS) or line.startswith(("uncertainty", "reference"))]
     return "; ".join(kept) or f"exit code {code}"
 
 
