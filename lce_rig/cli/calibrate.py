@@ -29,7 +29,7 @@ _AXES = ("x right", "y down", "z forward")
 
 
 def uncertainty_lines(calibration: Calibration) -> list[str]:
-    """State an extrinsic's standard deviations and its least certain motion, in lines of 80 columns."""
+    """State extrinsics's standard deviations and its least certain motion, in lines of 80 columns."""
     c = calibration
     sigmas = np.sqrt(np.diag(c.cov))
     return [

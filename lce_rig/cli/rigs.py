@@ -74,7 +74,7 @@ def show_profile(rig_name: str, as_json: bool, as_yaml: bool) -> None:
         for table in (_sensor_table(rig), _reconstruction_table(rig), _board_table(rig), _limit_table(rig)):
             if table.row_count:
                 screen.print_table(table)
-        _warn_of_doubts(rig)
+        _print_warnings(rig)
 
 
 def _sensor_table(rig: "Rig") -> Any:
@@ -171,15 +171,15 @@ def check_profile(file: str, as_json: bool) -> None:
             screen.print_json({"is_valid": False, "problems": problems, "warnings": []})
         raise
     if as_json:
-        screen.print_json({"is_valid": True, "problems": [], "warnings": rig.doubts()})
+        screen.print_json({"is_valid": True, "problems": [], "warnings": rig.warnings()})
         return
     click.echo(f"{find_profile(file)}: a valid profile of rig {rig.name}")
-    _warn_of_doubts(rig)
+    _print_warnings(rig)
 
 
-def _warn_of_doubts(rig: "Rig") -> None:
-    for doubt in rig.doubts():
-        screen.warn(doubt)
+def _print_warnings(rig: "Rig") -> None:
+    for warning in rig.warnings():
+        screen.warn(warning)
 
 
 @rigs.command("new")
@@ -215,7 +215,7 @@ def new_profile(name: str, origin: str, settings: tuple[str, ...], output: str |
         return
     _write_new(path, text)
     screen.note(f"wrote {path}; measure your board and edit it, then: lce-rig rigs check {path}")
-    _warn_of_doubts(load_rig(path))
+    _print_warnings(load_rig(path))
 
 
 def _write_new(path: Path, text: str) -> None:

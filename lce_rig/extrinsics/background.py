@@ -43,7 +43,7 @@ def estimate_shifts(
 ) -> Array:
     """Estimate how far each column of `describe_background` shifts ring ends, outwards: (3,) m.
 
-    Zeros where that is not certain. Robust least squares over all ring ends, with the extrinsic, the beam's
+    Zeros where that is not certain. Robust least squares over all ring ends, with the extrinsics, the beam's
     width and the shifts unknown.
 
     Args:
@@ -56,7 +56,7 @@ def estimate_shifts(
     first = np.flatnonzero(np.concatenate([np.arange(len(r)) == 0 for r, _ in parts]))
     inside = np.concatenate([r for r, _ in parts])
     background = np.concatenate([describe_background(observation.lidar) for observation in observations])
-    # Inside distance = - (change of the extrinsic) - beam's width - shifts.
+    # Inside distance = - (change of the extrinsics) - beam's width - shifts.
     A = -np.column_stack([np.concatenate([J[:, : SHIFT + 1] for _, J in parts]), background])
     # What few captures have is not told from their scatter; it stays zero, and so does what is uncertain.
     n_having = np.count_nonzero(np.add.reduceat(background, first, axis=0) > 0, axis=0)
@@ -97,7 +97,7 @@ def _fit_shifts(
 
 
 def _is_sure(shifts: Array, scatter: Array, n_captures: int) -> bool:
-    """Tell whether shifts (K,) are too large for chance, by Hotelling's test with their scatter (K, K)."""
+    """Return whether shifts (K,) are too large for chance, by Hotelling's test with their scatter (K, K)."""
     from scipy.special import fdtri
 
     freedoms, n_left = len(shifts), n_captures - len(shifts)

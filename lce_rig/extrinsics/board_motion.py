@@ -1,11 +1,11 @@
-"""The motion of a hand-held board in front of one camera, capture by capture, from all pictures of it.
+"""The motion of a hand-held board in front of one camera, capture by capture, from all images of it.
 
-Pictures of one capture, of one channel or several, see the board at different times. About each scan its pose
+Images of one capture, of one channel or several, see the board at different times. About each scan its pose
 is taken to change steadily,
 
     c(t) = c_0 + v t,    R(t) = exp((w t)^) R_0,    v ~ N(0, s_v^2 I),    w ~ N(0, s_w^2 I)               (1)
 
-The four vectors of each capture follow from its pictures by linear least squares in the tangent space of one
+The four vectors of each capture follow from its images by linear least squares in the tangent space of one
 of their poses; the hand's habits s_v and s_w follow from all captures together.
 """
 
@@ -23,20 +23,20 @@ from lce_rig.solvers.covariance import symmetric_inverse
 USUAL_HABITS = np.array([0.15, np.radians(10.0)])
 _USUAL_WEIGHT = 3.0
 _N_LEARNING = 15
-# What pictures err beyond their corners' noise: lens, board and reconstruction.
+# What images err beyond their corners' noise: lens, board and reconstruction.
 POSE_FLOOR = np.r_[np.full(3, 1e-3), np.full(3, np.radians(0.1))]
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class PoseSamples:
-    """Poses of the board in the pictures of F captures, J of each at most.
+    """Poses of the board in the images of F captures, J of each at most.
 
     Attributes:
         channels: names of the channels.
         T_cam_board: (F, J, 4, 4).
-        information: (F, J, 6, 6) inverse covariance, zero where there is no picture.
-        time_s: (F, J) after the scan's stamp, by the clocks as the profile has them.
+        information: (F, J, 6, 6) inverse covariance, zero if there is no image.
+        time_s: (F, J) after the scan's timestamp, by the clocks as the profile has them.
         channel: (F, J) index into `channels`.
     """
 
@@ -48,14 +48,14 @@ class PoseSamples:
 
     @property
     def is_followed(self) -> NDArray[np.bool_]:
-        """Whether a sample (F, J) is of a channel that has pictures of several times in its capture."""
+        """Whether a sample (F, J) is of a channel that has images of several times in its capture."""
         known = self.information[..., 0, 0] > 0
         mates = known[:, :, None] & known[:, None] & (self.channel[:, :, None] == self.channel[:, None])
         return np.asarray(np.any(mates & (self.time_s[:, :, None] != self.time_s[:, None]), axis=2))
 
     @property
     def tells_motion(self) -> NDArray[np.bool_]:
-        """Whether a capture (F,) has pictures of two times, or of two channels whose offset may differ."""
+        """Whether a capture (F,) has images of two times, or of two channels whose offset may differ."""
         known = self.information[..., 0, 0] > 0
         differs = (self.time_s != self.time_s[:, :1]) | (self.channel != self.channel[:, :1])
         return np.asarray(np.any(known & differs, axis=1))
@@ -73,7 +73,7 @@ class BoardMotions:
     """Equation (1) for F captures.
 
     Attributes:
-        T_cam_board: (F, 4, 4) at the scan's stamp.
+        T_cam_board: (F, 4, 4) at the scan's timestamp.
         rates: (F, 6) tangent per second (m/s, rad/s).
         cov: (F, 12, 12) of pose and rates.
         misfit, log_volume: (F,) each, their sum is -2 ln p(poses) up to a constant: how ill (1) at a hand's
@@ -94,7 +94,7 @@ class BoardMotions:
         return float(np.mean(squares)) / 6
 
     def at(self, time_s: Array) -> Array:
-        """Compute T_cam_board (F, 4, 4) at a time (F,) of each capture after its scan's stamp."""
+        """Compute T_cam_board (F, 4, 4) at a time (F,) of each capture after its scan's timestamp."""
         return perturb(self.T_cam_board, self.rates * time_s[:, None])
 
     def cov_at(self, time_s: Array) -> Array:
@@ -110,13 +110,13 @@ def sample_poses(
 ) -> PoseSamples:
     """Gather the poses of captures.
 
-    The pictures of one channel in one capture, reconstructed from one stream, share much of their error:
+    The images of one channel in one capture, reconstructed from one stream, share much of their error:
     together they weigh as one.
 
     Args:
-        captures: (channel, board, time in s of its picture after the scan's stamp) of each; the first board's
-            corners say which way up the others are taken to be.
-        noise_px: corner noise by channel, in place of what each picture shows by itself.
+        captures: (channel, board, time in s of its image after the scan's timestamp) of each; the first
+            board's corners say which way up the others are taken to be.
+        noise_px: corner noise by channel, in place of what each image shows by itself.
     """
     channels = tuple(sorted({channel for capture in captures for channel, *_ in capture}))
     rows = [
@@ -156,7 +156,7 @@ def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) 
 
     Args:
         samples: of F captures.
-        offset_s: (C,) what to add to the pictures' times, by channel.
+        offset_s: (C,) what to add to the images' times, by channel.
         only: a channel that alone places the board; the others then only tell how it moves.
 
     References:
@@ -194,7 +194,7 @@ def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) 
 def _disagreement(
     samples: PoseSamples, moved: Array, cov: Array, time_s: Array, is_silent: NDArray[np.bool_]
 ) -> Array:
-    """Measure how ill pictures fit motions that were found without them, (F,), as squared deviations.
+    """Measure how ill images fit motions that were found without them, (F,), as squared deviations.
 
     Another place of the camera, the same in all captures, is no misfit: a tangent (tau, phi) of it moves the
     board at c by tau + phi x c.
@@ -245,7 +245,7 @@ class _Lines:
 
 
 def _habit_precision(habits: Array) -> Array:
-    """Give the inverse covariance (6, 6) of rates at a hand's habits."""
+    """Return the inverse covariance (6, 6) of rates at a hand's habits."""
     return np.diag(np.repeat(habits, 3) ** -2.0)
 
 
@@ -267,7 +267,7 @@ def _place(
 
 
 def board_time_s(lidar: LidarBoard, sweep_s: float) -> float:
-    """Average the firing times of a board's points, s after the scan's stamp; mid sweep where unknown."""
+    """Average the firing times of a board's points, s after the scan's timestamp; mid scan where unknown."""
     return sweep_s / 2 if lidar.offset_ns is None else float(np.mean(lidar.offset_ns)) * 1e-9
 
 

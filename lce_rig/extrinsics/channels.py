@@ -2,8 +2,8 @@
 
     consensus by channel -> shared scans -> motion and time offsets -> one board pose a scan -> Algorithm 1
 
-Where pictures tell how the board moved, its pose at the time the LiDAR saw it takes the place of its pose in
-each picture. Every channel is also calibrated alone: a camera cannot sit in two places.
+Where images tell how the board moved, its pose at the time the LiDAR saw it takes the place of its pose in
+each image. Every channel is also calibrated alone: a camera cannot sit in two places.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -112,7 +112,7 @@ class _Mover:
 
     @property
     def is_motion_own(self) -> bool:
-        """Whether some channel tells of motion by itself, so that channels can be held against each other."""
+        """Whether a channel alone shows motion, so that channels can be compared."""
         return bool(np.mean(self.samples.is_followed.any(axis=1)) > 0.5)
 
 
@@ -159,7 +159,7 @@ def _offsets(
     clocks: Clocks,
     start: CalibrationEstimate,
 ) -> TimeOffsets | None:
-    """Estimate the channels' time offsets; None where the boards did not move, which says nothing of time."""
+    """Estimate the channels' time offsets; None if the boards did not move, which says nothing of time."""
     unit = 1 / NOMINAL_SIGMA_M**2
     weights = Weights(
         plane=start.diagnostics["plane_weight"] * unit,
@@ -182,7 +182,7 @@ def _offsets(
 
 
 def _widened(estimate: CalibrationEstimate, offsets: TimeOffsets | None) -> CalibrationEstimate:
-    """Add to the covariance what the uncertainty of the time offsets does to the extrinsic."""
+    """Add to the covariance what the uncertainty of the time offsets does to the extrinsics."""
     if offsets is None:
         return estimate
     added = offsets.sensitivity @ offsets.cov @ offsets.sensitivity.T
@@ -231,7 +231,7 @@ def _difference(
     """Hold two channels' extrinsics against each other: the tangent (6,) between them and its covariance.
 
     Where only the two channels together tell how boards moved, each pose depends on both; then one channel's
-    extrinsic from half of the scans is held against the other's from the other half, and of several ways to
+    extrinsic from half of the scans is compared with the other's from the other half, and of several ways to
     share them out the median counts.
     """
     if len(results) != 2:

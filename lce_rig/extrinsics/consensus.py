@@ -1,9 +1,9 @@
 """Which LiDAR candidate and which camera pose of each capture belong together.
 
-A scan may hold decoys of the board's size and a picture of a plane two poses; wrong pairs agree with no rigid
+A scan may hold decoys of the board's size and an image of a plane two poses; wrong pairs agree with no rigid
 extrinsic, right ones all with the same. Distances and angles between two boards are the same in both sensors
-(1), whatever the extrinsic, which already tells most wrong pairs: the pairs that agree with each other form a
-graph. The edges in the most triangles each propose an extrinsic (Wahba on both normals and the line between
+(1), whatever the extrinsics, which already tells most wrong pairs: the pairs that agree with each other form
+a graph. The edges in the most triangles each propose extrinsics (Wahba on both normals and the line between
 the centres), the proposals are scored by all captures, and the best is refined on what agrees with it.
 
 No assumption on how the sensors are mounted is made, only that both see the same side of the board.
@@ -26,7 +26,7 @@ CENTRE_TOLERANCE_M = 0.15
 _N_PROPOSALS = 400
 _N_REFINEMENTS = 10
 _MOVED_M = 0.1
-# Beyond this the picture alone rules the second pose out, whatever the errors of the camera model.
+# Beyond this the image alone rules the second pose out, whatever the errors of the camera model.
 _MAX_CHI2_GAP = 100.0
 
 
@@ -52,7 +52,7 @@ class _Pairs:
     """Every combination of a camera pose and a LiDAR candidate of the same capture.
 
     Attributes:
-        capture, pose, candidate: (P,) indices; pose 0 is the picture's first choice.
+        capture, pose, candidate: (P,) indices; pose 0 is the image's first choice.
         normal_cam, normal_lidar: (P, 3).
         centre_cam, centre_lidar: (P, 3) m.
     """
@@ -74,7 +74,7 @@ def find_consensus(candidates: Sequence[CaptureCandidates], board: Board) -> Con
         board: its size sets the scale at which an angle weighs as much as a distance.
 
     Returns:
-        The consensus; None where no three captures agree with any extrinsic.
+        The consensus; None if no three captures agree with any extrinsic.
     """
     candidates = sorted(candidates, key=lambda item: item.capture)
     pairs = _list_pairs(candidates)
@@ -133,7 +133,7 @@ def _centre(board: LidarBoard) -> Array:
 
 
 def _agreement(pairs: _Pairs) -> NDArray[np.float32]:
-    """Tell which pairs (P, P) keep angles and distances between their boards, (1)."""
+    """Return which pairs (P, P) keep angles and distances between their boards, (1)."""
     angles, along, lengths = [], [], []
     for normals, centres in ((pairs.normal_cam, pairs.centre_cam), (pairs.normal_lidar, pairs.centre_lidar)):
         baseline = centres[None] - centres[:, None]

@@ -10,14 +10,14 @@ from lce_rig.residuals.quadratics import Quadratics
 
 @dataclass(frozen=True, eq=False)
 class CalibrationEstimate:
-    """An extrinsic with its uncertainty, proof and residuals.
+    """Extrinsics with its uncertainty, proof and residuals.
 
     Attributes:
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera: what the scatter between
             captures shows, and what range errors of the LiDAR add that are the same in all captures. Errors
             of the intrinsics and of the board's size are not in it.
-        certificate: of the final cost over all captures used; its gap is infinite where there is none.
+        certificate: of the final cost over all captures used; its gap is infinite if there is none.
         metrics: errors over all captures used, of the boards as measured.
         used: names of the captures behind the estimate, sorted.
         refused: why each other capture is not.
@@ -32,7 +32,7 @@ class CalibrationEstimate:
         expansion: the method's own cost about its result, capture by capture, in the extrinsic (and those of
             cameras estimated with it) alone; None of methods that give none.
         estimated_with: cameras whose extrinsics were estimated together with this one.
-        channels: what each channel of the camera says alone; empty where they were not told apart.
+        channels: what each channel of the camera says alone; empty if they were not told apart.
         channel_difference: (6,) tangent between the extrinsics of two channels; None with one channel.
         channel_difference_cov: (6, 6) of it.
     """

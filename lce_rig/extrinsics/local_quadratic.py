@@ -1,6 +1,6 @@
-"""The cost of a result by another weighting: a second opinion for every check that leaves captures out.
+"""The cost of a result by another weighting: a independent check for every check that leaves captures out.
 
-It is built from points, planes and ring ends, whatever method found the extrinsic. Unknown beside the
+It is built from points, planes and ring ends, whatever method found the extrinsics. Unknown beside the
 extrinsic are the edge shift and the range offset of each laser, with priors: otherwise these would look like
 disagreement between captures.
 """
@@ -35,7 +35,7 @@ def expand(
     laser_bias_sigma_m: float,
     range_offset_sigma_m: float,
 ) -> Quadratics:
-    """Expand the cost of captures about an extrinsic.
+    """Expand the cost of captures about extrinsics.
 
     A capture counts 3 / sigma_plane^2 times the mean square over its points, and the square of each ring end
     over sigma_end^2, with both sigmas from the captures themselves.

@@ -1,4 +1,4 @@
-"""One camera and one LiDAR: pairs that agree on one extrinsic, then the method that the options name."""
+"""One camera and one LiDAR: reject pairs that disagree, then apply the method of the options."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -94,7 +94,8 @@ def agree(candidates: Sequence[CaptureCandidates], board: Board) -> Consensus:
     n_agreeing = 0 if consensus is None else len(consensus.observations)
     if consensus is None or n_agreeing < needed:
         raise NotEnoughDataError(
-            f"only {n_agreeing} of {len(candidates)} captures agree with one extrinsic, {needed} are needed",
-            "check the board's size, the intrinsics and the pairing of pictures with scans; add captures",
+            f"only {n_agreeing} of {len(candidates)} captures agree with one set of extrinsics, {needed} "
+            "are needed",
+            "check the board's size, the intrinsics and the pairing of images with scans; add captures",
         )
     return consensus

@@ -23,7 +23,7 @@ class CaptureCandidates:
 
     Attributes:
         capture: its name.
-        image: the board in the picture, with its second pose where there is one.
+        image: the board in the image, with its second pose where there is one.
         lidar: places in the scan where the board may be, best first.
     """
 
@@ -38,7 +38,7 @@ class CalibrateOptions:
 
     Attributes:
         method: how the extrinsic is found: "paper" (Algorithm 1 of LCE-Calib) or "ml" (from Algorithm 1's
-            solution on, the extrinsic, all board poses and the sensors' constant errors that are most
+            solution on, the extrinsics, all board poses and the sensors' constant errors that are most
             probable together).
         n_draws: I, subsets drawn for each subset size; they judge the result and do not change it.
         seed: of the draws.
@@ -73,7 +73,7 @@ class Algorithm1Parts:
 
     @property
     def edge_shift_precision(self) -> float | None:
-        """Inverse variance of the edge shift a priori, 1/m^2; None where it is held at zero."""
+        """Inverse variance of the edge shift a priori, 1/m^2; None if it is held at zero."""
         return 1 / EDGE_SHIFT_SIGMA_M**2 if self.is_shift_free and self.use_ends else None
 
 

@@ -36,7 +36,7 @@ def report_estimate(
     refused: Mapping[str, Refusal],
     diagnostics: Mapping[str, float],
 ) -> CalibrationEstimate:
-    """Measure the residuals of an extrinsic and put everything known about it together.
+    """Measure the residuals of extrinsics and put everything known about it together.
 
     Args:
         T_cam_lidar: (4, 4).
@@ -44,7 +44,7 @@ def report_estimate(
         observations: the F captures used, as measured: residuals are of these.
         features: of each.
         board: the board.
-        fitted: the same as the method's cost takes them, where it moves ring ends; as measured where None.
+        fitted: the same as the method's cost takes them, where it moves ring ends; as measured if None.
         certificate: of the minimum, where the method gives one.
         held_out_m: (F,) rms residual of each capture where it was not fitted, where the method knows it.
         refused: captures that the method left out.

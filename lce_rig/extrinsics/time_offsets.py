@@ -1,11 +1,11 @@
-"""By how much the stamps of each channel's pictures are off, from boards that moved while they were seen.
+"""By how much the timestamps of each channel's images are off, from boards that moved while they were seen.
 
 The cost of Algorithm 1 is a function of the channels' time offsets o: each o gives every capture another pose
 of the board at the time the LiDAR saw it (`calibrate.motion`), and the extrinsic is solved anew,
 
     C(o) = min_T sum_k rho(c_k(T, o) / u) + rho(m_k(o)) + l_k(o) + sum_c (o_c / sigma_c)^2                (1)
 
-with c_k the cost of capture k, u its typical size, m_k + l_k = -2 ln p of its pictures' poses (offsets of two
+with c_k the cost of capture k, u its typical size, m_k + l_k = -2 ln p of its images' poses (offsets of two
 channels that nearly agree would need boards faster than hands), and rho bounding what one capture can say.
 """
 
@@ -36,7 +36,7 @@ _FREEDOMS = 3
 
 @dataclass(frozen=True, eq=False)
 class TimeOffsets:
-    """What to add to the stamps of each channel's pictures to come to the LiDAR's time.
+    """What to add to the timestamps of each channel's images to come to the LiDAR's time.
 
     Attributes:
         channels: names.
@@ -54,7 +54,7 @@ class TimeOffsets:
 def at_sweep_time(
     observations: Sequence[Observation], motions: BoardMotions, sweep_s: float
 ) -> list[Observation]:
-    """Give every capture the board's pose at the time the LiDAR saw it.
+    """Return every capture the board's pose at the time the LiDAR saw it.
 
     Args:
         observations: of F captures.
@@ -98,7 +98,7 @@ def estimate_time_offsets(
 
     Args:
         samples: the poses of F captures by channel.
-        observations: the same captures as the LiDAR saw them, any channel's picture.
+        observations: the same captures as the LiDAR saw them, any channel's image.
         board: its size.
         options: switches of the features.
         weights: of the cost's terms.
@@ -127,7 +127,7 @@ def estimate_time_offsets(
 
 @dataclass(frozen=True, eq=False)
 class _Cost:
-    """Equation (1) for F captures, whose boards the LiDAR saw at times (F,) after their scans' stamps."""
+    """Equation (1) for F captures, whose boards the LiDAR saw at times (F,) after their scans' timestamps."""
 
     samples: PoseSamples
     features: Sequence[CaptureFeatures]

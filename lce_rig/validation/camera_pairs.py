@@ -1,4 +1,4 @@
-"""Two cameras that saw the same boards: where their pictures put them, and whether their extrinsics agree.
+"""Two cameras that saw the same boards: where their images put them, and whether their extrinsics agree.
 
 Each board held still that both see gives T_second_first = T_second_board T_first_board^-1 without any LiDAR.
 The extrinsics of both cameras with one LiDAR say the same thing by another way.
@@ -42,7 +42,7 @@ _BY_IMAGES = {
 
 @dataclass(frozen=True, eq=False)
 class PicturePose:
-    """Where one camera sits to another by the pictures of both.
+    """Where one camera sits to another by the images of both.
 
     Attributes:
         T_second_first: (4, 4), p_second = R p_first + t.
@@ -50,7 +50,7 @@ class PicturePose:
             between placements.
         captures: (F,) that both cameras used, as the first names them.
         board_rms_m: how far apart the two cameras put the middle of a board, rms.
-        scatter: of single boards about it, in standard deviations that poses in pictures usually have.
+        scatter: of single boards about it, in standard deviations that poses in images usually have.
         expansion: of the cost about T_second_first, capture by capture.
         centres: (F, 3) middle of the board in each, frame of the first camera, m.
     """
@@ -71,8 +71,8 @@ class CameraPair:
     Attributes:
         captures: that both used, as the first names them.
         T_second_first: (4, 4) to which their extrinsics compose.
-        pictures: what their pictures say; None where too few boards were seen by both.
-        apart: (6,) tangent from the extrinsics' pose to the pictures'; None likewise.
+        pictures: what their images say; None if too few boards were seen by both.
+        apart: (6,) tangent from the extrinsics' pose to the images'; None likewise.
         surprise: square of its length in standard deviations that both claim.
         board_rms_m: how far apart the extrinsics' pose puts the middle of a board, rms.
     """
@@ -100,10 +100,10 @@ def shared_boards(
 
 
 def relate(first: CalibrationEstimate, second: CalibrationEstimate) -> CameraPair | None:
-    """Hold the extrinsics of two cameras, whose boards stood still, against their pictures.
+    """Hold the extrinsics of two cameras, whose boards stood still, against their images.
 
     Returns:
-        None where the cameras share no capture.
+        None if the cameras share no capture.
     """
     shared = shared_boards(first.observations, second.observations)
     if not shared:
@@ -115,16 +115,16 @@ def relate(first: CalibrationEstimate, second: CalibrationEstimate) -> CameraPai
     if pictures is None:
         return CameraPair(captures, T, None, None, 0.0, board_rms_m)
     apart = difference(pictures.T_second_first, T)
-    # Errors that both ways share, those of the pictures, are counted twice: the surprise is rather too small.
+    # Errors that both ways share, those of the images, are counted twice: the surprise is rather too small.
     cov = relative_covariance(J, second.cov, first.cov) + pictures.cov
     surprise = float(apart @ np.linalg.solve(cov, apart))
     return CameraPair(captures, T, pictures, apart, surprise, board_rms_m)
 
 
 def pose_from_pictures(shared: Sequence[tuple[Observation, Observation]]) -> PicturePose | None:
-    """Estimate T_second_first from what both cameras' pictures say of the same boards.
+    """Estimate T_second_first from what both cameras' images say of the same boards.
 
-    A picture's pose errs by its corners' noise and by what corners have in common (`picture_terms`).
+    An image's pose errs by its corners' noise and by what corners have in common (`picture_terms`).
 
     Returns:
         None for fewer than four placements.
@@ -182,7 +182,7 @@ def _board_rms_m(shared: Sequence[tuple[Observation, Observation]], T_second_fir
 def doubt_cameras(
     pair: CameraPair, names: tuple[str, str], target: CalibrationSettings, limits: VerdictSettings
 ) -> list[Finding]:
-    """Doubt the extrinsics of two cameras that contradict the cameras' own pictures.
+    """Doubt the extrinsics of two cameras that contradict the cameras' own images.
 
     Args:
         pair: the cameras.
@@ -192,7 +192,7 @@ def doubt_cameras(
     """
     if pair.pictures is None or pair.apart is None:
         return []
-    # Pictures are exact enough to show any change that matters.
+    # Images are exact enough to show any change that matters.
     strict = limits.model_copy(update={"max_change": limits.max_camera_difference})
     halves = contrast_halves(pair.pictures.expansion, pair.pictures.centres)
     changed = doubt_halves(halves, pair.pictures.captures, target, strict)

@@ -23,7 +23,7 @@ from lce_rig.validation.weighing import Verdict, doubt
 
 # A difference is real where chance makes it this seldom.
 _CHANCE = 0.002
-# In units of the rotation to reach. A picture bent by as much as that cannot give it; a camera turned by its
+# In units of the rotation to reach. An image bent by as much as that cannot give it; a camera turned by its
 # principal point turns the extrinsic by the same angle, and three times the target counts as wrong.
 _BENT_MARGINAL, _BENT_FAIL = 0.5, 1.0
 _TURN_MARGINAL, _TURN_FAIL = 1.5, 2.5
@@ -44,12 +44,12 @@ class IntrinsicsCheck:
             turn of the camera that makes it least.
         displacement_sigma_px: standard deviation of that.
         displacement_deg: the same as an angle.
-        turn_deg: that turn; an extrinsic under the given intrinsics is off by it.
+        turn_deg: that turn; extrinsics under the given intrinsics is off by it.
         turn_sigma_deg: standard deviation of that.
         focal_ratio: fitted over given focal length.
         focal_sigma: standard deviation of that.
         chance: probability that boards seen by the given lens ask for one as different as the fitted one;
-            None where the models are not of one family.
+            None if the models are not of one family.
     """
 
     n_captures: int
@@ -114,7 +114,7 @@ def check_intrinsics(
         board: the board.
 
     Returns:
-        None where there are too few boards, or too little tilt, to fit a lens at all.
+        None if there are too few boards, or too little tilt, to fit a lens at all.
     """
     # Intrinsics that are wrong beyond measure lead nowhere; without their distortion they may.
     plain = replace(intrinsics, distortion=(0.0,) * 4)

@@ -1,4 +1,4 @@
-"""A control that must fail: an extrinsic known to be bad has to fit captures worse that were left out.
+"""A control that must fail: extrinsics known to be bad has to fit captures worse that were left out.
 
 Where it does not, the captures cannot tell the result from one that is several of its standard deviations,
 and as much as the target, away: the result is not the best one, or it is less certain than it says.
@@ -48,7 +48,7 @@ def run_control(
     target: CalibrationSettings,
     n_sigmas: float,
 ) -> NegativeControl:
-    """Move an extrinsic both ways along the axes of its covariance, and judge it on captures left out.
+    """Move extrinsics both ways along the axes of its covariance, and judge it on captures left out.
 
     Each capture is judged under the extrinsic that the captures of the other placements give.
 

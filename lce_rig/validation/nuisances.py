@@ -24,7 +24,7 @@ _HARMLESS_M = 0.002
 
 @dataclass(frozen=True)
 class Nuisances:
-    """Estimates beside the extrinsic, each with what captures left out one by one make of it.
+    """Estimates beside the extrinsics, each with what captures left out one by one make of it.
 
     Attributes:
         scale, scale_sigma: camera distances over LiDAR distances, less 1.

@@ -1,4 +1,4 @@
-"""What the uncertainty of an extrinsic means for a point that the LiDAR measures: pixels, and centimetres.
+"""What the uncertainty of extrinsics means for a point that the LiDAR measures: pixels, and centimetres.
 
 A point p = R q + t before the camera moves with the extrinsic by [I, -(p - t)^] times its tangent, as a
 rotation turns it about the LiDAR's origin.
@@ -17,7 +17,7 @@ _STEP_M = 1e-4
 
 
 def point_uncertainties(T_cam_lidar: Array, cov: Array, lens: Intrinsics) -> tuple[PointUncertainty, ...]:
-    """Propagate a covariance to points in the middle and in the corners of the picture.
+    """Propagate a covariance to points in the middle and in the corners of the image.
 
     Args:
         T_cam_lidar: (4, 4).
@@ -38,7 +38,7 @@ def point_uncertainties(T_cam_lidar: Array, cov: Array, lens: Intrinsics) -> tup
 
 
 def _corners(lens: Intrinsics, middle: Array) -> Array:
-    """Find the picture's corners (4, 2), or where the lens ends on the way to them."""
+    """Find the image's corners (4, 2), or where the lens ends on the way to them."""
     w, h = lens.width_px - 1.0, lens.height_px - 1.0
     corners = []
     for corner in np.array([[0, 0], [w, 0], [0, h], [w, h]]):
@@ -49,7 +49,7 @@ def _corners(lens: Intrinsics, middle: Array) -> Array:
 
 
 def _sigmas(point: Array, t: Array, cov: Array, lens: Intrinsics) -> tuple[float, float]:
-    """Compute the expected size of a point's error in the picture, px, and in space, m."""
+    """Compute the expected size of a point's error in the image, px, and in space, m."""
     by_tangent = np.concatenate([np.eye(3), -skew(point - t)], axis=1)
     cov_point = by_tangent @ cov @ by_tangent.T
     steps = _STEP_M * np.concatenate([np.eye(3), -np.eye(3)])

@@ -38,7 +38,7 @@ class PairDifference:
 
 @dataclass(frozen=True, eq=False)
 class Repeatability:
-    """Calibrations of the same sensors in several sessions, held against each other.
+    """Calibrations of the same sensors in several sessions, compared with each other.
 
     Attributes:
         names: of the sessions.
@@ -48,12 +48,12 @@ class Repeatability:
         spread_rotation_deg, spread_translation_m: standard deviation of one calibration, from these.
         claimed_rotation_deg, claimed_translation_m: the same as the calibrations state it, rms.
         scatter_rotation_deg, scatter_translation_m: the part of it that differs from session to session;
-            None where a calibration does not say. The rest, constant errors of the LiDAR, all share.
+            None if a calibration does not say. The rest, constant errors of the LiDAR, all share.
         chi2: least sum of squared distances from one common extrinsic, in units of the stated covariances.
         dof: what it is on average where these are true.
         p: probability that sound calibrations spread so far or farther.
         differences: of each two.
-        odd_one: the session without which the others agree; None where all agree or none can be blamed.
+        odd_one: the session without which the others agree; None if all agree or none can be blamed.
     """
 
     names: tuple[str, ...]

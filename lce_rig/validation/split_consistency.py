@@ -1,7 +1,7 @@
 """Do two shares of the captures give the same extrinsic? Early and late, near and far, left and right.
 
-Shares drawn by lot differ by noise; so do these, unless something changed on the way or is bent: a sensor
-that was nudged, a lens that is not the profile's. How far shares drawn by lot differ is the measure.
+Shares random differ by noise; so do these, unless something changed on the way or is bent: a sensor
+that was nudged, a lens that is not the profile's. How far shares random differ is the measure.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ class Contrast:
     Attributes:
         first, second: what tells them apart, in words: "near" and "far".
         rotation_deg, translation_m: angle and distance between their extrinsics.
-        chance: how often shares drawn by lot differ as much, in units of their noise.
+        chance: how often shares random differ as much, in units of their noise.
         n_first: captures in the first share.
     """
 

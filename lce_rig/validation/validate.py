@@ -1,4 +1,4 @@
-"""What is held against a result before it is judged: checks that need the captures themselves."""
+"""What is compared with a result before it is judged: checks that need the captures themselves."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ _N_DRAWS = 300
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """How far resampled captures spread the extrinsic; covariances (6, 6) of the result from each way.
+    """How far resampled captures spread the extrinsics; covariances (6, 6) of the result from each way.
 
     Attributes:
         bootstrap: placements drawn with replacement.
@@ -119,7 +119,7 @@ def widening(cov: Array, spread: Spread, limits: VerdictSettings) -> tuple[float
 
 # Fewer placements leave nothing to be left out.
 _MIN_PLACEMENTS = 4
-# More pictures say no more about a lens that is wrong, and take their time.
+# More images say no more about a lens that is wrong, and take their time.
 _MAX_VIEWS = 40
 
 
@@ -130,11 +130,11 @@ class Validation:
     Attributes:
         cov: (6, 6) to report: the estimate's, widened where captures spread it farther than it claims.
         widened_by: by how many times the standard deviations were widened; 1 where they were not.
-        remark: why; None where they were not.
+        remark: why; None if they were not.
         contrasts: shares of the captures that ought to agree.
         control: what happens to left-out captures when the result is moved.
-        nuisances: what the captures share beside the extrinsic.
-        intrinsics: the profile's, against those that the boards ask for; None where too few boards tell.
+        nuisances: what the captures share beside the extrinsics.
+        intrinsics: the profile's, against those that the boards ask for; None if too few boards tell.
     """
 
     cov: Array
@@ -160,7 +160,7 @@ def validate(
         rig: board, targets and limits.
         lidar: which errors its ranges may have.
         lens: of the camera.
-        views: its pictures of the board, of the captures used.
+        views: its images of the board, of the captures used.
     """
     board = rig.board.to_board()
     intrinsics = check_intrinsics(_thinned(views), lens, board) if views else None
@@ -175,7 +175,7 @@ def validate(
     if len(expansion.groups) < _MIN_PLACEMENTS:
         return Validation(estimate.cov, 1.0, None, (), None, None, intrinsics)
     settled = expansion.hold(SCALE).settled()
-    # A cost made anew scatters as it does itself: a claim is held against the scatter of its own method.
+    # A cost recomputed scatters as it does itself: a claim is compared with the scatter of its own method.
     widened_by, remark = widening(estimate.cov, resample(estimate.expansion or settled), rig.verdict)
     cov = widened_by**2 * estimate.cov
     control = run_control(

@@ -1,4 +1,4 @@
-"""May this extrinsic be used? Each doubt is one reason with its figure and what to do about it."""
+"""May these extrinsics be used? Each doubt is one reason with its figure and what to do about it."""
 
 from collections.abc import Sequence
 
@@ -30,7 +30,7 @@ def judge(
     n_captures: int,
     between_cameras: Sequence[Finding] = (),
 ) -> tuple[Verdict, tuple[Finding, ...]]:
-    """Weigh everything known about an extrinsic.
+    """Weigh everything known about extrinsics.
 
     Args:
         estimate: the extrinsic with its residuals and refusals, and what each channel says.
@@ -118,7 +118,7 @@ def _precision(estimate: CalibrationEstimate, cov: Array, rig: Rig) -> list[Find
 
 
 def residuals_beyond(metrics: Metrics, limits: QualitySettings) -> list[Finding]:
-    """List the mean residuals of an extrinsic that exceed the profile's limits."""
+    """List the mean residuals of extrinsics that exceed the profile's limits."""
     return [
         doubt(code, {"mean_m": value, "limit_m": limit}, is_fail=True)
         for value, limit, code in (

@@ -19,5 +19,5 @@ def doubt(
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
-    """Give the verdict that findings amount to."""
+    """Return the verdict that findings amount to."""
     return _VERDICTS[worst(findings)]

@@ -96,9 +96,9 @@ def test_a_full_disk_leaves_no_part_of_a_profile(capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
-        (["--set", "board.square_m=70"], 3, "board.square_m: did you mean 0.070 m?"),
+        (["--set", "board.square_m=70"], 3, "board.square_m: 70 looks like millimetres"),
         (["--set", "board.square_m"], 2, "KEY=VALUE"),
-        (["--from", "rlsf"], 3, "did you mean rlfs?"),
+        (["--from", "rlsf"], 3, "The nearest is rlfs"),
         (["--from", "missing.yaml"], 3, "there is no such file"),
     ],
 )

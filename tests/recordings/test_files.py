@@ -141,7 +141,7 @@ def test_damaged_pcd_is_named(tmp_path):
         (("vertex 2", "vertex 1000000000000"), "declares 1000000000000 points"),
         (("element vertex", "element nothing 5\nelement vertex"), "'nothing' has 0 properties"),
         (("element vertex", "element much 1000000000000\nproperty int a\nelement vertex"), "0 of 2 points"),
-        (("property ushort ring", "property ushort x"), "cannot be told apart"),
+        (("property ushort ring", "property ushort x"), "field names are not unique"),
     ],
 )
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])

@@ -1,4 +1,4 @@
-"""What a picture shows of the board in numbers, and why where it shows too little."""
+"""What an image shows of the board in numbers, and why where it shows too little."""
 
 from collections.abc import Mapping
 
@@ -21,7 +21,7 @@ def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> dict[str, flo
     Returns:
         mean_grey; contrast (grey values, white minus black); noise (grey values); square_px (shortest side);
         edge_width_px (10-90 %); sharpness (edge widths in a square: 1 is unreadable, above 5 is crisp);
-        border_px (outermost corner to the border of the picture); n_corners (fitted).
+        border_px (outermost corner to the border of the image); n_corners (fitted).
     """
     grid = crossings.grid_px
     height, width = grey.shape
@@ -110,7 +110,7 @@ def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool 
 def explain_other_grid(
     grey: NDArray[np.uint8], board: Board, seen_px: Array, is_from_events: bool = False
 ) -> Refusal:
-    """Say that another grid of corners is in the picture than the profile's.
+    """Say that another grid of corners is in the image than the profile's.
 
     Args:
         seen_px: (rows, cols, 2).
@@ -132,7 +132,7 @@ def explain_other_grid(
 def quality_problem(
     quality: Mapping[str, float], min_contrast: float, min_sharpness: float, is_from_events: bool = False
 ) -> Refusal | None:
-    """Judge the figures of a grid that was found; None where they will do."""
+    """Judge the figures of a grid that was found; None if they will do."""
     action = _action(is_from_events)
     if quality["contrast"] < min_contrast:
         figures = {"contrast": quality["contrast"], "min_contrast": min_contrast}
@@ -163,7 +163,7 @@ def _sizes(board: Board, seen_px: Array) -> tuple[tuple[int, int], tuple[int, in
 
 
 def _side_beyond(grey: NDArray[np.uint8], grid_px: Array) -> str:
-    """Name the border within 1.5 squares of the grid; empty where there is none."""
+    """Name the border within 1.5 squares of the grid; empty if there is none."""
     height, width = grey.shape
     square = max(float(np.linalg.norm(np.diff(grid_px, axis=axis), axis=-1).max()) for axis in (0, 1))
     low, high = grid_px.min(axis=(0, 1)), grid_px.max(axis=(0, 1))

@@ -192,7 +192,7 @@ def find_lidar_boards(
         min_rings: fewest rings on the board.
         max_template_m: largest mean distance of the outline from where the rings end, without noise.
         max_rms_m: largest rms distance of the board's returns from its plane, without noise.
-        beam: light spot of the LiDAR; that of a VLP-16 where None.
+        beam: light spot of the LiDAR; that of a VLP-16 if None.
 
     Returns:
         At most 4 boards that do not overlap, or why there is none.
@@ -245,11 +245,11 @@ def measure_plate(
         origin: (3,) m, the point of the plane the first guess is counted from.
         start: first guess of the outline.
         limits: with the scan's noise.
-        beam: light spot of the LiDAR; that of a VLP-16 where None.
+        beam: light spot of the LiDAR; that of a VLP-16 if None.
         max_beyond: largest share of returns in the plane beyond the outline, as it is guessed.
 
     Returns:
-        The board, why it is refused, None where there is no plate.
+        The board, why it is refused, None if there is no plate.
     """
     refined = refine(ordered, plane, origin, start, limits.template_m, max_beyond)
     if refined is None:
@@ -329,7 +329,7 @@ def track_lidar_board(
         min_range_m: nearer returns are ignored.
         min_rings: fewest rings on the board.
         max_rms_m: largest rms distance of the board's returns from its plane, without noise.
-        beam: light spot of the LiDAR; that of a VLP-16 where None.
+        beam: light spot of the LiDAR; that of a VLP-16 if None.
 
     Returns:
         The best candidate in the box, or why there is none.

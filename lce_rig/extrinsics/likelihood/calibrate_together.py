@@ -55,7 +55,7 @@ def calibrate_together(
 ) -> TogetherEstimate:
     """Estimate the extrinsics of cameras that share scans of one LiDAR in one likelihood.
 
-    What a camera alone says is where the estimate starts, and how large the errors of its pictures are
+    What a camera alone says is where the estimate starts, and how large the errors of its images are
     compared with those of the others'. Scans of which the cameras use different places are left out.
 
     Args:
@@ -123,7 +123,7 @@ def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
 
 
 def _label_scans(used: Sequence[Sequence[Observation]]) -> list[list[Observation]]:
-    """Give observations of the same scan the same name, whatever captures they lie in."""
+    """Return observations of the same scan the same name, whatever captures they lie in."""
     names: dict[bytes, str] = {}
     labelled = []
     for own in used:

@@ -12,7 +12,7 @@ from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M
 
 
 class PoseLevels(NamedTuple):
-    """Errors of a board's pose in a picture beyond corner noise, as in `Levels`; or ratios of them."""
+    """Errors of a board's pose in an image beyond corner noise, as in `Levels`; or ratios of them."""
 
     tilt_rad: float
     spin_rad: float
@@ -32,7 +32,7 @@ class Levels:
         edge_rad: blur of the ends of a ring end's interval, across the beam, by range (`along_rays`).
         backed_rad: the same where something stands close behind.
         lost_share: of ring ends whose last returns are missing; a share, not a deviation.
-        tilt_rad, spin_rad: errors of a board's turn in a picture beyond corner noise.
+        tilt_rad, spin_rad: errors of a board's turn in an image beyond corner noise.
         depth_m, across_m: errors of its place, along and across the line of sight.
         laser_m: of the lasers' range offsets about their mean.
     """
@@ -50,7 +50,7 @@ class Levels:
 
     @property
     def pose(self) -> PoseLevels:
-        """Those of a picture's pose."""
+        """Those of an image's pose."""
         return PoseLevels(self.tilt_rad, self.spin_rad, self.depth_m, self.across_m)
 
     def blurred(self, blur_rad: float) -> "Levels":

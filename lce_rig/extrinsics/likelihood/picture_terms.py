@@ -1,8 +1,8 @@
-"""Poses of boards in pictures against T_cam_lidar T_lidar_board.
+"""Poses of boards in images against T_cam_lidar T_lidar_board.
 
 Corners act through the pose that fits them and its covariance, which holds to first order all that they
-say. Beyond their noise a picture's pose errs by what its corners have in common: the lens model's misfit in
-that part of the picture, the print, the board's bend, its motion. The covariance of that error is
+say. Beyond their noise an image's pose errs by what its corners have in common: the lens model's misfit in
+that part of the image, the print, the board's bend, its motion. The covariance of that error is
 
     Q = sigma_tilt^2 about axes in the board's plane, sigma_spin^2 about its normal,
         sigma_depth^2 along the line of sight, sigma_across^2 across it                                   (1)
@@ -43,18 +43,18 @@ class Pictures:
         return self.cov + Q
 
     def with_larger_errors(self, ratios: PoseLevels) -> "Pictures":
-        """Let the pictures err beyond corner noise by so many times what levels say."""
+        """Let the images err beyond corner noise by so many times what levels say."""
         shapes = {name: getattr(ratios, name) ** 2 * shape for name, shape in self.shapes.items()}
         return replace(self, shapes=shapes)
 
 
 def stack_pictures(capture: Indices, images: Sequence[ImageBoard], n_repeats: Array) -> Pictures:
-    """Stack the pictures of one camera.
+    """Stack the images of one camera.
 
     Args:
         capture: (P,) which of the stacked captures they belong to.
         images: P of them.
-        n_repeats: (P,) pictures that show the board in the same place: they share the error Q, and count
+        n_repeats: (P,) images that show the board in the same place: they share the error Q, and count
             together as one.
     """
     T = np.array([image.T_cam_board for image in images])

@@ -1,6 +1,6 @@
 """Joint refinement: extrinsics of cameras that share one LiDAR, board poses, constant errors, noise levels.
 
-Fisher scoring: Gauss-Newton on ranges and pictures, mean information and score for the density of ring ends
+Fisher scoring: Gauss-Newton on ranges and images, mean information and score for the density of ring ends
 (`end_density`); noise levels are fitted in between.
 """
 
@@ -82,8 +82,8 @@ class JointEstimate:
     Attributes:
         T_cam_lidar: (C, 4, 4).
         T_lidar_board: (F, 4, 4).
-        cov: (C, 6, 6) of each extrinsic, everything else marginalised, tangent (translation m, rotation rad).
-        to_extrinsics: (C, 6, G) derivative of each extrinsic's tangent by the unknowns z of `system`.
+        cov: (C, 6, 6) of each result, everything else marginalised, tangent (translation m, rotation rad).
+        to_extrinsics: (C, 6, G) derivative of each result's tangent by the unknowns z of `system`.
         offset_m: (L,) by which ranges of each ring read too long.
         lens_m: (2,) lateral and vertical displacement of the LiDAR's lens, `along_rays`.
         shifts: (7,) of ring ends, `along_rays.SHIFTS`.
@@ -124,8 +124,8 @@ def refine(
         priors: of the constant errors.
         usual: what the noise levels usually are.
         levels: of the noise, where they are known; else estimated.
-        pose_ratios: for each camera, by how many times its pictures' errors beyond corner noise are larger
-            than `levels` says; 1 where None.
+        pose_ratios: for each camera, by how many times its images' errors beyond corner noise are larger
+            than `levels` says; 1 if None.
     """
     priors, usual = priors or Priors(), usual or Levels()
     usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
@@ -181,7 +181,7 @@ def _pictures(observations: Sequence[Observation], order: dict[str, int]) -> Pic
 
 
 def to_extrinsic(T_cam_lidar: Array, camera: int, n_unknowns: int) -> Array:
-    """Differentiate a camera's extrinsic, as it is reported, by the unknowns z.
+    """Differentiate a camera's extrinsics, as it is reported, by the unknowns z.
 
     Straight ahead of the camera a lens beside the axis is a shift of the whole LiDAR: that goes to the
     extrinsic, which is to be used with points as the driver gives them.

@@ -28,7 +28,7 @@ def inflate(
         joint: of F captures.
         placement: (F,) number of each capture's placement.
         camera: its number.
-        n_seen: placements that it saw; all where None.
+        n_seen: placements that it saw; all if None.
 
     Returns:
         The covariance and the factor, 1 where model and spread agree.

@@ -308,7 +308,7 @@ def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: fl
 
 
 def _picture_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, float]:
-    """Weigh what the pictures say, and add up the logs of their covariances' determinants."""
+    """Weigh what the images say, and add up the logs of their covariances' determinants."""
     block, log_volume = _no_block(terms), 0.0
     for c, (pictures, rows) in enumerate(zip(terms.pictures, terms.picture_rows, strict=True)):
         cov = pictures.total_cov(pose_levels)
