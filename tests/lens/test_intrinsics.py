@@ -64,7 +64,7 @@ def test_a_lens_moves_to_a_larger_model_unchanged_and_to_another_nearly():
     for name, limit_px in (("radtan5", 1e-9), ("rational", 1e-9), ("equidistant", 0.6)):
         moved, _, _ = MODELS[name].project(convert(WIDE, MODELS[name]), points)
         assert np.abs(moved - pixels).max() < limit_px
-    with pytest.raises(ValueError, match="is no radtan5"):
+    with pytest.raises(ValueError, match="is not radtan5"):
         RADTAN5.vector(FISHEYE)
 
 

@@ -177,7 +177,7 @@ def test_board_that_fits_both_ways_round_gives_a_warning() -> None:
 
 @pytest.mark.parametrize("size", ["[640, 360]", "[960, 540]", "[1920, 1080]", "[2560, 1440]"])
 def test_intrinsics_of_another_resolution_are_noticed(size: str) -> None:
-    assert "(about 1271x751)" in refusal(("[1280, 720]", size))
+    assert "(about 1271x751 px)" in refusal(("[1280, 720]", size))
 
 
 def test_all_problems_are_listed_at_once_in_the_files_order() -> None:
@@ -192,7 +192,7 @@ def test_all_problems_are_listed_at_once_in_the_files_order() -> None:
 
 
 def test_a_key_in_the_wrong_block_is_sent_to_the_right_one() -> None:
-    assert "into calibration" in refusal(("board:", "target_sigma_m: 0.02\nboard:"))
+    assert "move it to calibration" in refusal(("board:", "target_sigma_m: 0.02\nboard:"))
 
 
 def test_weights_in_profiles_of_earlier_sessions_change_nothing() -> None:
