@@ -156,6 +156,11 @@ if TYPE_CHECKING:
     show_default=True,
     help="Estimate with Algorithm 1 of LCE-Calib (paper), or refine its result by maximum likelihood (ml).",
 )
+@click.option(
+    "--name",
+    metavar="NAME",
+    help="Write the result to SESSION/results/NAME/ and leave SESSION/calibration/ unchanged.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export failed results too, marked NOT FOR USE.")
 @click.option(
@@ -175,6 +180,7 @@ def calibrate(
     cameras: tuple[str, ...],
     channels: list[str] | None,
     event_image: Any,
+    name: str | None,
     as_json: bool,
     force: bool,
     method: Any,
@@ -193,6 +199,7 @@ def calibrate(
     import lce_rig as lce
     from lce_rig.core.errors import UsageError
     from lce_rig.export.reference import read_reference
+    from lce_rig.pipeline.result_files import OVERLAYS
 
     opened = lce.Session.open(session)
     rig = opened.rig
@@ -226,7 +233,13 @@ def calibrate(
             show.warn(str(shortage))
         if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
             show.warn(f"{reference} has no T_cam_lidar for these sensors")
-        written = result.write(force=force)
+        written = result.write(name=name, force=force)
+    if written.had_overlays:
+        with show.progress_bar("drawing") as progress:
+            lce.verify(opened, result, detections, name=name, event_image=event_image).write(
+                progress=progress
+            )
+        show.note(f"overlays drawn again in {written.files[0].parent / OVERLAYS}")
     if as_json:
         show.print_json(result.document())
     else:

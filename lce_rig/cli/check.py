@@ -10,7 +10,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import event_image_option, json_option, session_argument
-from lce_rig.core.results import Refusal
+from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.words import describe, recommend, refusal_as_json
 
@@ -82,11 +82,11 @@ def _record(image: ImageDetection, lidar: LidarDetection, refusal: Refusal | Non
     }
 
 
-def _figures(found: Any) -> dict[str, float | None] | None:
+def _figures(found: ImageBoard | LidarBoard | Refusal) -> dict[str, float | None] | None:
     """Return a detection's quality record, with null for figures that were not measured."""
     if isinstance(found, Refusal):
         return None
-    return {key: float(value) if math.isfinite(value) else None for key, value in found.quality.items()}
+    return {key: float(value) if math.isfinite(value) else None for key, value in found.figures().items()}
 
 
 # Heading and unit, sensor, figure, scale to the unit, digits.
@@ -132,9 +132,7 @@ def _table(detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -
 def _columns(detections: Detections, pair: Pair) -> tuple[Column, ...]:
     """Choose columns that fit a terminal of 80 characters; images from events have their own figures."""
     images = [detections.of(pair, name)[0] for name in detections.captures(pair)]
-    is_from_events = any(
-        not isinstance(image, Refusal) and "events_px_s" in image.quality for image in images
-    )
+    is_from_events = any(not isinstance(image, Refusal) and image.events is not None for image in images)
     return (*_IMAGE, *(_EVENTS if is_from_events else _POINTS), *_LIDAR)
 
 

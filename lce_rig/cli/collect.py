@@ -266,6 +266,7 @@ def _tell(report: Any, session: Path, n_captures: int) -> None:
     new = f"{len(report.captured)} new" + (
         f", {report.n_resumed} captured before" if report.n_resumed else ""
     )
+    new += f", {report.n_rejected} rejected earlier" if report.n_rejected else ""
     show.note(f"{session}: {show.counted(n_captures, 'capture')} ({new})")
     for error in report.errors[:-1]:
         show.warn(str(error))

@@ -23,11 +23,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("lce_rig.cli.simulate", "Simulate a session or recording of a rig, with exact truth."),
     "collect": ("lce_rig.cli.collect", "Build a session, live and guided, or from recordings."),
     "reconstruct": ("lce_rig.cli.reconstruct", "Reconstruct images from the events of a recording."),
+    "captures": ("lce_rig.cli.captures", "List the captures of a session; reject or restore some."),
     "check": ("lce_rig.cli.check", "Report the detections in each capture, or the cause of refusal."),
     "calibrate": ("lce_rig.cli.calibrate", "Estimate the extrinsics of a session."),
     "intrinsics": ("lce_rig.cli.intrinsics", "Estimate the cameras' intrinsics from a session."),
     "verify": ("lce_rig.cli.verify", "Project the point clouds into the images and print residuals."),
-    "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of independent sessions."),
+    "results": ("lce_rig.cli.results", "List the results of a session with figures and verdicts."),
+    "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of sessions, or the results of one."),
 }
 EXIT_BUG = 70
 

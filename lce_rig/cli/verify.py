@@ -18,6 +18,7 @@ from lce_rig.words import describe
     metavar="FILE",
     help="Check the result.json of another session of this rig on these captures.",
 )
+@click.option("--name", metavar="NAME", help="Check this result of SESSION (see `lce-rig results`).")
 @click.option(
     "-o",
     "--output",
@@ -27,21 +28,31 @@ from lce_rig.words import describe
 )
 @json_option
 @event_image_option
-def verify(session: Path, result: Path | None, output: Path | None, as_json: bool, event_image: Any) -> None:
+def verify(
+    session: Path,
+    result: Path | None,
+    name: str | None,
+    output: Path | None,
+    as_json: bool,
+    event_image: Any,
+) -> None:
     """Project the point clouds of SESSION (default: session/) into the images and print residuals.
 
     Images and a contact sheet replace those in SESSION/calibration/overlays/, with --result FILE those in
-    SESSION/overlays/. Exits with 7 if the verdict is fail or these captures contradict the extrinsics.
+    SESSION/overlays/, with --name NAME those beside that result. Exits with 7 if the verdict is fail or these
+    captures contradict the extrinsics.
     """
     import lce_rig as lce
     from lce_rig.cli.calibrate import exit_by_verdict
-    from lce_rig.core.errors import ResultRefusedError
+    from lce_rig.core.errors import ResultRefusedError, UsageError
     from lce_rig.detect.detection import Pair
 
+    if result is not None and name is not None:
+        raise UsageError("--result and --name exclude each other", "Name a file or a result of the session.")
     opened = lce.Session.open(session)
     saved = None if result is None else lce.read_result(result)
     with show.progress_bar("detecting") as progress:
-        verification = lce.verify(opened, saved, event_image=event_image, progress=progress)
+        verification = lce.verify(opened, saved, name=name, event_image=event_image, progress=progress)
     with show.progress_bar("drawing") as progress:
         checks = verification.write(output, progress=progress)
     if as_json:

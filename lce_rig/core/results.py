@@ -1,7 +1,8 @@
 """The data passed between stages, as frozen dataclasses."""
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Literal, cast
 
 import numpy as np
@@ -37,6 +38,94 @@ class Refusal(Finding):
         return Refusal(f"{stage}.error", figures={"what": error.what, "hint": error.hint}, action=action)
 
 
+@dataclass(frozen=True)
+class ImageQuality:
+    """What an image shows of the pattern.
+
+    Attributes:
+        mean_grey: of the whole image, grey values.
+        contrast: white minus black squares, grey values.
+        noise: standard deviation, grey values.
+        square_px: shortest side of a square.
+        edge_width_px: of the squares' edges, 10-90 %.
+        sharpness: edge widths in a square: 1 is unreadable, above 5 is crisp.
+        border_px: outermost corner to the border of the image.
+        n_corners: that could be fitted.
+    """
+
+    mean_grey: float
+    contrast: float
+    noise: float
+    square_px: float
+    edge_width_px: float
+    sharpness: float
+    border_px: float
+    n_corners: int
+
+
+@dataclass(frozen=True)
+class EventQuality:
+    """What events show of the board and of its motion; NaN if it could not be measured.
+
+    Attributes:
+        events_px_s: events per second and pixel of the board, just before the image.
+        events_px: events per pixel of the board in the time that the network remembers.
+        speed_mps, turn_deg_s: of the board about the time of the image.
+        speed_sigma_mps, turn_sigma_deg_s: standard deviation of these.
+        smear_m: how far the board moves while the LiDAR scans it.
+        smear_depth_m: the part of it along the board's normal, which thickens or tilts the plane.
+    """
+
+    events_px_s: float
+    events_px: float
+    speed_mps: float = math.nan
+    speed_sigma_mps: float = math.nan
+    turn_deg_s: float = math.nan
+    turn_sigma_deg_s: float = math.nan
+    smear_m: float = math.nan
+    smear_depth_m: float = math.nan
+
+
+@dataclass(frozen=True)
+class LidarQuality:
+    """What a scan shows of the plate.
+
+    Attributes:
+        width_m, height_m: of the plate as measured.
+        width_sigma_m, height_sigma_m: standard deviation of these.
+        size_ratio: both sides together over the nominal ones.
+        n_rings, n_points: on the plate.
+        n_ring_ends: at its outline.
+        n_ring_ends_dropped: that do not fit the outline.
+        thickness_m: range of the points' heights over the plane without the outer 5 %.
+        plane_rms_m: of those heights.
+        edge_rms_m: of the ring ends' distances from the outline; NaN without ring ends.
+        template_m: error of the nominal outline.
+        beyond_share: returns in the plane beyond the outline over those on the plate.
+        distance_m: of the plate's middle.
+        incidence_deg: between the beam and the plate's normal there.
+        range_noise_m: of the whole scan.
+    """
+
+    width_m: float
+    height_m: float
+    width_sigma_m: float
+    height_sigma_m: float
+    size_ratio: float
+    n_rings: int
+    n_points: int
+    n_ring_ends: int
+    n_ring_ends_dropped: int
+    thickness_m: float
+    plane_rms_m: float
+    edge_rms_m: float
+    template_m: float
+    beyond_share: float
+    distance_m: float
+    incidence_deg: float
+    range_noise_m: float
+
+
 @dataclass(frozen=True, eq=False)
 class ImageBoard:
     """The board detected in one image.
@@ -50,10 +139,11 @@ class ImageBoard:
         is_ambiguous: whether the image alone cannot decide between the two (chi2_gap < 9).
         reprojection_px: rms of the corner residuals.
         sigma_px: corner noise per coordinate, from the residuals and their degrees of freedom.
-        quality: figures by name: sharpness, tilt_deg, distance_m, square_px, border_px, ...
+        quality: figures of the pattern in the image; None if only its corners are known.
+        events: figures of the board's events; None if the image was not reconstructed from known events.
         stamp_ns: of the image; None if the recording carries no time.
         track_ns: (K,) int64 timestamps of further images of this channel, shortly before and after, in which
-            the board was followed; None if there are none.
+            the board was tracked; None if there are none.
         track_T_cam_board: (K, 4, 4) its poses there, corners in the same order as here.
         track_cov: (K, 6, 6) of those poses, as `cov`.
     """
@@ -66,11 +156,31 @@ class ImageBoard:
     is_ambiguous: bool
     reprojection_px: float
     sigma_px: float
-    quality: Mapping[str, float] = field(default_factory=dict)
+    quality: ImageQuality | None = None
+    events: EventQuality | None = None
     stamp_ns: int | None = None
     track_ns: NDArray[np.int64] | None = None
     track_T_cam_board: Array | None = None
     track_cov: Array | None = None
+
+    @property
+    def distance_m(self) -> float:
+        """Distance of the pattern's middle from the camera."""
+        return float(np.linalg.norm(self.T_cam_board[:3, 3]))
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle between the board's normal and the line of sight."""
+        cosine = abs(float(self.T_cam_board[:3, 2] @ self.T_cam_board[:3, 3])) / self.distance_m
+        return float(np.degrees(np.arccos(min(cosine, 1.0))))
+
+    def figures(self) -> dict[str, float]:
+        """List every figure by name, for tables and programs."""
+        figures = {} if self.quality is None else asdict(self.quality)
+        figures["corner_rms_px"] = self.reprojection_px
+        figures |= {"tilt_deg": self.tilt_deg, "distance_m": self.distance_m}
+        measured = {} if self.events is None else asdict(self.events)
+        return figures | {name: value for name, value in measured.items() if not math.isnan(value)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +203,7 @@ class LidarBoard:
         sigma_m: rms distance of `points` from the plane.
         T_lidar_board: (4, 4) from the template; known up to the symmetries of a rectangle.
         offset_ns: (N,) int64 firing time of each point after the scan's timestamp; None without.
-        quality: figures by name: n_rings, n_points, thickness_m, width_m, height_m, edge_rms_m, template_m,
-            distance_m, ...
+        quality: figures of the plate in the scan.
         stamp_ns: of the scan; None if the recording carries no time.
     """
 
@@ -109,9 +218,13 @@ class LidarBoard:
     plane: Array
     sigma_m: float
     T_lidar_board: Array
+    quality: LidarQuality
     offset_ns: NDArray[np.int64] | None = None
-    quality: Mapping[str, float] = field(default_factory=dict)
     stamp_ns: int | None = None
+
+    def figures(self) -> dict[str, float]:
+        """List every figure of the quality by name, for tables and programs."""
+        return asdict(self.quality)
 
 
 @dataclass(frozen=True, eq=False)

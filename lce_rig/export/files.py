@@ -10,11 +10,10 @@ import numpy as np
 import yaml
 
 import lce_rig
-from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError
+from lce_rig.core.errors import LceRigError, ResultRefusedError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Calibration
 from lce_rig.rig import Rig
-from lce_rig.session.durable import replace_file
 
 _Arguments = ParamSpec("_Arguments")
 _Read = TypeVar("_Read")
@@ -85,21 +84,6 @@ def header(
     if lacking and not of_one_camera:
         lines.append(f"not in this file, without a usable result: {', '.join(lacking)}")
     return lines
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a file so that it is complete or absent, even after a power failure.
-
-    Raises:
-        SessionError: the folder cannot be written to.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, text.encode())
-    except OSError as error:
-        raise SessionError(
-            f"{path}: cannot be written: {error.strerror or error}", "Free space, or choose another folder."
-        ) from error
 
 
 def reads_back(

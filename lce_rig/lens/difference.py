@@ -63,7 +63,7 @@ class LensCertainty:
 
     Attributes:
         pixels: (H, W, 2) grid over the image.
-        sigma_px: (H, W) root of the summed variances of both coordinates; NaN where the model has no ray.
+        sigma_px: (H, W) root of the summed variances of both coordinates; NaN for pixels without a ray.
         is_covered: (H, W) whether boards were seen there.
     """
 

@@ -5,8 +5,6 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError, UsageError
@@ -206,7 +204,9 @@ def _is_doubtful(board: ImageDetection, limit_px: float) -> bool:
     """Return whether wrong intrinsics may have caused a detection to fail: board, pose or single corners."""
     if isinstance(board, Refusal):
         return True
-    return board.reprojection_px > limit_px or board.quality.get("n_corners", np.inf) < len(board.corners_px)
+    return board.reprojection_px > limit_px or (
+        board.quality is not None and board.quality.n_corners < len(board.corners_px)
+    )
 
 
 def _scaled(given: Intrinsics, image: Image) -> Intrinsics:

@@ -3,7 +3,7 @@
 Layout, every file plain: rig.yaml, session.json, journal.jsonl, detections/ and
 captures/000012/{meta.json, cam.frames.png, lidar.pcd, cam.events.npz}. A capture is written to
 captures/.new-000012/, its files are flushed, the folder is renamed and its parent flushed: it exists whole or
-not at all, whenever the power goes.
+not at all, whenever the power goes. A rejected capture is its folder moved to rejected/.
 """
 
 import errno
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lce_rig import __version__
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.documents import parse_json
-from lce_rig.core.errors import LceRigError, SessionError
+from lce_rig.core.errors import LceRigError, SessionError, reading
 from lce_rig.core.limits import MAX_DOCUMENT_BYTES, MAX_FILE_BYTES, open_regular
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import cache
@@ -62,9 +62,9 @@ def read_entries(path: Path) -> list[dict[str, Any]]:
 
 
 PROFILE, JOURNAL, LOCK = "rig.yaml", "journal.jsonl", ".lock"
-CAPTURES, DETECTIONS, DRAFT_PREFIX = "captures", "detections", ".new-"
-CALIBRATION, INTRINSICS, DEBUG = "calibration", "intrinsics", "debug"
-_WRITTEN = (JOURNAL, LOCK, CAPTURES, DETECTIONS, CALIBRATION, INTRINSICS, DEBUG)
+CAPTURES, REJECTED, DETECTIONS, DRAFT_PREFIX = "captures", "rejected", "detections", ".new-"
+CALIBRATION, RESULTS, INTRINSICS, DEBUG = "calibration", "results", "intrinsics", "debug"
+_WRITTEN = (JOURNAL, LOCK, CAPTURES, REJECTED, DETECTIONS, CALIBRATION, RESULTS, INTRINSICS, DEBUG)
 
 
 class Session:
@@ -203,14 +203,16 @@ class Session:
         Raises:
             SessionError: their folder may not be read.
         """
-        folder = self.path / CAPTURES
-        try:
-            names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
-        except OSError as error:
-            raise SessionError(f"{folder} cannot be read: {error.strerror or error}") from error
-        numbered = [name for name in names if re.fullmatch(r"[0-9]{6,}", name)]
-        # By number: 1000000 follows 999999.
-        return [Capture(folder / name) for name in sorted(numbered, key=lambda name: (len(name), name))]
+        return _captures_in(self.path / CAPTURES)
+
+    @property
+    def rejected(self) -> list[Capture]:
+        """Every capture that was rejected, by name: nothing uses them, and `restore` takes one back.
+
+        Raises:
+            SessionError: their folder may not be read.
+        """
+        return _captures_in(self.path / REJECTED)
 
     def capture(self, name: str) -> Capture:
         """Find one capture.
@@ -221,12 +223,55 @@ class Session:
         for capture in self.captures:
             if capture.name == name:
                 return capture
+        if any(capture.name == name for capture in self.rejected):
+            raise SessionError(
+                f"{self.path}: capture {name} is rejected",
+                f"Restore it: lce-rig captures {self.path} --restore {name}",
+            )
         raise SessionError(f"{self.path} has no capture {name!r}; it has {len(self.captures)}")
+
+    def reject(self, name: str, reason: str = "") -> None:
+        """Put a capture aside: it is used no more, and not collected again.
+
+        Args:
+            name: of the capture.
+            reason: kept in the journal.
+
+        Raises:
+            SessionError: there is no capture of that name, the session is open read-only, or the disk is.
+        """
+        self.capture(name)
+        self._move(name, CAPTURES, REJECTED)
+        self.journal("rejected", capture=name, reason=reason)
+
+    def restore(self, name: str) -> None:
+        """Take a rejected capture back; raises as `reject`."""
+        if all(capture.name != name for capture in self.rejected):
+            names = ", ".join(capture.name for capture in self.rejected) or "none"
+            raise SessionError(
+                f"{self.path} has no rejected capture {name!r}", f"Rejected captures: {names}."
+            )
+        self._move(name, REJECTED, CAPTURES)
+        self.journal("restored", capture=name)
+
+    def _move(self, name: str, source: str, target: str) -> None:
+        """Move a capture's folder in one step, so that it is in one place whatever happens."""
+        self._require_lock()
+        old, new = self.own(source, name), self.own(target, name)
+        if new.exists():
+            raise SessionError(f"{new} is in the way of capture {name}", f"Move {new} out of the session.")
+        try:
+            new.parent.mkdir(exist_ok=True)
+            old.rename(new)
+            flush_folder(new.parent)
+            flush_folder(old.parent)
+        except OSError as error:
+            raise _not_writable(new, error) from error
 
     def find_duplicate(
         self, images: Iterable[Image], scans: Iterable[Scan], events: Iterable[Events] = ()
     ) -> str | None:
-        """Return the capture that already holds exactly this data; None if it is new."""
+        """Return the capture, even if rejected, that already holds exactly this data; None if it is new."""
         return self._contents().get(content_hash(images, scans, events))
 
     def add_capture(
@@ -252,13 +297,12 @@ class Session:
                 order or outside their sensor, or the disk is full; earlier captures are not affected.
         """
         images, scans, events = list(images), list(scans), list(events)
-        if self._lock is None:
-            raise SessionError(f"{self.path} is open for reading only")
+        self._require_lock()
         check_samples(self.rig, images, scans, events)
         recorded = [(event_channel(self.rig, stretch.sensor), stretch) for stretch in events]
         contents = self._contents()
         captures = self.captures
-        name = f"{int(captures[-1].name) + 1 if captures else 0:06d}"
+        name = self.next_name
         folder = self.own(CAPTURES, name)
         draft = folder.with_name(DRAFT_PREFIX + name)
         try:
@@ -274,6 +318,15 @@ class Session:
         contents.setdefault(Capture(folder).content_sha256, name)
         self.journal("captured", capture=name)
         return name
+
+    @property
+    def next_name(self) -> str:
+        """The name of the next capture; that of a rejected one is not given again."""
+        return f"{max((int(each.name) for each in self.captures + self.rejected), default=-1) + 1:06d}"
+
+    def _require_lock(self) -> None:
+        if self._lock is None:
+            raise SessionError(f"{self.path} is open for reading only")
 
     def journal(self, event: str, **fields: Any) -> None:
         """Append an entry with the time to journal.jsonl.
@@ -295,10 +348,8 @@ class Session:
             SessionError: the journal cannot be read.
         """
         path = self.path / JOURNAL
-        try:
+        with reading(path, SessionError):
             return read_entries(path)
-        except (OSError, ValueError) as error:
-            raise SessionError(f"{path} cannot be read: {error}") from None
 
     def store_cached(self, key: str, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, Any]) -> bool:
         """Store arrays and JSON values under a key such as "3f9a1c/000012" for `load_cached`.
@@ -356,13 +407,21 @@ class Session:
     def _contents(self) -> dict[str, str]:
         if self._names_by_content is None:
             self._names_by_content = {}
-            for capture in self.captures:
+            for capture in self.captures + self.rejected:
                 try:
                     self._names_by_content.setdefault(capture.content_sha256, capture.name)
                 except SessionError:
                     # A damaged capture is reported when it is read; nothing is a duplicate of it.
                     continue
         return self._names_by_content
+
+
+def _captures_in(folder: Path) -> list[Capture]:
+    with reading(folder, SessionError):
+        names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+    numbered = [name for name in names if re.fullmatch(r"[0-9]{6,}", name)]
+    # By number: 1000000 follows 999999.
+    return [Capture(folder / name) for name in sorted(numbered, key=lambda name: (len(name), name))]
 
 
 def _check_rig(path: Path, rig: Rig) -> None:

@@ -20,19 +20,6 @@ from lce_rig.core.geometry import Array, exp_so3, project_to_so3, skew
 N_ROTATION = 9
 
 
-def moment_matrix(rows: Array, weights: Array) -> Array:
-    """Sum w a a^T, equation (2).
-
-    Args:
-        rows: (..., n, m).
-        weights: (..., n).
-
-    Returns:
-        (..., m, m).
-    """
-    return np.asarray(np.swapaxes(rows * weights[..., None], -1, -2) @ rows)
-
-
 def vec_rotation(R: Array) -> Array:
     """Stack the columns of R (..., 3, 3) into (..., 9)."""
     return np.swapaxes(R, -1, -2).reshape(*R.shape[:-2], N_ROTATION)

@@ -215,12 +215,14 @@ def _plate(estimate: CalibrationEstimate, board: Board) -> list[Finding]:
     """Compare the plate as the LiDAR measures it with the profile; sigmas are mostly the beam's spot."""
     found = []
     records = [estimate.observations[name].lidar.quality for name in estimate.used]
-    for side, wanted_m in (("width", board.width_m), ("height", board.height_m)):
-        known = [q for q in records if q.get(f"{side}_sigma_m", np.inf) < PLATE_KNOWN_M]
+    for side, wanted_m, sides in (
+        ("width", board.width_m, [(q.width_m, q.width_sigma_m) for q in records]),
+        ("height", board.height_m, [(q.height_m, q.height_sigma_m) for q in records]),
+    ):
+        known = [each for each in sides if each[1] < PLATE_KNOWN_M]
         if len(known) < 3:
             continue
-        measured_m = float(np.median([q[f"{side}_m"] for q in known]))
-        sigma_m = float(np.median([q[f"{side}_sigma_m"] for q in known]))
+        measured_m, sigma_m = (float(median) for median in np.median(known, axis=0))
         if abs(measured_m - wanted_m) > 2 * sigma_m:
             figures: dict[str, Figure] = {
                 "side": side,

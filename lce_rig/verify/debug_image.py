@@ -261,7 +261,7 @@ def _image_report(result: ImageBoard | Refusal) -> Picture:
     if isinstance(result, Refusal):
         return _refusal("camera", result)
     notes = ["pose ambiguous from the image alone"] if result.is_ambiguous else []
-    return _figures("camera: board found", result.quality, _IMAGE_FIGURES, notes)
+    return _figures("camera: board found", result.figures(), _IMAGE_FIGURES, notes)
 
 
 def _lidar_report(result: Sequence[LidarBoard] | Refusal, chosen: int) -> Picture:
@@ -269,8 +269,8 @@ def _lidar_report(result: Sequence[LidarBoard] | Refusal, chosen: int) -> Pictur
         return _refusal("LiDAR", result)
     rivals = len(result) - 1
     notes = [f"{rivals} other plate{'s' if rivals > 1 else ''} of the board's size"] if rivals else []
-    quality = result[chosen].quality if chosen < len(result) else {}
-    return _figures("LiDAR: board found", quality, _LIDAR_FIGURES, notes)
+    figures = result[chosen].figures() if chosen < len(result) else {}
+    return _figures("LiDAR: board found", figures, _LIDAR_FIGURES, notes)
 
 
 def _refusal(sensor: str, refusal: Refusal) -> Picture:
@@ -285,14 +285,14 @@ def _refusal(sensor: str, refusal: Refusal) -> Picture:
 
 
 def _figures(
-    heading: str, quality: Mapping[str, float], wanted: Mapping[str, str], notes: Sequence[str]
+    heading: str, figures: Mapping[str, float], wanted: Mapping[str, str], notes: Sequence[str]
 ) -> Picture:
     pane = canvas.panel(_PANE_PX, _REPORT_PX)
     canvas.draw_text(pane, heading, 14, 28, _TEXT_PX + 2, BLUE)
     lines = [
-        text.format(quality[name] * (1000 if " mm" in text else 1))
+        text.format(figures[name] * (1000 if " mm" in text else 1))
         for name, text in wanted.items()
-        if name in quality
+        if name in figures
     ]
     lines += notes
     for index, line in enumerate(lines):

@@ -222,6 +222,19 @@ PHRASES: dict[str, Phrase] = {
         "board"
     ),
     "verify.unseen": Phrase("both sensors detect the board in no capture"),
+    "results.agree": Phrase(
+        "the {n_sessions} results of {camera} and {lidar} agree: they differ by up to {rotation_deg:3deg} "
+        "and {translation_m:1mm}; common errors stay hidden, as they share captures",
+    ),
+    "results.disagree": Phrase(
+        "{first} and {second} of {camera} and {lidar} disagree: results differ by up to {rotation_deg:3deg} "
+        "and {translation_m:1mm}, more than their uncertainties allow",
+        "compare the overlays of both (`lce-rig verify --name NAME`) and collect more captures",
+    ),
+    "results.outdated": Phrase(
+        "{subject}: the profile or the captures that it used have changed since",
+        "run `lce-rig calibrate` again with the same options",
+    ),
     "repeat.agree": Phrase(_agree),
     "repeat.disagree": Phrase(
         "the {n_sessions} calibrations of {camera} and {lidar} disagree: they differ by up to "

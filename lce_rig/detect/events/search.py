@@ -13,7 +13,7 @@ from lce_rig.core.data import Events, Image
 from lce_rig.core.geometry import Array, exp_so3, pose, rotation_angle, skew
 from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.detect.events.event_limits import explain_missing_board, gate_event_board
-from lce_rig.detect.events.figures import event_figures, motion_figures, outline_px
+from lce_rig.detect.events.figures import event_quality, outline_px, with_motion
 from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
 from lce_rig.detect.image.search import find_image_board, region_around
 from lce_rig.detect.limits_met import gate_image_board
@@ -177,9 +177,8 @@ def find_event_board(
     if isinstance(found, Refusal):
         return EventSighting(picture, explain_missing_board(events, stamp_ns, found, limits))
     found = _followed(replace(found, stamp_ns=stamp_ns), picture, pictures, board, intrinsics, limits)
-    made = event_figures(events, stamp_ns, outline_px(found.T_cam_board, board, intrinsics))
-    quality = {**found.quality, **made, **motion_figures(found, sweep_s)}
-    gated = gate_image_board(replace(found, quality=quality), limits)
+    made = event_quality(events, stamp_ns, outline_px(found.T_cam_board, board, intrinsics))
+    gated = gate_image_board(replace(found, events=with_motion(made, found, sweep_s)), limits)
     return EventSighting(picture, gate_event_board(gated, limits) if isinstance(gated, ImageBoard) else gated)
 
 

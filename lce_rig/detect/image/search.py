@@ -1,6 +1,6 @@
 """The board in a picture: corners, both poses and figures, or why there is none."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array, transform
-from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.core.results import ImageBoard, ImageQuality, Refusal
 from lce_rig.detect.image.corners import find_grid, order_corners, seen_grid
 from lce_rig.detect.image.quality import (
     explain_absence,
@@ -106,19 +106,17 @@ def find_image_board(
     )
     if solved is None or solved.reprojection_px > max_reprojection_px:
         return _misfit(solved, intrinsics, max_reprojection_px)
-    quality |= {"n_corners": float(crossings.is_fitted.sum()), "corner_rms_px": solved.reprojection_px}
+    quality = replace(quality, n_corners=int(crossings.is_fitted.sum()))
     return board_from_pose(crossings.grid_px.reshape(-1, 2), solved, quality)
 
 
-def board_from_pose(
-    corners_px: Array, solved: PlanarPose, quality: Mapping[str, float] | None = None
-) -> ImageBoard:
+def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality | None = None) -> ImageBoard:
     """Put together what an image shows of the board, once its pose is solved for.
 
     Args:
         corners_px: (rows * cols, 2) in the order of `Board.corners()`.
         solved: both poses that they admit.
-        quality: figures of the image; those of the pose are added.
+        quality: figures of the image.
     """
     return ImageBoard(
         corners_px=corners_px,
@@ -129,7 +127,7 @@ def board_from_pose(
         is_ambiguous=solved.chi2_gap < _AMBIGUOUS_CHI2,
         reprojection_px=solved.reprojection_px,
         sigma_px=solved.sigma_px,
-        quality={**(quality or {}), **_pose_quality(solved.T_cam_board)},
+        quality=quality,
     )
 
 
@@ -282,13 +280,6 @@ def _solve(
 def _errors(T_cam_board: Array, crossings: Crossings, corners_board: Array, intrinsics: Intrinsics) -> Array:
     predicted, _ = intrinsics.project(transform(T_cam_board, corners_board))
     return np.asarray(np.linalg.norm(predicted - crossings.grid_px.reshape(-1, 2), axis=1))
-
-
-def _pose_quality(T_cam_board: Array) -> dict[str, float]:
-    """Measure tilt_deg (print's normal against the line of sight) and distance_m."""
-    distance_m = float(np.linalg.norm(T_cam_board[:3, 3]))
-    cosine = abs(float(T_cam_board[:3, 2] @ T_cam_board[:3, 3])) / distance_m
-    return {"tilt_deg": float(np.degrees(np.arccos(min(cosine, 1.0)))), "distance_m": distance_m}
 
 
 def _misfit(solved: PlanarPose | None, intrinsics: Intrinsics, max_reprojection_px: float) -> Refusal:

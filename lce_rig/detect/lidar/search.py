@@ -31,12 +31,12 @@ def no_returns(n_points: int, min_range_m: float) -> Refusal:
 
 def too_few_rings(found: LidarBoard, min_rings: int) -> Refusal:
     """Refuse a board on which too few rings lie; their number goes with 1 / distance."""
-    n_rings, distance_m = found.quality["n_rings"], found.quality["distance_m"]
+    n_rings, distance_m = found.quality.n_rings, found.quality.distance_m
     closer_m = max(0.1, distance_m * (1.0 - n_rings / min_rings))
     return Refusal(
         "lidar.too_few_rings",
         figures={
-            "n_rings": int(n_rings),
+            "n_rings": n_rings,
             "min_rings": min_rings,
             "distance_m": distance_m,
             "closer_m": closer_m,
@@ -260,7 +260,7 @@ def measure_plate(
     measured = build_board(ordered, scan, board, view, placement, beam or Beam())
     if measured is None:
         return None
-    if measured.quality["n_rings"] < limits.min_rings:
+    if measured.quality.n_rings < limits.min_rings:
         return too_few_rings(measured, limits.min_rings)
     if measured.sigma_m > limits.rms_m:
         heights_m = measured.points @ measured.plane[:3] + measured.plane[3]
@@ -270,7 +270,7 @@ def measure_plate(
 
 def _is_clear(found: LidarBoard) -> bool:
     """Return whether a candidate has many rings and its plane almost to itself."""
-    return found.quality["n_rings"] >= CLEAR_RINGS and found.quality["beyond_share"] < CLEAR_SHARE
+    return found.quality.n_rings >= CLEAR_RINGS and found.quality.beyond_share < CLEAR_SHARE
 
 
 def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
@@ -287,11 +287,11 @@ def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
 def _doubt(found: LidarBoard, board: Board) -> float:
     """Rate a candidate in m: misfit of outline and size, what no ring shows, what else is in its plane."""
     q = found.quality
-    doubt = q["template_m"] + 0.03 / q["n_rings"] + 0.15 * (q["width_sigma_m"] + q["height_sigma_m"])
-    doubt += 0.05 * q["beyond_share"]
+    doubt = q.template_m + 0.03 / q.n_rings + 0.15 * (q.width_sigma_m + q.height_sigma_m)
+    doubt += 0.05 * q.beyond_share
     for measured_m, sigma_m, wanted_m in (
-        (q["width_m"], q["width_sigma_m"], board.width_m),
-        (q["height_m"], q["height_sigma_m"], board.height_m),
+        (q.width_m, q.width_sigma_m, board.width_m),
+        (q.height_m, q.height_sigma_m, board.height_m),
     ):
         doubt += 0.5 * max(0.0, abs(measured_m - wanted_m) - 2 * sigma_m - 0.005)
     return doubt
@@ -387,7 +387,7 @@ def _measure_again(
     width_axis = plane_axes(previous.plane[:3]).T @ T[:3, 0]
     half_m = (board.width_m / 2, board.height_m / 2)
     start = Placement(0.0, 0.0, float(np.arctan2(width_axis[1], width_axis[0])), half_m)
-    limits = replace(limits, template_m=min(limits.template_m, previous.quality["template_m"] + WORSE_M))
+    limits = replace(limits, template_m=min(limits.template_m, previous.quality.template_m + WORSE_M))
     measured = measure_plate(
         ordered, nearby, board, previous.plane, T[:3, 3], start, limits.widened(ordered.sigma_m), beam
     )

@@ -123,7 +123,7 @@ def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
 
 
 def _label_scans(used: Sequence[Sequence[Observation]]) -> list[list[Observation]]:
-    """Give observations of the same scan the same name, in any capture."""
+    """Rename observations so that those of the same scan share a name, in any capture."""
     names: dict[bytes, str] = {}
     labelled = []
     for own in used:

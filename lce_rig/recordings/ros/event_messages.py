@@ -1,6 +1,7 @@
 """Events in ROS 1 and ROS 2 bags."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -58,21 +59,6 @@ class EventPacket:
         if len(self.payload) % dtype.itemsize:
             raise ValueError(f"{len(self.payload)} bytes are no whole number of {dtype.itemsize}-byte words")
         return self.payload.view(dtype)
-
-
-@dataclass(frozen=True, eq=False)
-class Triggers:
-    """Edges on the camera's trigger input.
-
-    Attributes:
-        t_ns: (N,) int64 device time.
-        is_rising: (N,) bool.
-        source: (N,) int16 number of the input.
-    """
-
-    t_ns: NDArray[np.int64]
-    is_rising: NDArray[np.bool_]
-    source: NDArray[np.int16]
 
 
 def parse_packet(data: bytes, encoding: str) -> EventPacket:
@@ -168,24 +154,11 @@ def _shift(events: EventColumns, packet: EventPacket) -> EventColumns:
 
 def _decode_mono(packet: EventPacket) -> EventColumns:
     """Decode polarity 1 | y 15 | x 16 | ns after the time base 32 bits."""
-    t_ns, upper, is_set = _split_mono(packet)
-    x, y = (upper & 0xFFFF).astype(np.uint16), ((upper >> 16) & 0x7FFF).astype(np.uint16)
-    return EventColumns(t_ns, x, y, is_set, packet.header.stamp_ns)
-
-
-def decode_triggers(packets: list[EventPacket]) -> Triggers:
-    """Decode packets of encoding "trigger": mono's layout, with the input's number in place of y."""
-    parts = [_split_mono(packet) for packet in packets]
-    empty = (np.empty(0, np.int64), np.empty(0, np.uint32), np.empty(0, bool))
-    t_ns, upper, is_set = (np.concatenate(column) for column in zip(*([empty] + parts), strict=True))
-    return Triggers(t_ns, is_set, ((upper >> 16) & 0x7FFF).astype(np.int16))
-
-
-def _split_mono(packet: EventPacket) -> tuple[NDArray[np.int64], NDArray[np.uint32], NDArray[np.bool_]]:
     words = packet.words("u8").astype(np.uint64)
     upper = (words >> np.uint64(32)).astype(np.uint32)
     t_ns = packet.time_base_ns + (words & np.uint64(0xFFFFFFFF)).astype(np.int64)
-    return t_ns, upper, (upper >> 31).astype(bool)
+    x, y = (upper & 0xFFFF).astype(np.uint16), ((upper >> 16) & 0x7FFF).astype(np.uint16)
+    return EventColumns(t_ns, x, y, (upper >> 31).astype(bool), packet.header.stamp_ns)
 
 
 def _decode_libcaer(packet: EventPacket) -> EventColumns:
@@ -276,30 +249,6 @@ class BagEvents:
         return None
 
 
-def read_triggers(path: Path, topic: str | None = None) -> Triggers:
-    """Read the edges on a camera's trigger input from EventPackets of encoding "trigger"; there may be none.
-
-    Raises:
-        SourceError: the bag cannot be read, or lacks the topic.
-    """
-    bag = BagFile(path)
-    topics = [topic] if topic else [name for name, (kind, _) in bag.topics.items() if kind in PACKET_TYPES]
-    packets = []
-    for name in topics:
-        if name not in bag.topics:
-            raise SourceError(f"{path} has no topic {name}", list_topics(bag.topics))
-        packets += [p for p in _packets(bag, name) if p.encoding == "trigger"]
-    return decode_triggers(packets)
-
-
-def _packets(bag: BagFile, topic: str) -> Iterator[EventPacket]:
-    for _, message in _messages(bag, topic, DamageCounts()):
-        try:
-            yield parse_packet(message.data, message.encoding)
-        except ValueError:
-            continue
-
-
 def _messages(bag: BagFile, topic: str, findings: DamageCounts) -> Iterator[tuple[int, RawMessage]]:
     """Yield the messages of a topic with their number; where the bag is torn, that is said and all."""
     messages = bag.messages({topic})
@@ -337,5 +286,7 @@ def _choose_topic(bag: BagFile, asked: str | None) -> str:
 def _holds_triggers(bag: BagFile, topic: str) -> bool:
     if bag.topics[topic][0] not in PACKET_TYPES:
         return False
-    first = next(_packets(bag, topic), None)
-    return first is not None and first.encoding == "trigger"
+    for _, message in _messages(bag, topic, DamageCounts()):
+        with suppress(ValueError):
+            return parse_packet(message.data, message.encoding).encoding == "trigger"
+    return False

@@ -10,7 +10,7 @@ from lce_rig.recordings.events.prophesee_raw import Evt2Decoder
 from lce_rig.recordings.events.stream import EventColumns, join
 from lce_rig.recordings.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
 from lce_rig.recordings.ros.event_array import decode_event_array, encode_event_array
-from lce_rig.recordings.ros.event_messages import PacketDecoder, decode_triggers, parse_packet
+from lce_rig.recordings.ros.event_messages import PacketDecoder, parse_packet
 from tests.recordings.events import encoders
 from tests.recordings.events.encoders import Event, listed, random_events
 
@@ -141,13 +141,9 @@ def test_stamps_that_wrap_inside_a_libcaer_packet_go_on() -> None:
     assert columns_listed(columns) == truth
 
 
-def test_triggers_come_back_with_their_edges() -> None:
+def test_packets_of_triggers_hold_no_events() -> None:
     edges = [(10, 0, 3, True), (20, 0, 3, False)]
     data = encoders.packet(encoders.mono(edges, 0), "trigger", is_ros1=True, base_ns=0)
-    triggers = decode_triggers([parse_packet(data, "ros1")])
-    assert triggers.t_ns.tolist() == [10_000, 20_000]
-    assert triggers.is_rising.tolist() == [True, False]
-    assert triggers.source.tolist() == [3, 3]
     assert list(PacketDecoder().decode(parse_packet(data, "ros1"))) == []
 
 
