@@ -34,7 +34,7 @@ from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.result_files import Result
 from lce_rig.rig import Rig
 from lce_rig.session import Session
-from lce_rig.validation.camera_pairs import CameraPair, doubt_cameras, relate
+from lce_rig.validation.camera_pairs import CameraPair, camera_findings, relate
 from lce_rig.validation.reach import point_uncertainties
 from lce_rig.validation.validate import Validation, validate
 from lce_rig.validation.verdict import judge
@@ -73,7 +73,7 @@ class _Link:
     first: int
     second: int
     pair: CameraPair
-    doubts: tuple[Finding, ...]
+    findings: tuple[Finding, ...]
 
 
 def calibrate(
@@ -161,9 +161,9 @@ def calibrate_detections(
     calibrations = []
     for k, own in enumerate(sensors):
         mine = [link for link in links if k in (link.first, link.second)]
-        doubts = [doubt for link in mine for doubt in link.doubts]
+        contradictions = [finding for link in mine for finding in link.findings]
         others = tuple(_other_camera(sensors, final, checked, k, link, joint) for link in mine)
-        calibration = _judged(rig, detections, own, final[k], checked[k], doubts, others)
+        calibration = _judged(rig, detections, own, final[k], checked[k], contradictions, others)
         truth = reference.of(own.camera, own.lidar) if reference else None
         calibrations.append(calibration if truth is None else _compared(calibration, truth))
     return calibrations, shortages
@@ -258,7 +258,7 @@ def _links(rig: Rig, sensors: Sequence[_Sensors], alone: Sequence[CalibrationEst
             pair = relate(alone[i], alone[j])
             if pair is not None:
                 names = sensors[i].camera, sensors[j].camera
-                yield _Link(i, j, pair, tuple(doubt_cameras(pair, names, rig.calibration, rig.verdict)))
+                yield _Link(i, j, pair, tuple(camera_findings(pair, names, rig.calibration, rig.verdict)))
 
 
 def _is_still(estimate: CalibrationEstimate) -> bool:
@@ -286,11 +286,13 @@ def _groups(n: int, links: Sequence[_Link]) -> list[list[int]]:
     """List groups of two or more connected cameras, without those that have a contradicted link."""
     group = list(range(n))
     for link in links:
-        if not link.doubts:
+        if not link.findings:
             mine, other = group[link.first], group[link.second]
             group = [mine if number == other else number for number in group]
-    doubted = {group[link.first] for link in links if link.doubts and group[link.first] == group[link.second]}
-    found = [[k for k in range(n) if group[k] == number] for number in sorted(set(group) - doubted)]
+    contradicted = {
+        group[link.first] for link in links if link.findings and group[link.first] == group[link.second]
+    }
+    found = [[k for k in range(n) if group[k] == number] for number in sorted(set(group) - contradicted)]
     return [members for members in found if len(members) > 1]
 
 

@@ -269,13 +269,13 @@ def test_documented_defaults_are_those_of_the_code() -> None:
                 assert float(documented[key]) == field.default, key
 
 
-def test_what_a_copied_camera_shares_with_the_first_is_doubted() -> None:
+def test_what_a_copied_camera_shares_with_the_first_is_a_warning() -> None:
     document = load_rig("rlfs").model_dump(exclude_none=True)
     right = document["cameras"]["cam"] | {"frame": "right_link", "optical_frame": "right_optical"}
     document["cameras"]["right"] = right
     topic, device = Rig.model_validate(document).warnings()
-    for doubt, key, value in (
+    for warning, key, value in (
         (topic, "channels.frames.topic", "/camera/image_raw"),
         (device, "driver.device", "/dev/video0"),
     ):
-        assert doubt.startswith(f"cameras.right.{key}: {value} ") and f" cameras.cam.{key}" in doubt
+        assert warning.startswith(f"cameras.right.{key}: {value} ") and f" cameras.cam.{key}" in warning
