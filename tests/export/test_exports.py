@@ -255,7 +255,7 @@ def test_a_pose_read_back_wrong_by_a_hair_is_noticed(rles: Rig, make: Make, move
 
     calibration = make()
     check_pose(Path("x.yaml"), "T", calibration.T_cam_lidar, calibration, rles)
-    with pytest.raises(LceRigError, match="does not say what was calibrated"):
+    with pytest.raises(LceRigError, match="reads back differently"):
         check_pose(Path("x.yaml"), "T", perturb(calibration.T_cam_lidar, np.array(moved)), calibration, rles)
 
 
