@@ -21,7 +21,7 @@ def export_camera_info(calibrations: Sequence[Calibration], rig: Rig, folder: Pa
     """Write a file for each calibrated camera and check it by reading it back.
 
     Raises:
-        LceRigError: a file does not project as the rig's camera does.
+        LceRigError: a file projects differently from the rig's camera.
     """
     chosen = {calibration.camera: calibration for calibration in choose_channels(calibrations, rig)}
     paths = []
@@ -37,7 +37,7 @@ def export_camera_info(calibrations: Sequence[Calibration], rig: Rig, folder: Pa
 
 
 def ros_distortion(intrinsics: Intrinsics) -> tuple[str, tuple[float, ...]]:
-    """Name the ROS distortion model and list the coefficients it wants (4, 5 or 8)."""
+    """Return the name of the ROS distortion model and its coefficients (4, 5 or 8)."""
     given = intrinsics.distortion
     if intrinsics.model == "equidistant":
         return "equidistant", given
@@ -74,7 +74,7 @@ def read_camera_info(path: Path) -> Intrinsics:
     """Read a camera model from a camera_info file.
 
     Raises:
-        LceRigError: a model or shape that ROS does not know.
+        LceRigError: a model or shape that ROS does not support.
     """
     import yaml
 

@@ -24,7 +24,7 @@ def derive_text(
         text: the other profile.
         name: name of the new rig.
         settings: (key path, YAML value) to set, such as ("board.square_m", "0.08").
-        source: what to call the new text in errors, as a rule the file it is for.
+        source: name of the new text in errors, usually its file.
         origin: name of the other profile.
         removed: key paths to remove, such as "nominal_extrinsics".
 
@@ -35,7 +35,7 @@ def derive_text(
         ProfileError: the new profile would not be valid.
         UsageError: a value that is not YAML, or a path into something that has no keys.
     """
-    head = f"# {name}: made from {origin} by `lce-rig rigs new`; the comments below are {origin}'s.\n"
+    head = f"# {name}: made from {origin} by `lce-rig rigs new`; the comments below are from {origin}.\n"
     # What the other profile says of itself above its first key does not hold for this one.
     text = text[_begin(text) :]
     # A name such as 346 is a text only in quotes.
@@ -60,7 +60,7 @@ def set_value(text: str, path: str, value: str) -> str:
 
     Args:
         text: valid YAML.
-        path: keys and places in lists joined by dots: "nominal_extrinsics.0.tolerance_m".
+        path: keys and list indices joined by dots: "nominal_extrinsics.0.tolerance_m".
         value: the value as YAML on one line: "0.1", "[1, 2]".
 
     Raises:
@@ -69,7 +69,7 @@ def set_value(text: str, path: str, value: str) -> str:
     wanted = _parsed(path, value)
     root = yaml.compose(text, Loader=yaml.SafeLoader)
     if root is None:
-        raise UsageError(f"--set {path}: there is nothing to set it in")
+        raise UsageError(f"--set {path}: no block for this key")
     keys = path.split(".")
     node, depth = _descend(root, keys)
     if depth == len(keys):
@@ -79,7 +79,7 @@ def set_value(text: str, path: str, value: str) -> str:
     else:
         raise UsageError(f"--set {path}: {'.'.join(keys[:depth])} has no key {keys[depth]}")
     if not _holds(new, keys, wanted):
-        raise UsageError(f"--set {path}: {value!r} cannot be put there", "quote a text that holds : or #")
+        raise UsageError(f"--set {path}: {value!r} is not allowed there", "quote a text that holds : or #")
     return new
 
 
@@ -150,9 +150,9 @@ def _parsed(path: str, value: str) -> object:
     try:
         parsed: object = yaml.safe_load(value)
     except (yaml.YAMLError, RecursionError, *BAD_SCALARS) as error:
-        raise UsageError(f"--set {path}: {value!r} is no YAML value") from error
+        raise UsageError(f"--set {path}: {value!r} is not a YAML value") from error
     if "\n" in value or not value.strip() or not all(path.split(".")):
-        raise UsageError(f"--set {path}={value}: KEY=VALUE is expected, such as board.square_m=0.08")
+        raise UsageError(f"--set {path}={value}: expected KEY=VALUE, such as board.square_m=0.08")
     return parsed
 
 
@@ -176,7 +176,7 @@ def _child(node: yaml.Node, key: str) -> yaml.Node | None:
 
 
 def _end(node: yaml.Node) -> int:
-    """Find where a node's text ends; a block's own mark lies behind the comments that follow it."""
+    """Find where a node's text ends; a block's own mark is after the comments that follow it."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)
