@@ -22,6 +22,7 @@ from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.results import Calibration, OtherCamera
 from lce_rig.detect.detection import Pair
 from lce_rig.words import sentence
+from lce_rig.words.extrinsics import weakest_words
 
 # How the report of a calibration states what is uncertain: by axis, and for points at several distances.
 
@@ -36,7 +37,7 @@ def uncertainty_lines(calibration: Calibration) -> list[str]:
         f"  known to     {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
         f"               about {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
         f"               along {_by_axis(1000 * sigmas[:3], '.1f')} mm",
-        f"  weakest: {c.weak_direction}",
+        *([f"  weakest: {weakest_words(c.weakest)}"] if c.weakest else []),
         *_at_distances(c),
     ]
 
@@ -291,7 +292,7 @@ def exit_by_verdict(calibrations: Sequence[Calibration], *, are_told: bool = Fal
     failed = [c for c in calibrations if c.verdict == "fail"]
     if failed:
         pairs = ", ".join(str(Pair.of(c)) for c in failed)
-        causes = "\n".join(reason for c in failed for reason in c.reasons)
+        causes = "\n".join(sentence(finding) for c in failed for finding in c.findings)
         raise ResultRefusedError(f"do not use the result of {pairs}", "" if are_told else causes)
 
 
@@ -321,7 +322,7 @@ def _lines(calibration: Calibration) -> list[str]:
         )
     for name, why in c.captures_refused.items():
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {sentence(why)}')}[/]")
-    lines += [f"  [{colour}]{show.escape(reason)}[/]" for reason in c.reasons]
+    lines += [f"  [{colour}]{show.escape(sentence(finding))}[/]" for finding in c.findings]
     return lines
 
 

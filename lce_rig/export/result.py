@@ -11,12 +11,12 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from lce_rig.core.documents import read_json
 from lce_rig.core.errors import ResultRefusedError, SessionError
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Figure, Finding, Severity
 from lce_rig.core.geometry import FARTHEST_M, Array
 from lce_rig.core.limits import describe
 from lce_rig.core.results import Calibration, ChannelResult, OtherCamera, PointUncertainty, Refusal
 from lce_rig.export.files import MADE_BY, write_atomically
-from lce_rig.words import as_json, is_renderable, refusal_as_json
+from lce_rig.words import as_json, is_renderable, refusal_as_json, sentence
 
 # The schema of result.json, strict where it is read.
 
@@ -106,7 +106,7 @@ class FindingRecord(_SavedRecord):
         known = Finding(self.code, self.severity, self.subject, self.figures, self.action_code)
         if is_renderable(known):
             return known
-        return Finding("verdict.text", self.severity, figures={"text": self.text})
+        return Finding("verdict.text", self.severity, figures={"text": self.text, "advice": self.action})
 
 
 class CertificateRecord(_SavedRecord):
@@ -287,7 +287,7 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
         "egt_rotation_deg": _figure(calibration.egt_rotation_deg),
         "egt_translation_m": _figure(calibration.egt_translation_m),
         "verdict": calibration.verdict,
-        "reasons": list(calibration.reasons),
+        "reasons": [sentence(finding) for finding in calibration.findings],
         "findings": [as_json(finding) for finding in calibration.findings],
         "diagnostics": {name: _figure(value) for name, value in sorted(calibration.diagnostics.items())},
         "channels": [_channel(result, calibration) for result in calibration.channel_results],
@@ -426,7 +426,7 @@ def _calibration(pair: PairRecord) -> Calibration:
 
     return Calibration(
         camera=pair.camera,
-        channel=pair.channel,
+        channels=tuple(record.channel for record in pair.channels) or tuple(pair.channel.split("+")),
         lidar=pair.lidar,
         T_cam_lidar=np.array(pair.T_cam_lidar, dtype=np.float64),
         cov=np.array(pair.cov, dtype=np.float64),
@@ -439,8 +439,7 @@ def _calibration(pair: PairRecord) -> Calibration:
         captures_used=tuple(pair.captures_used),
         captures_refused={name: record.refusal for name, record in pair.captures_refused.items()},
         verdict=pair.verdict,
-        reasons=tuple(pair.reasons),
-        findings=tuple(record.finding for record in pair.findings),
+        findings=_findings(pair),
         egt_rotation_deg=pair.egt_rotation_deg,
         egt_translation_m=pair.egt_translation_m,
         diagnostics={name: figure(value) for name, value in pair.diagnostics.items()},
@@ -449,6 +448,16 @@ def _calibration(pair: PairRecord) -> Calibration:
         uncertainty=tuple(PointUncertainty(**each.model_dump()) for each in pair.uncertainty),
         estimated_with=tuple(pair.estimated_with),
         other_cameras=tuple(_other(record) for record in pair.other_cameras),
+    )
+
+
+def _findings(pair: PairRecord) -> tuple[Finding, ...]:
+    """Read the findings; files of earlier versions hold their sentences only."""
+    if pair.findings:
+        return tuple(record.finding for record in pair.findings)
+    severity: Severity = "error" if pair.verdict == "fail" else "warning"
+    return tuple(
+        Finding("verdict.text", severity, figures={"text": reason, "advice": ""}) for reason in pair.reasons
     )
 
 

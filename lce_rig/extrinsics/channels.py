@@ -79,7 +79,8 @@ def calibrate_channels(
     estimate = _widened(calibrate_observations(mover.observations(), board, options, progress), offsets)
     for consensus in agreed.values():
         estimate = with_consensus(estimate, consensus)
-    estimate = replace(estimate, refused={**conflicts, **estimate.refused})
+    same_scan = {scan.capture: scan.captures for scan in scans if len(scan.captures) > 1}
+    estimate = replace(estimate, refused={**conflicts, **estimate.refused}, same_scan=same_scan)
     alone = {name: _alone_moved(mover, name, board, options, offsets) for name in agreed}
     results = tuple(
         _channel_result(

@@ -28,7 +28,6 @@ from lce_rig.extrinsics.consensus import find_consensus
 from lce_rig.extrinsics.likelihood.calibrate_together import TogetherEstimate, calibrate_together
 from lce_rig.extrinsics.metrics import error_to_reference
 from lce_rig.extrinsics.relative_pose import relative_pose
-from lce_rig.extrinsics.shared_scans import take_apart
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.result_files import Result
@@ -350,7 +349,7 @@ def _examine(
     rig: Rig, detections: Detections, sensors: _Sensors, estimate: CalibrationEstimate
 ) -> Validation:
     """Check an estimate on its own captures and images."""
-    used = sorted(take_apart(estimate.used))
+    used = sorted(estimate.captures_of(estimate.used))
     channels = {channel.channel for channel in estimate.channels}
     views = []
     for name in used:
@@ -383,7 +382,7 @@ def _judged(
     lens = rig.cameras[camera].to_intrinsics()
     return Calibration(
         camera=camera,
-        channel="+".join(channel.channel for channel in estimate.channels),
+        channels=tuple(channel.channel for channel in estimate.channels),
         lidar=lidar,
         T_cam_lidar=estimate.T_cam_lidar,
         cov=examination.cov,
@@ -391,10 +390,9 @@ def _judged(
         metrics=estimate.metrics,
         n_captures=n_captures,
         n_detected=n_captures - len(sensors.refused),
-        captures_used=tuple(sorted(take_apart(estimate.used))),
+        captures_used=tuple(sorted(estimate.captures_of(estimate.used))),
         captures_refused=_still_refused(estimate, sensors.refused),
         verdict=verdict,
-        reasons=tuple(sentence(finding) for finding in findings),
         findings=findings,
         diagnostics=diagnostics,
         channel_results=estimate.channels,
@@ -402,7 +400,7 @@ def _judged(
         uncertainty=point_uncertainties(estimate.T_cam_lidar, examination.cov, lens),
         estimated_with=estimate.estimated_with,
         other_cameras=others,
-        weak_direction=estimate.weak_direction,
+        weakest=estimate.weakest,
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,
         observations=estimate.observations,
@@ -411,10 +409,10 @@ def _judged(
 
 def _still_refused(estimate: CalibrationEstimate, refused: Mapping[str, Refusal]) -> dict[str, Refusal]:
     """List refusals by capture, less what another channel of the same scan made up for."""
-    used = take_apart(estimate.used)
+    used = estimate.captures_of(estimate.used)
     every = dict(refused)
     for name, why in estimate.refused.items():
-        every |= dict.fromkeys(take_apart([name]), why)
+        every |= dict.fromkeys(estimate.captures_of([name]), why)
     return {name: every[name] for name in sorted(every) if name not in used}
 
 

@@ -109,7 +109,7 @@ def _precision(estimate: CalibrationEstimate, cov: Array, rig: Rig) -> list[Find
                 f"sigma_{unit}": sigma,
                 f"target_{unit}": goal,
                 f"by_axis_{unit}": tuple(float(axis) for axis in axes),
-                "weakest": estimate.weak_direction,
+                **estimate.weakest.figures(),
             }
             is_fail = sigma > rig.verdict.fail_factor * goal
             action = "measure_ranges" if is_lidar else ""
@@ -173,8 +173,11 @@ def _refusals(estimate: CalibrationEstimate) -> list[Finding]:
     n = len(disagreeing) + len(estimate.used)
     if 4 * len(disagreeing) <= n:
         return []
-    shown = ", ".join(disagreeing[:4]) + (" ..." if len(disagreeing) > 4 else "")
-    figures: dict[str, Figure] = {"n_refused": len(disagreeing), "n_captures": n, "captures": shown}
+    figures: dict[str, Figure] = {
+        "n_refused": len(disagreeing),
+        "n_captures": n,
+        "captures": tuple(disagreeing),
+    }
     return [doubt("verdict.sensors_disagree", figures, is_fail=2 * len(disagreeing) > n)]
 
 

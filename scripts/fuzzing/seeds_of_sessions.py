@@ -114,7 +114,7 @@ def calibration() -> Calibration:
     figures = Metrics(0.009, 0.0085, 0.2)
     return Calibration(
         camera=CAMERA,
-        channel="frames",
+        channels=("frames",),
         lidar=LIDAR,
         T_cam_lidar=T,
         cov=np.diag([1e-6, 1e-6, 4e-6, 1e-8, 4e-8, 1e-8]),
@@ -125,7 +125,6 @@ def calibration() -> Calibration:
         captures_used=("000000", "000002"),
         captures_refused={"000003": Refusal("pair.no_candidate")},
         verdict="pass",
-        reasons=(),
         diagnostics={"split_half_deg": 0.1, "b": 1 / 3},
         uncertainty=_uncertainty(),
     )

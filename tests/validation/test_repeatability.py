@@ -18,7 +18,7 @@ COV = ROOT @ ROOT.T
 def calibration(T, cov=COV, **diagnostics) -> Calibration:
     return Calibration(
         camera="cam",
-        channel="frames",
+        channels=("frames",),
         lidar="lidar",
         T_cam_lidar=T,
         cov=cov,
@@ -29,7 +29,6 @@ def calibration(T, cov=COV, **diagnostics) -> Calibration:
         captures_used=("000000",),
         captures_refused={},
         verdict="pass",
-        reasons=(),
         diagnostics=diagnostics,
     )
 

@@ -14,7 +14,7 @@ from lce_rig.extrinsics.likelihood.levels import PoseLevels
 from lce_rig.extrinsics.likelihood.refine import refine
 from lce_rig.extrinsics.likelihood.spread import inflate
 from lce_rig.extrinsics.options import EstimateSettings
-from lce_rig.extrinsics.shared_scans import scan_key, take_apart
+from lce_rig.extrinsics.shared_scans import scan_key
 from lce_rig.residuals.placements import group_shared_placements
 
 # Diagnostics that hold a camera's pose errors beyond corner noise, by the level that they are.
@@ -87,6 +87,7 @@ def calibrate_together(
             method=start.method,
             expansion=expand_joint(joint, k, placement),
             estimated_with=tuple(other for other in names if other != name),
+            same_scan=start.same_scan,
         )
     scale = np.concatenate(scales)
     cov = scale[:, None] * (J @ joint.cost.covariance() @ J.T) * scale
@@ -95,7 +96,7 @@ def calibrate_together(
 
 def _without(start: CalibrationEstimate, conflicts: Mapping[str, Refusal]) -> CalibrationEstimate:
     """Leave captures out, and figures that hold for the camera alone."""
-    singles = [take_apart([name]) for name in start.used]
+    singles = [start.captures_of([name]) for name in start.used]
     kept = [k for k, names in enumerate(singles) if not names & conflicts.keys()]
     mine = {name: why for name, why in conflicts.items() if name in set().union(*singles)}
     return replace(
@@ -114,7 +115,7 @@ def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
     for camera, estimate in sorted(alone.items()):
         for observation in estimate.observations.values():
             key = scan_key(observation)
-            for capture in sorted(take_apart([observation.capture])):
+            for capture in sorted(estimate.captures_of([observation.capture])):
                 other, held = seen.setdefault(capture, (camera, key))
                 if held != key:
                     figures = {"first": other, "second": camera}
