@@ -63,8 +63,8 @@ def read_entries(path: Path) -> list[dict[str, Any]]:
 
 PROFILE, JOURNAL, LOCK = "rig.yaml", "journal.jsonl", ".lock"
 CAPTURES, REJECTED, DETECTIONS, DRAFT_PREFIX = "captures", "rejected", "detections", ".new-"
-CALIBRATION, INTRINSICS, DEBUG = "calibration", "intrinsics", "debug"
-_WRITTEN = (JOURNAL, LOCK, CAPTURES, REJECTED, DETECTIONS, CALIBRATION, INTRINSICS, DEBUG)
+CALIBRATION, RESULTS, INTRINSICS, DEBUG = "calibration", "results", "intrinsics", "debug"
+_WRITTEN = (JOURNAL, LOCK, CAPTURES, REJECTED, DETECTIONS, CALIBRATION, RESULTS, INTRINSICS, DEBUG)
 
 
 class Session:

@@ -279,8 +279,8 @@ class PcapRecording:
                 yield scan
         finally:
             self._summarise(stream)
-        if stream.counts.n_scans == 0:
-            said = "; ".join(_account(stream)) or f"{stream.counts.n_data} packets are less than a revolution"
+        if stream.n_scans == 0:
+            said = "; ".join(_account(stream)) or f"{stream.n_data} packets are less than a revolution"
             raise SourceError(f"{self.path}: no whole revolution in it: {said}", "Record a second or more.")
 
     def _survey(self) -> _Survey:
@@ -362,20 +362,8 @@ def _push(stream: Vlp16Stream, datagram: Datagram) -> Scan | None:
 
 def _account(stream: Vlp16Stream) -> list[str]:
     """Say what was lost or skipped, in words."""
-    counts, order = stream.counts, stream.counts.order
-    figures = {
-        "data packets lost on the way": order.n_lost,
-        "data packets late or sent twice, left out": order.n_late,
-        "data packets with a damaged time, left out": order.n_astray,
-        "times the sensor's clock was set": order.n_steps,
-        "revolutions cut off at an end or where the clock was set, left out": counts.n_partial,
-        "revolutions with more than half of their packets lost, left out": counts.n_thin,
-        "revolutions without any return": counts.n_empty,
-        "scans whose stamps do not rise, left out": counts.n_not_rising,
-    }
-    lines = [f"{n} {what}" for what, n in figures.items() if n]
-    return lines + [describe(flaw) for flaw in counts.flaws()]
+    return [describe(each) for each in stream.losses.findings()]
 
 
 def _flaw(code: str, n: int) -> Finding:
-    return Finding(code, "warning", figures={"n": n, "of": "data"})
+    return Finding(code, "warning", subject="data", figures={"n": n})
