@@ -67,9 +67,9 @@ def together_lines(calibration: Calibration) -> list[str]:
         return []
     figures = calibration.diagnostics
     alone = ""
-    if "alone_sigma_rotation_deg" in figures:
-        sigma_mm = 1000 * figures["alone_sigma_translation_m"]
-        alone = f"; alone it is known to {figures['alone_sigma_rotation_deg']:.3f} deg, {sigma_mm:.1f} mm"
+    if math.isfinite(figures.alone_sigma_rotation_deg):
+        sigma_mm = 1000 * figures.alone_sigma_translation_m
+        alone = f"; alone it is known to {figures.alone_sigma_rotation_deg:.3f} deg, {sigma_mm:.1f} mm"
     return [f"  together     with {', '.join(calibration.estimated_with)}{alone}"]
 
 
@@ -362,9 +362,9 @@ def _channel_lines(calibration: Calibration) -> list[str]:
             )
         texts.append(text)
     figures = calibration.diagnostics
-    if "channels_rotation_deg" in figures:
+    if math.isfinite(figures.channels_rotation_deg):
         texts.append(
-            f"they differ by {figures['channels_rotation_deg']:.2f} deg, "
-            f"{1000 * figures['channels_translation_m']:.1f} mm"
+            f"they differ by {figures.channels_rotation_deg:.2f} deg, "
+            f"{1000 * figures.channels_translation_m:.1f} mm"
         )
     return [f"  {'channels' if k == 0 else '':<13}{text}" for k, text in enumerate(texts)]

@@ -8,6 +8,7 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.diagnostics import NO_DIAGNOSTICS, Diagnostics
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, sigma_sizes
@@ -414,7 +415,7 @@ class Calibration:
         findings: the reasons for it, worst first, and notes.
         captures_used: names of the captures behind the estimate.
         captures_refused: why each other capture is not.
-        diagnostics: further figures by name.
+        diagnostics: further figures.
         method: that found the extrinsic, as `CalibrateOptions.method`.
         uncertainty: what `cov` means for points at several distances; empty where no lens was at hand.
         estimated_with: cameras whose extrinsics were estimated together with this one.
@@ -440,7 +441,7 @@ class Calibration:
     findings: tuple[Finding, ...] = ()
     egt_rotation_deg: float | None = None
     egt_translation_m: float | None = None
-    diagnostics: Mapping[str, float] = field(default_factory=dict)
+    diagnostics: Diagnostics = NO_DIAGNOSTICS
     channel_results: tuple[ChannelResult, ...] = ()
     method: str = "paper"
     uncertainty: tuple[PointUncertainty, ...] = ()

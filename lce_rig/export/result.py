@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.documents import read_json
 from lce_rig.core.errors import ResultRefusedError, SessionError
 from lce_rig.core.findings import Figure, Finding, Severity
@@ -289,7 +290,7 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
         "verdict": calibration.verdict,
         "reasons": [sentence(finding) for finding in calibration.findings],
         "findings": [as_json(finding) for finding in calibration.findings],
-        "diagnostics": {name: _figure(value) for name, value in sorted(calibration.diagnostics.items())},
+        "diagnostics": calibration.diagnostics.figures(),
         "channels": [_channel(result, calibration) for result in calibration.channel_results],
         "method": calibration.method,
         "uncertainty": [asdict(each) for each in calibration.uncertainty],
@@ -442,7 +443,7 @@ def _calibration(pair: PairRecord) -> Calibration:
         findings=_findings(pair),
         egt_rotation_deg=pair.egt_rotation_deg,
         egt_translation_m=pair.egt_translation_m,
-        diagnostics={name: figure(value) for name, value in pair.diagnostics.items()},
+        diagnostics=Diagnostics.of(pair.diagnostics),
         channel_results=tuple(_channel_result(record) for record in pair.channels),
         method=pair.method,
         uncertainty=tuple(PointUncertainty(**each.model_dump()) for each in pair.uncertainty),

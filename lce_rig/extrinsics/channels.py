@@ -163,8 +163,8 @@ def _offsets(
     """Estimate the channels' time offsets; None where the boards did not move, which says nothing of time."""
     unit = 1 / NOMINAL_SIGMA_M**2
     weights = Weights(
-        plane=start.diagnostics["plane_weight"] * unit,
-        edge=start.diagnostics["edge_weight"] * unit,
+        plane=start.diagnostics.plane_weight * unit,
+        edge=start.diagnostics.edge_weight * unit,
         shift_prior=options.parts.edge_shift_precision,
     )
     moving = np.flatnonzero(samples.tells_motion).tolist()

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import (
     CaptureResidual,
@@ -35,7 +36,7 @@ class CalibrationEstimate:
         residuals: one per capture used, in the order of `used`.
         held_out_m: mean over captures of `CaptureResidual.held_out_m`.
         weakest: the least certain motion.
-        diagnostics: further figures by name.
+        diagnostics: further figures.
         method: that found it, as `CalibrateOptions.method`.
         expansion: the method's own cost about its result, capture by capture, in the extrinsic (and those of
             cameras estimated with it) alone; None of methods that give none.
@@ -57,7 +58,7 @@ class CalibrationEstimate:
     residuals: tuple[CaptureResidual, ...]
     held_out_m: float
     weakest: WeakestMotion
-    diagnostics: Mapping[str, float]
+    diagnostics: Diagnostics
     method: str = "paper"
     expansion: Quadratics | None = None
     estimated_with: tuple[str, ...] = ()

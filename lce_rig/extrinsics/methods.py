@@ -74,7 +74,7 @@ def with_consensus(estimate: CalibrationEstimate, consensus: Consensus) -> Calib
     return replace(
         estimate,
         refused=dict(sorted({**consensus.refused, **estimate.refused}.items())),
-        diagnostics={**estimate.diagnostics, "n_alternative_poses": float(consensus.n_alternative_poses)},
+        diagnostics=replace(estimate.diagnostics, n_alternative_poses=float(consensus.n_alternative_poses)),
     )
 
 

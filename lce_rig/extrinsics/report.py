@@ -1,10 +1,12 @@
 """From a solution to an estimate with residuals and figures, the same whatever method found it."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from lce_rig.core.board import Board
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.results import Certificate, Observation, Refusal
 from lce_rig.extrinsics.estimate import CalibrationEstimate
@@ -17,10 +19,16 @@ from lce_rig.residuals.placements import group_placements
 NO_CERTIFICATE = Certificate(is_optimal=False, gap=float("inf"))
 
 
-def name_sigmas(part: str, cov: Array) -> dict[str, float]:
-    """Name the sizes of a part of a claim, "scatter" or "systematic", as diagnostics: cov (6 + k, 6 + k)."""
-    sigma_deg, sigma_m = sigma_sizes(cov)
-    return {f"sigma_{part}_rotation_deg": sigma_deg, f"sigma_{part}_translation_m": sigma_m}
+def with_parts(figures: Diagnostics, scatter: Array, systematic: Array) -> Diagnostics:
+    """Add the sizes of both parts of a covariance, each (6 + k, 6 + k)."""
+    (scatter_deg, scatter_m), (systematic_deg, systematic_m) = map(sigma_sizes, (scatter, systematic))
+    return replace(
+        figures,
+        sigma_scatter_rotation_deg=scatter_deg,
+        sigma_scatter_translation_m=scatter_m,
+        sigma_systematic_rotation_deg=systematic_deg,
+        sigma_systematic_translation_m=systematic_m,
+    )
 
 
 def report_estimate(
@@ -34,7 +42,7 @@ def report_estimate(
     certificate: Certificate = NO_CERTIFICATE,
     held_out_m: Array | None = None,
     refused: Mapping[str, Refusal],
-    diagnostics: Mapping[str, float],
+    diagnostics: Diagnostics,
 ) -> CalibrationEstimate:
     """Measure the residuals of an extrinsic and put everything known about it together.
 
@@ -56,12 +64,13 @@ def report_estimate(
         for observation, error in zip(observations, held_out, strict=True)
     )
     metrics = summarise(residuals)
-    figures = {
+    figures = replace(
+        diagnostics,
         # The paper's code counts every ring end twice, which halves its mean.
-        "paper_mee_m": metrics.mee_m / 2,
-        "held_out_m": float(np.mean(held_out)),
-        "n_placements": float(group_placements(observations).max() + 1),
-    }
+        paper_mee_m=metrics.mee_m / 2,
+        held_out_m=float(np.mean(held_out)),
+        n_placements=float(group_placements(observations).max() + 1),
+    )
     return CalibrationEstimate(
         T_cam_lidar=T_cam_lidar,
         cov=cov,
@@ -74,5 +83,5 @@ def report_estimate(
         residuals=residuals,
         held_out_m=float(np.mean(held_out)),
         weakest=find_weakest(cov, features),
-        diagnostics={**diagnostics, **figures},
+        diagnostics=figures,
     )

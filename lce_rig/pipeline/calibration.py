@@ -304,10 +304,11 @@ def _from_all_cameras(
         return alone
     estimate = joint[k].estimates[sensors.camera]
     sigma_deg, sigma_m = sigma_sizes(_examine(rig, detections, sensors, alone).cov)
-    figures = {"alone_sigma_rotation_deg": sigma_deg, "alone_sigma_translation_m": sigma_m}
     return replace(
         estimate,
-        diagnostics={**estimate.diagnostics, **figures},
+        diagnostics=replace(
+            estimate.diagnostics, alone_sigma_rotation_deg=sigma_deg, alone_sigma_translation_m=sigma_m
+        ),
         channels=alone.channels,
         channel_difference=alone.channel_difference,
         channel_difference_cov=alone.channel_difference_cov,
@@ -373,12 +374,14 @@ def _judged(
     camera, lidar = sensors.camera, sensors.lidar
     n_captures = len({name for pair in sensors.pairs for name in detections.captures(pair)})
     verdict, findings = judge(estimate, examination, rig, camera, lidar, n_captures, between_cameras)
-    diagnostics = dict(estimate.diagnostics)
+    diagnostics = estimate.diagnostics
     if examination.widened_by != 1:
-        diagnostics["sigma_widened"] = examination.widened_by
+        diagnostics = replace(diagnostics, sigma_widened=examination.widened_by)
     if estimate.channel_difference is not None:
         rotation_deg, translation_m = tangent_sizes(estimate.channel_difference)
-        diagnostics |= {"channels_rotation_deg": rotation_deg, "channels_translation_m": translation_m}
+        diagnostics = replace(
+            diagnostics, channels_rotation_deg=rotation_deg, channels_translation_m=translation_m
+        )
     lens = rig.cameras[camera].to_intrinsics()
     return Calibration(
         camera=camera,

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.core.results import Calibration, Certificate, Metrics, Refusal
@@ -73,7 +74,7 @@ def calibration(T_cam_lidar: Array | None = None, **changes: Any) -> Calibration
             Finding("verdict.widened", "note", figures={"ratio": 1.5, "spread": "halves"}),
             Finding("verdict.rotation_uncertain", "warning", figures=_UNCERTAIN, action="measure_ranges"),
         ),
-        "diagnostics": {"split_half_deg": 0.1, "b": 1 / 3},
+        "diagnostics": Diagnostics(n_placements=4.0, fit_plane_rms_m=1 / 300),
     }
     return Calibration(**(fields | changes))
 

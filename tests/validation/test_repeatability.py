@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import exp_so3, perturb, pose
 from lce_rig.core.results import Calibration, Certificate, Metrics
 from lce_rig.validation.repeatability import compare_calibrations
@@ -29,7 +30,7 @@ def calibration(T, cov=COV, **diagnostics) -> Calibration:
         captures_used=("000000",),
         captures_refused={},
         verdict="pass",
-        diagnostics=diagnostics,
+        diagnostics=Diagnostics(**diagnostics),
     )
 
 

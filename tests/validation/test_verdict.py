@@ -72,7 +72,7 @@ def test_a_deviation_above_the_target_is_marginal_and_far_above_fails(estimate, 
 def test_where_the_lidar_itself_misses_the_target_more_captures_are_not_advised(estimate, verdict_of):
     cov = np.diag([0.015**2 / 3] * 3 + [1e-8] * 3)
     by_scatter = replace(estimate, cov=cov)
-    figures = dict(estimate.diagnostics) | {"sigma_systematic_translation_m": 0.014}
+    figures = replace(estimate.diagnostics, sigma_systematic_translation_m=0.014)
     by_lidar = replace(by_scatter, diagnostics=figures)
     assert verdict_of(by_scatter)[1][0].action == ""
     assert verdict_of(by_lidar)[1][0].action == "measure_ranges"
@@ -96,7 +96,7 @@ def test_sensors_that_disagree_in_many_captures_are_a_doubt(estimate, verdict_of
 
 
 def test_boards_that_moved_between_picture_and_scan_are_a_doubt(estimate, verdict_of):
-    moving = dict(estimate.diagnostics) | {"fit_plane_rms_m": 0.025}
+    moving = replace(estimate.diagnostics, fit_plane_rms_m=0.025)
     verdict, reasons = verdict_of(replace(estimate, diagnostics=moving))
     assert verdict == "marginal"
     assert (reasons[0].code, reasons[0].figures) == ("verdict.planes_apart", {"rms_m": 0.025})
