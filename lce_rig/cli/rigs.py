@@ -156,6 +156,7 @@ def _limit_table(rig: "Rig") -> Any:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def check_profile(file: str, as_json: bool) -> None:
     """Check a profile; every problem is named with its line. Exits with 3 where there is one."""
+    from lce_rig import words
     from lce_rig.core.errors import ProfileError
     from lce_rig.pipeline.detect_session import check_networks
     from lce_rig.rig import find_profile, load_rig
@@ -166,18 +167,28 @@ def check_profile(file: str, as_json: bool) -> None:
     except ProfileError as error:
         if as_json:
             problems = error.hint.splitlines() if error.hint else [error.what]
-            screen.print_json({"is_valid": False, "problems": problems, "warnings": []})
+            screen.print_json({"is_valid": False, "problems": problems, "warnings": [], "findings": []})
         raise
     if as_json:
-        screen.print_json({"is_valid": True, "problems": [], "warnings": rig.doubts()})
+        doubts = rig.doubts()
+        screen.print_json(
+            {
+                "is_valid": True,
+                "problems": [],
+                "warnings": [words.sentence(doubt) for doubt in doubts],
+                "findings": [words.as_json(doubt) for doubt in doubts],
+            }
+        )
         return
     click.echo(f"{find_profile(file)}: a valid profile of rig {rig.name}")
     _warn_of_doubts(rig)
 
 
 def _warn_of_doubts(rig: "Rig") -> None:
+    from lce_rig import words
+
     for doubt in rig.doubts():
-        screen.warn(doubt)
+        screen.warn(words.sentence(doubt))
 
 
 @rigs.command("new")

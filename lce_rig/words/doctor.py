@@ -1,4 +1,4 @@
-"""What the doctor looks at: the computer, each sensor's stream, clock, pulses and images, the board."""
+"""What the doctor looks at: computer, profile, each sensor's stream, clock, pulses and images, the board."""
 
 from collections.abc import Mapping
 from textwrap import shorten
@@ -262,4 +262,15 @@ _IMAGES: Mapping[str, Phrase] = {
     ),
     "board.in_events": Phrase("{distance_m:.2f} m away, seen in its events"),
 }
-PHRASES: Mapping[str, Phrase] = {**_COMPUTER, **_SENSORS, **_CLOCKS, **_IMAGES}
+_PROFILE: Mapping[str, Phrase] = {
+    "profile.swapped_sides": Phrase(
+        "{subject}: {n_cols}x{n_rows} inner corners run along the shorter side of the plate "
+        "{width_m:g} x {height_m:g} m",
+        "check whether width_m and height_m, or the inner_corners, are swapped",
+    ),
+    "profile.drifting_clock": Phrase(
+        "{subject}: the sensor's own clock without sync drifts away from the others",
+    ),
+    "profile.shared": Phrase("{subject}: {value} is that of {other} too: two sensors would send the same"),
+}
+PHRASES: Mapping[str, Phrase] = {**_COMPUTER, **_SENSORS, **_CLOCKS, **_IMAGES, **_PROFILE}

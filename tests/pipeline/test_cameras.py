@@ -157,7 +157,7 @@ def test_a_nudged_camera_is_told_at_both_and_not_estimated_with_the_other(option
         assert own.estimated_with == ()
         (change,) = (each for each in own.findings if each.code == "verdict.camera_changed")
         assert change.subject.split(" to ") == [LEFT, RIGHT]
-        assert change.figures.capture == "000006"
+        assert change.figures["capture"] == "000006"
     # The left camera, which nobody touched, is what it is without the other.
     error = difference(found[LEFT].T_cam_lidar, TRUTH[LEFT])
     assert error @ np.linalg.solve(found[LEFT].cov, error) < 25
