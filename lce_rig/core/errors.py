@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+from lce_rig.core.findings import Finding
+
 
 class LceRigError(Exception):
     """Base of every error the user can repair.
@@ -47,9 +49,19 @@ class SourceError(LceRigError):
 
 
 class NotEnoughDataError(LceRigError):
-    """Too few captures, or captures that leave a direction undetermined."""
+    """Too few captures, or captures that leave a direction undetermined.
+
+    Args:
+        what: as of every error.
+        hint: as of every error.
+        finding: the same as code and figures, where a calibration lacks captures.
+    """
 
     exit_code = 6
+
+    def __init__(self, what: str, hint: str = "", finding: Finding | None = None) -> None:
+        super().__init__(what, hint)
+        self.finding = finding
 
 
 class ResultRefusedError(LceRigError):
