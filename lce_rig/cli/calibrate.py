@@ -158,6 +158,11 @@ if TYPE_CHECKING:
     show_default=True,
     help="Algorithm 1 of LCE-Calib, or from its solution on the maximum likelihood of everything together.",
 )
+@click.option(
+    "--name",
+    metavar="NAME",
+    help="Keep the result under a name, in SESSION/results/NAME/; SESSION/calibration/ is unchanged.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export a failed result too, marked as failed.")
 @click.option(
@@ -177,6 +182,7 @@ def calibrate(
     cameras: tuple[str, ...],
     channels: list[str] | None,
     event_image: Any,
+    name: str | None,
     as_json: bool,
     force: bool,
     method: Any,
@@ -195,6 +201,7 @@ def calibrate(
     import lce_rig as lce
     from lce_rig.core.errors import UsageError
     from lce_rig.export.reference import read_reference
+    from lce_rig.pipeline.result_files import OVERLAYS
 
     opened = lce.Session.open(session)
     rig = opened.rig
@@ -228,7 +235,13 @@ def calibrate(
             show.warn(str(not_enough(shortage)))
         if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
             show.warn(f"{reference} holds no T_cam_lidar of these sensors")
-        written = result.write(force=force)
+        written = result.write(name=name, force=force)
+    if written.had_overlays:
+        with show.progress_bar("drawing") as progress:
+            lce.verify(opened, result, detections, name=name, event_image=event_image).write(
+                progress=progress
+            )
+        show.note(f"overlays drawn again in {written.files[0].parent / OVERLAYS}")
     if as_json:
         show.print_json(result.document())
     else:

@@ -17,7 +17,6 @@ from lce_rig.screen.keys import Controls, controls
 
 if TYPE_CHECKING:
     from lce_rig.collect.live.options import LiveReport
-    from lce_rig.collect.live.recorder import SampleRecorder
     from lce_rig.collect.live.simulated import SimulatedRig
     from lce_rig.collect.live.state import LiveState
     from lce_rig.devices.reading import LiveSource
@@ -75,7 +74,6 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
         listeners, links = _open_preview(stack, given)
         session = stack.enter_context(_session(path, rig))
         n_before = len(session.captures)
-        recorder = stack.enter_context(_recorder(given, rig))
         sources, simulated = _open_rig(stack, rig, path, given)
         listeners += [simulated.watch] if simulated else []
         asked = stack.enter_context(controls())
@@ -91,7 +89,7 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
                     listener(state)
 
             try:
-                report = collect_live(session, sources, options, tell, asked, recorder)
+                report = collect_live(session, sources, options, tell, asked, given.record)
             finally:
                 n_captures = len(session.captures)
                 if n_captures or is_begun.is_set():
@@ -143,7 +141,7 @@ def _open_rig(
     if not given.simulated:
         from lce_rig.devices.opening import open_live
 
-        return open_live(rig, given.record), None
+        return open_live(rig), None
     from lce_rig.collect.live.simulated import SimulatedRig
     from lce_rig.simulate import SimulationOptions, rig_truth
 
@@ -176,22 +174,6 @@ def _tell_troubles(preview: "Preview") -> None:
         show.note(text)
 
 
-@contextmanager
-def _recorder(given: LiveArguments, rig: "Rig") -> "Iterator[SampleRecorder | None]":
-    """Record the raw streams where it is wanted; a VLP-16 records its own packets."""
-    if given.record is None:
-        yield None
-        return
-    from lce_rig.collect.live.recorder import SampleRecorder
-
-    packets = frozenset() if given.simulated else frozenset(rig.lidars)
-    with SampleRecorder(given.record, rig, packets) as recorder:
-        yield recorder
-    for problem in recorder.problems():
-        show.warn(problem)
-    show.note(f"{given.record}: {recorder.n_written} samples recorded")
-
-
 def _tell(
     report: "LiveReport",
     n_captures: int,
@@ -209,6 +191,8 @@ def _tell(
 
     for text in report.notes:
         show.note(text)
+    if report.n_recorded is not None:
+        show.note(f"{given.record}: {report.n_recorded} samples recorded")
     lost = {name: n for name, n in report.n_lost.items() if n}
     if lost:
         show.note("lost on the way: " + ", ".join(f"{name} {n}" for name, n in sorted(lost.items())))

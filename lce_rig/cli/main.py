@@ -28,7 +28,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("lce_rig.cli.calibrate", "Estimate the extrinsics of a session."),
     "intrinsics": ("lce_rig.cli.intrinsics", "Measure the cameras' lenses from a session."),
     "verify": ("lce_rig.cli.verify", "Draw the LiDAR into the pictures and print residuals."),
-    "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of independent sessions."),
+    "results": ("lce_rig.cli.results", "List the results of a session with figures and verdicts."),
+    "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of sessions, or the results of one."),
 }
 EXIT_BUG = 70
 

@@ -1,4 +1,4 @@
-"""`lce-rig repeat`: do independent sessions of one rig give the same extrinsic?"""
+"""`lce-rig repeat`: do independent sessions of one rig, or results of one, give the same extrinsic?"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,22 +16,38 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("sessions", nargs=-1, type=click.Path(path_type=Path), metavar="SESSION...")
+@click.option(
+    "--name",
+    "names",
+    metavar="NAME",
+    multiple=True,
+    help="Compare this named result, see `lce-rig results`; may be repeated for one session.",
+)
 @json_option
-def repeat(sessions: tuple[Path, ...], as_json: bool) -> None:
-    """Compare the calibrations of two or more independent SESSIONs of one rig.
+def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) -> None:
+    """Compare the calibrations of two or more independent SESSIONs of one rig, or the results of one SESSION.
 
     The best test of an extrinsic: collect again, with the board put up anew, and see whether the results
     differ by no more than their stated uncertainties say. Errors that all sessions share do not show: those
     of the intrinsics, of the board's size, and constant ones of the LiDAR's ranges.
 
+    Of one session, its results are compared, such as that of `calibrate --channels events --name events` with
+    the current one. They share captures, and errors that both contain do not show.
+
     A session that was not calibrated yet is calibrated for this; nothing is written. Exits with 7 where the
     calibrations disagree, or one of them failed by itself.
     """
-    from lce_rig.core.errors import ResultRefusedError
+    from lce_rig.core.errors import ResultRefusedError, UsageError
+    from lce_rig.pipeline.comparison import compare_results
     from lce_rig.pipeline.comparison import repeat as compare
 
-    with show.progress_bar("reading") as progress:
-        compared = compare(sessions, progress=progress)
+    if len(sessions) == 1:
+        compared = compare_results(sessions[0], names)
+    elif len(names) > 1:
+        raise UsageError("several results and several sessions", "Name one session, or one result.")
+    else:
+        with show.progress_bar("reading") as progress:
+            compared = compare(sessions, name=next(iter(names), None), progress=progress)
     for name in compared.calibrated:
         show.note(f"{name} held no result: calibrated for this comparison, not written")
     for finding in compared.findings:
@@ -85,7 +101,8 @@ def _summary(comparison: "Repeatability") -> list[str]:
         f"spread   {c.spread_rotation_deg:.3f} deg, {1000 * c.spread_translation_m:.1f} mm "
         "(1 sigma of one session)",
         f"claimed  {c.claimed_rotation_deg:.3f} deg, {1000 * c.claimed_translation_m:.1f} mm{_scatter(c)}",
-        f"chi2     {c.chi2:.1f} with {c.dof} degrees of freedom, chance {c.p:.2g}",
+        f"chi2     {c.chi2:.1f} with {c.dof} degrees of freedom, chance {c.p:.2g}"
+        + ("" if c.are_independent else " (at least: the results share captures)"),
     ]
     colour = "green" if c.agrees else "red"
     return [*lines, f"[{colour}]{show.escape(as_line(sentence(c.finding)))}[/]"]
@@ -139,5 +156,6 @@ def _pair(comparison: "Repeatability") -> dict[str, Any]:
         "dof": c.dof,
         "p": c.p,
         "odd_one": c.odd_one,
+        "are_independent": c.are_independent,
         "differences": [vars(pair) for pair in c.differences],
     }

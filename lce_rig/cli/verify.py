@@ -18,26 +18,37 @@ from lce_rig.words import describe
     metavar="FILE",
     help="A result.json of another session of this rig: check it on the captures of this one.",
 )
+@click.option("--name", metavar="NAME", help="Take this result of SESSION, see `lce-rig results`.")
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the pictures go."
 )
 @json_option
 @event_image_option
-def verify(session: Path, result: Path | None, output: Path | None, as_json: bool, event_image: Any) -> None:
+def verify(
+    session: Path,
+    result: Path | None,
+    name: str | None,
+    output: Path | None,
+    as_json: bool,
+    event_image: Any,
+) -> None:
     """Draw the LiDAR of each capture of SESSION (default: session/) into its picture, print residuals.
 
     Images and one contact sheet replace those in SESSION/calibration/overlays/, with --result FILE those in
-    SESSION/overlays/. Exits with 7 where the verdict is fail or these captures contradict the extrinsic.
+    SESSION/overlays/, with --name NAME those beside that result. Exits with 7 where the verdict is fail or
+    these captures contradict the extrinsic.
     """
     import lce_rig as lce
     from lce_rig.cli.calibrate import exit_by_verdict
-    from lce_rig.core.errors import ResultRefusedError
+    from lce_rig.core.errors import ResultRefusedError, UsageError
     from lce_rig.detect.detection import Pair
 
+    if result is not None and name is not None:
+        raise UsageError("--result and --name exclude each other", "Name a file or a result of the session.")
     opened = lce.Session.open(session)
     saved = None if result is None else lce.read_result(result)
     with show.progress_bar("detecting") as progress:
-        verification = lce.verify(opened, saved, event_image=event_image, progress=progress)
+        verification = lce.verify(opened, saved, name=name, event_image=event_image, progress=progress)
     with show.progress_bar("drawing") as progress:
         checks = verification.write(output, progress=progress)
     if as_json:

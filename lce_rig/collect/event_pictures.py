@@ -3,8 +3,8 @@
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 
-from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
+from lce_rig.core.losses import Losses
 from lce_rig.core.results import Refusal
 from lce_rig.detect.events.search import reconstructor_for
 from lce_rig.rig import Rig
@@ -16,7 +16,7 @@ _GONE_BY = Refusal("read.events_gone_by")
 
 
 def with_event_pictures(
-    samples: Iterable[Sample], rig: Rig, cameras: Collection[str], tally: RefusalCounts
+    samples: Iterable[Sample], rig: Rig, cameras: Collection[str], tally: Losses
 ) -> Iterator[Sample]:
     """Pass samples on, and add a picture of each camera for the middle of every sweep.
 
@@ -44,7 +44,7 @@ def with_event_pictures(
 class _Darkroom:
     """Events of one camera that wait until it is known which pictures are wanted of them."""
 
-    def __init__(self, rig: Rig, camera: str, tally: RefusalCounts) -> None:
+    def __init__(self, rig: Rig, camera: str, tally: Losses) -> None:
         channel = event_channel(rig, camera) or ""
         self._rig = rig
         self._camera = camera

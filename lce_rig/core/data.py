@@ -1,6 +1,7 @@
 """Sensor data as frozen samples."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -116,6 +117,20 @@ class Events:
             self.height_px,
             self.host_ns,
         )
+
+
+def join_events(parts: Sequence[Events]) -> Events:
+    """Put stretches of one camera's stream together, at least one, in order of time."""
+    filled = [part for part in parts if len(part)] or parts[:1]
+    if len(filled) == 1:
+        return filled[0]
+    return replace(
+        filled[0],
+        t_ns=np.concatenate([part.t_ns for part in filled]),
+        x=np.concatenate([part.x for part in filled]),
+        y=np.concatenate([part.y for part in filled]),
+        polarity=np.concatenate([part.polarity for part in filled]),
+    )
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, join_events
 from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.core.results import Refusal
@@ -38,7 +38,6 @@ from lce_rig.doctor.sensor_report import SensorReport
 from lce_rig.doctor.sensor_sources import driver_of, sensors, source_of
 from lce_rig.rig import Rig
 from lce_rig.rig.sync_settings import BOARD
-from lce_rig.timing.event_buffer import join_events
 
 SensorCheck = Callable[[SensorReport, str], Check | None]
 

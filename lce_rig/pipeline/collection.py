@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from lce_rig.collect import CollectOptions, CollectReport, collect
-from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.losses import Losses
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.recordings import open_recordings
 from lce_rig.recordings.protocol import Recording, SourceOptions
@@ -55,7 +55,7 @@ def collect_from(
         raise report.errors[0]
     filled = Session.open(session)
     if not filled.captures:
-        refused = RefusalCounts()
+        refused = Losses()
         refused.update(report.counts)
         for refusal in report.refused.values():
             refused.add(refusal)

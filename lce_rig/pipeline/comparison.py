@@ -14,10 +14,9 @@ from lce_rig.core.results import Calibration
 from lce_rig.export.result import read_result
 from lce_rig.pipeline.calibration import calibrate
 from lce_rig.pipeline.detect_session import Progress, silent
-from lce_rig.pipeline.result_files import RESULT
+from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_parts, stored_results
 from lce_rig.session import Session
 from lce_rig.session.identity import DifferingKey, differing_keys
-from lce_rig.session.session import CALIBRATION
 from lce_rig.validation.repeatability import Repeatability, compare_calibrations
 from lce_rig.words import describe, recommend
 
@@ -27,7 +26,7 @@ _SAME_SENSORS = frozenset({"intrinsics", "resolution_px", "model"})
 
 @dataclass(frozen=True, eq=False)
 class Repeat:
-    """Sessions of one rig, compared.
+    """Sessions of one rig, or results of one session, compared.
 
     Attributes:
         rig: its name.
@@ -47,13 +46,47 @@ class Repeat:
         return tuple(finding for finding in self.findings if finding.severity == "error")
 
 
-def repeat(folders: Sequence[Path | str], *, progress: Progress = silent) -> Repeat:
+def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
+    """Compare the results that one session holds, such as those of frames and of events.
+
+    Args:
+        folder: of the session.
+        names: of the results; all but the previous one where empty.
+
+    Raises:
+        UsageError: fewer than two results; or a name is given twice, or cannot be one.
+        SessionError: there is no result of that name, or one cannot be read.
+    """
+    session = Session.open(folder)
+    stored = {each.name: each for each in stored_results(session)}
+    listed = f"Its results: {', '.join(stored) or 'none'}."
+    for name in names:
+        result_parts(name)
+        if list(names).count(name) > 1:
+            raise UsageError(f"result {name} is given twice")
+        if name not in stored:
+            raise SessionError(f"{session.path} has no result {name!r}", listed)
+    chosen = list(names) or [name for name in stored if name != PREVIOUS]
+    if len(chosen) < 2:
+        raise UsageError(
+            f"{session.path} has no two results to compare",
+            f"{listed} Add one: lce-rig calibrate {session.path} --name NAME, or name a second session.",
+        )
+    results = {name: _read_calibrations(session, stored[name].folder) for name in chosen}
+    comparisons, lonely = _comparisons(results, are_independent=False)
+    _require_some(comparisons, results, "results")
+    outdated = [Finding("results.outdated", "warning", name) for name in chosen if stored[name].is_outdated]
+    return Repeat(session.rig.name, comparisons, (), (*outdated, *lonely, *_failures(results)))
+
+
+def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: Progress = silent) -> Repeat:
     """Compare the results of independent sessions of one rig.
 
     A session without a result is calibrated with the usual options; nothing is written.
 
     Args:
         folders: of the sessions.
+        name: of the result to take from each; None for the one in calibration/.
         progress: called with (done, total) sessions.
 
     Raises:
@@ -72,29 +105,39 @@ def repeat(folders: Sequence[Path | str], *, progress: Progress = silent) -> Rep
     results: dict[str, list[Calibration]] = {}
     calibrated: list[str] = []
     troubles: list[Finding] = []
-    for done, (name, session) in enumerate(sessions.items(), start=1):
-        if (session.path / CALIBRATION / RESULT).exists():
-            results[name] = _read_calibrations(session)
+    for done, (label, session) in enumerate(sessions.items(), start=1):
+        where = session.path.joinpath(*result_parts(name))
+        if (where / RESULT).exists() or name not in (None, CURRENT):
+            results[label] = _read_calibrations(session, where)
         else:
-            results[name], own_troubles = _calibrate(name, session)
-            calibrated.append(name)
+            results[label], own_troubles = _calibrate(label, session)
+            calibrated.append(label)
             troubles += own_troubles
         progress(done, len(sessions))
     rig = next(iter(sessions.values())).rig.name
     comparisons, lonely = _comparisons(results)
+    _require_some(comparisons, results, "sessions")
+    findings = (*_other_boards(sessions), *troubles, *lonely, *_failures(results))
+    return Repeat(rig, comparisons, tuple(calibrated), findings)
+
+
+def _require_some(
+    comparisons: Sequence[Repeatability], results: dict[str, list[Calibration]], what: str
+) -> None:
     if not comparisons:
         raise SessionError(
-            "no camera and LiDAR are calibrated in two of the sessions",
+            f"no camera and LiDAR are calibrated in two of the {what}",
             "\n".join(_calibrated_sensors(name, own) for name, own in results.items()),
         )
-    failed = [
+
+
+def _failures(results: dict[str, list[Calibration]]) -> list[Finding]:
+    return [
         Finding("repeat.failed", "error", name, {"camera": c.camera, "lidar": c.lidar})
         for name, own in results.items()
         for c in own
         if c.verdict == "fail"
     ]
-    findings = (*_other_boards(sessions), *troubles, *lonely, *failed)
-    return Repeat(rig, comparisons, tuple(calibrated), findings)
 
 
 def _require_different(paths: Sequence[Path]) -> None:
@@ -191,8 +234,8 @@ def _calibrated_sensors(name: str, calibrations: Sequence[Calibration]) -> str:
     return f"{name}: {sensors or 'its result holds no sensors'}"
 
 
-def _read_calibrations(session: Session) -> list[Calibration]:
-    path = session.path / CALIBRATION / RESULT
+def _read_calibrations(session: Session, folder: Path) -> list[Calibration]:
+    path = folder / RESULT
     saved = read_result(path)
     if saved.rig != session.rig.name:
         raise SessionError(
@@ -208,7 +251,9 @@ def _read_calibrations(session: Session) -> list[Calibration]:
     return list(saved.pairs)
 
 
-def _comparisons(results: dict[str, list[Calibration]]) -> tuple[tuple[Repeatability, ...], list[Finding]]:
+def _comparisons(
+    results: dict[str, list[Calibration]], *, are_independent: bool = True
+) -> tuple[tuple[Repeatability, ...], list[Finding]]:
     """Compare camera by camera and LiDAR by LiDAR; and say what only one session calibrates."""
     groups: dict[tuple[str, str], dict[str, Calibration]] = {}
     for name, calibrations in results.items():
@@ -220,7 +265,11 @@ def _comparisons(results: dict[str, list[Calibration]]) -> tuple[tuple[Repeatabi
                     "Run `lce-rig calibrate` again.",
                 )
             group[name] = calibration
-    comparisons = [compare_calibrations(group) for _, group in sorted(groups.items()) if len(group) > 1]
+    comparisons = [
+        compare_calibrations(group, are_independent=are_independent)
+        for _, group in sorted(groups.items())
+        if len(group) > 1
+    ]
     lonely = [
         Finding("repeat.only_one", "warning", next(iter(group)), {"camera": camera, "lidar": lidar})
         for (camera, lidar), group in sorted(groups.items())

@@ -5,18 +5,25 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError
+from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.core.limits import read_file
 from lce_rig.core.results import Calibration
 from lce_rig.session import Session
+from lce_rig.session.capture import SAFE_NAME
 from lce_rig.session.capture_files import MANIFEST
 from lce_rig.session.replacing import check_folder, copy_over
-from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE
+from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE, RESULTS
+
+if TYPE_CHECKING:
+    from lce_rig.export.result import SavedResult
 
 RESULT, OVERLAYS, PREVIOUS = "result.json", "overlays", "previous"
+CURRENT = "current"
+"""How the result in calibration/ is called beside those with names."""
+_LONGEST_NAME = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +68,15 @@ class Result:
 
         return layout(self.document())
 
-    def write(self, folder: Path | str | None = None, *, force: bool = False) -> "WrittenResults":
+    def write(
+        self, folder: Path | str | None = None, *, name: str | None = None, force: bool = False
+    ) -> "WrittenResults":
         """Write result.json and, unless a verdict forbids it, every export.
 
         Args:
             folder: None, or the session's calibration/: the files there are replaced in one step, and the
                 earlier ones kept in calibration/previous/. In any other folder files are replaced one by one.
+            name: writes the session's results/NAME/ instead, in the same way; calibration/ is untouched.
             force: export failed results too; each file then says so.
 
         Raises:
@@ -75,7 +85,7 @@ class Result:
         """
         own = self.session.path / CALIBRATION
         if folder is None or Path(folder).resolve() == own.resolve():
-            return write_results(self.session, self.pairs, force=force)
+            return write_results(self.session, self.pairs, force=force, name=name)
         names = _write_files(Path(folder), self.session, self.pairs, force=force)
         return WrittenResults(tuple(Path(folder) / name for name in names), None, False, (), False)
 
@@ -90,6 +100,7 @@ class WrittenResults:
         has_usable_previous: whether that run had a result that may be used.
         only_previous: cameras and LiDARs with a usable result there and none, usable or not, in this run.
         is_same: whether this result is the same to the byte as the one that was there.
+        had_overlays: whether overlays of the earlier result moved to `previous`, and this one has none.
     """
 
     files: tuple[Path, ...]
@@ -97,9 +108,30 @@ class WrittenResults:
     has_usable_previous: bool
     only_previous: tuple[str, ...]
     is_same: bool
+    had_overlays: bool = False
 
 
-def write_results(session: Session, calibrations: Sequence[Calibration], *, force: bool) -> WrittenResults:
+def result_parts(name: str | None) -> tuple[str, ...]:
+    """Give the path in a session of the result of a name; None is its main one, in calibration/.
+
+    Raises:
+        UsageError: a name that is no folder's, or one that results have anyway.
+    """
+    if name is None or name == CURRENT:
+        return (CALIBRATION,)
+    if name == PREVIOUS:
+        return (CALIBRATION, PREVIOUS)
+    if not SAFE_NAME.fullmatch(name) or len(name) > _LONGEST_NAME:
+        raise UsageError(
+            f"{name!r} cannot name a result",
+            f"Use up to {_LONGEST_NAME} letters, digits, dots, dashes and underscores, such as `events-ml`.",
+        )
+    return (RESULTS, name)
+
+
+def write_results(
+    session: Session, calibrations: Sequence[Calibration], *, force: bool, name: str | None = None
+) -> WrittenResults:
     """Write result.json and, unless a verdict forbids it, every export, in place of an earlier run's.
 
     All files of a run appear together. Those of the earlier run move to calibration/previous/; a failed run
@@ -107,18 +139,29 @@ def write_results(session: Session, calibrations: Sequence[Calibration], *, forc
     Where the result is the same to the byte, overlays and calibration/previous/ stay. Files that lce-rig did
     not write stay, too.
 
+    Args:
+        session: whose result it is.
+        calibrations: the result.
+        force: export failed results too.
+        name: writes results/NAME/ instead of calibration/.
+
     Raises:
+        UsageError: the name cannot be one.
         SessionError: a capture that was used is gone, or the disk is full; the earlier files are untouched.
         ResultRefusedError: a pose or covariance is not finite; the same.
     """
-    folder = session.path / CALIBRATION
-    is_same = False
+    parts = result_parts(name)
+    if name in (CURRENT, PREVIOUS):
+        raise UsageError(f"no result can be named {name!r}", "That is a name of what is in calibration/.")
+    folder = session.path.joinpath(*parts)
+    is_same = had_overlays = False
 
     def finish(earlier: Path, draft: Path) -> None:
-        nonlocal is_same
+        nonlocal is_same, had_overlays
         is_same = _keep_earlier_results(earlier, draft)
+        had_overlays = (earlier / OVERLAYS).is_dir() and not is_same
 
-    with session.replacing(CALIBRATION, finish=finish) as draft:
+    with session.replacing(*parts, finish=finish) as draft:
         names = _write_files(draft, session, calibrations, force=force)
     previous = folder / PREVIOUS
     return WrittenResults(
@@ -127,6 +170,7 @@ def write_results(session: Session, calibrations: Sequence[Calibration], *, forc
         is_usable(previous),
         tuple(sorted(_usable(previous) - {f"{c.camera} and {c.lidar}" for c in calibrations})),
         is_same,
+        had_overlays,
     )
 
 
@@ -226,13 +270,66 @@ def keep_foreign(earlier: Path, draft: Path, is_ours: Callable[[Path], bool]) ->
             copy_over(entry, draft / entry.name)
 
 
-def result_content(session: Session) -> bytes | None:
-    """Read the session's result.json as it lies on the disk; None where there is none.
+@dataclass(frozen=True, eq=False)
+class StoredResult:
+    """A result of a session as it lies on the disk.
+
+    Attributes:
+        name: "current" and "previous" for those in calibration/, else as `calibrate --name` was told.
+        folder: with its result.json.
+        saved: its content; None where it cannot be read.
+        problem: why it cannot; "" where it can.
+        written_s: when it was written, seconds since 1970.
+        is_outdated: whether the profile, or a capture that it used, is another one now or gone.
+    """
+
+    name: str
+    folder: Path
+    saved: "SavedResult | None"
+    problem: str
+    written_s: float
+    is_outdated: bool
+
+
+def stored_results(session: Session) -> list[StoredResult]:
+    """List a session's results: the current one, the one before it, and those with names in their order."""
+    named = session.path / RESULTS
+    names = sorted(entry.name for entry in named.iterdir()) if named.is_dir() else []
+    names = [CURRENT, PREVIOUS, *(name for name in names if SAFE_NAME.fullmatch(name))]
+    return [
+        _stored(session, name)
+        for name in names
+        if session.path.joinpath(*result_parts(name), RESULT).is_file()
+    ]
+
+
+def _stored(session: Session, name: str) -> StoredResult:
+    from lce_rig.export.result import read_result
+
+    folder = session.path.joinpath(*result_parts(name))
+    written_s = (folder / RESULT).stat().st_mtime
+    try:
+        saved = read_result(folder / RESULT)
+    except LceRigError as error:
+        return StoredResult(name, folder, None, error.what, written_s, False)
+    return StoredResult(name, folder, saved, "", written_s, _is_outdated(session, saved))
+
+
+def _is_outdated(session: Session, saved: "SavedResult") -> bool:
+    """Tell whether a session no longer holds what a result was made from."""
+    try:
+        return dict(saved.inputs_sha256) != inputs_sha256(session, saved.pairs)
+    except LceRigError:
+        return True
+
+
+def result_content(session: Session, name: str | None = None) -> bytes | None:
+    """Read a result.json of the session as it lies on the disk; None where there is none.
 
     Raises:
         SessionError: it cannot be read.
     """
-    path = session.path / CALIBRATION / RESULT
+    path = session.path.joinpath(*result_parts(name), RESULT)
     try:
         return _content(path)
     except OSError as error:

@@ -12,10 +12,10 @@ from lce_rig.detect.events.search import EventImage
 from lce_rig.export.result import SavedResult, read_result
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import Progress, detect, event_channels, event_picture, silent
-from lce_rig.pipeline.result_files import OVERLAYS, RESULT, Result, keep_foreign, result_content
+from lce_rig.pipeline.result_files import OVERLAYS, RESULT, Result, keep_foreign, result_content, result_parts
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
-from lce_rig.session.session import CALIBRATION, DEBUG
+from lce_rig.session.session import DEBUG
 from lce_rig.verify.event_picture import CameraView
 from lce_rig.verify.overlay_files import is_overlay
 from lce_rig.verify.session_check import SessionCheck, check_session, draw_check
@@ -32,6 +32,7 @@ class Verification:
         detections: of the session.
         event_image: how pictures are made of raw events, as the detections were made.
         own_result: content of the session's result.json where the calibrations are those in it, else None.
+        name: of the session's result that they are those of; None for the one in calibration/.
     """
 
     session: Session
@@ -40,6 +41,7 @@ class Verification:
     detections: Detections
     event_image: EventImage | None
     own_result: bytes | None
+    name: str | None = None
 
     @property
     def unchecked(self) -> tuple[Calibration, ...]:
@@ -53,8 +55,8 @@ class Verification:
         """Draw the LiDAR into every picture of the session.
 
         Args:
-            folder: for the images; by default the session's calibration/overlays/ where the result is its
-                own, else its overlays/, which are replaced as a whole. Several pairs get a folder each.
+            folder: for the images; by default overlays/ beside the session's result.json where the result is
+                its own, else the session's overlays/, replaced as a whole. Several pairs get a folder each.
             progress: called with (done, total) for each pair in turn.
 
         Returns:
@@ -68,15 +70,16 @@ class Verification:
         if folder is not None:
             return self._draw(Path(folder), progress)
 
+        parts = (OVERLAYS,) if self.own_result is None else (*result_parts(self.name), OVERLAYS)
+
         def finish(earlier: Path, draft: Path) -> None:
-            if self.own_result is not None and result_content(session) != self.own_result:
+            if self.own_result is not None and result_content(session, self.name) != self.own_result:
                 raise SessionError(
-                    f"{session.path / CALIBRATION} was calibrated again while overlays were drawn",
+                    f"{session.path.joinpath(*parts[:-1])} was calibrated again while overlays were drawn",
                     "Run `lce-rig verify` again.",
                 )
             _keep_users_files(session.rig, earlier, draft)
 
-        parts = (OVERLAYS,) if self.own_result is None else (CALIBRATION, OVERLAYS)
         with session.replacing(*parts, finish=finish) as draft:
             drawn = self._draw(draft, progress)
         place = session.path.joinpath(*parts)
@@ -101,6 +104,7 @@ def verify(
     result: Result | SavedResult | None = None,
     detections: Detections | None = None,
     *,
+    name: str | None = None,
     event_image: EventImage | None = None,
     progress: Progress = silent,
 ) -> Verification:
@@ -109,6 +113,7 @@ def verify(
     Args:
         session: may be another one than the extrinsics come from.
         result: of `calibrate` or `read_result`; None takes the session's own result.json.
+        name: of the session's result to take; None for the one in calibration/.
         detections: of this session; None detects the board first.
         event_image: how pictures are made of raw events, as the detections were made.
         progress: called with (done, total) while the board is detected.
@@ -117,7 +122,7 @@ def verify(
         SessionError: there is no result, or it is of another rig; or the session has no captures of its
             sensors.
     """
-    calibrations, own_result = _extrinsics(session, result)
+    calibrations, own_result = _extrinsics(session, result, name)
     detections = detections or detect(session, event_image=event_image, progress=progress)
     checks = tuple(
         check_session(session.rig, detections, c, channel, clocks_of(session.rig, c.camera, c.lidar))
@@ -130,20 +135,20 @@ def verify(
         raise SessionError(
             f"{session.path} holds no captures of {wanted}", "The result belongs to another session."
         )
-    return Verification(session, checks, tuple(calibrations), detections, event_image, own_result)
+    return Verification(session, checks, tuple(calibrations), detections, event_image, own_result, name)
 
 
 def _extrinsics(
-    session: Session, result: Result | SavedResult | None
+    session: Session, result: Result | SavedResult | None, name: str | None
 ) -> tuple[Sequence[Calibration], bytes | None]:
     """Give the extrinsics to check; and the content of the session's result.json where it holds them."""
-    content = result_content(session)
+    content = result_content(session, name)
     if isinstance(result, Result):
         rig, calibrations = result.session.rig.name, result.pairs
         is_own = result.session.path.resolve() == session.path.resolve()
         content = content if is_own and result.text().encode() == content else None
     else:
-        saved = result or read_result(session.path / CALIBRATION / RESULT)
+        saved = result or read_result(session.path.joinpath(*result_parts(name), RESULT))
         rig, calibrations, is_own = saved.rig, saved.pairs, result is None
         content = content if is_own else None
     if rig != session.rig.name or not calibrations:

@@ -22,9 +22,10 @@ class PairDifference:
     """How far two calibrations lie apart.
 
     Attributes:
-        first, second: names of their sessions.
+        first, second: names of their sessions or results.
         rotation_deg, translation_m: angle and distance between the extrinsics.
-        distance: Mahalanobis distance d, d^2 = x^T (cov_1 + cov_2)^-1 x with x the tangent between them.
+        distance: Mahalanobis distance d, d^2 = x^T (cov_1 + cov_2)^-1 x with x the tangent between them;
+            for results of the same captures with 2 (cov_1 + cov_2).
         p: probability that sound calibrations lie this far apart or farther.
     """
 
@@ -38,10 +39,10 @@ class PairDifference:
 
 @dataclass(frozen=True, eq=False)
 class Repeatability:
-    """Calibrations of the same sensors in several sessions, held against each other.
+    """Several calibrations of the same sensors, compared.
 
     Attributes:
-        names: of the sessions.
+        names: of the sessions, or of the results of one session.
         camera, lidar: what is calibrated.
         T_cam_lidar: (4, 4) mean, all sessions alike.
         deviations: (K, 6) tangents from the mean to each, translation m, rotation rad.
@@ -54,6 +55,8 @@ class Repeatability:
         p: probability that sound calibrations spread so far or farther.
         differences: of each two.
         odd_one: the session without which the others agree; None where all agree or none can be blamed.
+        are_independent: whether each was made from captures of its own. If not, errors that they share do not
+            show, and chi2, dof and p are those of the two that differ most, p times the number of pairs.
     """
 
     names: tuple[str, ...]
@@ -72,6 +75,7 @@ class Repeatability:
     p: float
     differences: tuple[PairDifference, ...]
     odd_one: str | None
+    are_independent: bool = True
 
     @property
     def agrees(self) -> bool:
@@ -100,10 +104,17 @@ class Repeatability:
             "camera": self.camera,
             "lidar": self.lidar,
             "n_sessions": len(self.names),
+            "are_independent": self.are_independent,
             "rotation_deg": self.max_rotation_deg,
             "translation_m": self.max_translation_m,
             "p": self.p,
         }
+        if not self.are_independent:
+            worst = min(self.differences, key=lambda pair: pair.p)
+            figures |= {"first": worst.first, "second": worst.second}
+            if self.agrees:
+                return Finding("results.agree", "note", figures=figures)
+            return Finding("results.disagree", "error", figures=figures)
         if self.agrees:
             figures["is_generous"] = self.p > _GENEROUS
             return Finding("repeat.agree", "note", figures=figures)
@@ -112,11 +123,17 @@ class Repeatability:
         return Finding("repeat.disagree", "error", figures=figures, action=action)
 
 
-def compare_calibrations(calibrations: Mapping[str, Calibration]) -> Repeatability:
-    """Hold calibrations of the same camera and LiDAR against each other.
+def compare_calibrations(
+    calibrations: Mapping[str, Calibration], *, are_independent: bool = True
+) -> Repeatability:
+    """Compare calibrations of the same camera and LiDAR.
+
+    Results of the same captures share errors to an unknown extent. For any correlation, the covariance of
+    a - b is at most 2 (cov_a + cov_b), because that of a + b is not negative: this bound is used for them.
 
     Args:
-        calibrations: by the name of their session, at least two.
+        calibrations: by the name of their session or result, at least two.
+        are_independent: whether each was made from captures of its own.
 
     Raises:
         ValueError: there are fewer than two.
@@ -129,9 +146,15 @@ def compare_calibrations(calibrations: Mapping[str, Calibration]) -> Repeatabili
     # Weighted by full covariances a mean may lie beside all it is made of: right for chi2, odd to look at.
     mean, _ = mean_pose(T, np.broadcast_to(np.eye(6), cov.shape))
     deviations = difference(T, mean)
-    chi2 = _spread(T, cov)
-    dof = 6 * (len(names) - 1)
-    p = _tail(chi2, dof)
+    pairs = list(combinations(range(len(names)), 2))
+    factor = 1.0 if are_independent else 2.0
+    differences = tuple(_difference(names, T, factor * cov, i, j) for i, j in pairs)
+    if are_independent:
+        chi2, dof = _spread(T, cov), 6 * (len(names) - 1)
+        p = _tail(chi2, dof)
+    else:
+        chi2, dof = max(pair.distance for pair in differences) ** 2, 6
+        p = min(1.0, len(pairs) * _tail(chi2, dof))
     first = calibrations[names[0]]
     scatter_deg = _rms([c.diagnostics.sigma_scatter_rotation_deg for c in calibrations.values()])
     scatter_m = _rms([c.diagnostics.sigma_scatter_translation_m for c in calibrations.values()])
@@ -151,8 +174,9 @@ def compare_calibrations(calibrations: Mapping[str, Calibration]) -> Repeatabili
         chi2=chi2,
         dof=dof,
         p=p,
-        differences=tuple(_difference(names, T, cov, i, j) for i, j in combinations(range(len(names)), 2)),
-        odd_one=_odd_one(names, T, cov) if p < _CHANCE else None,
+        differences=differences,
+        odd_one=_odd_one(names, T, cov) if are_independent and p < _CHANCE else None,
+        are_independent=are_independent,
     )
 
 

@@ -27,6 +27,13 @@ def _flicker(finding: Finding) -> str:
     return f"most events come from light that flickers{rhythm}"
 
 
+def _no_image(finding: Finding) -> str:
+    """No image at the time of the scan; the nearest was {nearest_s} away."""
+    nearest_s = finding.figures.get("nearest_s")
+    nearest = f" (nearest: {nearest_s:.3f} s away)" if isinstance(nearest_s, float) else ""
+    return f"no image at the time of the scan{nearest}"
+
+
 def _lost(finding: Finding) -> str:
     """Lost near its last place, for the code in {cause}, with its figures."""
     return f"lost near its last place: {describe(_cause(finding))}"
@@ -85,7 +92,7 @@ PHRASES: dict[str, Phrase] = {
         "no events at the time of the scan",
         "record events while the LiDAR runs and check that the clocks agree",
     ),
-    "read.no_image_at_scan": Phrase("no image at the time of the scan"),
+    "read.no_image_at_scan": Phrase(_no_image),
     "image.none": Phrase("no board in any image"),
     "lidar.none": Phrase("no board in the scan"),
     "calibrate.same_placement": Phrase("the board stood as in a capture before"),

@@ -110,6 +110,9 @@ _DEVICE: Mapping[str, Phrase] = {
         "if the image is slanted, let the command write JPEG (jpegenc)",
     ),
     "device.recording_stopped": Phrase("recording to {path} stopped: {cause}", "free some space"),
+    "device.recording_incomplete": Phrase(
+        "{n} samples missing in {path}: the disk is too slow", "record to a faster disk"
+    ),
     "device.board_silent": Phrase(
         "no message from the board for {silent_s:.0f} s", "check its cable and power, press its reset"
     ),
@@ -160,16 +163,24 @@ _STREAM: Mapping[str, Phrase] = {
     "buffer.small": Phrase("the receive buffer holds {buffer_s:0ms} (minimum 250 ms)", _RAISE_LIMIT),
 }
 _PACKETS: Mapping[str, Phrase] = {
-    "packet.wrong_length": Phrase("{n} {of} packets of wrong length skipped"),
-    "packet.wrong_flag": Phrase("{n} {of} packets with a wrong block flag skipped"),
-    "packet.time_beyond_hour": Phrase("{n} {of} packets with a time beyond the hour skipped"),
-    "packet.azimuth_beyond_360": Phrase("{n} {of} packets with an azimuth beyond 360 deg skipped"),
+    "packet.wrong_length": Phrase("{n} {subject} packets of wrong length skipped"),
+    "packet.wrong_flag": Phrase("{n} {subject} packets with a wrong block flag skipped"),
+    "packet.time_beyond_hour": Phrase("{n} {subject} packets with a time beyond the hour skipped"),
+    "packet.azimuth_beyond_360": Phrase("{n} {subject} packets with an azimuth beyond 360 deg skipped"),
     "packet.unknown_factory_bytes": Phrase(
-        "{n} {of} packets with unknown factory bytes skipped (firmware before 3.0.29 sends none)"
+        "{n} {subject} packets with unknown factory bytes skipped (firmware before 3.0.29 sends none)"
     ),
-    "packet.uneven_azimuths": Phrase("{n} {of} packets with uneven azimuths skipped"),
-    "packet.unknown_pps": Phrase("{n} {of} packets with an unknown PPS state skipped"),
-    "packet.other_model": Phrase("{n} {of} packets of another LiDAR model skipped"),
+    "packet.uneven_azimuths": Phrase("{n} {subject} packets with uneven azimuths skipped"),
+    "packet.unknown_pps": Phrase("{n} {subject} packets with an unknown PPS state skipped"),
+    "packet.lost": Phrase("{n} data packets lost"),
+    "packet.late": Phrase("{n} data packets late or sent twice, skipped"),
+    "packet.astray": Phrase("{n} data packets with a damaged time skipped"),
+    "packet.clock_set": Phrase("the LiDAR's clock was set {n} times"),
+    "scan.partial": Phrase("{n} revolutions skipped: cut off at an end, or where the clock was set"),
+    "scan.thin": Phrase("{n} revolutions skipped: more than half of their packets are lost"),
+    "scan.empty": Phrase("{n} revolutions without a return"),
+    "scan.not_rising": Phrase("{n} scans skipped: their timestamps do not rise"),
+    "packet.other_model": Phrase("{n} {subject} packets of another LiDAR model skipped"),
     "datagram.fragmented": Phrase("{n} datagrams sent in fragments skipped"),
     "datagram.cut_short": Phrase("{n} datagrams cut short by the recorder skipped"),
 }
@@ -274,6 +285,13 @@ _PULSES: Mapping[str, Phrase] = {
     "pulses.not_followed": Phrase("its images do not follow the pulses", "set the camera to trigger mode"),
     "pulses.board_restarted": Phrase("the board restarted its count"),
     "pulses.camera_restarted": Phrase("the camera restarted its count"),
+    "pulses.image_unmatched": Phrase("{n} images match no pulse"),
+    "pulses.image_lost": Phrase("{n} images lost, by the camera's numbers"),
+    "pulses.message_lost": Phrase("messages of {n} pulses lost, whose images came"),
+    "pulses.missed_by_camera": Phrase("{n} pulses made no image"),
+    "pulses.repeated": Phrase("{n} images and pulses came twice"),
+    "pulses.slip": Phrase("the camera's count slipped {n} times"),
+    "pulses.restart": Phrase("the camera or the board restarted its count {n} times"),
     "pulses.slipped": Phrase(
         "its count slipped against the pulses {n_slips} times and restarted {n_restarts} times; "
         "{n_matched} images matched, {n_unmatched} not"

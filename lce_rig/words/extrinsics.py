@@ -286,6 +286,19 @@ PHRASES: dict[str, Phrase] = {
         "in {n_elsewhere} of {n_captures} captures nothing in the scan is where the extrinsics put the board"
     ),
     "verify.unseen": Phrase("no capture shows the board to both sensors"),
+    "results.agree": Phrase(
+        "the {n_sessions} results of {camera} and {lidar} agree: they differ by up to {rotation_deg:3deg} "
+        "and {translation_m:1mm}; errors that they share do not show, as they are of the same captures",
+    ),
+    "results.disagree": Phrase(
+        "{first} and {second} of {camera} and {lidar} disagree: results differ by up to {rotation_deg:3deg} "
+        "and {translation_m:1mm}, more than their uncertainties allow",
+        "compare the overlays of both (`lce-rig verify --name NAME`) and collect more captures",
+    ),
+    "results.outdated": Phrase(
+        "{subject}: the profile or the captures that it used have changed since",
+        "run `lce-rig calibrate` again with the same options",
+    ),
     "repeat.agree": Phrase(_agree),
     "repeat.disagree": Phrase(
         "the {n_sessions} calibrations of {camera} and {lidar} disagree: they differ by up to "

@@ -368,7 +368,7 @@ def _payloads(events: Events) -> dict[str, bytes]:
 
 def pcap(samples: Samples) -> list[Files]:
     """A pcap file of two revolutions of a VLP-16, position packets between them."""
-    from lce_rig.devices.vlp16.packet_recorder import PcapWriter
+    from lce_rig.recordings.velodyne.datagrams import PcapWriter
 
     def write(path: Path) -> None:
         with PcapWriter(path) as writer:

@@ -11,10 +11,9 @@ from wire.vlp16_packets import SensorPacket
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.vlp16.packet_recorder import PcapWriter
 from lce_rig.recordings import open_recording
 from lce_rig.recordings.protocol import ContinuousRecording, SourceOptions
-from lce_rig.recordings.velodyne.datagrams import Datagram, build_frame
+from lce_rig.recordings.velodyne.datagrams import Datagram, PcapWriter, build_frame
 from lce_rig.recordings.velodyne.pcap import PcapFile, PcapRecording
 from lce_rig.rig import Rig
 from tests.notes import has_note

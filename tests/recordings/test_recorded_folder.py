@@ -7,13 +7,12 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.vlp16.packet_recorder import PcapWriter
 from lce_rig.recordings import open_recordings
 from lce_rig.recordings.folder.folder_recorder import FolderRecorder
 from lce_rig.recordings.folder.recorded_folder import list_parts
 from lce_rig.recordings.joining import JoinedRecording, join_recordings
 from lce_rig.recordings.protocol import ContinuousRecording, SourceOptions
-from lce_rig.recordings.velodyne.datagrams import Datagram
+from lce_rig.recordings.velodyne.datagrams import Datagram, PcapWriter
 from lce_rig.rig import Rig, load_rig
 
 from .rig_samples import KINDS, T0_NS, one_second

@@ -43,7 +43,7 @@ def test_the_einride_payloads_make_whole_scans_without_a_loss(recordings: Path) 
     stream = stream_of()
     fields = einride(recordings)
     scans = [scan for packet in fields if (scan := stream.push_data(packet.tobytes(), 0)) is not None]
-    assert (len(scans), stream.counts.order.n_lost, stream.counts.bad.total()) == (13, 0, 0)
+    assert (len(scans), stream.losses.n("packet.lost"), stream.flaws()) == (13, 0, [])
 
 
 def nebula_packets(recordings: Path) -> list[tuple[int, bytes]]:

@@ -11,15 +11,15 @@ from lce_rig.collect.offline.slow_motion import find_moving_moments
 from lce_rig.collect.offline.stillness import StillnessOptions, find_still_moments
 from lce_rig.collect.offline.stored_events import StoredEvents
 from lce_rig.collect.placement_dedupe import Placements, board_figures, capture_poses, known_placements
-from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.errors import LceRigError, SessionError, SourceError
+from lce_rig.core.losses import Losses
 from lce_rig.core.results import Refusal
 from lce_rig.recordings.joining import join_recordings, require_sensors
 from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording, PairFiles, Recording
 from lce_rig.rig import Rig
 from lce_rig.session import Session
-from lce_rig.timing.scan_pairing import PairingCounts, pair_by_time
+from lce_rig.timing.scan_pairing import pair_by_time
 from lce_rig.words import describe
 
 # The moments of a recording that are worth a capture.
@@ -40,6 +40,7 @@ class MomentSearch:
         stillness: when a board stands still; None takes the profile's `quality.max_motion_m`.
         motion: how a moving board is judged.
         min_move_m, min_turn_deg: how far placements of a moving board must be apart.
+        losses: what became no moment so far.
     """
 
     rig: Rig
@@ -48,8 +49,7 @@ class MomentSearch:
     motion: MotionOptions
     min_move_m: float
     min_turn_deg: float
-    _pairing: PairingCounts = field(default_factory=PairingCounts)
-    _tally: RefusalCounts = field(default_factory=RefusalCounts)
+    losses: Losses = field(default_factory=Losses)
 
     @property
     def has_events(self) -> bool:
@@ -75,21 +75,22 @@ class MomentSearch:
         """
         cameras = {camera for camera, _ in self.reconstructed}
         if cameras:
-            samples = with_event_pictures(samples, self.rig, cameras, self._tally)
+            samples = with_event_pictures(samples, self.rig, cameras, self.losses)
         stillness = self.stillness or StillnessOptions(max_motion_m=self.rig.quality.max_motion_m)
         interval_s = self.motion.search_interval_s if self.has_events else stillness.search_interval_s
-        watcher = BoardTracker(self.rig, interval_s, self._tally, _THOROUGH_S)
-        frames = pair_by_time(samples, self.rig, self._pairing)
+        watcher = BoardTracker(self.rig, interval_s, self.losses, _THOROUGH_S)
+        # Why a scan got no image made of events is counted where it was not made.
+        frames = pair_by_time(samples, self.rig, Losses() if cameras else self.losses)
         sightings = (watcher.sight(frame) for frame in frames)
         if self.has_events:
             taken = Placements(self.min_move_m, self.min_turn_deg)
-            moments = find_moving_moments(sightings, self.rig, self.motion, taken, self._tally)
+            moments = find_moving_moments(sightings, self.rig, self.motion, taken, self.losses)
         else:
             moments = find_still_moments(sightings, self.rig.board.to_board(), stillness)
         for moment in moments:
             confirmed = watcher.confirm(moment)
             if isinstance(confirmed, Refusal):
-                self._tally.add(confirmed)
+                self.losses.add(confirmed)
             else:
                 yield confirmed
 
@@ -97,24 +98,6 @@ class MomentSearch:
         """List the pictures of a moment that its capture keeps: all but those that its events give again."""
         images = moment.sighting.frame.images
         return [image for image in images if (image.sensor, image.channel) not in self.reconstructed]
-
-    def counts(self) -> RefusalCounts:
-        """Count what became no moment so far."""
-        # Why a picture could not be made of events is in the tally.
-        n_alone = 0 if self.reconstructed else self._pairing.n_alone
-        total = RefusalCounts()
-        total.add(Refusal("read.no_image_at_scan"), n_alone)
-        total.update(self._tally)
-        return total
-
-    def notes(self) -> list[str]:
-        """Say how scans and pictures came together."""
-        if self._pairing.n_alone == 0 or self.reconstructed:
-            return []
-        if self._pairing.nearest_ns is None:
-            return ["no picture could be compared with a scan: one of the two has none"]
-        apart_s = self._pairing.nearest_ns * 1e-9
-        return [f"{self._pairing.n_alone} scans without a picture; the nearest was {apart_s:.3f} s away"]
 
 
 Progress = Callable[[int, int, str], None]
@@ -164,7 +147,7 @@ class CollectReport:
     n_rejected: int = 0
     duplicates: dict[str, str] = field(default_factory=dict)
     refused: dict[str, Refusal] = field(default_factory=dict)
-    counts: RefusalCounts = field(default_factory=RefusalCounts)
+    counts: Losses = field(default_factory=Losses)
     notes: list[str] = field(default_factory=list)
     errors: list[SourceError] = field(default_factory=list)
     n_missing: int = 0
@@ -276,8 +259,7 @@ class _Collector:
                 self.note(["stopped early: the session has as many captures as wanted"])
                 break
             self._take_moment(recording.key, moment, search.kept_images(moment), known)
-        self.report.counts.update(search.counts())
-        self.note(search.notes())
+        self.report.counts.update(search.losses)
         if torn:
             raise torn[0]
 

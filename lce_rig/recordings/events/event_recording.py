@@ -1,6 +1,7 @@
 """A recording of events: checked, sorted by time, with a count of faults."""
 
 from collections.abc import Generator, Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits
-from lce_rig.core.data import Events
+from lce_rig.core.data import Events, join_events
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.events.stream import (
     NO_EVENTS,
@@ -422,12 +423,11 @@ class _TimeWindow:
                 break
             if stretch.t_ns[-1] >= start_ns:
                 self._kept.append(stretch)
-        return self._join([stretch.between(start_ns, end_ns) for stretch in self._kept])
-
-    def _join(self, parts: list[Events]) -> Events:
+        parts = [stretch.between(start_ns, end_ns) for stretch in self._kept]
+        if not any(map(len, parts)):
+            return self._recording.to_events(NO_EVENTS)
         # Arrival is known of a stretch's first event, not of a window's.
-        columns = [EventColumns(p.t_ns, p.x, p.y, p.polarity) for p in parts if len(p)]
-        return self._recording.to_events(join(columns or [NO_EVENTS]))
+        return replace(join_events(parts), host_ns=None)
 
 
 def _size(resolution_px: tuple[int, int]) -> str:

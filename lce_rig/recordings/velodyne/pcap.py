@@ -9,7 +9,7 @@ from typing import BinaryIO
 
 from lce_rig.core import limits, velodyne
 from lce_rig.core.data import Scan, Stream
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.findings import Finding
 from lce_rig.recordings.fingerprint import fingerprint
 from lce_rig.recordings.protocol import SourceOptions, Span
@@ -69,13 +69,8 @@ class PcapFile:
         self.flaws: Counter[str] = Counter()
         self.damage = ""
         self.n_bytes_read = 0
-        try:
-            with limits.open_regular(path) as file:
-                head = file.read(24)
-        except OSError as error:
-            raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-        except ValueError as error:
-            raise SourceError(f"{path}: cannot be read: {error}") from None
+        with reading(path, SourceError), limits.open_regular(path) as file:
+            head = file.read(24)
         self._order, self._ns_per_tick, self._link = _read_head(path, head)
         if self._link is not None:
             self._check_link(self._link)
@@ -279,8 +274,8 @@ class PcapRecording:
                 yield scan
         finally:
             self._summarise(stream)
-        if stream.counts.n_scans == 0:
-            said = "; ".join(_account(stream)) or f"{stream.counts.n_data} packets are less than a revolution"
+        if stream.n_scans == 0:
+            said = "; ".join(_account(stream)) or f"{stream.n_data} packets are less than a revolution"
             raise SourceError(f"{self.path}: no whole revolution in it: {said}", "Record a second or more.")
 
     def _survey(self) -> _Survey:
@@ -362,20 +357,8 @@ def _push(stream: Vlp16Stream, datagram: Datagram) -> Scan | None:
 
 def _account(stream: Vlp16Stream) -> list[str]:
     """Say what was lost or skipped, in words."""
-    counts, order = stream.counts, stream.counts.order
-    figures = {
-        "data packets lost on the way": order.n_lost,
-        "data packets late or sent twice, left out": order.n_late,
-        "data packets with a damaged time, left out": order.n_astray,
-        "times the sensor's clock was set": order.n_steps,
-        "revolutions cut off at an end or where the clock was set, left out": counts.n_partial,
-        "revolutions with more than half of their packets lost, left out": counts.n_thin,
-        "revolutions without any return": counts.n_empty,
-        "scans whose stamps do not rise, left out": counts.n_not_rising,
-    }
-    lines = [f"{n} {what}" for what, n in figures.items() if n]
-    return lines + [describe(flaw) for flaw in counts.flaws()]
+    return [describe(each) for each in stream.losses.findings()]
 
 
 def _flaw(code: str, n: int) -> Finding:
-    return Finding(code, "warning", figures={"n": n, "of": "data"})
+    return Finding(code, "warning", subject="data", figures={"n": n})

@@ -9,7 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.data import Events, Image
+from lce_rig.core.data import Events, Image, join_events
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.results import Refusal
 from lce_rig.detect.events.reconstruct.filters import NoiseFilter
@@ -354,7 +354,7 @@ class Reconstructor:
             raise SourceError(
                 f"{batch.sensor}: events go back in time by {back_s:.6f} s", "sort the recording"
             )
-        self._current = replace(self._current, events=_joined(pending, batch))
+        self._current = replace(self._current, events=join_events([pending, batch]))
 
     def _rule(self) -> WindowRule:
         assert self._current is not None
@@ -404,22 +404,10 @@ class Reconstructor:
         events = self._cleaned(window.events.between(window.start_ns, stamp_ns))
         is_thin = self._rule().fill(len(events), stamp_ns - window.start_ns) < _MIN_FILL
         if is_thin and self._previous is not None:
-            events = _joined(self._previous.events, events)
+            events = join_events([self._previous.events, events])
             window = self._previous
         picture, _ = self._imager.picture(events, window.start_ns, stamp_ns, window.states)
         return Image(events.sensor, self.options.channel, stamp_ns, self._scale.to_grey(picture))
-
-
-def _joined(first: Events, second: Events) -> Events:
-    if not len(first) or not len(second):
-        return second if not len(first) else first
-    return replace(
-        first,
-        t_ns=np.concatenate([first.t_ns, second.t_ns]),
-        x=np.concatenate([first.x, second.x]),
-        y=np.concatenate([first.y, second.y]),
-        polarity=np.concatenate([first.polarity, second.polarity]),
-    )
 
 
 def _check_request(stamps_ns: Sequence[int] | None, every_ns: int | None) -> None:
