@@ -25,7 +25,7 @@ def main(rig_name: str, folder: str, session_folder: str) -> None:
         point_cam = pair.T_cam_lidar @ [5.0, 0.0, 0.0, 1.0]
         print(f"p_lidar (5, 0, 0) m is p_cam {np.round(point_cam[:3], 3)} m")
     for shortage in result.shortages:
-        print(shortage)
+        print(f"{shortage.subject}: {lce.sentence(shortage)}")
     written = result.write()
     print(f"{len(written.files)} files in {written.files[0].parent}")
     overlays = lce.verify(session, result).write()

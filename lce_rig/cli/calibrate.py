@@ -21,7 +21,7 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.results import Calibration, OtherCamera
 from lce_rig.detect.detection import Pair
-from lce_rig.words import sentence
+from lce_rig.words import not_enough, sentence
 from lce_rig.words.extrinsics import weakest_words
 
 # How the report of a calibration states what is uncertain: by axis, and for points at several distances.
@@ -232,7 +232,7 @@ def calibrate(
                 progress=progress,
             )
         for shortage in result.shortages:
-            show.warn(str(shortage))
+            show.warn(str(not_enough(shortage)))
         if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
             show.warn(f"{reference} holds no T_cam_lidar of these sensors")
         written = result.write(name=name, force=force)

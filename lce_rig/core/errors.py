@@ -1,6 +1,10 @@
 """Errors that the user can repair; each states what happened, where, and an action."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from lce_rig.core.findings import Finding
 
 
 class LceRigError(Exception):
@@ -47,15 +51,42 @@ class SourceError(LceRigError):
 
 
 class NotEnoughDataError(LceRigError):
-    """Too few captures, or captures that leave a direction undetermined."""
+    """Too few captures, or captures that leave a direction undetermined.
+
+    Args:
+        what: as of every error.
+        hint: as of every error.
+        finding: the same as code and figures, where a calibration lacks captures.
+    """
 
     exit_code = 6
+
+    def __init__(self, what: str, hint: str = "", finding: Finding | None = None) -> None:
+        super().__init__(what, hint)
+        self.finding = finding
 
 
 class ResultRefusedError(LceRigError):
     """A computed result that must not be used."""
 
     exit_code = 7
+
+
+@contextmanager
+def reading(path: Path, kind: type[LceRigError], hint: str = "") -> Iterator[None]:
+    """Turn what prevents a block from reading a file into an error of one kind that names the file.
+
+    Args:
+        path: the file.
+        kind: of the error raised for an OSError, and for a ValueError, whose words follow the file's name.
+        hint: what to do about content that is not what it should be.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{path}: cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise kind(f"{path}: {error}", hint) from error
 
 
 def join_shortages(errors: Sequence[NotEnoughDataError]) -> NotEnoughDataError:

@@ -1,10 +1,10 @@
 """Results as files that other programs read; each is read back before it is handed out."""
 
 from collections.abc import Callable, Iterable, Sequence
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 
-from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError
+from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError, reading
 from lce_rig.core.results import Calibration
 from lce_rig.export.frames import require_known
 from lce_rig.rig import Rig
@@ -31,8 +31,7 @@ def load_exporter(name: str) -> Exporter:
     """
     if name not in EXPORTS:
         raise UsageError(f"no export format is called {name}", f"there is {', '.join(EXPORTS)}")
-    module, function = EXPORTS[name].split(":")
-    exporter: Exporter = getattr(import_module(module), function)
+    exporter: Exporter = resolve_name(EXPORTS[name])
     return exporter
 
 
@@ -108,8 +107,5 @@ def is_export(path: Path) -> bool:
     """
     if path.suffix not in (".yaml", ".urdf", ".txt") or not path.is_file() or path.is_symlink():
         return False
-    try:
-        with path.open("rb") as file:
-            return b", written by lce-rig " in file.read(300)
-    except OSError as error:
-        raise SessionError(f"{path}: cannot be read: {error.strerror}") from error
+    with reading(path, SessionError), path.open("rb") as file:
+        return b", written by lce-rig " in file.read(300)

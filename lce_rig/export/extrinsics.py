@@ -18,11 +18,11 @@ from lce_rig.export.files import (
     reads_back,
     rows,
     texts,
-    write_atomically,
 )
 from lce_rig.export.probes import TOLERANCE, check_pose
 from lce_rig.export.rotations import quaternion_wxyz, rotation_from_quaternion
 from lce_rig.rig import Rig
+from lce_rig.session.durable import write_atomically
 from lce_rig.words import sentence
 
 FILE_NAME = "extrinsics.yaml"

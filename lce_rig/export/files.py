@@ -10,11 +10,10 @@ import numpy as np
 import yaml
 
 import lce_rig
-from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError
+from lce_rig.core.errors import LceRigError, ResultRefusedError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Calibration
 from lce_rig.rig import Rig
-from lce_rig.session.durable import replace_file
 from lce_rig.words import sentence
 
 _Arguments = ParamSpec("_Arguments")
@@ -86,21 +85,6 @@ def header(
     if lacking and not of_one_camera:
         lines.append(f"not in this file, for want of a result to use: {', '.join(lacking)}")
     return lines
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a file so that it is there whole or not at all, also after a power cut.
-
-    Raises:
-        SessionError: the folder cannot be written to.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, text.encode())
-    except OSError as error:
-        raise SessionError(
-            f"{path}: cannot be written: {error.strerror or error}", "free space or choose another folder"
-        ) from error
 
 
 def reads_back(

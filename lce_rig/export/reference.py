@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lce_rig.core.documents import read_json
-from lce_rig.core.errors import SessionError
+from lce_rig.core.errors import SessionError, reading
 from lce_rig.core.geometry import Array, parse_pose
 
 # References are often printed with four digits.
@@ -32,12 +32,8 @@ def read_reference(path: Path | str) -> Reference:
         SessionError: there is none, or it is not a rigid transform.
     """
     path = Path(path)
-    try:
+    with reading(path, SessionError):
         document = read_json(path)
-    except OSError as error:
-        raise SessionError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise SessionError(f"{path}: {error}") from error
     if not isinstance(document, dict):
         raise SessionError(f"{path}: holds no T_cam_lidar")
     pairs = document.get("pairs")

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,12 +11,13 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.documents import read_json
-from lce_rig.core.errors import ResultRefusedError, SessionError
+from lce_rig.core.errors import ResultRefusedError, SessionError, reading
 from lce_rig.core.findings import Figure, Finding, Severity
-from lce_rig.core.geometry import FARTHEST_M, Array
+from lce_rig.core.geometry import FARTHEST_M
 from lce_rig.core.limits import describe
 from lce_rig.core.results import Calibration, ChannelResult, OtherCamera, PointUncertainty, Refusal
-from lce_rig.export.files import MADE_BY, write_atomically
+from lce_rig.export.files import MADE_BY
+from lce_rig.session.durable import write_atomically
 from lce_rig.words import as_json, is_renderable, refusal_as_json, sentence
 
 # The schema of result.json, strict where it is read.
@@ -264,82 +265,44 @@ def to_json_dict(
 
 
 def _pair(calibration: Calibration) -> dict[str, Any]:
-    metrics, certificate = calibration.metrics, calibration.certificate
-    refused = {
-        name: refusal_as_json(refusal) for name, refusal in sorted(calibration.captures_refused.items())
+    """List what `PairRecord` holds, in its order."""
+    pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
+    calculated = {
+        **vars(calibration.metrics),
+        "mge_m": calibration.metrics.mge_m,
+        "channels": calibration.channel_results,
     }
-    return {
-        "camera": calibration.camera,
-        "channel": calibration.channel,
-        "lidar": calibration.lidar,
-        "T_cam_lidar": _matrix(calibration.T_cam_lidar, "T_cam_lidar", calibration),
-        "cov": _matrix(calibration.cov, "cov", calibration),
-        "sigma_rotation_deg": calibration.sigma_rotation_deg,
-        "sigma_translation_m": calibration.sigma_translation_m,
-        "n_captures": int(calibration.n_captures),
-        "n_detected": int(calibration.n_detected),
-        "captures_used": list(calibration.captures_used),
-        "captures_refused": refused,
-        "mpe_m": _figure(metrics.mpe_m),
-        "mee_m": _figure(metrics.mee_m),
-        "mge_m": _figure(metrics.mge_m),
-        "reprojection_px": _figure(metrics.reprojection_px),
-        "certificate": {"is_optimal": bool(certificate.is_optimal), "gap": _figure(certificate.gap)},
-        "egt_rotation_deg": _figure(calibration.egt_rotation_deg),
-        "egt_translation_m": _figure(calibration.egt_translation_m),
-        "verdict": calibration.verdict,
-        "reasons": [sentence(finding) for finding in calibration.findings],
+    written = {
+        "captures_refused": {
+            name: refusal_as_json(refusal) for name, refusal in sorted(calibration.captures_refused.items())
+        },
         "findings": [as_json(finding) for finding in calibration.findings],
+        "reasons": [sentence(finding) for finding in calibration.findings],
         "diagnostics": calibration.diagnostics.figures(),
-        "channels": [_channel(result, calibration) for result in calibration.channel_results],
-        "method": calibration.method,
-        "uncertainty": [asdict(each) for each in calibration.uncertainty],
-        "estimated_with": list(calibration.estimated_with),
-        "other_cameras": [_other_camera(other, calibration) for other in calibration.other_cameras],
     }
-
-
-def _channel(result: ChannelResult, calibration: Calibration) -> dict[str, Any]:
     return {
-        "channel": result.channel,
-        "n_captures": int(result.n_captures),
-        "noise_px": float(result.noise_px),
-        "T_cam_lidar": _matrix(result.T_cam_lidar, f"T_cam_lidar of {result.channel}", calibration),
-        "cov": _matrix(result.cov, f"cov of {result.channel}", calibration),
-        "depth_scatter_m": float(result.depth_scatter_m),
-        "depth_scatter_still_m": float(result.depth_scatter_still_m),
-        "time_offset_s": _figure(result.time_offset_s),
-        "time_offset_sigma_s": _figure(result.time_offset_sigma_s),
+        name: written[name]
+        if name in written
+        else _plain(calculated[name] if name in calculated else getattr(calibration, name), name, pair)
+        for name in PairRecord.model_fields
     }
 
 
-def _other_camera(other: OtherCamera, calibration: Calibration) -> dict[str, Any]:
-    def matrix(value: Array | None, name: str) -> list[list[float]] | None:
-        return None if value is None else _matrix(value, f"{name} to {other.camera}", calibration)
-
-    return {
-        "camera": other.camera,
-        "n_captures": int(other.n_captures),
-        "T_cam_other": matrix(other.T_cam_other, "T_cam_other"),
-        "cov": matrix(other.cov, "cov"),
-        "T_cam_other_pictures": matrix(other.T_cam_other_pictures, "T_cam_other_pictures"),
-        "apart_rotation_deg": _figure(other.apart_rotation_deg),
-        "apart_translation_m": _figure(other.apart_translation_m),
-        "board_rms_m": float(other.board_rms_m),
-    }
-
-
-def _matrix(matrix: Array, name: str, calibration: Calibration) -> list[list[float]]:
-    if not np.isfinite(matrix).all():
-        pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
-        raise ResultRefusedError(
-            f"{name} of {pair} is not finite", "the captures leave a direction undetermined: add captures"
-        )
-    return [[float(value) for value in row] for row in np.asarray(matrix) + 0.0]
-
-
-def _figure(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(value)
+def _plain(value: Any, name: str, pair: str) -> Any:
+    """Turn a value into plain types: records and mappings into dicts, arrays into rows, NaN into null."""
+    if is_dataclass(value):
+        value = vars(value)
+    if isinstance(value, Mapping):
+        return {key: _plain(each, f"{name}.{key}", pair) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each, f"{name}[{k}]", pair) for k, each in enumerate(value)]
+    if isinstance(value, np.ndarray):
+        if not np.isfinite(value).all():
+            what = f"{name} of {pair} is not finite"
+            raise ResultRefusedError(what, "the captures leave a direction undetermined: add captures")
+        return (value.astype(np.float64) + 0.0).tolist()
+    value = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def result_text(
@@ -390,16 +353,10 @@ def read_result(path: Path | str) -> SavedResult:
         SessionError: no such file, or not a result that can be trusted; with the key at fault.
     """
     path = Path(path)
-    try:
+    if not path.exists():
+        raise SessionError(f"{path}: there is no such file", "`lce-rig calibrate SESSION` writes it")
+    with reading(path, SessionError, "run `lce-rig calibrate SESSION` again"):
         data = read_json(path)
-    except FileNotFoundError as error:
-        raise SessionError(
-            f"{path}: there is no such file", "`lce-rig calibrate SESSION` writes it"
-        ) from error
-    except OSError as error:
-        raise SessionError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise SessionError(f"{path}: {error}", "run `lce-rig calibrate SESSION` again") from error
     version = data.get("format_version") if isinstance(data, dict) else None
     if version != FORMAT_VERSION or isinstance(version, bool):
         raise SessionError(

@@ -9,11 +9,12 @@ import numpy as np
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, pose
 from lce_rig.core.results import Calibration
-from lce_rig.export.files import header, number, reads_back, write_atomically
+from lce_rig.export.files import header, number, reads_back
 from lce_rig.export.frames import Joint, build_trees, choose_channels
 from lce_rig.export.probes import check_pose
 from lce_rig.export.rotations import quaternion_wxyz, rotation_from_quaternion
 from lce_rig.rig import Rig
+from lce_rig.session.durable import write_atomically
 
 FILE_NAME = "static_transforms.txt"
 _NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")

@@ -4,14 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import MOTIONS, Motion, WeakestMotion
 from lce_rig.residuals.features import CaptureFeatures
 from lce_rig.residuals.moments import Problem, Weights
 from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS
 from lce_rig.solvers.registration import vec_rotation, with_one
-from lce_rig.words.extrinsics import motion_words
+from lce_rig.words import not_enough
 
 # One capture's board plane, camera against LiDAR, is good to about this much.
 PLANE_SIGMA_M = 0.005
@@ -44,13 +44,12 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
     weak = values < 1 / MAX_WEAK_SIGMA_M**2
     if not weak.any():
         return
-    names = list(dict.fromkeys(motion_words(main_motion(vector)) for vector in vectors[:, weak].T))
-    spread_deg = normal_spread_deg(features)
-    raise NotEnoughDataError(
-        f"{' and '.join(names)} cannot be told from {len(features)} captures: their boards are nearly "
-        f"parallel (normals spread by {spread_deg:.1f} deg)",
-        "add captures with the board tilted by 20 deg or more, left and right as well as up and down",
-    )
+    figures: dict[str, Figure] = {
+        "motions": tuple(dict.fromkeys(main_motion(vector) for vector in vectors[:, weak].T)),
+        "n_captures": len(features),
+        "spread_deg": normal_spread_deg(features),
+    }
+    raise not_enough(Finding("shortage.undetermined", "warning", figures=figures))
 
 
 def lever_arm(features: Sequence[CaptureFeatures]) -> float:

@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
 from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal
 from lce_rig.detect.detection import Detections, Pair
@@ -37,7 +37,7 @@ from lce_rig.validation.camera_pairs import CameraPair, doubt_cameras, relate
 from lce_rig.validation.reach import point_uncertainties
 from lce_rig.validation.validate import Validation, validate
 from lce_rig.validation.verdict import judge
-from lce_rig.words import sentence
+from lce_rig.words import not_enough, sentence
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ def calibrate_detections(
     channels: Sequence[str] | None = None,
     reference: Reference | None = None,
     progress: Progress = silent,
-) -> tuple[list[Calibration], list[NotEnoughDataError]]:
+) -> tuple[list[Calibration], list[Finding]]:
     """Estimate and judge the extrinsic of every camera with every LiDAR from what they saw of the board.
 
     Channels of one camera share pixels and lens: together they give one extrinsic. Cameras that saw the same
@@ -148,7 +148,7 @@ def calibrate_detections(
             alone.append(calibrate_channels(own.candidates, board, own.settings, clocks, progress))
             sensors.append(own)
         except NotEnoughDataError as error:
-            shortages.append(error)
+            shortages.append(_shortage(pairs, error))
     if not sensors:
         raise _nothing_solved(shortages, cameras)
     links = list(_links(rig, sensors, alone))
@@ -166,16 +166,21 @@ def calibrate_detections(
     return calibrations, shortages
 
 
-def _nothing_solved(
-    troubles: Sequence[NotEnoughDataError], cameras: Sequence[str] | None
-) -> NotEnoughDataError:
+def _nothing_solved(shortages: Sequence[Finding], cameras: Sequence[str] | None) -> NotEnoughDataError:
     """Say of every pair why it could not be calibrated."""
-    if not troubles:
+    if not shortages:
         of_cameras = f" of {' or '.join(cameras)}" if cameras else ""
         return NotEnoughDataError(
             f"the session holds no capture with a picture{of_cameras} and a scan", "Collect captures first."
         )
-    return join_shortages(troubles)
+    return join_shortages([not_enough(shortage) for shortage in shortages])
+
+
+def _shortage(pairs: Sequence[Pair], error: NotEnoughDataError) -> Finding:
+    """Name the sensors that lack captures, where the error does not."""
+    figures = {"text": error.what, "advice": error.hint}
+    found = error.finding or Finding("shortage.text", "warning", figures=figures)
+    return found if found.subject else replace(found, subject=f"{pairs[0].camera} and {pairs[0].lidar}")
 
 
 def _pairs_by_sensors(
@@ -208,20 +213,22 @@ def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: C
     candidates: dict[str, list[CaptureCandidates]] = {}
     refused: dict[str, Refusal] = {}
     needed = rig.quality.min_captures
-    trouble: NotEnoughDataError | None = None
+    shortage: Finding | None = None
     for pair in pairs:
         own, own_refused = _candidates(detections, pair)
         refused |= {name: why for name, why in own_refused.items() if name not in refused}
         if len(own) >= needed:
             candidates[pair.channel] = own
-        elif trouble is None:
-            trouble = NotEnoughDataError(
-                f"{pair}: the board was found by both sensors in {len(own)} of "
-                f"{len(own) + len(own_refused)} captures, at least {needed} are needed",
-                _commonest(own_refused) or "collect more captures",
-            )
-    if not candidates and trouble is not None:
-        raise trouble
+        elif shortage is None:
+            figures: dict[str, Figure] = {
+                "n_detected": len(own),
+                "n_captures": len(own) + len(own_refused),
+                "n_needed": needed,
+                "causes": _commonest(own_refused),
+            }
+            shortage = Finding("shortage.few_detected", "warning", str(pair), figures)
+    if not candidates and shortage is not None:
+        raise not_enough(shortage)
     found = {item.capture for items in candidates.values() for item in items}
     refused = {name: why for name, why in refused.items() if name not in found}
     settings = EstimateSettings.of(options, rig.lidars[pairs[0].lidar])
@@ -241,10 +248,10 @@ def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandida
     return candidates, refused
 
 
-def _commonest(refused: dict[str, Refusal]) -> str:
-    """List the commonest causes of refusal, one a line."""
-    counts = Counter(f"{why.stage}: {sentence(why)}" for why in refused.values())
-    return "\n".join(f"{n} x {text}" for text, n in counts.most_common(3))
+def _commonest(refused: dict[str, Refusal]) -> tuple[Figure, ...]:
+    """List the commonest causes of refusal: how often, code, words."""
+    counts = Counter((why.code, f"{why.stage}: {sentence(why)}") for why in refused.values())
+    return tuple((n, code, text) for (code, text), n in counts.most_common(3))
 
 
 def _links(rig: Rig, sensors: Sequence[_Sensors], alone: Sequence[CalibrationEstimate]) -> Iterator[_Link]:

@@ -13,7 +13,7 @@ from lce_rig.core.documents import read_json
 from lce_rig.core.errors import LceRigError, UsageError
 from lce_rig.core.results import Refusal
 from lce_rig.export.camera_info import camera_info_text, read_camera_info, ros_distortion
-from lce_rig.export.files import MADE_BY, number, numbers, write_atomically
+from lce_rig.export.files import MADE_BY, number, numbers
 from lce_rig.pipeline.lens import MeasuredIntrinsics
 from lce_rig.pipeline.result_files import keep_earlier
 from lce_rig.rig import (
@@ -27,6 +27,7 @@ from lce_rig.rig import (
     shipped_profiles,
 )
 from lce_rig.session import Session
+from lce_rig.session.durable import write_atomically
 from lce_rig.session.replacing import copy_over
 from lce_rig.session.session import INTRINSICS
 from lce_rig.words import refusal_as_json

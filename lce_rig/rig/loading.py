@@ -11,7 +11,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from lce_rig.core.errors import ProfileError
+from lce_rig.core.errors import ProfileError, reading
 from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
 from lce_rig.rig.document import Document, KeyPath, read_document
 from lce_rig.rig.profile import Rig
@@ -206,14 +206,11 @@ def read_profile(path: Path) -> str:
     Raises:
         ProfileError: it cannot be read, or is not a text of a profile's size.
     """
-    try:
-        return read_file(path, MAX_DOCUMENT_BYTES).decode()
-    except OSError as error:
-        raise ProfileError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ProfileError(f"{path}: is not UTF-8 text (byte {error.start})") from error
-    except ValueError as error:
-        raise ProfileError(f"{path}: {error}") from error
+    with reading(path, ProfileError):
+        try:
+            return read_file(path, MAX_DOCUMENT_BYTES).decode()
+        except UnicodeDecodeError as error:
+            raise ProfileError(f"{path}: is not UTF-8 text (byte {error.start})") from error
 
 
 def parse_rig(text: str, source: str = "profile") -> Rig:

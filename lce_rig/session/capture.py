@@ -4,6 +4,7 @@ import hashlib
 import os
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -167,12 +168,8 @@ class Capture:
         Raises:
             SessionError: there is none.
         """
-        try:
+        with self._reading(MANIFEST):
             return hashlib.sha256(read_file(self.path / MANIFEST, MAX_DOCUMENT_BYTES)).hexdigest()
-        except OSError as error:
-            raise self._damaged(f"{MANIFEST} cannot be read: {error.strerror}") from None
-        except ValueError as error:
-            raise self._damaged(f"{MANIFEST}: {error}") from None
 
     @property
     def image_keys(self) -> list[tuple[str, str]]:
@@ -203,10 +200,8 @@ class Capture:
 
         entries = [e for e in self._manifest.images if (e.camera, e.channel) == (camera, channel)]
         entry: ImageEntry = self._only(entries, f"nothing from {camera}.{channel}")
-        try:
+        with self._reading(entry.file):
             pixels = decode_pixels(self._read(entry), cv2.IMREAD_UNCHANGED)
-        except ValueError as error:
-            raise self._damaged(f"{entry.file}: {error}") from None
         if pixels.dtype != np.uint8 or not (pixels.ndim == 2 or pixels.shape[2:] == (3,)):
             raise self._damaged(f"{entry.file} is {pixels.dtype} {pixels.shape}, not 8-bit grey or BGR")
         return Image(camera, channel, entry.stamp_ns, pixels, entry.host_ns)
@@ -219,7 +214,7 @@ class Capture:
         """
         entries = [e for e in self._manifest.scans if e.lidar == lidar]
         entry: ScanEntry = self._only(entries, f"nothing from {lidar}")
-        try:
+        with self._reading(entry.file):
             cloud = decode_pcd(self._read(entry))
             has_time = "time" in (cloud.dtype.names or ())
             return Scan(
@@ -231,8 +226,6 @@ class Capture:
                 _whole(cloud, "time", -_MAX_OFFSET_NS, _MAX_OFFSET_NS) if has_time else None,
                 entry.host_ns,
             )
-        except ValueError as error:
-            raise self._damaged(f"{entry.file}: {error}") from None
 
     def events(self, camera: str) -> Events:
         """Read the events about this capture exactly as they were recorded, timestamps to the microsecond.
@@ -242,11 +235,9 @@ class Capture:
         """
         entries = [e for e in self._manifest.events if e.camera == camera]
         entry: EventsEntry = self._only(entries, f"no events from {camera}")
-        try:
+        with self._reading(entry.file):
             events = decode_events(self._read(entry), camera)
             check_events(events)
-        except ValueError as error:
-            raise self._damaged(f"{entry.file}: {error}") from None
         if stamps_of(events) != {"first_ns": entry.first_ns, "last_ns": entry.last_ns}:
             raise self._damaged(f"{entry.file} holds other stamps than {MANIFEST} says")
         return events
@@ -262,18 +253,12 @@ class Capture:
 
     @cached_property
     def _manifest(self) -> Manifest:
-        try:
+        with self._reading(MANIFEST):
             document = read_json(self.path / MANIFEST)
             version = document.get("format_version") if isinstance(document, dict) else None
             if isinstance(version, int) and version > EVENTS_VERSION:
                 raise SessionError(f"capture {self.name} was written by a newer lce-rig", "Update lce-rig.")
             manifest = parse_manifest(document)
-        except FileNotFoundError:
-            raise self._damaged(f"it has no {MANIFEST}") from None
-        except OSError as error:
-            raise self._damaged(f"{MANIFEST} cannot be read: {error.strerror}") from None
-        except ValueError as error:
-            raise self._damaged(f"{MANIFEST}: {error}") from None
         for entry in manifest.files:
             self._require_here(entry.file)
         return manifest
@@ -299,17 +284,23 @@ class Capture:
         raise SessionError(f"capture {self.name} has {lacking}; it has {', '.join(have) or 'nothing'}")
 
     def _read(self, entry: Entry) -> bytes:
-        try:
+        with self._reading(entry.file):
             data = read_file(self.path / entry.file)
-        except OSError as error:
-            raise self._damaged(f"{entry.file}: {error.strerror}") from None
-        except ValueError as error:
-            raise self._damaged(f"{entry.file}: {error}") from None
         if len(data) != entry.bytes:
             raise self._damaged(f"{entry.file} has {len(data)} of {entry.bytes} bytes")
         if hashlib.sha256(data).hexdigest() != entry.sha256:
             raise self._damaged(f"{entry.file} is not what was captured (checksum)")
         return data
+
+    @contextmanager
+    def _reading(self, name: str) -> Iterator[None]:
+        """Report what is wrong with a file of the capture as damage."""
+        try:
+            yield
+        except OSError as error:
+            raise self._damaged(f"{name}: {error.strerror}") from None
+        except ValueError as error:
+            raise self._damaged(f"{name}: {error}") from None
 
     def _damaged(self, what: str) -> SessionError:
         hint = f"Remove {self.path} and collect again; the other captures are not affected."

@@ -5,6 +5,8 @@ import fcntl
 import os
 from pathlib import Path
 
+from lce_rig.core.errors import SessionError
+
 # A link that somebody put in a file's place must not lead elsewhere.
 _WRITE_OWN = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 
@@ -51,6 +53,21 @@ def replace_file(path: Path, data: bytes) -> None:
         draft.unlink(missing_ok=True)
         raise
     flush_folder(path.parent)
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a file of results, and its folder, so that it is there whole or not at all.
+
+    Raises:
+        SessionError: a full disk, no permission.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, content.encode() if isinstance(content, str) else content)
+    except OSError as error:
+        raise SessionError(
+            f"{path}: cannot be written: {error.strerror or error}", "Free space or choose another folder."
+        ) from error
 
 
 def flush_folder(path: Path) -> None:

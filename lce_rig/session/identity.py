@@ -10,7 +10,7 @@ import yaml
 
 from lce_rig import __version__
 from lce_rig.core.documents import read_json
-from lce_rig.core.errors import SessionError
+from lce_rig.core.errors import SessionError, reading
 from lce_rig.rig import Rig, dump_rig
 
 FORMAT_VERSION = 1
@@ -44,17 +44,14 @@ def read_marker(path: Path) -> dict[str, Any]:
     Raises:
         SessionError: there is none, or it is damaged.
     """
-    try:
-        marker = read_json(path / MARKER)
-    except FileNotFoundError:
-        hint = "Make one with `lce-rig collect` or `lce-rig simulate`."
-        raise SessionError(f"{path} is no session: it has no {MARKER}", hint) from None
-    except OSError as error:
-        raise SessionError(f"{path / MARKER} cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise SessionError(f"{path / MARKER} cannot be read: {error}") from None
+    with reading(path / MARKER, SessionError):
+        try:
+            marker = read_json(path / MARKER)
+        except FileNotFoundError:
+            hint = "Make one with `lce-rig collect` or `lce-rig simulate`."
+            raise SessionError(f"{path} is no session: it has no {MARKER}", hint) from None
     if not isinstance(marker, dict) or type(marker.get("format_version")) is not int:
-        raise SessionError(f"{path / MARKER} cannot be read: it has no format_version")
+        raise SessionError(f"{path / MARKER}: it has no format_version")
     return marker
 
 

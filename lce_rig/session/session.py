@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lce_rig import __version__
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.documents import parse_json
-from lce_rig.core.errors import LceRigError, SessionError
+from lce_rig.core.errors import LceRigError, SessionError, reading
 from lce_rig.core.limits import MAX_DOCUMENT_BYTES, MAX_FILE_BYTES, open_regular
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import cache
@@ -348,10 +348,8 @@ class Session:
             SessionError: the journal cannot be read.
         """
         path = self.path / JOURNAL
-        try:
+        with reading(path, SessionError):
             return read_entries(path)
-        except (OSError, ValueError) as error:
-            raise SessionError(f"{path} cannot be read: {error}") from None
 
     def store_cached(self, key: str, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, Any]) -> bool:
         """Keep arrays and JSON values under a key such as "3f9a1c/000012" for `load_cached`.
@@ -419,10 +417,8 @@ class Session:
 
 
 def _captures_in(folder: Path) -> list[Capture]:
-    try:
+    with reading(folder, SessionError):
         names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
-    except OSError as error:
-        raise SessionError(f"{folder} cannot be read: {error.strerror or error}") from error
     numbered = [name for name in names if re.fullmatch(r"[0-9]{6,}", name)]
     # By number: 1000000 follows 999999.
     return [Capture(folder / name) for name in sorted(numbered, key=lambda name: (len(name), name))]

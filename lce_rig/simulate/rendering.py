@@ -10,7 +10,7 @@ from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.backdrop import SHADOW_STEP_PX, Backdrop, beside_changes, pixel_rays, sub_rays
 from lce_rig.simulate.light import irradiance, reached
 from lce_rig.simulate.options import CameraNoise
-from lce_rig.simulate.scene import Hits, Scene
+from lce_rig.simulate.scene import Scene
 
 SUBPIXELS = 5
 _GAMMA = 1 / 2.2
@@ -83,7 +83,7 @@ def _paint_mirror_images(radiance: Array, scene: Scene, backdrop: Backdrop) -> N
     hits = scene.cast_moving(mirrors.starts[near], mirrors.directions[near])
     seen = np.flatnonzero(hits.range_m < mirrors.range_m[near])
     chosen = near[seen]
-    kept = Hits(hits.range_m[seen], hits.surface[seen], hits.normals[seen])
+    kept = hits.select(seen)
     points = reached(mirrors.starts[chosen], mirrors.directions[chosen], kept)
     image = scene.colour(kept, points) * irradiance(backdrop.lamps, points, kept.normals, scene.occluders)
     radiance[v[chosen], u[chosen]] += mirrors.weight[chosen] * (image - mirrors.image[chosen])
@@ -136,7 +136,7 @@ def _look_through_centres(
     hits = scene.cast_moving(backdrop.origin, rays)
     label = np.where(hits.range_m < window.backdrop_range_m.ravel(), hits.surface, -1).astype(np.int32)
     seen = np.flatnonzero(label >= 0)
-    kept = Hits(hits.range_m[seen], hits.surface[seen], hits.normals[seen])
+    kept = hits.select(seen)
     points = reached(backdrop.origin, rays[seen], kept)
     colour, light = np.zeros((len(rays), 3)), np.zeros((len(rays), 3))
     colour[seen] = scene.colour(kept, points)
@@ -160,7 +160,7 @@ def _look_through(
     flat = rays.reshape(-1, 3)
     hits = scene.cast_moving(origin, flat, with_carrier=with_carrier)
     near = np.flatnonzero(hits.range_m < window.backdrop_range_m[v, u])
-    kept = Hits(hits.range_m[near], hits.surface[near], hits.normals[near])
+    kept = hits.select(near)
     on_carrier, on_board = (light[v[near], u[near]] for light in lights)
     light = np.where((kept.surface == scene.board_index)[:, None], on_board, on_carrier)
     samples = window.backdrop[v, u]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from lce_rig.core.errors import SessionError
-from lce_rig.session.durable import replace_file
+from lce_rig.session.durable import write_atomically
 from lce_rig.verify import canvas
 from lce_rig.verify.canvas import INK, Picture
 
@@ -92,12 +92,7 @@ def write_picture(path: Path, picture: Picture) -> Path:
     is_encoded, data = cv2.imencode(".png", picture, _PNG)
     if not is_encoded:
         raise SessionError(f"{path}: a picture of shape {picture.shape} cannot be written as PNG")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, np.asarray(data).tobytes())
-    except OSError as error:
-        hint = "free space on the disk or choose another folder"
-        raise SessionError(f"{path}: cannot be written: {error.strerror}", hint) from error
+    write_atomically(path, np.asarray(data).tobytes())
     return path
 
 

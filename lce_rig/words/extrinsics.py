@@ -142,6 +142,25 @@ def _plate(finding: Finding) -> str:
     )
 
 
+def _commonest(finding: Finding) -> str:
+    """The commonest of {causes} of refusal with their counts, or: collect more captures."""
+    causes = finding.figures["causes"]
+    assert isinstance(causes, tuple)
+    lines = [f"{cause[0]} x {cause[2]}" for cause in causes if isinstance(cause, tuple)]
+    return "\n".join(lines) or "collect more captures"
+
+
+def _undetermined(finding: Finding) -> str:
+    """{motions} open after {n_captures} captures: boards nearly parallel, normals spread by {spread_deg}."""
+    motions, n_captures = finding.figures["motions"], finding.figures["n_captures"]
+    assert isinstance(motions, tuple)
+    names = " and ".join(motion_words(str(motion)) for motion in motions)
+    return (
+        f"{names} cannot be told from {n_captures} captures: their boards are nearly parallel "
+        f"(normals spread by {finding.figure('spread_deg'):.1f} deg)"
+    )
+
+
 def _agree(finding: Finding) -> str:
     """The {n_sessions} calibrations of {camera} and {lidar} agree: {rotation_deg}, {translation_m} apart.
 
@@ -291,7 +310,25 @@ PHRASES: dict[str, Phrase] = {
         "the calibration of {subject} ({camera} and {lidar}) failed by itself",
         "see its reasons with `lce-rig calibrate`",
     ),
-    "repeat.not_calibrated": Phrase("{subject}: {what}", "{hint}"),
+    "shortage.few_detected": Phrase(
+        "the board was found by both sensors in {n_detected} of {n_captures} captures, at least {n_needed} "
+        "are needed",
+        _commonest,
+    ),
+    "shortage.few_captures": Phrase(
+        "{n_captures} captures show the board in both sensors, {n_needed} are needed",
+        "add captures: ten or more, with the board at different places and tilts",
+    ),
+    "shortage.few_agree": Phrase(
+        "only {n_agreeing} of {n_captures} captures agree with one extrinsic, {n_needed} are needed",
+        "check the board's size, the intrinsics and the pairing of pictures with scans; add captures",
+    ),
+    "shortage.undetermined": Phrase(
+        _undetermined,
+        "add captures with the board tilted by 20 deg or more, left and right as well as up and down",
+    ),
+    "shortage.text": Phrase("{text}", "{advice}"),
+    "repeat.not_calibrated": Phrase("{subject}: {sensors}: {what}", "{hint}"),
     "repeat.only_one": Phrase("{camera} and {lidar} are calibrated in {subject} only"),
     "repeat.other_board": Phrase("{first} and {subject} were taken with different boards"),
 }

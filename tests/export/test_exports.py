@@ -168,6 +168,12 @@ def test_several_cameras_and_lidars_hang_in_one_tree_under_the_base(
         np.testing.assert_allclose(T_cam_lidar, calibration.T_cam_lidar, atol=1e-12)
 
 
+def test_ros_2_takes_a_urdf_for_the_text_of_a_parameter(rles: Rig, make: Make, tmp_path: Path) -> None:
+    """The value of `-p robot_description:="$(cat rig.urdf)"` is parsed as YAML."""
+    export([make()], rles, tmp_path, formats=["urdf"])
+    assert isinstance(yaml.safe_load((tmp_path / "rles.urdf").read_text()), str)
+
+
 def test_sensors_that_no_calibration_connects_get_a_urdf_each(
     three_sensor_rig: Rig, make: Make, tmp_path: Path
 ) -> None:

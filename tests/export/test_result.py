@@ -229,7 +229,7 @@ def test_a_folder_that_cannot_be_written_is_a_session_error(make: Make, tmp_path
 WRITER = """
 import sys
 from pathlib import Path
-from lce_rig.export.files import write_atomically
+from lce_rig.session.durable import write_atomically
 print("ready", flush=True)
 while True:
     for letter in "ab":

@@ -121,7 +121,8 @@ def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_pat
 
 
 def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path: Path, rig: Rig) -> None:
-    from lce_rig.recordings.ros.bag_recorder import add_event_topic, encode_image, encode_scan, typestore
+    from lce_rig.recordings.ros.bag_recorder import add_event_topic, encode_image, encode_scan
+    from lce_rig.recordings.ros.message_fields import typestore
 
     def write(path: Path, has_pictures: bool) -> Path:
         with open_bag_writer(path) as writer:

@@ -155,7 +155,7 @@ def test_a_session_whose_creation_was_cut_off_is_created_anew(tmp_path, rig):
 def test_a_damaged_marker_is_named(tmp_path, rig, text):
     Session.create(tmp_path / "s", rig).close()
     (tmp_path / "s" / "session.json").write_text(text)
-    with pytest.raises(SessionError, match=r"session\.json cannot be read"):
+    with pytest.raises(SessionError, match=r"session\.json"):
         Session.open(tmp_path / "s")
 
 

@@ -13,7 +13,6 @@ from lce_rig.core.geometry import Array
 from lce_rig.recordings.velodyne.packet import read_data_packet, read_position_packet
 from lce_rig.recordings.velodyne.stream import Vlp16Stream
 from lce_rig.simulate.carriers import build_carrier
-from lce_rig.simulate.lidar import simulate_scan
 from lce_rig.simulate.options import LidarNoise
 from lce_rig.simulate.room import Room
 from lce_rig.simulate.scene import Scene
@@ -27,7 +26,7 @@ from tests.recordings.vlp16_room import (
     settings,
 )
 
-from .conftest import board_before_lidar
+from .conftest import board_before_lidar, simulate_scan
 
 HALF_RANGE_STEP_M = 0.001
 # A block's azimuth is rounded in the packet, each point's once more on decoding.

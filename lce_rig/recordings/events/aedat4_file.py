@@ -11,10 +11,10 @@ References:
 import re
 import struct
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 from lce_rig.core import limits, unpacking
 from lce_rig.core.errors import SourceError
@@ -28,6 +28,7 @@ _MAX_HEAD_BYTES = 1 << 20
 _MIN_PACKET_BYTES = 8
 _SEARCH_BYTES = 1 << 24
 _SEARCH_STEP_BYTES = 1 << 16
+_Content = TypeVar("_Content")
 _STREAM_NUMBER = re.compile("[0-9]{1,9}")
 
 
@@ -91,31 +92,36 @@ class Aedat4File:
             self.notes.append(f"{self.path.name}: {what} of stream {numbers[0]}, the first of {len(numbers)}")
         return numbers[0] if numbers else None
 
-    def packets(self, stream: int, findings: DamageCounts) -> Iterator[tuple[str, bytes]]:
-        """Yield the packets of a stream as flatbuffers, with their place; damaged ones are skipped."""
+    def packets(
+        self, stream: int, findings: DamageCounts, decode: Callable[[bytes], _Content]
+    ) -> Iterator[_Content]:
+        """Yield the packets of a stream, decoded from their flatbuffers; damaged ones are skipped."""
         with open_recorded(self.path) as file:
             for place in self._places(file, findings):
                 if place.stream != stream:
                     continue
                 file.seek(place.at)
                 try:
-                    yield place.where, _decompress(file.read(place.n_bytes))[4:]
+                    content = decode(_decompress(file.read(place.n_bytes))[4:])
                 except Exception as error:  # Damage shows in any way: lz4, zstd, struct, sizes.
-                    add_broken(findings, place.where, error)
+                    where = f"{place.where}: {str(error) or type(error).__name__}"
+                    findings.add("broken packets left out", where)
+                    continue
+                yield content
 
     def n_packets(self, stream: int) -> int:
         """Count the packets of a stream; only their heads are read."""
         with open_recorded(self.path) as file:
             return sum(place.stream == stream for place in self._places(file, DamageCounts()))
 
-    def last_packet(self, stream: int) -> bytes | None:
-        """Read the last whole packet of a stream, not those before it; None where there is none."""
+    def last_packet(self, stream: int, decode: Callable[[bytes], _Content]) -> _Content | None:
+        """Decode the last whole packet of a stream, not those before it; None where there is none."""
         with open_recorded(self.path) as file:
             places = [place for place in self._places(file, DamageCounts()) if place.stream == stream]
             for place in reversed(places):
                 file.seek(place.at)
                 try:
-                    return _decompress(file.read(place.n_bytes))[4:]
+                    return decode(_decompress(file.read(place.n_bytes))[4:])
                 except Exception:  # As above; the one before it will do.
                     continue
         return None
@@ -195,11 +201,6 @@ def vector_at(table: bytes, index: int) -> tuple[int, int]:
     at += struct.unpack_from("<I", table, at)[0]
     (length,) = struct.unpack_from("<I", table, at)
     return at + 4, int(length)
-
-
-def add_broken(findings: DamageCounts, where: str, error: Exception) -> None:
-    """Count a packet that cannot be decoded."""
-    findings.add("broken packets left out", f"{where}: {str(error) or type(error).__name__}")
 
 
 def _parse_header(file: BinaryIO) -> Aedat4Header:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import SourceError, reading
 
 NS_PER_US = 1000
 _PIXELS = re.compile("[0-9]{1,9}")
@@ -118,15 +118,8 @@ class EventStream(Protocol):
         notes: what was chosen or assumed on opening, in words.
     """
 
-    @property
-    def resolution_px(self) -> tuple[int, int] | None:
-        """(width, height) that the file declares; None where it declares none."""
-        ...
-
-    @property
-    def notes(self) -> list[str]:
-        """What was chosen or assumed on opening, in words."""
-        ...
+    resolution_px: tuple[int, int] | None
+    notes: list[str]
 
     def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         """Yield the events from the beginning, as they lie in the file; may be called again and again.
@@ -157,12 +150,8 @@ def open_recorded(path: Path) -> BinaryIO:
     Raises:
         SourceError: it is not a regular file, or may not be read.
     """
-    try:
+    with reading(path, SourceError):
         return limits.open_regular(path)
-    except ValueError as error:
-        raise SourceError(f"{path}: {error}") from None
-    except OSError as error:
-        raise SourceError(f"{path} cannot be read: {error.strerror}") from None
 
 
 def parse_size(width: str, height: str) -> tuple[int, int] | None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.limits import MAX_FIELDS, MAX_FILE_BYTES, check_points, check_size, describe, read_file
 from lce_rig.core.pcd import decode_pcd
 from lce_rig.core.text_table import read_table
@@ -131,9 +131,5 @@ def read_cloud(path: Path) -> NDArray[Any]:
     Raises:
         SourceError: the file is missing, empty, truncated or damaged.
     """
-    try:
+    with reading(path, SourceError):
         return DECODERS[path.suffix.lower()](read_file(path))
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise SourceError(f"{path}: {error}") from None

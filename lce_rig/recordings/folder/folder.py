@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lce_rig.core.data import Image
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.limits import read_file
 from lce_rig.recordings.folder.cloud import to_scan
 from lce_rig.recordings.folder.cloud_file import DECODERS, read_cloud
@@ -148,12 +148,8 @@ class PairOnDisk:
         sensors = [f"{picture.camera} {picture.channel}" for picture in self.pictures]
         digest = hashlib.sha256(" ".join([*sensors, self.lidar]).encode())
         for path in (*(picture.path for picture in self.pictures), self.cloud_path):
-            try:
+            with reading(path, SourceError):
                 digest.update(hashlib.sha256(read_file(path)).digest())
-            except OSError as error:
-                raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-            except ValueError as error:
-                raise SourceError(f"{path}: {error}") from None
         return digest.hexdigest()
 
     def read(self) -> RecordedPair:

@@ -160,6 +160,13 @@ def is_bag_file(path: Path) -> bool:
     return suffixes[-1:] != [] and (suffixes[-1] in SUFFIXES or _is_packed(suffixes))
 
 
+def kind_of(path: Path) -> str:
+    """Name the kind of a recording: its suffix, ".bag" for a folder with bag files, else "folder"."""
+    if not path.is_dir():
+        return path.suffix.lower()
+    return ".bag" if any(is_bag_file(file) for file in path.iterdir()) else "folder"
+
+
 def list_topics(topics: Mapping[str, tuple[str, int]]) -> str:
     """List the topics of a bag, for messages.
 

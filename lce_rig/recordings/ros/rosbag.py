@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from lce_rig.recordings.overlap import check_overlap
 from lce_rig.recordings.protocol import SourceOptions, Span
 from lce_rig.recordings.ros.bag_file import BagFile, list_topics
 from lce_rig.recordings.ros.event_messages import BagEvents
-from lce_rig.recordings.ros.message_fields import MessageReader, read_header
+from lce_rig.recordings.ros.message_fields import MessageReader, read_header, typestore
 from lce_rig.recordings.ros.storage import RawMessage
 from lce_rig.recordings.ros.topics import CLOUD_TYPES, Target, choose_topics
 from lce_rig.rig import Rig
@@ -375,7 +374,7 @@ def _deserialize(message: RawMessage) -> Any:
     is_ros1 = message.encoding == "ros1"
     if message.msgtype in CLOUD_TYPES:
         check_field_count(message.data, message.encoding)
-    store = _typestore(is_ros1)
+    store = typestore(is_ros1)
     msgtype = message.msgtype.replace("/", "/msg/")
     try:
         if is_ros1:
@@ -383,13 +382,6 @@ def _deserialize(message: RawMessage) -> Any:
         return store.deserialize_cdr(message.data, msgtype)
     except Exception as error:  # A damaged message fails in any way: struct, assert, unicode, index.
         raise ValueError(f"a message is damaged: {str(error) or type(error).__name__}") from None
-
-
-@cache
-def _typestore(is_ros1: bool) -> Any:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
 
 
 def _is_in_order(sample: Image | Scan, stream: _BagStream) -> bool:

@@ -9,7 +9,7 @@ from typing import BinaryIO
 
 from lce_rig.core import limits, velodyne
 from lce_rig.core.data import Scan, Stream
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.findings import Finding
 from lce_rig.recordings.fingerprint import fingerprint
 from lce_rig.recordings.protocol import SourceOptions, Span
@@ -69,13 +69,8 @@ class PcapFile:
         self.flaws: Counter[str] = Counter()
         self.damage = ""
         self.n_bytes_read = 0
-        try:
-            with limits.open_regular(path) as file:
-                head = file.read(24)
-        except OSError as error:
-            raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-        except ValueError as error:
-            raise SourceError(f"{path}: cannot be read: {error}") from None
+        with reading(path, SourceError), limits.open_regular(path) as file:
+            head = file.read(24)
         self._order, self._ns_per_tick, self._link = _read_head(path, head)
         if self._link is not None:
             self._check_link(self._link)

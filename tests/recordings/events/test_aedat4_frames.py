@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lce_rig.recordings.events.aedat4 import Aedat4Image, decode_frame
 from lce_rig.recordings.events.aedat4_file import Aedat4File
-from lce_rig.recordings.events.camera_file import Aedat4Frames, Aedat4Image, decode_frame
 from lce_rig.recordings.events.stream import DamageCounts
 from tests.notes import kinds
 from tests.recordings.events.aedat4_files import RawFrame, flatbuffer, write_davis
@@ -24,7 +24,7 @@ def read(path: Path, findings: DamageCounts | None = None) -> list[Aedat4Image]:
     file = Aedat4File(path)
     number = file.first_stream("FRME")
     assert number is not None
-    return list(Aedat4Frames(file, number).frames(findings or DamageCounts()))
+    return list(file.packets(number, findings or DamageCounts(), decode_frame))
 
 
 @pytest.mark.parametrize("style", ["dv", "dv-processing", "exposure only"])
