@@ -10,9 +10,10 @@ from itertools import combinations
 
 import numpy as np
 
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
+from lce_rig.core.geometry import invert, sigma_sizes, tangent_sizes
 from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
@@ -63,6 +64,28 @@ class _Sensors:
     @property
     def lidar(self) -> str:
         return self.pairs[0].lidar
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """What the captures of one camera and one LiDAR say of the extrinsic.
+
+    Attributes:
+        sensors: the two.
+        estimate: the extrinsic.
+        validation: of the estimate on the camera's own captures and images.
+        together: the estimate of several cameras that it is part of; None where it stands alone.
+    """
+
+    sensors: _Sensors
+    estimate: CalibrationEstimate
+    validation: Validation
+    together: TogetherEstimate | None = None
+
+    @property
+    def is_still(self) -> bool:
+        """Whether boards stood still, so that images count as they are, whenever they were taken."""
+        return all(channel.time_offset_s is None for channel in self.estimate.channels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,31 +162,19 @@ def calibrate_detections(
         NotEnoughDataError: every pair has too few captures or leaves a direction open; the causes are named.
         UsageError: no capture holds one of the channels.
     """
-    board = rig.board.to_board()
-    sensors, alone, shortages = [], [], []
+    alone: list[_Solved] = []
+    shortages: list[Finding] = []
     for pairs in _pairs_by_sensors(detections, cameras, channels):
         try:
-            own = _sensors(rig, detections, pairs, options or CalibrateOptions())
-            clocks = clocks_of(rig, own.camera, own.lidar)
-            alone.append(calibrate_channels(own.candidates, board, own.settings, clocks, progress))
-            sensors.append(own)
+            alone.append(_solve(rig, detections, pairs, options or CalibrateOptions(), progress))
         except NotEnoughDataError as error:
             shortages.append(_shortage(pairs, error))
-    if not sensors:
+    if not alone:
         raise _nothing_solved(shortages, cameras)
-    links = list(_links(rig, sensors, alone))
-    joint = _estimate_together(rig, sensors, alone, links)
-    final = [_from_all_cameras(rig, detections, k, sensors[k], alone[k], joint) for k in range(len(sensors))]
-    checked = [_examine(rig, detections, *each) for each in zip(sensors, final, strict=True)]
-    calibrations = []
-    for k, own in enumerate(sensors):
-        mine = [link for link in links if k in (link.first, link.second)]
-        doubts = [doubt for link in mine for doubt in link.doubts]
-        others = tuple(_other_camera(sensors, final, checked, k, link, joint) for link in mine)
-        calibration = _judged(rig, detections, own, final[k], checked[k], doubts, others)
-        truth = reference.of(own.camera, own.lidar) if reference else None
-        calibrations.append(calibration if truth is None else _compared(calibration, truth))
-    return calibrations, shortages
+    links = list(_links(rig, alone))
+    solved = _solve_together(rig, detections, alone, links)
+    calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
+    return [_compared(calibration, reference) for calibration in calibrations], shortages
 
 
 def _nothing_solved(shortages: Sequence[Finding], cameras: Sequence[str] | None) -> NotEnoughDataError:
@@ -204,6 +215,22 @@ def _pairs_by_sensors(
     return list(groups.values())
 
 
+def _solve(
+    rig: Rig, detections: Detections, pairs: Sequence[Pair], options: CalibrateOptions, progress: Progress
+) -> _Solved:
+    """Estimate one extrinsic by the captures of its own sensors alone.
+
+    Raises:
+        NotEnoughDataError: there are too few, or they leave a direction open.
+    """
+    sensors = _sensors(rig, detections, pairs, options)
+    clocks = clocks_of(rig, sensors.camera, sensors.lidar)
+    estimate = calibrate_channels(
+        sensors.candidates, rig.board.to_board(), sensors.settings, clocks, progress
+    )
+    return _Solved(sensors, estimate, _examine(rig, detections, sensors, estimate))
+
+
 def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: CalibrateOptions) -> _Sensors:
     """Gather the candidates of each channel that has captures enough, and why other captures are unusable.
 
@@ -212,23 +239,16 @@ def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: C
     """
     candidates: dict[str, list[CaptureCandidates]] = {}
     refused: dict[str, Refusal] = {}
-    needed = rig.quality.min_captures
-    shortage: Finding | None = None
+    shortages: list[Finding] = []
     for pair in pairs:
         own, own_refused = _candidates(detections, pair)
         refused |= {name: why for name, why in own_refused.items() if name not in refused}
-        if len(own) >= needed:
+        if len(own) >= rig.quality.min_captures:
             candidates[pair.channel] = own
-        elif shortage is None:
-            figures: dict[str, Figure] = {
-                "n_detected": len(own),
-                "n_captures": len(own) + len(own_refused),
-                "n_needed": needed,
-                "causes": _commonest(own_refused),
-            }
-            shortage = Finding("shortage.few_detected", "warning", str(pair), figures)
-    if not candidates and shortage is not None:
-        raise not_enough(shortage)
+        else:
+            shortages.append(_few_detected(pair, len(own), own_refused, rig.quality.min_captures))
+    if not candidates:
+        raise not_enough(shortages[0])
     found = {item.capture for items in candidates.values() for item in items}
     refused = {name: why for name, why in refused.items() if name not in found}
     settings = EstimateSettings.of(options, rig.lidars[pairs[0].lidar])
@@ -248,42 +268,45 @@ def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandida
     return candidates, refused
 
 
-def _commonest(refused: dict[str, Refusal]) -> tuple[Figure, ...]:
-    """List the commonest causes of refusal: how often, code, words."""
+def _few_detected(pair: Pair, n_detected: int, refused: Mapping[str, Refusal], n_needed: int) -> Finding:
+    """Say in how many captures both sensors found the board, and the commonest causes of refusal."""
     counts = Counter((why.code, f"{why.stage}: {sentence(why)}") for why in refused.values())
-    return tuple((n, code, text) for (code, text), n in counts.most_common(3))
+    figures: dict[str, Figure] = {
+        "n_detected": n_detected,
+        "n_captures": n_detected + len(refused),
+        "n_needed": n_needed,
+        "causes": tuple((n, code, text) for (code, text), n in counts.most_common(3)),
+    }
+    return Finding("shortage.few_detected", "warning", str(pair), figures)
 
 
-def _links(rig: Rig, sensors: Sequence[_Sensors], alone: Sequence[CalibrationEstimate]) -> Iterator[_Link]:
+def _links(rig: Rig, solved: Sequence[_Solved]) -> Iterator[_Link]:
     """Compare cameras of one LiDAR that saw the same boards held still."""
-    for i, j in combinations(range(len(sensors)), 2):
-        if sensors[i].lidar == sensors[j].lidar and _is_still(alone[i]) and _is_still(alone[j]):
+    for (i, one), (j, other) in combinations(enumerate(solved), 2):
+        if one.sensors.lidar == other.sensors.lidar and one.is_still and other.is_still:
             # Captures that contradict each other widen what a method claims: that must not excuse them.
-            pair = relate(alone[i], alone[j])
+            pair = relate(one.estimate, other.estimate)
             if pair is not None:
-                names = sensors[i].camera, sensors[j].camera
+                names = one.sensors.camera, other.sensors.camera
                 yield _Link(i, j, pair, tuple(doubt_cameras(pair, names, rig.calibration, rig.verdict)))
 
 
-def _is_still(estimate: CalibrationEstimate) -> bool:
-    """Tell whether boards stood still, so that images count as they are, whenever they were taken."""
-    return all(channel.time_offset_s is None for channel in estimate.channels)
-
-
-def _estimate_together(
-    rig: Rig, sensors: Sequence[_Sensors], alone: Sequence[CalibrationEstimate], links: Sequence[_Link]
-) -> dict[int, TogetherEstimate]:
-    """Estimate cameras that agree together, with method "ml", by their place.
+def _solve_together(
+    rig: Rig, detections: Detections, alone: Sequence[_Solved], links: Sequence[_Link]
+) -> list[_Solved]:
+    """Estimate cameras that agree together, with method "ml"; leave the others as they are.
 
     One that contradicts another is not among them, or it would spoil the other's extrinsic.
     """
-    joint: dict[int, TogetherEstimate] = {}
-    for group in _groups(len(sensors), links):
-        settings = sensors[group[0]].settings
+    solved = list(alone)
+    for group in _groups(len(alone), links):
+        settings = alone[group[0]].sensors.settings
         if settings.method == "ml":
-            own = {sensors[k].camera: alone[k] for k in group}
-            joint |= dict.fromkeys(group, calibrate_together(own, rig.board.to_board(), settings))
-    return joint
+            own = {alone[k].sensors.camera: alone[k].estimate for k in group}
+            together = calibrate_together(own, rig.board.to_board(), settings)
+            for k in group:
+                solved[k] = _part_of(together, rig, detections, alone[k])
+    return solved
 
 
 def _groups(n: int, links: Sequence[_Link]) -> list[list[int]]:
@@ -298,51 +321,37 @@ def _groups(n: int, links: Sequence[_Link]) -> list[list[int]]:
     return [members for members in found if len(members) > 1]
 
 
-def _from_all_cameras(
-    rig: Rig,
-    detections: Detections,
-    k: int,
-    sensors: _Sensors,
-    alone: CalibrationEstimate,
-    joint: Mapping[int, TogetherEstimate],
-) -> CalibrationEstimate:
-    """Give the estimate together with other cameras where there is one, else the camera's own."""
-    if k not in joint:
-        return alone
-    estimate = joint[k].estimates[sensors.camera]
-    sigma_deg, sigma_m = sigma_sizes(_examine(rig, detections, sensors, alone).cov)
-    return replace(
+def _part_of(together: TogetherEstimate, rig: Rig, detections: Detections, alone: _Solved) -> _Solved:
+    """Put a camera's part of an estimate of several in place of its own."""
+    estimate = together.estimates[alone.sensors.camera]
+    sigma_deg, sigma_m = sigma_sizes(alone.validation.cov)
+    estimate = replace(
         estimate,
         diagnostics=replace(
             estimate.diagnostics, alone_sigma_rotation_deg=sigma_deg, alone_sigma_translation_m=sigma_m
         ),
-        channels=alone.channels,
-        channel_difference=alone.channel_difference,
-        channel_difference_cov=alone.channel_difference_cov,
+        channels=alone.estimate.channels,
+        channel_difference=alone.estimate.channel_difference,
+        channel_difference_cov=alone.estimate.channel_difference_cov,
     )
+    return _Solved(alone.sensors, estimate, _examine(rig, detections, alone.sensors, estimate), together)
 
 
-def _other_camera(
-    sensors: Sequence[_Sensors],
-    estimates: Sequence[CalibrationEstimate],
-    checked: Sequence[Validation],
-    k: int,
-    link: _Link,
-    joint: Mapping[int, TogetherEstimate],
-) -> OtherCamera:
-    """Say where the other camera of a link sits to camera k."""
+def _other_camera(solved: Sequence[_Solved], link: _Link, k: int) -> OtherCamera:
+    """Say where the other camera of a link sits to that at place k."""
     pair, is_second = link.pair, k == link.second
-    other = link.first if is_second else link.second
-    T, J = relative_pose(estimates[k].T_cam_lidar, estimates[other].T_cam_lidar)
+    own, other = solved[k], solved[link.first if is_second else link.second]
+    T, J = relative_pose(own.estimate.T_cam_lidar, other.estimate.T_cam_lidar)
     cov = None
-    if k in joint and joint[k] is joint.get(other):
+    if own.together is not None and own.together is other.together:
         # Widened as both extrinsics were.
-        J = J * np.repeat([checked[k].widened_by, checked[other].widened_by], 6)
-        cov = np.asarray(J @ joint[k].covariance_of(sensors[k].camera, sensors[other].camera) @ J.T)
+        J = J * np.repeat([own.validation.widened_by, other.validation.widened_by], 6)
+        both = own.together.covariance_of(own.sensors.camera, other.sensors.camera)
+        cov = np.asarray(J @ both @ J.T)
     seen = None if pair.pictures is None else pair.pictures.T_second_first
     apart_deg, apart_m = (None, None) if pair.apart is None else tangent_sizes(pair.apart)
     return OtherCamera(
-        camera=sensors[other].camera,
+        camera=other.sensors.camera,
         n_captures=len(pair.captures),
         T_cam_other=T,
         cov=cov,
@@ -370,32 +379,22 @@ def _examine(
 
 
 def _judged(
-    rig: Rig,
-    detections: Detections,
-    sensors: _Sensors,
-    estimate: CalibrationEstimate,
-    examination: Validation,
-    between_cameras: Sequence[Finding],
-    others: tuple[OtherCamera, ...],
+    rig: Rig, detections: Detections, solved: Sequence[_Solved], links: Sequence[_Link], k: int
 ) -> Calibration:
+    """Weigh everything known about the extrinsic at place k, and put it together."""
+    sensors, estimate, validation = solved[k].sensors, solved[k].estimate, solved[k].validation
     camera, lidar = sensors.camera, sensors.lidar
+    mine = [link for link in links if k in (link.first, link.second)]
+    doubts = [doubt for link in mine for doubt in link.doubts]
     n_captures = len({name for pair in sensors.pairs for name in detections.captures(pair)})
-    verdict, findings = judge(estimate, examination, rig, camera, lidar, n_captures, between_cameras)
-    diagnostics = estimate.diagnostics
-    if examination.widened_by != 1:
-        diagnostics = replace(diagnostics, sigma_widened=examination.widened_by)
-    if estimate.channel_difference is not None:
-        rotation_deg, translation_m = tangent_sizes(estimate.channel_difference)
-        diagnostics = replace(
-            diagnostics, channels_rotation_deg=rotation_deg, channels_translation_m=translation_m
-        )
+    verdict, findings = judge(estimate, validation, rig, camera, lidar, n_captures, doubts)
     lens = rig.cameras[camera].to_intrinsics()
     return Calibration(
         camera=camera,
         channels=tuple(channel.channel for channel in estimate.channels),
         lidar=lidar,
         T_cam_lidar=estimate.T_cam_lidar,
-        cov=examination.cov,
+        cov=validation.cov,
         certificate=estimate.certificate,
         metrics=estimate.metrics,
         n_captures=n_captures,
@@ -404,17 +403,28 @@ def _judged(
         captures_refused=_still_refused(estimate, sensors.refused),
         verdict=verdict,
         findings=findings,
-        diagnostics=diagnostics,
+        diagnostics=_diagnostics(estimate, validation),
         channel_results=estimate.channels,
         method=estimate.method,
-        uncertainty=point_uncertainties(estimate.T_cam_lidar, examination.cov, lens),
+        uncertainty=point_uncertainties(estimate.T_cam_lidar, validation.cov, lens),
         estimated_with=estimate.estimated_with,
-        other_cameras=others,
+        other_cameras=tuple(_other_camera(solved, link, k) for link in mine),
         weakest=estimate.weakest,
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,
         observations=estimate.observations,
     )
+
+
+def _diagnostics(estimate: CalibrationEstimate, validation: Validation) -> Diagnostics:
+    """Add what the validation and the comparison of channels found."""
+    figures = estimate.diagnostics
+    if validation.widened_by != 1:
+        figures = replace(figures, sigma_widened=validation.widened_by)
+    if estimate.channel_difference is None:
+        return figures
+    rotation_deg, translation_m = tangent_sizes(estimate.channel_difference)
+    return replace(figures, channels_rotation_deg=rotation_deg, channels_translation_m=translation_m)
 
 
 def _still_refused(estimate: CalibrationEstimate, refused: Mapping[str, Refusal]) -> dict[str, Refusal]:
@@ -426,9 +436,12 @@ def _still_refused(estimate: CalibrationEstimate, refused: Mapping[str, Refusal]
     return {name: every[name] for name in sorted(every) if name not in used}
 
 
-def _compared(calibration: Calibration, reference: Array) -> Calibration:
-    """Report the error against a T_cam_lidar (4, 4) that somebody else vouches for."""
-    rotation_deg, translation_m = error_to_reference(calibration.T_cam_lidar, reference)
+def _compared(calibration: Calibration, reference: Reference | None) -> Calibration:
+    """Report the error against a T_cam_lidar that somebody else vouches for, where there is one."""
+    truth = reference.of(calibration.camera, calibration.lidar) if reference else None
+    if truth is None:
+        return calibration
+    rotation_deg, translation_m = error_to_reference(calibration.T_cam_lidar, truth)
     return replace(calibration, egt_rotation_deg=rotation_deg, egt_translation_m=translation_m)
 
 
