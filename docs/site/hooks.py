@@ -17,8 +17,8 @@ TOP_PAGES = {
     "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security.md",
 }
-# Files at the top that the site shows as they are.
-TOP_FILES = {"CITATION.cff": "citation.cff"}
+# Files that the site holds as they are.
+TOP_FILES = {"CITATION.cff": "citation.cff", "docs/site/site.css": "site.css"}
 _ALL = {**TOP_PAGES, **TOP_FILES}
 _LINK = re.compile(r"(\]\(|src=\")([^)#\"\s]+)")
 _CODE = re.compile(r"`[^`]*`")

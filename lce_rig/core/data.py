@@ -162,7 +162,7 @@ class Stream:
 
     sensor: str
     channel: str
-    kind: Literal["pictures", "events", "scans"]
+    kind: Literal["images", "events", "scans"]
 
     def __str__(self) -> str:
         return f"{self.sensor}.{self.channel}" if self.channel else self.sensor

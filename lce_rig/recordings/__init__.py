@@ -42,7 +42,7 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
     if kind not in RECORDINGS:
         known = ", ".join(suffix for suffix in RECORDINGS if suffix != "folder")
         hint = f"Give a folder with img/ and pcd/, a bag, or a file of events ({known})."
-        raise SourceError(f"{path} is no recording this program reads", hint)
+        raise SourceError(f"{path} is not a recording that lce-rig reads", hint)
     recording: Recording = resolve_name(RECORDINGS[kind])(path, rig, options or SourceOptions())
     return recording
 
@@ -70,7 +70,7 @@ def open_recordings(
 
 
 def _open_parts(parts: list[tuple[Path, SourceOptions]], rig: Rig) -> list[Recording]:
-    """Open the recordings of one folder; a file that a killed recorder left empty is passed over."""
+    """Open the recordings of one folder; a file that a killed recorder left empty is skipped."""
     opened: list[Recording] = []
     failures: list[SourceError] = []
     for path, options in parts:
@@ -80,5 +80,5 @@ def _open_parts(parts: list[tuple[Path, SourceOptions]], rig: Rig) -> list[Recor
             failures.append(error)
     if not opened:
         raise failures[0]
-    opened[0].notes.extend(f"left out: {error.what}" for error in failures)
+    opened[0].notes.extend(f"skipped: {error.what}" for error in failures)
     return opened

@@ -155,7 +155,7 @@ def _look_through(
     rays: Array,
     with_carrier: bool,
 ) -> Array:
-    """Average what n rays (M, n, 3) a pixel see: (M, 3), lit as carrier and board are lit there."""
+    """Average what n rays (M, n, 3) a pixel see: (M, 3), with the light on carrier and board there."""
     v, u = (np.repeat(index, rays.shape[1]) for index in pixels)
     flat = rays.reshape(-1, 3)
     hits = scene.cast_moving(origin, flat, with_carrier=with_carrier)

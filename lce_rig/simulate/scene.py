@@ -191,7 +191,7 @@ class Scene:
     def cast_moving(
         self, origins: Array, directions: Array, *, with_carrier: bool = True, with_normals: bool = True
     ) -> Hits:
-        """Find what each ray meets first of the carrier and the board, whatever stands before them."""
+        """Find what each ray meets first of the carrier and the board, ignoring what stands before them."""
         hits = self.cast_board(origins, directions)
         if not with_carrier or not self.moving.surfaces:
             return hits

@@ -13,13 +13,14 @@ INK, BLUE, RED = "#1c2733", "#2f5d8a", "#c2410c"
 
 def draw_board(rig: Rig) -> Any:
     """Draw plate and pattern twice: upright with dimensions, and as a diamond before the LiDAR's rings."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(12.2, 4.9), width_ratios=(1.55, 1))
+    plt.rcParams["font.size"] = 13
+    figure, (left, right) = plt.subplots(1, 2, figsize=(12.6, 5.2), width_ratios=(1.65, 1))
     _draw_plate(left, rig)
     _draw_dimensions(left, rig)
     _draw_plate(right, rig, turned_deg=45)
     _draw_rings(right, rig)
-    left.set_title("Measure: every figure goes into the profile", color=INK, fontsize=13)
-    right.set_title("Hold it as a diamond: rings cross all four edges", color=INK, fontsize=13)
+    left.set_title("Measure: every figure goes into the profile", color=INK, fontsize=15)
+    right.set_title("Hold it as a diamond: rings cross all four edges", color=INK, fontsize=15)
     for axes in (left, right):
         axes.set_aspect("equal")
         axes.axis("off")
@@ -61,7 +62,7 @@ def _draw_dimensions(axes: Any, rig: Rig) -> None:
     axes.annotate(
         f"inner_corners [{board.cols}, {board.rows}]:\nwhere four squares meet",
         xy=(x_low, y_low),
-        xytext=(-w - 430, -h * 0.5),
+        xytext=(-w - 520, -h * 0.5),
         color=RED,
         arrowprops={"arrowstyle": "->", "color": RED},
         va="center",
@@ -70,14 +71,14 @@ def _draw_dimensions(axes: Any, rig: Rig) -> None:
     axes.annotate(
         "pattern_offset_m [right, up]:\npattern's centre from\nthe plate's centre",
         xy=(0, 0),
-        xytext=(-w - 430, h * 0.5),
+        xytext=(-w - 520, h * 0.5),
         color=BLUE,
         arrowprops={"arrowstyle": "->", "color": BLUE},
         va="center",
         zorder=5,
     )
-    axes.set_xlim(-w - 440, w + 110)
-    axes.set_ylim(-h - 110, h + 100)
+    axes.set_xlim(-w - 530, w + 130)
+    axes.set_ylim(-h - 120, h + 110)
 
 
 def _dimension(
@@ -91,7 +92,7 @@ def _dimension(
 ) -> None:
     axes.annotate("", xy=end, xytext=start, arrowprops={"arrowstyle": "<->", "color": BLUE, "lw": 1.2})
     x, y = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
-    offset = (22, 0) if turned else (0, -22 if below else 18)
+    offset = (34, 0) if turned else (0, -34 if below else 32)
     axes.text(
         x + offset[0],
         y + offset[1],

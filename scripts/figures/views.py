@@ -55,7 +55,7 @@ GOOD = (
 BAD = (
     Placement("cut by the image's border", (0.93, 0.45)),
     Placement("too far", (0.5, 0.5), 6.3),
-    Placement("too oblique", (0.5, 0.45), left_deg=76.0),
+    Placement("too oblique", (0.5, 0.45), left_deg=71.5),
 )
 
 
@@ -68,7 +68,7 @@ def draw_placements(rig: Rig, places: Sequence[Placement], columns: int = 3) -> 
     """Draw each placement as `verify` does, with what the tool says where it refuses it."""
     stage, finder = stage_of(rig), BoardFinder(rig)
     rows = -(-len(places) // columns)
-    figure, grid = plt.subplots(rows, columns, figsize=(3.9 * columns, 2.95 * rows), squeeze=False)
+    figure, grid = plt.subplots(rows, columns, figsize=(3.6 * columns, 2.6 * rows), squeeze=False)
     for index, (axes, place) in enumerate(zip(grid.flat, places, strict=True)):
         capture = capture_at(stage, index, _pose(stage, place))
         seen = finder.image(capture.images[0]), finder.scan(capture.scans[0])
@@ -78,11 +78,11 @@ def draw_placements(rig: Rig, places: Sequence[Placement], columns: int = 3) -> 
         picture = _overlay(rig, stage, capture, _truth(stage), image_board, lidar_board)
         axes.imshow(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
         axes.axis("off")
-        axes.set_title(place.caption, fontsize=12, color=_BAD if refused else _GOOD, fontweight="bold")
+        axes.set_title(place.caption, fontsize=14, color=_BAD if refused else _GOOD, fontweight="bold")
         if refused:
             lines = (lce.describe(refused[0]), lce.recommend(refused[0]))
-            text = "\n".join(textwrap.fill(line, 52) for line in lines)
-            axes.text(0.5, -0.03, text, transform=axes.transAxes, ha="center", va="top", fontsize=9)
+            text = "\n".join(textwrap.fill(line, 40) for line in lines)
+            axes.text(0.5, -0.03, text, transform=axes.transAxes, ha="center", va="top", fontsize=10.5)
     figure.tight_layout(h_pad=1.6)
     return figure
 
@@ -99,11 +99,11 @@ def draw_good_and_bad(rig: Rig, degrees: float, millimetres: float) -> Any:
     turned[:3, :3] = exp_so3(np.radians([0.0, degrees, 0.0])) @ truth[:3, :3]
     moved[:3, 3] += [0.0, millimetres / 1000, 0.0]
     cases = (
-        ("good\nring ends lie on the outline on all sides", truth, _GOOD),
-        (f"rotated by {degrees:g} deg\nall ends are shifted to one side", turned, _BAD),
-        (f"{millimetres:g} mm too low\nends lie inside above and outside below", moved, _BAD),
+        ("good\nring ends on the outline, all sides", truth, _GOOD),
+        (f"rotated by {degrees:g} deg\nall ends shifted to one side", turned, _BAD),
+        (f"{millimetres:g} mm too low\ninside above, outside below", moved, _BAD),
     )
-    figure, grid = plt.subplots(1, 3, figsize=(13.2, 4.9))
+    figure, grid = plt.subplots(1, 3, figsize=(12.6, 4.8))
     for axes, (title, T_cam_lidar, colour) in zip(grid, cases, strict=True):
         picture = _overlay(rig, stage, capture, T_cam_lidar, image_board, lidar_board)
         width_px = picture.shape[1]
@@ -114,7 +114,7 @@ def draw_good_and_bad(rig: Rig, degrees: float, millimetres: float) -> Any:
         axes.set_xlim(u - half, u + half)
         axes.set_ylim(v + half, v - half)
         axes.axis("off")
-        axes.set_title(title, fontsize=10.5, color=colour, fontweight="bold")
+        axes.set_title(title, fontsize=13, color=colour, fontweight="bold")
     figure.tight_layout()
     return figure
 

@@ -363,7 +363,7 @@ def test_a_piece_of_a_bag_that_metadata_lists_and_that_is_not_there_is_told(tmp_
     listed = "  relative_file_paths:\n    - a_0.db3\n    - a_1.db3\n"
     (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n{listed}")
     n_read, what = read_damaged(folder)
-    assert n_read == 1 and has_note([what], "metadata.yaml", "'a_1.db3'", "not there")
+    assert n_read == 1 and has_note([what], "metadata.yaml", "'a_1.db3'", "missing")
 
 
 def test_clouds_and_pictures_of_absurd_sizes_are_left_out_and_the_others_read(

@@ -252,7 +252,7 @@ def test_a_file_damaged_anywhere_gives_scans_or_an_error(
 
 REFUSED: dict[str, tuple[bytes, str]] = {
     "empty": (b"", "is empty"),
-    "a text": (b"some text, longer than a header of pcap\n", "no pcap or pcapng file"),
+    "a text": (b"some text, longer than a header of pcap\n", "not a pcap or pcapng file"),
     "a torn header": (struct.pack("<IHH", 0xA1B2C3D4, 2, 4), "nothing was recorded"),
     "without frames": (struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1), "no UDP packets at all"),
     "of a wireless card": (struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 127), "802.11 radiotap"),

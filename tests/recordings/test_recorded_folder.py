@@ -69,7 +69,7 @@ def test_a_file_that_a_killed_recorder_left_empty_is_passed_over_and_named(tmp_p
     fill(folder, rles)
     (folder / "events.aedat4").write_bytes(b"")
     joined = read(folder, rles)
-    assert any("left out" in note and "events.aedat4" in note for note in joined.notes)
+    assert any("skipped" in note and "events.aedat4" in note for note in joined.notes)
     assert isinstance(joined, JoinedRecording)
     assert sum(isinstance(sample, Events) for sample in joined.samples()) > 0, "those of the bag"
     for file in folder.iterdir():

@@ -59,7 +59,7 @@ class MomentSearch:
     @property
     def reconstructed(self) -> frozenset[ImageKey]:
         """(camera, channel) of the pictures that are made of events to watch the board."""
-        with_pictures = {stream.sensor for stream in self.streams if stream.kind == "pictures"}
+        with_pictures = {stream.sensor for stream in self.streams if stream.kind == "images"}
         return frozenset(
             (stream.sensor, stream.channel)
             for stream in self.streams

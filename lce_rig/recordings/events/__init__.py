@@ -49,7 +49,7 @@ def open_events(
     kind = kind_of(path)
     if kind not in READERS:
         hint = f"Give a ROS 2 bag's folder or a file of one of these kinds: {', '.join(READERS)}."
-        raise SourceError(f"{path} is no recording of events this program reads", hint)
+        raise SourceError(f"{path} is not an event recording that lce-rig reads", hint)
     reader = resolve_name(READERS[kind])
     stream = reader(path, topic) if reader.__name__ == "BagEvents" else reader(path)
     return EventRecording(path, stream, sensor, resolution)

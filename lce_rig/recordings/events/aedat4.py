@@ -110,7 +110,7 @@ def decode_frame(table: bytes) -> Aedat4Image:
         ValueError: it holds no frame, or one of a kind that is not known.
     """
     if table[4:8] != b"FRME":
-        raise ValueError(f"it holds {bytes(table[4:8])!r}, no frame")
+        raise ValueError(f"it holds {bytes(table[4:8])!r}, not a frame")
     stamp_us, start_us, end_us, exposure_us = (
         _number(table, index, "q") for index in (_TIMESTAMP, _EXPOSURE_START, _EXPOSURE_END, _EXPOSURE)
     )
@@ -134,7 +134,7 @@ def _pixels(table: bytes) -> NDArray[np.uint8]:
     if n_channels is None:
         raise ValueError(f"its pixels are of OpenCV's type {kind}, not 8-bit grey or colour")
     if width <= 0 or height <= 0 or n_bytes != width * height * n_channels:
-        raise ValueError(f"{n_bytes} bytes are no picture of {width}x{height} pixels")
+        raise ValueError(f"{n_bytes} bytes are not an image of {width}x{height} pixels")
     pixels = np.frombuffer(table, np.uint8, n_bytes, at).reshape(height, width, n_channels)
     return np.array(pixels[..., 0] if n_channels == 1 else pixels[..., :3])
 

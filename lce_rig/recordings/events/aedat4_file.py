@@ -82,7 +82,7 @@ class Aedat4File:
         self.header = read_header(path)
         self.notes: list[str] = []
         if self.header.end is None:
-            self.notes.append(f"{path.name}: was never closed; read as far as it goes")
+            self.notes.append(f"{path.name}: was never closed; read up to its end")
 
     def first_stream(self, kind: str) -> int | None:
         """Name the first stream of a type, "EVTS" or "FRME"; None where there is none. Others are noted."""
@@ -105,7 +105,7 @@ class Aedat4File:
                     content = decode(_decompress(file.read(place.n_bytes))[4:])
                 except Exception as error:  # Damage shows in any way: lz4, zstd, struct, sizes.
                     where = f"{place.where}: {str(error) or type(error).__name__}"
-                    findings.add("broken packets left out", where)
+                    findings.add("broken packets skipped", where)
                     continue
                 yield content
 
@@ -136,9 +136,9 @@ class Aedat4File:
             if size is None:
                 following = self._next_packet(file, position + 1, end)
                 if following is None:
-                    findings.add("torn ends of the file left out", f"{end - position} bytes, {where}")
+                    findings.add("torn ends of the file skipped", f"{end - position} bytes, {where}")
                     return
-                findings.add("broken packets left out", f"{where}: its head is damaged")
+                findings.add("broken packets skipped", f"{where}: its head is damaged")
                 position, n_packets = following, n_packets + 1
                 continue
             yield PacketPlace(number, position + 8, size, where)
@@ -175,7 +175,9 @@ def read_header(path: Path) -> Aedat4Header:
     """
     with open_recorded(path) as file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise SourceError(f"{path} is no AEDAT4 file", "Convert older files (AEDAT 2, 3) with DV first.")
+            raise SourceError(
+                f"{path} is not an AEDAT4 file", "Convert older files (AEDAT 2, 3) with DV first."
+            )
         try:
             return _parse_header(file)
         except (struct.error, ValueError, ElementTree.ParseError) as error:

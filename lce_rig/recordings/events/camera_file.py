@@ -92,11 +92,11 @@ class EventCameraFile:
         channel = self._rig.cameras[self._camera].first_channel("frames")
         if channel is None:
             self.notes.append(
-                f"{self.path.name}: frames left out; {self._camera} has no channel of kind frames"
+                f"{self.path.name}: frames skipped; {self._camera} has no channel of kind frames"
             )
             return False
         self._channel, self._number = channel, number
-        self.streams[Stream(self._camera, channel, "pictures")] = first.mid_exposure_ns, last.mid_exposure_ns
+        self.streams[Stream(self._camera, channel, "images")] = first.mid_exposure_ns, last.mid_exposure_ns
         self.n_samples = self._file.n_packets(number)
         self.notes += self._file.notes
         self.notes.append(f"{self.path.name}: {self._camera}.{channel} {_meaning(first.exposure_ns)}")
@@ -106,7 +106,7 @@ class EventCameraFile:
         last_ns: int | None = None
         for frame in self._file.packets(self._number, findings, decode_frame):
             if last_ns is not None and frame.mid_exposure_ns <= last_ns:
-                findings.add("out of order left out")
+                findings.add("out of order skipped")
                 continue
             last_ns = frame.mid_exposure_ns
             yield Image(self._camera, self._channel, last_ns, frame.pixels)
@@ -114,5 +114,5 @@ class EventCameraFile:
 
 def _meaning(exposure_ns: int) -> str:
     if exposure_ns:
-        return f"stamped at the middle of the exposure, {exposure_ns * 1e-6:.1f} ms in the first frame"
-    return "carries no exposure: its stamps are taken for the middle of it"
+        return f"timestamped at mid exposure; exposure {exposure_ns * 1e-6:.1f} ms in the first frame"
+    return "has no exposure time; its timestamps are used as mid exposure"

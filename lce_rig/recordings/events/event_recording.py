@@ -68,7 +68,7 @@ def _on_any_clock(stretch: EventColumns, findings: DamageCounts) -> EventColumns
     if not len(t_ns) or (t_ns.min() > -limit and t_ns.max() < limit):
         return stretch
     is_sound = (t_ns > -limit) & (t_ns < limit)
-    findings.add("events with stamps beyond any clock left out", n=int(np.count_nonzero(~is_sound)))
+    findings.add("events with timestamps beyond any clock skipped", n=int(np.count_nonzero(~is_sound)))
     return stretch.select(is_sound)
 
 
@@ -117,16 +117,16 @@ class _Sorter:
         """Drop what came before the clock was set, if that is next to nothing; else yield it and give up."""
         before_ns, after_ns = int(together.t_ns[:reset].max()), int(together.t_ns[reset])
         back_s = (before_ns - after_ns) * 1e-9
-        where = f"{seconds_in(before_ns, self._first_ns)} the stamps run back by {back_s:.3f} s"
+        where = f"{seconds_in(before_ns, self._first_ns)} the timestamps decrease by {back_s:.3f} s"
         if self._delivered_ns is None and before_ns - self._first_ns < _MAX_LEAD_NS:
-            self._findings.add("events before the clock was set left out", where, reset)
+            self._findings.add("events before the clock was set skipped", where, reset)
             self._first_ns = after_ns
             return together.select(slice(reset, None))
         sound = self._tidied(together.select(slice(0, reset)))
         if len(sound):
             yield sound
         raise SourceError(
-            f"{self._path}: {where}, and stay there",
+            f"{self._path}: {where} and do not recover",
             "The clock was set, or two recordings were joined: split the recording there.",
         )
 
@@ -136,15 +136,15 @@ class _Sorter:
         n_stray = int(np.count_nonzero(stray))
         if n_stray:
             where = seconds_in(int(events.t_ns[max(int(np.argmax(stray)) - 1, 0)]), self._first_ns)
-            self._findings.add("events with stray stamps left out", where, n_stray)
+            self._findings.add("events with stray timestamps skipped", where, n_stray)
             events = events.select(~stray)
         if self._delivered_ns is not None:
             is_late = events.t_ns < self._delivered_ns
-            self._findings.add("events that came too late left out", n=int(np.count_nonzero(is_late)))
+            self._findings.add("events that came too late skipped", n=int(np.count_nonzero(is_late)))
             events = events.select(~is_late)
         n_back = int(np.count_nonzero(np.diff(events.t_ns) < 0))
         if n_back:
-            self._findings.add("places where stamps run back by up to 20 ms, sorted", n=n_back)
+            self._findings.add("places where timestamps decrease by up to 20 ms, sorted", n=n_back)
             events = events.select(np.argsort(events.t_ns, kind="stable"))
         return events
 
@@ -196,8 +196,8 @@ def _stray(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Find the timestamps that do not fit the others, (N,)."""
     late = np.maximum.accumulate(t_ns) - t_ns > REORDER_NS
     early = t_ns - np.minimum.accumulate(t_ns[::-1])[::-1] > REORDER_NS
-    # A timestamp too far ahead makes all that follow look late, and the other way round: the fewer are
-    # astray.
+    # A timestamp too far ahead makes all that follow look late, and the other way round: the the fewer are
+    # stray.
     return min(late, early, key=np.count_nonzero)
 
 
@@ -282,7 +282,7 @@ class EventRecording:
 
     def _unordered(self) -> SourceError:
         said = "; ".join(self._findings.lines())
-        what = f"{self.path} holds no events that could be put in order"
+        what = f"{self.path} holds no events that can be sorted by time"
         return SourceError(what + (f": {said}" if said else ""))
 
     def extent_ns(self) -> tuple[int, int]:
@@ -364,7 +364,7 @@ class EventRecording:
             raise SourceError(
                 f"{self.path}: its events are of a sensor of {_size(file_px)} pixels, "
                 f"camera {self.sensor!r} has {_size(profile_px)}",
-                "Is it another camera's recording? Else correct resolution_px in the profile.",
+                "Give this camera's recording, or correct resolution_px in the profile.",
             )
         if file_px and file_px[0] * file_px[1] > limits.MAX_EVENT_PIXELS:
             raise SourceError(
@@ -383,7 +383,7 @@ class EventRecording:
                 f"{self.path} declares no resolution; its events reach column {width - 1}, row {height - 1}",
                 "No event camera has so many pixels: the file is damaged.",
             )
-        self._assumed.append(f"declares no resolution; {width}x{height}, the extent of its events, is taken")
+        self._assumed.append(f"declares no resolution; {width}x{height}, the extent of its events, is used")
         return width, height
 
     def _on_sensor(self, stretch: EventColumns, findings: DamageCounts) -> EventColumns:
@@ -397,9 +397,9 @@ class EventRecording:
             raise SourceError(
                 f"{self.path}: {n_off} of {len(stretch)} events lie off the sensor, up to column {right}, "
                 f"row {bottom}; camera {self.sensor!r} has {_size(self.resolution_px)} pixels",
-                "Is it another camera's recording? Else correct resolution_px in the profile.",
+                "Give this camera's recording, or correct resolution_px in the profile.",
             )
-        findings.add("events off the sensor left out", f"column {right}, row {bottom}", n_off)
+        findings.add("events off the sensor skipped", f"column {right}, row {bottom}", n_off)
         return stretch.select(is_on)
 
 

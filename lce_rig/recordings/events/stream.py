@@ -155,7 +155,7 @@ def open_recorded(path: Path) -> BinaryIO:
 
 
 def parse_size(width: str, height: str) -> tuple[int, int] | None:
-    """Read a resolution from a file's text, px; None where it is none that a camera has."""
+    """Read a resolution from a file's text, px; None where no camera has it."""
     # Longer ones are not pixels, and take Python long to read.
     if not (_PIXELS.fullmatch(width) and _PIXELS.fullmatch(height)):
         return None

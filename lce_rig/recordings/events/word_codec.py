@@ -33,7 +33,7 @@ class WordLayout:
         single: one event at the other coordinate.
         base: first coordinate and polarity of the vectors that follow.
         vectors: number of bits by code of vector.
-        known: other codes that may occur and are passed over.
+        known: other codes that may occur and are skipped.
         is_line_x: the shared coordinate is the column.
     """
 
@@ -58,7 +58,7 @@ class WordDecoder:
     Attributes:
         layout: what the codes mean.
         n_untimed: events met before any timestamp, skipped.
-        n_unknown: words of no known code, passed over.
+        n_unknown: words of no known code, skipped.
     """
 
     layout: WordLayout

@@ -1,4 +1,4 @@
-"""Point point clouds from files."""
+"""Point clouds from files."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -56,9 +56,7 @@ def decode_ply(data: bytes) -> NDArray[Any]:
     n_rows_before, start = 0, first
     for element in elements[: names.index("vertex") + 1]:
         if element.has_list:
-            raise ValueError(
-                f"its element {describe(element.name)} has a list, which this program does not read"
-            )
+            raise ValueError(f"its element {describe(element.name)} has a list, which is not supported")
         dtype = _dtype(element, _ORDERS[encoding])
         if element.name != "vertex":
             n_rows_before += element.count
@@ -82,7 +80,7 @@ def _dtype(element: _Element, order: str) -> np.dtype[Any]:
     try:
         return np.dtype([(name, order + kind) for name, kind in element.columns])
     except ValueError as error:
-        raise ValueError(f"its properties cannot be told apart: {error}") from None
+        raise ValueError(f"its properties are ambiguous: {error}") from None
 
 
 def _split_header(data: bytes) -> tuple[str, list[_Element], int]:
@@ -115,7 +113,7 @@ def _is_count(word: str) -> bool:
 
 def _parse_property(words: list[str]) -> tuple[str, str]:
     if len(words) != 3 or words[1] not in _KINDS:
-        raise ValueError(f"its header line {describe(' '.join(words))} cannot be understood")
+        raise ValueError(f"its header line {describe(' '.join(words))} is not understood")
     return words[2], _KINDS[words[1]]
 
 

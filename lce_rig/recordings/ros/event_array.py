@@ -61,7 +61,7 @@ def _cdr_events(reader: MessageReader, n_events: int) -> NDArray[np.void]:
     begin = reader.rest()
     n_bytes = n_events * 16 - _CDR_LEAD_BYTES - _CDR_TAIL_BYTES
     if len(begin) < n_bytes:
-        raise ValueError(f"it says {n_events} events and ends after {len(begin)} bytes")
+        raise ValueError(f"it declares {n_events} events and ends after {len(begin)} bytes")
     padded = np.zeros(n_events * 16, np.uint8)
     padded[_CDR_LEAD_BYTES : _CDR_LEAD_BYTES + n_bytes] = begin[:n_bytes]
     padded[:4] = begin[:4]

@@ -57,7 +57,9 @@ class EventPacket:
         """
         dtype = np.dtype(f"{'>' if self.is_big_endian else '<'}{kind}")
         if len(self.payload) % dtype.itemsize:
-            raise ValueError(f"{len(self.payload)} bytes are no whole number of {dtype.itemsize}-byte words")
+            raise ValueError(
+                f"{len(self.payload)} bytes are not a whole number of {dtype.itemsize}-byte words"
+            )
         return self.payload.view(dtype)
 
 
@@ -132,14 +134,12 @@ class PacketDecoder:
                 host_ns = None
 
     def account(self, findings: DamageCounts) -> None:
-        """Say what was passed over, and what could not be decoded inside packets."""
-        findings.add("packets of triggers passed over", n=self._n_trigger_packets)
-        findings.add("events before the first stamp left out", n=self._evt3.n_untimed)
+        """Count what was skipped, and what could not be decoded inside packets."""
+        findings.add("packets of triggers skipped", n=self._n_trigger_packets)
+        findings.add("events before the first timestamp skipped", n=self._evt3.n_untimed)
         n_repaired = self._evt3.n_repaired + self._compressed.n_repaired
-        findings.add("time words that did not fit repaired", n=n_repaired)
-        findings.add(
-            "words of no known code passed over", n=self._evt3.n_unknown + self._compressed.n_unknown
-        )
+        findings.add("inconsistent time words repaired", n=n_repaired)
+        findings.add("words of no known code skipped", n=self._evt3.n_unknown + self._compressed.n_unknown)
 
 
 def _pieces(words: NDArray[np.uint16]) -> Iterator[NDArray[np.uint16]]:
@@ -165,7 +165,7 @@ def _decode_libcaer(packet: EventPacket) -> EventColumns:
     """Decode x 15 | y 15 | polarity 1 | valid 1 bits, then 31 bits of us, which may wrap inside a packet."""
     pairs = packet.words("u4").astype(np.uint32)
     if len(pairs) % 2:
-        raise ValueError(f"{len(packet.payload)} bytes are no whole number of 8-byte events")
+        raise ValueError(f"{len(packet.payload)} bytes are not a whole number of 8-byte events")
     where, t_us = pairs[0::2], pairs[1::2].astype(np.int64)
     wraps = np.cumsum(np.diff(t_us, prepend=t_us[:1]) < -_LIBCAER_WRAP_US // 2)
     t_ns = packet.time_base_ns + (t_us + wraps * _LIBCAER_WRAP_US) * NS_PER_US
@@ -224,7 +224,7 @@ class BagEvents:
                 yield from decoder.decode(packet)
             except ValueError as error:
                 where = f"message {index}, received {seconds_in(message.log_ns, first_ns)}: {error}"
-                findings.add("broken packets left out", where)
+                findings.add("broken packets skipped", where)
                 continue
             if last_number is not None and packet.number > last_number + 1:
                 lost = packet.number - last_number - 1
@@ -250,7 +250,7 @@ class BagEvents:
 
 
 def _messages(bag: BagFile, topic: str, findings: DamageCounts) -> Iterator[tuple[int, RawMessage]]:
-    """Yield the messages of a topic with their number; where the bag is torn, that is said and all."""
+    """Yield the messages of a topic with their number; a tear in the bag is counted and ends them."""
     messages = bag.messages({topic})
     index = 0
     while True:

@@ -63,7 +63,7 @@ class MessageReader:
     def block(self, size: int) -> NDArray[np.uint8]:
         """Read `size` bytes, without copying."""
         if self._at + size > len(self._data):
-            raise ValueError(f"it says {size} bytes and ends after {len(self._data) - self._at}")
+            raise ValueError(f"it declares {size} bytes and ends after {len(self._data) - self._at}")
         block = np.frombuffer(self._data, np.uint8, size, self._at)
         self._at += size
         return block

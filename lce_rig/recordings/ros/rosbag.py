@@ -72,13 +72,13 @@ def decode_ros_image(message: Any) -> NDArray[np.uint8]:
     n_bytes, n_channels, conversion = _ENCODINGS[encoding]
     width, height = int(message.width), int(message.height)
     if width * height > limits.MAX_PIXELS:
-        raise ValueError(f"it declares {width}x{height} pixels, at most {limits.MAX_PIXELS} are read")
+        raise ValueError(f"it declares {width}x{height} pixels (limit {limits.MAX_PIXELS})")
     n_row = width * n_channels * n_bytes
     step = int(message.step) or n_row
     data = np.ascontiguousarray(message.data, dtype=np.uint8)
     if width * height == 0 or step < n_row or len(data) < (height - 1) * step + n_row:
         raise ValueError(
-            f"{len(data)} bytes are no {width}x{height} picture in {encoding} with rows of {step} bytes"
+            f"{len(data)} bytes are not a {width}x{height} image in {encoding} with rows of {step} bytes"
         )
     kind = np.dtype(f"{'>' if message.is_bigendian else '<'}u{n_bytes}")
     rows = np.ndarray((height, width, n_channels), kind, data.data, 0, (step, n_channels * n_bytes, n_bytes))
@@ -97,7 +97,7 @@ def decode_ros_compressed_image(message: Any) -> NDArray[np.uint8]:
     """
     form = str(message.format).lower()
     if "compresseddepth" in form:
-        raise ValueError("it is a depth image, not a picture")
+        raise ValueError("it is a depth image")
     pixels = decode_image(bytes(message.data))
     mosaic = form.split(";")[0].strip()
     # A camera's raw mosaic may have been compressed as if it were grey.
@@ -136,7 +136,7 @@ def check_field_count(data: bytes, encoding: str) -> None:
     read_header(reader)  # Height and width stand behind the header as they do in messages of events.
     n_fields = reader.number("I")
     if n_fields > limits.MAX_FIELDS:
-        raise ValueError(f"it declares {n_fields} fields a point, at most {limits.MAX_FIELDS} are read")
+        raise ValueError(f"it declares {n_fields} fields per point (limit {limits.MAX_FIELDS})")
 
 
 def decode_pointcloud2(message: Any) -> NDArray[Any]:
@@ -169,7 +169,7 @@ def decode_pointcloud2(message: Any) -> NDArray[Any]:
             offsets.append(int(entry.offset))
     width, height, step = int(message.width), int(message.height), int(message.point_step)
     if width * height > limits.MAX_POINTS:
-        raise ValueError(f"it declares {width * height} points, at most {limits.MAX_POINTS} are read")
+        raise ValueError(f"it declares {width * height} points (limit {limits.MAX_POINTS})")
     # Some drivers leave row_step at zero in point clouds of one row.
     row_step = int(message.row_step) or width * step
     if row_step < width * step:
@@ -180,14 +180,14 @@ def decode_pointcloud2(message: Any) -> NDArray[Any]:
     data = np.ascontiguousarray(message.data, dtype=np.uint8)
     n_needed = (height - 1) * row_step + width * step
     if len(data) < n_needed:
-        raise ValueError(f"{len(data)} of {n_needed} bytes of its points are there")
+        raise ValueError(f"it holds {len(data)} of {n_needed} bytes of points")
     rows: NDArray[Any] = np.ndarray((height, width), dtype, data.data, 0, (row_step, step))
     return rows.reshape(-1)
 
 
 # A timestamp this much earlier than the one before is a clock that was set, not a message that came late.
 CLOCK_JUMP_NS = 1_000_000_000
-# Drivers start within this many messages of each other; who comes later has no span told beforehand.
+# Drivers start within this many messages of each other; the span of a later one is not known beforehand.
 _N_PROBED = 500
 
 
@@ -269,7 +269,7 @@ class BagRecording:
             self._summarise(streams)
         for topic, stream in streams.items():
             if stream.n_yielded == 0 and stream.counts:
-                cause = stream.first_failure or "its stamps do not rise"
+                cause = stream.first_failure or "its timestamps do not increase"
                 raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}")
 
     def _open_events(self) -> dict[Stream, CameraEvents]:
@@ -319,7 +319,7 @@ class BagRecording:
                 if len(found) == len(self._targets):
                     break
         except SourceError:
-            pass  # It is said when everything in front of the damage has been read.
+            pass  # Reported once everything before the damage has been read.
         return found
 
     def _decode(self, message: RawMessage, stream: _BagStream) -> Image | Scan | None:
@@ -328,7 +328,7 @@ class BagRecording:
             content = _deserialize(message)
             stamp_ns = _header_stamp_ns(content)
             if stamp_ns == 0:
-                stream.notes.add("headers carry no stamps: time of receipt taken")
+                stream.notes.add("headers have no timestamps; the time of receipt is used")
                 stamp_ns = message.log_ns
             return self._to_sample(message, content, target, stamp_ns, stream)
         except (SourceError, ValueError) as error:
@@ -345,7 +345,9 @@ class BagRecording:
             pixels = decode_ros_compressed_image(content) if is_compressed else decode_ros_image(content)
             channel = self._rig.cameras[target.sensor].channels[target.channel]
             if channel.timestamps.reference == "start":
-                stream.notes.add("messages carry no exposure: stamps of its start are taken for its middle")
+                stream.notes.add(
+                    "messages have no exposure time; timestamps of its start are used as its middle"
+                )
             return Image(target.sensor, target.channel, stamp_ns, pixels, message.log_ns)
         settings = self._rig.lidars[target.sensor]
         cloud = decode_pointcloud2(content)
@@ -391,11 +393,11 @@ def _is_in_order(sample: Image | Scan, stream: _BagStream) -> bool:
         stream.last_ns = stamp_ns
         return True
     if stamp_ns == stream.last_ns:
-        stream.counts["sent twice (equal stamps)"] += 1
+        stream.counts["sent twice (equal timestamps)"] += 1
         return False
     if stream.last_ns - stamp_ns < CLOCK_JUMP_NS:
-        stream.counts["out of order (stamps run backwards)"] += 1
+        stream.counts["out of order (timestamps decrease)"] += 1
         return False
-    stream.counts["jumps of the clock back by more than a second"] += 1
+    stream.counts["jumps of the clock back by more than 1 s"] += 1
     stream.last_ns = stamp_ns
     return True

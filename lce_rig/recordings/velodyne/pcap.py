@@ -103,7 +103,7 @@ class PcapFile:
         while head := file.read(header.size):
             seconds, fraction, length, _ = header.unpack(_whole(head, header.size))
             if length > _MAX_FRAME_BYTES or fraction * self._ns_per_tick >= 2 * _NS_PER_S:
-                raise _TornError("it holds nonsense in place of a frame")
+                raise _TornError("a frame's header is invalid")
             frame = _whole(file.read(length), length)
             yield link, seconds * _NS_PER_S + fraction * self._ns_per_tick, frame
 
@@ -118,7 +118,7 @@ class PcapFile:
                 file.seek(-4, 1)
                 length, interfaces = struct.unpack(f"{order}I", head[4:])[0], []
             if length < 12 or length % 4 or length > _MAX_BLOCK_BYTES:
-                raise _TornError("it holds nonsense in place of a block")
+                raise _TornError("a block's header is invalid")
             body = _whole(file.read(length - 8), length - 8)[:-4]
             if kind == _INTERFACE:
                 interfaces.append(_read_interface(order, body))
@@ -151,9 +151,9 @@ def _read_head(path: Path, head: bytes) -> tuple[str, int, int | None]:
     if magic == struct.pack("<I", _SECTION):
         return "<", 1, None
     if not head:
-        raise SourceError(f"{path} is empty", "Was the recorder started on the right card?")
+        raise SourceError(f"{path} is empty", "Record the network card that the LiDAR is on.")
     hint = "Unpack it with gunzip first." if magic[:2] == b"\x1f\x8b" else ""
-    raise SourceError(f"{path} is no pcap or pcapng file", hint)
+    raise SourceError(f"{path} is not a pcap or pcapng file", hint)
 
 
 def _section_order(magic: bytes) -> str:
@@ -276,7 +276,7 @@ class PcapRecording:
             self._summarise(stream)
         if stream.n_scans == 0:
             said = "; ".join(_account(stream)) or f"{stream.n_data} packets are less than a revolution"
-            raise SourceError(f"{self.path}: no whole revolution in it: {said}", "Record a second or more.")
+            raise SourceError(f"{self.path}: no whole revolution in it: {said}", "Record at least 1 s.")
 
     def _survey(self) -> _Survey:
         survey = _Survey()
@@ -323,7 +323,7 @@ class PcapRecording:
             models = ", ".join(f"{n} of {model}" for model, n in survey.others.most_common())
             raise SourceError(
                 f"{self.path}: holds packets of another LiDAR ({models}), not of a VLP-16",
-                "Only the VLP-16 (Puck, Puck LITE) is read from packets; record another's clouds as a bag.",
+                "Only VLP-16 packets (Puck, Puck LITE) are read. Record another LiDAR's scans in a bag.",
             )
         raise SourceError(f"{self.path}: holds no packets of a VLP-16: {self._what_is_there(survey)}")
 

@@ -34,7 +34,7 @@ MAX_DISAGREEMENT_NS = 100_000_000
 # Position packets come 50 to 150 times per second; a sentence stays until the next, a second later.
 _MAX_AGE_S = 3
 _SENTENCE_LAG_S = (0, 1)
-# The least delayed arrival of a tenth of a second tells the host's time of a firing best. Of twenty of them
+# The least delayed arrival of a tenth of a second gives the host's time of a firing best. Of twenty of them
 # the lower quartile is safe from late arrivals and from a damaged packet.
 _WINDOW_NS = 100_000_000
 _N_WINDOWS = 20
@@ -82,7 +82,7 @@ class VelodyneClock:
     def ahead_ns(self) -> int | None:
         """Give by how much the sensor's time is ahead of the host's; None where there is no host's time.
 
-        The hour is the host's. A packet arrives after its last firing, so its length is taken off the
+        The hour is the host's. A packet arrives after its last firing, so its length is subtracted from the
         arrival; what is left is the host's time of the first firing, late by the network's delay.
         """
         host_ns = self._host_ns(self._last_elapsed_ns)

@@ -98,12 +98,12 @@ def test_pictures_that_contradict_themselves_are_refused_by_what_is_wrong() -> N
     assert np.array_equal(decode_frame(flatbuffer(b"FRME", sound)[4:]).pixels, GREY)
     for wrong, cause in [
         ({5: ("b", 17)}, "OpenCV's type 17"),
-        ({6: ("h", 347)}, "89960 bytes are no picture of 347x260 pixels"),
-        ({7: ("h", 0)}, "no picture of 346x0 pixels"),
+        ({6: ("h", 347)}, "89960 bytes .*347x260"),
+        ({7: ("h", 0)}, "346x0"),
     ]:
         with pytest.raises(ValueError, match=cause):
             decode_frame(flatbuffer(b"FRME", sound | wrong)[4:])
-    with pytest.raises(ValueError, match="no frame"):
+    with pytest.raises(ValueError, match="not a frame"):
         decode_frame(flatbuffer(b"IMUS", sound)[4:])
 
 

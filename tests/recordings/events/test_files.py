@@ -321,5 +321,5 @@ def test_paths_that_are_no_recording_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").touch()
     (tmp_path / "img").mkdir()
     for name in ("a.mp4", "img"):
-        with pytest.raises(SourceError, match="no recording of events"):
+        with pytest.raises(SourceError, match="not an event recording"):
             open_events(tmp_path / name)

@@ -61,7 +61,7 @@ def test_stamps_mixed_a_little_are_sorted_and_none_is_lost(
     parts = np.split(t_us, sorted({c // 100 * 100 for c in cuts} - {0}))
     recording = record(*(columns(part) for part in parts))
     assert stamps_us(recording) == sorted(t_us.tolist())
-    assert any("run back" in note for note in recording.notes) == bool((np.diff(t_us) < 0).any())
+    assert any("decrease" in note for note in recording.notes) == bool((np.diff(t_us) < 0).any())
 
 
 def test_equal_stamps_keep_their_order() -> None:
@@ -83,7 +83,7 @@ def test_a_clock_that_wraps_goes_on_and_is_said(bits: int, cut: int) -> None:
 def test_a_clock_that_was_set_back_is_refused_with_figures_after_what_is_sound() -> None:
     first, second = np.arange(1000) * 1000, np.arange(1000) * 1000 - 5_000_000
     delivered = []
-    with pytest.raises(SourceError, match=r"run back by 5\.999 s") as caught:
+    with pytest.raises(SourceError, match=r"5\.999 s") as caught:
         for stretch in record(columns(first[:500]), columns(first[500:]), columns(second)):
             delivered += stretch.t_ns.tolist()
     assert "split" in caught.value.hint
