@@ -134,8 +134,10 @@ def _board_table(rig: "Rig") -> Any:
     table.add_row("plate", f"{board.width_m:g} x {board.height_m:g} m")
     table.add_row("pattern's centre from the plate's", f"{1e3 * x:g}, {1e3 * y:g} mm (right, up)")
     for entry in rig.nominal_extrinsics:
-        limits = f"within {entry.tolerance_deg:g} deg, {1e3 * entry.tolerance_m:g} mm"
-        table.add_row(f"drawing, {entry.lidar} to {entry.camera}", limits)
+        limits = f"CAD model, result within {entry.tolerance_deg:g} deg, {1e3 * entry.tolerance_m:g} mm"
+        if entry.source == "typical":
+            limits = "typical, not compared with results"
+        table.add_row(f"nominal extrinsics, {entry.lidar} to {entry.camera}", limits)
     return table
 
 

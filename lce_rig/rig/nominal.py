@@ -1,5 +1,7 @@
 """Nominal poses of a profile: the CAD model's values, as a check of the result."""
 
+from typing import Literal
+
 import numpy as np
 from pydantic import model_validator
 
@@ -12,7 +14,7 @@ _ROUNDING = 5e-3
 
 
 class NominalExtrinsic(Settings):
-    """Where the CAD model puts a camera; compared with the result, never an initial guess.
+    """Where a camera should be; compared with the result, never an initial guess.
 
     It takes points from the LiDAR's frame to the camera's optical frame: p_cam = R p_lidar + t. The rotation
     is given in exactly one way.
@@ -22,6 +24,8 @@ class NominalExtrinsic(Settings):
         rpy_deg: (roll, pitch, yaw) about fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF.
         matrix: the rows of R.
         translation_m: t, the LiDAR's origin in the optical frame.
+        source: "cad", this rig's CAD model, with which the result must agree; or "typical", how such rigs are
+            built: for guidance and simulation, and no test of a result.
         tolerance_deg: larger differences from the result are reported.
         tolerance_m: larger differences from the result are reported.
     """
@@ -32,6 +36,7 @@ class NominalExtrinsic(Settings):
     rpy_deg: Row | None = None
     matrix: tuple[Row, Row, Row] | None = None
     translation_m: Row
+    source: Literal["cad", "typical"] = "cad"
     tolerance_deg: Positive = 5.0
     tolerance_m: Positive = 0.1
 

@@ -14,7 +14,9 @@ from lce_rig.core.errors import SessionError, reading
 from lce_rig.rig import Rig, dump_rig
 
 FORMAT_VERSION = 1
-_MAY_DIFFER = re.compile(r"description|(lidars|cameras)\.[^.]+\.driver(\..*)?|sync\.(device|baud)").fullmatch
+_MAY_DIFFER = re.compile(
+    r"description|nominal_extrinsics|(lidars|cameras)\.[^.]+\.driver(\..*)?|sync\.(device|baud)"
+).fullmatch
 MARKER = "session.json"
 
 
@@ -75,7 +77,8 @@ class DifferingKey:
 def differing_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
     """List the keys in which two profiles differ, with both values.
 
-    The description may differ, and how attached sensors are reached: a camera is /dev/video2 today.
+    The description and the nominal extrinsics may differ, on which no capture depends, and how attached
+    sensors are reached: a camera is /dev/video2 today.
     """
     a, b = (_flatten(yaml.safe_load(dump_rig(rig))) for rig in (theirs, ours))
     paths = sorted(path for path in a.keys() | b.keys() if a.get(path) != b.get(path))

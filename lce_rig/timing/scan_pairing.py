@@ -13,8 +13,8 @@ from lce_rig.timing.event_buffer import AFTER_NS, BEFORE_NS, EventBuffer, EventC
 from lce_rig.timing.rig_time import rig_time_ns
 
 PATIENCE_NS = 1_000_000_000
-# Scans wait for others and come late in bags; what lies this far back no scan asks for any more.
-_KEPT_NS = BEFORE_NS + AFTER_NS + 3 * PATIENCE_NS
+#: How long events wait for a scan: in a bag, scans are late by up to two seconds beside their own waiting.
+IN_BAGS_NS, LIVE_NS = 3 * PATIENCE_NS, 3 * PATIENCE_NS // 2
 _Buffers: TypeAlias = dict[tuple[str, str], deque[tuple[int, Image | Scan]]]
 
 
@@ -35,7 +35,9 @@ class Frame:
     events: tuple[EventCut, ...] = ()
 
 
-def pair_by_time(samples: Iterable[Sample], rig: Rig, losses: Losses) -> Iterator[Frame]:
+def pair_by_time(
+    samples: Iterable[Sample], rig: Rig, losses: Losses, events_wait_ns: int = IN_BAGS_NS
+) -> Iterator[Frame]:
     """Give each scan of the first LiDAR heard the nearest picture of each camera channel, and its events.
 
     Samples come in order of receipt: a scan waits until every other sensor has passed its time, or a second
@@ -45,8 +47,9 @@ def pair_by_time(samples: Iterable[Sample], rig: Rig, losses: Losses) -> Iterato
         samples: pictures, scans and packets of events; each sensor's stamps rise.
         rig: its timestamps say what to add to stamps, and how far pairs may lie apart.
         losses: receives the scans without an image within the tolerance, and how near the nearest was.
+        events_wait_ns: how long events are kept for scans that wait or come late.
     """
-    pairing = _Pairing(rig, losses)
+    pairing = _Pairing(rig, losses, BEFORE_NS + AFTER_NS + events_wait_ns)
     for sample in samples:
         pairing.take(sample)
         yield from pairing.due_frames()
@@ -56,9 +59,10 @@ def pair_by_time(samples: Iterable[Sample], rig: Rig, losses: Losses) -> Iterato
 class _Pairing:
     """Scans that wait, and what has come of the other sensors."""
 
-    def __init__(self, rig: Rig, losses: Losses) -> None:
+    def __init__(self, rig: Rig, losses: Losses, kept_ns: int) -> None:
         self._rig = rig
         self._losses = losses
+        self._kept_ns = kept_ns
         self._nearest_ns: int | None = None
         self._waiting: deque[tuple[int, int, Scan]] = deque()
         self._buffers: _Buffers = {}
@@ -80,7 +84,7 @@ class _Pairing:
             time_ns += half_ns
             self._take_frame_part(sample, time_ns, half_ns)
         self._position_ns = max(self._position_ns, time_ns)
-        self._events.forget_before(self._position_ns - _KEPT_NS)
+        self._events.forget_before(self._position_ns - self._kept_ns)
 
     def due_frames(self) -> Iterator[Frame]:
         """Yield the frames that nothing more can come for."""

@@ -197,7 +197,7 @@ def _placements(estimate: CalibrationEstimate, needed: int) -> list[Finding]:
 
 
 def _nominal(estimate: CalibrationEstimate, nominal: NominalExtrinsic | None) -> list[Finding]:
-    if nominal is None:
+    if nominal is None or nominal.source == "typical":
         return []
     expected = nominal.to_matrix()
     T = estimate.T_cam_lidar

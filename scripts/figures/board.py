@@ -77,8 +77,8 @@ def _draw_dimensions(axes: Any, rig: Rig) -> None:
         va="center",
         zorder=5,
     )
-    axes.set_xlim(-w - 530, w + 110)
-    axes.set_ylim(-h - 110, h + 100)
+    axes.set_xlim(-w - 530, w + 130)
+    axes.set_ylim(-h - 120, h + 110)
 
 
 def _dimension(
@@ -92,7 +92,7 @@ def _dimension(
 ) -> None:
     axes.annotate("", xy=end, xytext=start, arrowprops={"arrowstyle": "<->", "color": BLUE, "lw": 1.2})
     x, y = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
-    offset = (22, 0) if turned else (0, -22 if below else 18)
+    offset = (34, 0) if turned else (0, -34 if below else 32)
     axes.text(
         x + offset[0],
         y + offset[1],

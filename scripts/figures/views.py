@@ -55,7 +55,7 @@ GOOD = (
 BAD = (
     Placement("cut by the image's border", (0.93, 0.45)),
     Placement("too far", (0.5, 0.5), 6.3),
-    Placement("too oblique", (0.5, 0.45), left_deg=76.0),
+    Placement("too oblique", (0.5, 0.45), left_deg=71.5),
 )
 
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
+from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment, TakenByHand
 from lce_rig.collect.live.capture_triggers import LiveGate, SlowBoards, StillBoards
 from lce_rig.collect.live.capture_writer import CaptureWriter, Task, record_streams
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
@@ -42,6 +42,8 @@ from lce_rig.words import describe, sentence
 THOROUGH_S = 3.0
 #: How often a scan is searched for other things of the board's size while all that are known are followed.
 RESCAN_S = 1.0
+# Such searches are as many times rarer than the longest of the last frames took, forgotten by this a frame.
+_RARE, _FORGET = 6.0, 0.95
 
 
 class BoardSearch(Worker):
@@ -74,15 +76,23 @@ class _Search:
     """What runs there: what was searched is not sent back."""
 
     def __init__(self, rig: Rig, search_interval_s: float) -> None:
-        self._watcher = BoardTracker(
+        self._tracker = BoardTracker(
             rig, search_interval_s, thorough_interval_s=THOROUGH_S, rescan_interval_s=RESCAN_S
         )
+        self._longest_s = 0.0
 
     def sight(self, frame: Frame) -> BoardDetection:
-        return _without_samples(self._watcher.sight(frame))
+        began_s = time.monotonic()
+        found = self._tracker.sight(frame)
+        # On a busy computer a thorough search may take longer than the time to the next one: rare searches
+        # must stay rare, or every frame waits for one.
+        self._longest_s = max(time.monotonic() - began_s, _FORGET * self._longest_s)
+        self._tracker.thorough_interval_s = max(THOROUGH_S, _RARE * self._longest_s)
+        self._tracker.rescan_interval_s = max(RESCAN_S, _RARE * self._longest_s)
+        return _without_samples(found)
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
-        found = self._watcher.confirm(moment)
+        found = self._tracker.confirm(moment)
         if isinstance(found, CaptureMoment):
             return replace(found, sighting=_without_samples(found.sighting))
         return found
@@ -331,7 +341,7 @@ class _Loop:
         if self._seeing_guide(sighting) is None:
             self._monitor.cue("refused", "not captured: not every sensor sees the board")
             return
-        confirmed = self._search.confirm(CaptureMoment(sighting, {"by_hand": 1.0}))
+        confirmed = self._search.confirm(CaptureMoment(sighting, TakenByHand()))
         if isinstance(confirmed, CaptureMoment):
             self._capture(confirmed)
         else:

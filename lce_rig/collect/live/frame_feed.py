@@ -16,7 +16,7 @@ from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.rig_clock import SLOW_TRIGGERS_HZ, RigClock
 from lce_rig.timing.rig_time import event_channel
-from lce_rig.timing.scan_pairing import Frame, pair_by_time
+from lce_rig.timing.scan_pairing import LIVE_NS, Frame, pair_by_time
 
 _WAIT_S = 0.1
 _REFRESH_S = 0.5
@@ -109,7 +109,7 @@ class FrameFeed:
 
     def _run(self) -> None:
         try:
-            for frame in pair_by_time(self._with_pictures(), self._rig, self.losses):
+            for frame in pair_by_time(self._with_pictures(), self._rig, self.losses, LIVE_NS):
                 self._frames.put(frame)
         except BaseException as error:  # Whoever takes frames is told, of bugs too.
             self._failure = error
@@ -126,7 +126,7 @@ class FrameFeed:
         }
         if not cameras:
             return self._samples()
-        return with_event_pictures(self._samples(), self._rig, cameras, self.losses)
+        return with_event_pictures(self._samples(), self._rig, cameras, self.losses, is_live=True)
 
     def _refresh_clock(self) -> None:
         """Let the clock take what sensors and board know, and the board's lines run as it needs them."""

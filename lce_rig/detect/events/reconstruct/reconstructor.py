@@ -328,9 +328,17 @@ class Reconstructor:
             self._fed_ns = int(events.t_ns[-1])
             self._advance(self._fed_ns)
 
-    def picture_at(self, stamp_ns: int) -> Image | Refusal:
-        """Give the picture at a stamp up to which the stream was fed, or the reason for none."""
-        return too_late(stamp_ns, None) if self._first_ns is None else self._picture_at(stamp_ns)
+    def picture_at(self, stamp_ns: int, *, is_step: bool = False) -> Image | Refusal:
+        """Give the picture at a stamp up to which the stream was fed, or the reason for none.
+
+        Args:
+            stamp_ns: on the events' clock.
+            is_step: end the window there where it is half full, so that the network does not run again over
+                its events; later pictures then depend on the stamps asked for.
+        """
+        if self._first_ns is None:
+            return too_late(stamp_ns, None)
+        return self._picture_at(stamp_ns, is_step=is_step)
 
     def _begin(self, events: Events) -> None:
         self._first_ns = int(events.t_ns[0]) if len(events) else 0
@@ -392,7 +400,7 @@ class Reconstructor:
     def _cleaned(self, events: Events) -> Events:
         return self._noise.clean(events) if self.options.is_filtered else events
 
-    def _picture_at(self, stamp_ns: int) -> Image | Refusal:
+    def _picture_at(self, stamp_ns: int, *, is_step: bool = False) -> Image | Refusal:
         assert self._first_ns is not None
         if stamp_ns <= self._first_ns:
             return too_early(stamp_ns, self._first_ns)
@@ -406,7 +414,10 @@ class Reconstructor:
         if is_thin and self._previous is not None:
             events = join_events([self._previous.events, events])
             window = self._previous
-        picture, _ = self._imager.picture(events, window.start_ns, stamp_ns, window.states)
+        if is_step and not is_thin:
+            picture = self._commit(stamp_ns)
+        else:
+            picture, _ = self._imager.picture(events, window.start_ns, stamp_ns, window.states)
         return Image(events.sensor, self.options.channel, stamp_ns, self._scale.to_grey(picture))
 
 
