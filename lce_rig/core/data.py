@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +75,31 @@ class Scan:
 
 
 @dataclass(frozen=True, eq=False)
+class EventColumns:
+    """Events as read: not checked against a resolution, not sorted.
+
+    Attributes:
+        t_ns: (N,) int64 device time.
+        x, y: (N,) uint16 px.
+        polarity: (N,) bool, True where it became brighter.
+        host_ns: arrival of the first event at the host; None where unknown.
+    """
+
+    t_ns: NDArray[np.int64]
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    polarity: NDArray[np.bool_]
+    host_ns: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def select(self, keep: NDArray[Any] | slice) -> "EventColumns":
+        """Keep the events of a mask, an index or a slice."""
+        return EventColumns(self.t_ns[keep], self.x[keep], self.y[keep], self.polarity[keep], self.host_ns)
+
+
+@dataclass(frozen=True, eq=False)
 class Events:
     """A range of an event camera's stream.
 
@@ -119,7 +144,10 @@ class Events:
         )
 
 
-def join_events(parts: Sequence[Events]) -> Events:
+_Stretch = TypeVar("_Stretch", Events, EventColumns)
+
+
+def join_events(parts: Sequence[_Stretch]) -> _Stretch:
     """Put stretches of one camera's stream together, at least one, in order of time."""
     filled = [part for part in parts if len(part)] or parts[:1]
     if len(filled) == 1:
