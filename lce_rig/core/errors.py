@@ -12,7 +12,7 @@ class LceRigError(Exception):
 
     Args:
         what: what is wrong and where (file and key, sensor, capture), one line.
-        hint: what to do about it; empty where `what` says it already.
+        hint: what to do about it; empty if `what` says it already.
     """
 
     exit_code = 1

@@ -85,8 +85,8 @@ class EventArchive:
     Attributes:
         n_events: how many there are.
         largest_column_bytes: of the columns with the events, in memory.
-        resolution_px: (width, height); None where the archive does not say.
-        host_ns: host time of the first event; None where the archive does not say.
+        resolution_px: (width, height); None if the archive does not say.
+        host_ns: host time of the first event; None if the archive does not say.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -114,7 +114,7 @@ class EventArchive:
     def stretches(
         self, n_events: int
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]]:
-        """Yield times (ns), x, y and polarity of so many events at a time; once where there is none.
+        """Yield times (ns), x, y and polarity of so many events at a time; once if there is none.
 
         Raises:
             ValueError: what is wrong with the file, in words.

@@ -29,7 +29,7 @@ _Check = Callable[[Any, _Sizes], bool]
 
 
 def check_fields(kind: type, fields: Mapping[str, Any]) -> None:
-    """Make sure that fields can be those of a detection.
+    """Check that fields can be those of a detection.
 
     Args:
         kind: ImageBoard, LidarBoard, Refusal or Image.
@@ -183,7 +183,7 @@ def to_arrays(detection: ImageDetection | LidarDetection | Image) -> Arrays:
     """Flatten a detection into named arrays; figures and names travel as one JSON text.
 
     Args:
-        detection: one image board, the LiDAR candidates of a scan, a refusal, or the picture of one.
+        detection: one image board, the LiDAR candidates of a scan, a refusal, or the image of one.
     """
     items = detection if isinstance(detection, list) else [detection]
     arrays: Arrays = {}
@@ -253,7 +253,7 @@ class Pair:
 
     @property
     def folder_name(self) -> str:
-        """What a folder of this pair's files is called where there are several."""
+        """What a folder of this pair's files is called if there are several."""
         return f"{self.camera}.{self.channel}.{self.lidar}"
 
     def __str__(self) -> str:
@@ -287,5 +287,5 @@ class Detections:
         return sorted(self.images[pair.camera, pair.channel].keys() & self.lidars[pair.lidar].keys())
 
     def of(self, pair: Pair, capture: str) -> tuple[ImageDetection, LidarDetection]:
-        """Give what both sensors of a pair saw in one capture."""
+        """Return what both sensors of a pair saw in one capture."""
         return self.images[pair.camera, pair.channel][capture], self.lidars[pair.lidar][capture]

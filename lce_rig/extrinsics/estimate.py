@@ -1,4 +1,4 @@
-"""What comes out of a calibration."""
+"""The result of a calibration."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -19,30 +19,29 @@ from lce_rig.residuals.quadratics import Quadratics
 
 @dataclass(frozen=True, eq=False)
 class CalibrationEstimate:
-    """An extrinsic with its uncertainty, proof and residuals.
+    """Extrinsics with their uncertainty, certificate and residuals.
 
     Attributes:
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
-        cov: (6, 6), tangent (translation m, rotation rad), axes of the camera: what the scatter between
-            captures shows, and what range errors of the LiDAR add that are the same in all captures. Errors
-            of the intrinsics and of the board's size are not in it.
-        certificate: of the final cost over all captures used; its gap is infinite where there is none.
+        cov: (6, 6), tangent (translation m, rotation rad), axes of the camera: from the scatter between
+            captures, and from range errors of the LiDAR that are common to all captures. It excludes errors
+            of the intrinsics and of the board's size.
+        certificate: of the final cost over all captures used; its gap is infinite if there is none.
         metrics: errors over all captures used, of the boards as measured.
-        used: names of the captures behind the estimate, sorted; one stands for all that hold the same scan.
-        refused: why each other capture is not.
+        used: names of the captures used, sorted; one stands for all that hold the same scan.
+        refused: why each other capture is not used.
         observations: capture -> the boards that were paired, as measured, for each capture used.
-        fitted: the same as the method's cost takes them: Algorithm 1 moves ring ends by what the background
-            does to them.
+        fitted: the same as used in the method's cost: Algorithm 1 moves ring ends by the background's shift.
         residuals: one per capture used, in the order of `used`.
         held_out_m: mean over captures of `CaptureResidual.held_out_m`.
-        weakest: the least certain motion.
+        weakest: the least determined motion.
         diagnostics: further figures.
         method: that found it, as `CalibrateOptions.method`.
         expansion: the method's own cost about its result, capture by capture, in the extrinsic (and those of
-            cameras estimated with it) alone; None of methods that give none.
+            cameras estimated with it) alone; None if the method has none.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
-        channels: what each channel of the camera says alone; empty where they were not told apart.
+        channels: the result of each channel of the camera alone; empty if they were not separated.
         channel_difference: (6,) tangent between the extrinsics of two channels; None with one channel.
         channel_difference_cov: (6, 6) of it.
     """

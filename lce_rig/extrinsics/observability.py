@@ -1,4 +1,4 @@
-"""Which motions of the extrinsic the captures determine, and which they leave open."""
+"""Which motions of the extrinsics the captures determine, and which they do not."""
 
 from collections.abc import Sequence
 
@@ -13,16 +13,16 @@ from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS
 from lce_rig.solvers.registration import vec_rotation, with_one
 from lce_rig.words import not_enough
 
-# One capture's board plane, camera against LiDAR, is good to about this much.
+# Standard deviation of one capture's board plane between camera and LiDAR.
 PLANE_SIGMA_M = 0.005
-# A motion that moves the board by more than this without a trace in the planes counts as undetermined.
+# A motion that moves the board by more than this without changing the planes counts as undetermined.
 MAX_WEAK_SIGMA_M = 0.1
 
 
 def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_cam_lidar: Array) -> None:
     """Check that the boards' planes alone determine all six directions.
 
-    Edges could stand in for planes, but a set that needs them to is fragile: their errors are systematic.
+    Edges could replace planes, but a set that requires this is fragile, as edge errors are systematic.
 
     Args:
         features: of the captures in `problem`.
@@ -30,7 +30,7 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
         T_cam_lidar: (4, 4) estimate.
 
     Raises:
-        NotEnoughDataError: a direction is left open; it is named.
+        NotEnoughDataError: a direction is undetermined; it is named.
     """
     x = with_one(
         np.concatenate([vec_rotation(T_cam_lidar[:3, :3]), T_cam_lidar[:3, 3], np.zeros(problem.n_shift)])
@@ -53,7 +53,7 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
 
 
 def lever_arm(features: Sequence[CaptureFeatures]) -> float:
-    """Compute the rms distance of the boards from the camera, m: what a rotation of 1 rad moves them by."""
+    """Compute the rms distance of the boards from the camera, m: displacement by a rotation of 1 rad."""
     return float(np.sqrt(np.mean([f.centre @ f.centre for f in features])))
 
 
@@ -71,7 +71,7 @@ def main_motion(direction: Array) -> Motion:
 
 
 def find_weakest(cov: Array, features: Sequence[CaptureFeatures]) -> WeakestMotion:
-    """Find which motion is least certain, and how uncertain, from a covariance (6, 6)."""
+    """Find the least determined motion and its standard deviation, from a covariance (6, 6)."""
     lever_m = lever_arm(features)
     scale = np.r_[np.ones(3), np.full(3, lever_m)]
     _, vectors = np.linalg.eigh(cov * np.outer(scale, scale))

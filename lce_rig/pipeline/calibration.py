@@ -1,4 +1,4 @@
-"""Estimate and judge the extrinsic of every camera with every LiDAR of a session.
+"""Estimate and judge the extrinsics of every camera with every LiDAR of a session.
 
 detections -> estimate of each camera with each LiDAR -> cameras of one LiDAR, together -> checks, verdict
 """
@@ -34,7 +34,7 @@ from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.result_files import Result
 from lce_rig.rig import Rig
 from lce_rig.session import Session
-from lce_rig.validation.camera_pairs import CameraPair, doubt_cameras, relate
+from lce_rig.validation.camera_pairs import CameraPair, camera_findings, relate
 from lce_rig.validation.reach import point_uncertainties
 from lce_rig.validation.validate import Validation, validate
 from lce_rig.validation.verdict import judge
@@ -43,12 +43,12 @@ from lce_rig.words import not_enough, sentence
 
 @dataclass(frozen=True, eq=False)
 class _Sensors:
-    """One camera with one LiDAR, and what both saw.
+    """One camera with one LiDAR, and their detections.
 
     Attributes:
         pairs: channels of the camera with the LiDAR.
-        settings: the user's options, with what the profile says of the LiDAR.
-        candidates: by channel, of captures in which both sensors saw something.
+        settings: the user's options, with the LiDAR's properties from the profile.
+        candidates: by channel, of captures with detections of both sensors.
         refused: why the other captures are unusable.
     """
 
@@ -68,11 +68,11 @@ class _Sensors:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """What the captures of one camera and one LiDAR say of the extrinsic.
+    """The result of the captures of one camera and one LiDAR.
 
     Attributes:
         sensors: the two.
-        estimate: the extrinsic.
+        estimate: of the extrinsics.
         validation: of the estimate on the camera's own captures and images.
         together: the estimate of several cameras that it is part of; None where it stands alone.
     """
@@ -84,18 +84,18 @@ class _Solved:
 
     @property
     def is_still(self) -> bool:
-        """Whether boards stood still, so that images count as they are, whenever they were taken."""
+        """Whether boards stood still, so that images need no motion compensation."""
         return all(channel.time_offset_s is None for channel in self.estimate.channels)
 
 
 @dataclass(frozen=True, eq=False)
 class _Link:
-    """Two cameras that saw the same boards, by their place among all that have an estimate."""
+    """Two cameras that saw the same boards, by their indices among those with an estimate."""
 
     first: int
     second: int
     pair: CameraPair
-    doubts: tuple[Finding, ...]
+    findings: tuple[Finding, ...]
 
 
 def calibrate(
@@ -108,19 +108,20 @@ def calibrate(
     reference: Reference | None = None,
     progress: Progress = silent,
 ) -> Result:
-    """Estimate and judge the extrinsic of every camera with every LiDAR of a session; nothing is written.
+    """Estimate and judge the extrinsics of every camera with every LiDAR of a session; nothing is written.
 
     Args:
         session: open for reading is enough.
         detections: of the session; None detects the board first, as `detect` does by default.
-        options: of the estimate; None takes the usual ones.
-        cameras: to calibrate, as if the session held no others; None takes all.
-        channels: of the cameras, to use; None takes all that the session holds.
+        options: of the estimate; None for the defaults.
+        cameras: the cameras to calibrate, as if the session held no others; None for all.
+        channels: the cameras' channels to use; None for all that the session holds.
         reference: extrinsics to report errors against; they never enter the estimate or the verdict.
         progress: called with (done, total) for each camera and LiDAR in turn.
 
     Raises:
-        NotEnoughDataError: every pair has too few captures or leaves a direction open; the causes are named.
+        NotEnoughDataError: every pair has too few captures or an undetermined direction; the causes are
+            named.
         UsageError: no capture holds one of the channels.
     """
     pairs, shortages = calibrate_detections(
@@ -145,10 +146,10 @@ def calibrate_detections(
     reference: Reference | None = None,
     progress: Progress = silent,
 ) -> tuple[list[Calibration], list[Finding]]:
-    """Estimate and judge the extrinsic of every camera with every LiDAR from what they saw of the board.
+    """Estimate and judge the extrinsics of every camera with every LiDAR from their detections.
 
-    Channels of one camera share pixels and lens: together they give one extrinsic. Cameras that saw the same
-    boards are held against each other, and with method "ml" estimated together.
+    Channels of one camera share pixels and lens: together they give one set of extrinsics. Cameras that saw
+    the same boards are compared with each other, and with method "ml" estimated together.
 
     Args:
         rig: thresholds, targets and nominal extrinsics.
@@ -156,10 +157,11 @@ def calibrate_detections(
         options, cameras, channels, reference, progress: as of `calibrate`.
 
     Returns:
-        The sensors that could be calibrated; and for each other pair why not.
+        The calibrated sensors, and for each other pair the cause.
 
     Raises:
-        NotEnoughDataError: every pair has too few captures or leaves a direction open; the causes are named.
+        NotEnoughDataError: every pair has too few captures or an undetermined direction; the causes are
+            named.
         UsageError: no capture holds one of the channels.
     """
     alone: list[_Solved] = []
@@ -178,17 +180,17 @@ def calibrate_detections(
 
 
 def _nothing_solved(shortages: Sequence[Finding], cameras: Sequence[str] | None) -> NotEnoughDataError:
-    """Say of every pair why it could not be calibrated."""
+    """State for every pair why it could not be calibrated."""
     if not shortages:
         of_cameras = f" of {' or '.join(cameras)}" if cameras else ""
         return NotEnoughDataError(
-            f"the session holds no capture with a picture{of_cameras} and a scan", "Collect captures first."
+            f"the session has no capture with an image{of_cameras} and a scan", "Collect captures first."
         )
     return join_shortages([not_enough(shortage) for shortage in shortages])
 
 
 def _shortage(pairs: Sequence[Pair], error: NotEnoughDataError) -> Finding:
-    """Name the sensors that lack captures, where the error does not."""
+    """Name the sensors that lack captures, if the error does not."""
     figures = {"text": error.what, "advice": error.hint}
     found = error.finding or Finding("shortage.text", "warning", figures=figures)
     return found if found.subject else replace(found, subject=f"{pairs[0].camera} and {pairs[0].lidar}")
@@ -197,12 +199,12 @@ def _shortage(pairs: Sequence[Pair], error: NotEnoughDataError) -> Finding:
 def _pairs_by_sensors(
     detections: Detections, cameras: Sequence[str] | None, channels: Sequence[str] | None
 ) -> list[list[Pair]]:
-    """Bring together the pairs of one camera and LiDAR, whose channels are calibrated as one."""
+    """Group the pairs by camera and LiDAR, whose channels are calibrated jointly."""
     held = sorted({pair.channel for pair in detections.pairs})
     unknown = sorted(set(channels or ()) - set(held))
     if unknown:
         raise UsageError(
-            f"no capture of the session holds channel {unknown[0]!r}", f"there is {', '.join(held)}"
+            f"no capture of the session has channel {unknown[0]!r}", f"Choose one of: {', '.join(held)}"
         )
     wanted = [
         pair
@@ -218,10 +220,10 @@ def _pairs_by_sensors(
 def _solve(
     rig: Rig, detections: Detections, pairs: Sequence[Pair], options: CalibrateOptions, progress: Progress
 ) -> _Solved:
-    """Estimate one extrinsic by the captures of its own sensors alone.
+    """Estimate the extrinsics of one camera and LiDAR from their own captures alone.
 
     Raises:
-        NotEnoughDataError: there are too few, or they leave a direction open.
+        NotEnoughDataError: there are too few, or a direction is undetermined.
     """
     sensors = _sensors(rig, detections, pairs, options)
     clocks = clocks_of(rig, sensors.camera, sensors.lidar)
@@ -232,10 +234,10 @@ def _solve(
 
 
 def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: CalibrateOptions) -> _Sensors:
-    """Gather the candidates of each channel that has captures enough, and why other captures are unusable.
+    """Collect the candidates of each channel with enough captures, and why other captures are unusable.
 
     Raises:
-        NotEnoughDataError: no channel has.
+        NotEnoughDataError: no channel has enough.
     """
     candidates: dict[str, list[CaptureCandidates]] = {}
     refused: dict[str, Refusal] = {}
@@ -269,7 +271,7 @@ def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandida
 
 
 def _few_detected(pair: Pair, n_detected: int, refused: Mapping[str, Refusal], n_needed: int) -> Finding:
-    """Say in how many captures both sensors found the board, and the commonest causes of refusal."""
+    """State in how many captures both sensors found the board, and the most frequent causes of refusal."""
     counts = Counter((why.code, f"{why.stage}: {sentence(why)}") for why in refused.values())
     figures: dict[str, Figure] = {
         "n_detected": n_detected,
@@ -281,22 +283,22 @@ def _few_detected(pair: Pair, n_detected: int, refused: Mapping[str, Refusal], n
 
 
 def _links(rig: Rig, solved: Sequence[_Solved]) -> Iterator[_Link]:
-    """Compare cameras of one LiDAR that saw the same boards held still."""
+    """Compare cameras of one LiDAR that saw the same still boards."""
     for (i, one), (j, other) in combinations(enumerate(solved), 2):
         if one.sensors.lidar == other.sensors.lidar and one.is_still and other.is_still:
-            # Captures that contradict each other widen what a method claims: that must not excuse them.
+            # Contradicting captures widen a method's covariance; that must not hide the contradiction.
             pair = relate(one.estimate, other.estimate)
             if pair is not None:
                 names = one.sensors.camera, other.sensors.camera
-                yield _Link(i, j, pair, tuple(doubt_cameras(pair, names, rig.calibration, rig.verdict)))
+                yield _Link(i, j, pair, tuple(camera_findings(pair, names, rig.calibration, rig.verdict)))
 
 
 def _solve_together(
     rig: Rig, detections: Detections, alone: Sequence[_Solved], links: Sequence[_Link]
 ) -> list[_Solved]:
-    """Estimate cameras that agree together, with method "ml"; leave the others as they are.
+    """Estimate cameras that agree jointly with method "ml"; leave the others unchanged.
 
-    One that contradicts another is not among them, or it would spoil the other's extrinsic.
+    A camera that contradicts another is excluded, as it would corrupt the other's extrinsics.
     """
     solved = list(alone)
     for group in _groups(len(alone), links):
@@ -310,19 +312,21 @@ def _solve_together(
 
 
 def _groups(n: int, links: Sequence[_Link]) -> list[list[int]]:
-    """List groups of two or more that sound links connect, without those in which a link is doubted."""
+    """List groups of two or more connected cameras, without those that have a contradicted link."""
     group = list(range(n))
     for link in links:
-        if not link.doubts:
+        if not link.findings:
             mine, other = group[link.first], group[link.second]
             group = [mine if number == other else number for number in group]
-    doubted = {group[link.first] for link in links if link.doubts and group[link.first] == group[link.second]}
-    found = [[k for k in range(n) if group[k] == number] for number in sorted(set(group) - doubted)]
+    contradicted = {
+        group[link.first] for link in links if link.findings and group[link.first] == group[link.second]
+    }
+    found = [[k for k in range(n) if group[k] == number] for number in sorted(set(group) - contradicted)]
     return [members for members in found if len(members) > 1]
 
 
 def _part_of(together: TogetherEstimate, rig: Rig, detections: Detections, alone: _Solved) -> _Solved:
-    """Put a camera's part of an estimate of several in place of its own."""
+    """Replace a camera's own estimate by its part of a joint one."""
     estimate = together.estimates[alone.sensors.camera]
     sigma_deg, sigma_m = sigma_sizes(alone.validation.cov)
     estimate = replace(
@@ -338,13 +342,13 @@ def _part_of(together: TogetherEstimate, rig: Rig, detections: Detections, alone
 
 
 def _other_camera(solved: Sequence[_Solved], link: _Link, k: int) -> OtherCamera:
-    """Say where the other camera of a link sits to that at place k."""
+    """State the pose of the other camera of a link relative to the camera of index k."""
     pair, is_second = link.pair, k == link.second
     own, other = solved[k], solved[link.first if is_second else link.second]
     T, J = relative_pose(own.estimate.T_cam_lidar, other.estimate.T_cam_lidar)
     cov = None
     if own.together is not None and own.together is other.together:
-        # Widened as both extrinsics were.
+        # Widened like both extrinsics.
         J = J * np.repeat([own.validation.widened_by, other.validation.widened_by], 6)
         both = own.together.covariance_of(own.sensors.camera, other.sensors.camera)
         cov = np.asarray(J @ both @ J.T)
@@ -381,13 +385,13 @@ def _examine(
 def _judged(
     rig: Rig, detections: Detections, solved: Sequence[_Solved], links: Sequence[_Link], k: int
 ) -> Calibration:
-    """Weigh everything known about the extrinsic at place k, and put it together."""
+    """Judge the extrinsics of index k and assemble their result."""
     sensors, estimate, validation = solved[k].sensors, solved[k].estimate, solved[k].validation
     camera, lidar = sensors.camera, sensors.lidar
     mine = [link for link in links if k in (link.first, link.second)]
-    doubts = [doubt for link in mine for doubt in link.doubts]
+    contradictions = [finding for link in mine for finding in link.findings]
     n_captures = len({name for pair in sensors.pairs for name in detections.captures(pair)})
-    verdict, findings = judge(estimate, validation, rig, camera, lidar, n_captures, doubts)
+    verdict, findings = judge(estimate, validation, rig, camera, lidar, n_captures, contradictions)
     lens = rig.cameras[camera].to_intrinsics()
     return Calibration(
         camera=camera,
@@ -428,7 +432,7 @@ def _diagnostics(estimate: CalibrationEstimate, validation: Validation) -> Diagn
 
 
 def _still_refused(estimate: CalibrationEstimate, refused: Mapping[str, Refusal]) -> dict[str, Refusal]:
-    """List refusals by capture, less what another channel of the same scan made up for."""
+    """List refusals by capture, except those for which another channel of the same scan is usable."""
     used = estimate.captures_of(estimate.used)
     every = dict(refused)
     for name, why in estimate.refused.items():
@@ -437,7 +441,7 @@ def _still_refused(estimate: CalibrationEstimate, refused: Mapping[str, Refusal]
 
 
 def _compared(calibration: Calibration, reference: Reference | None) -> Calibration:
-    """Report the error against a T_cam_lidar that somebody else vouches for, where there is one."""
+    """Report the error from a reference T_cam_lidar, if there is one."""
     truth = reference.of(calibration.camera, calibration.lidar) if reference else None
     if truth is None:
         return calibration
@@ -446,14 +450,14 @@ def _compared(calibration: Calibration, reference: Reference | None) -> Calibrat
 
 
 def refusals_of(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refusal]:
-    """Say why captures of a pair cannot be used: a sensor saw no board, or both sensors disagree."""
+    """State why captures of a pair are unusable: a sensor found no board, or both sensors disagree."""
     candidates, refused = _candidates(detections, pair)
     consensus = find_consensus(candidates, rig.board.to_board()) if len(candidates) >= 3 else None
     return dict(sorted({**refused, **(consensus.refused if consensus else {})}.items()))
 
 
 def clocks_of(rig: Rig, camera: str, lidar: str) -> Clocks:
-    """Read what the profile says of the time of a camera and a LiDAR."""
+    """Read the time settings of a camera and a LiDAR from the profile."""
     stamps = {name: channel.timestamps for name, channel in rig.cameras[camera].channels.items()}
     return Clocks(
         sweep_s=1 / rig.lidars[lidar].rate_hz,

@@ -1,4 +1,4 @@
-"""The whole profile of a rig: start reading the schema here."""
+"""The profile of a rig: start reading the schema here."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,8 +27,8 @@ class Rig(Settings):
         base_frame: a LiDAR's or camera's frame, root of the URDF; the first LiDAR's by default.
         lidars: settings by the LiDAR's name.
         cameras: settings by the camera's name.
-        nominal_extrinsics: what the CAD model says, a sanity check only.
-        sync: the board that makes the pulse per second and triggers cameras; None without.
+        nominal_extrinsics: the CAD model's values, a sanity check only.
+        sync: the board that makes the pulse per second and triggers cameras; None without one.
     """
 
     format_version: Literal[1]
@@ -97,25 +97,27 @@ class Rig(Settings):
         cameras = {name: camera.located(folder) for name, camera in self.cameras.items()}
         return self.model_copy(update={"cameras": cameras})
 
-    def doubts(self) -> tuple[Finding, ...]:
-        """List what is allowed but rarely meant; the subject is the key."""
+    def warnings(self) -> tuple[Finding, ...]:
+        """List valid but probably unintended settings; the subject is the key."""
         (cols, rows), width_m, height_m = self.board.inner_corners, self.board.width_m, self.board.height_m
         found = []
         if (cols - rows) * (width_m - height_m) < 0:
             figures = {"n_cols": cols, "n_rows": rows, "width_m": width_m, "height_m": height_m}
             found.append(Finding("profile.swapped_sides", "warning", "board", figures))
-        stamps = [(f"lidars.{name}", lidar.timestamps) for name, lidar in self.lidars.items()]
+        timestamps = [(f"lidars.{name}", lidar.timestamps) for name, lidar in self.lidars.items()]
         for camera, settings in self.cameras.items():
-            stamps += [(f"cameras.{camera}.channels.{n}", c.timestamps) for n, c in settings.channels.items()]
+            timestamps += [
+                (f"cameras.{camera}.channels.{n}", c.timestamps) for n, c in settings.channels.items()
+            ]
         found += [
             Finding("profile.drifting_clock", "warning", f"{key}.timestamps")
-            for key, settings in stamps
+            for key, settings in timestamps
             if settings.clock == "device" and settings.sync == "none"
         ]
         return (*found, *self._shared())
 
     def _shared(self) -> Iterator[Finding]:
-        """List what two sensors can hardly have in common, as a copied block gives it."""
+        """List settings that two sensors cannot share, usually left from a copied block."""
         owned = [(f"lidars.{n}.topic", "topic", lidar.topic) for n, lidar in self.lidars.items()]
         for name, camera in self.cameras.items():
             owned += [
@@ -130,7 +132,7 @@ class Rig(Settings):
                 yield Finding("profile.shared", "warning", key, {"value": value, "other": first[kind, value]})
 
     def nominal(self, camera: str, lidar: str) -> NominalExtrinsic | None:
-        """Find the CAD pose of a pair of sensors; None where the profile has none."""
+        """Find the CAD pose of a pair of sensors; None if the profile has none."""
         matches = (
             entry for entry in self.nominal_extrinsics if (entry.camera, entry.lidar) == (camera, lidar)
         )

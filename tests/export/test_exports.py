@@ -238,8 +238,8 @@ def test_a_forced_export_of_a_failed_result_says_so_in_every_file(
     assert len(paths) == len(EXPORTS)
     for path in paths:
         head = path.read_text(encoding="utf-8")[:500]
-        assert "davis/frames and lidar: fail, standard deviation" in head
-        assert "NOT FOR USE: the calibration of davis/frames and lidar failed" in head
+        assert "davis/frames and lidar" in head and "fail, standard deviation" in head
+        assert "NOT FOR USE" in head and "the calibration of davis/frames and lidar failed" in head
     assert read_urdf(tmp_path / "rles.urdf")
     assert read_camera_info(tmp_path / "camera_info_davis.yaml") == rles.cameras["davis"].to_intrinsics()
 
@@ -256,7 +256,7 @@ def test_a_pose_read_back_wrong_by_a_hair_is_noticed(rles: Rig, make: Make, move
 
     calibration = make()
     check_pose(Path("x.yaml"), "T", calibration.T_cam_lidar, calibration, rles)
-    with pytest.raises(LceRigError, match="does not say what was calibrated"):
+    with pytest.raises(LceRigError, match="reads back differently"):
         check_pose(Path("x.yaml"), "T", perturb(calibration.T_cam_lidar, np.array(moved)), calibration, rles)
 
 

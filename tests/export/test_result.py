@@ -157,7 +157,7 @@ def set_in(document: Any, path: str, value: Any) -> None:
         ("pairs.0.T_cam_lidar.0.0", "1", "pairs.0.T_cam_lidar.0.0"),
         ("pairs.0.cov.0.1", 1.0, "not symmetric"),
         ("pairs.0.cov.0.0", -1.0, "negative"),
-        ("pairs.0.sigma_rotation_deg", 3.0, "does not belong to cov"),
+        ("pairs.0.sigma_rotation_deg", 3.0, "contradicts cov"),
         ("pairs.0.n_detected", 5, "5 of 4 captures"),
         ("pairs.0.verdict", "great", "pairs.0.verdict"),
         ("pairs.0.captures_refused.000001", {"stage": "moon"}, "pairs.0.captures_refused.000001.stage"),

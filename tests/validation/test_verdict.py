@@ -1,4 +1,4 @@
-"""The verdict: a sound result passes, and each kind of doubt is named with its figure."""
+"""The verdict: a sound result passes, and each kind of finding is named with its figure."""
 
 import functools
 from dataclasses import replace

@@ -19,7 +19,7 @@ _SLOW_EVENTS_PX = 4.0
 def gate_event_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:
     """Hold a board seen through events against the profile's limits on events and motion.
 
-    A figure that could not be measured, and pictures that others reconstructed, are not judged; speeds count
+    A figure that could not be measured, and images that others reconstructed, are not judged; speeds count
     from where two standard deviations leave no doubt.
 
     Args:
@@ -53,9 +53,9 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
     """Say what about the events keeps the board from being found; what was seen where they are not to blame.
 
     Args:
-        events: about the picture.
-        stamp_ns: of the picture.
-        seen: why there is no picture, or no board in it.
+        events: about the image.
+        stamp_ns: of the image.
+        seen: why there is no image, or no board in it.
         limits: `quality` of the rig profile.
     """
     if len(events) and seen.stage == "read":
@@ -64,7 +64,7 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
 
 
 def events_problem(events: Events, stamp_ns: int, limits: QualitySettings) -> Refusal | None:
-    """Say what about the events before a stamp keeps a board from being found; None where nothing does."""
+    """Say what about the events before a timestamp keeps a board from being found; None if nothing does."""
     if not len(events):
         return Refusal("image.no_events")
     recent = events.between(stamp_ns - MEMORY_NS, stamp_ns)
@@ -85,7 +85,7 @@ def events_problem(events: Events, stamp_ns: int, limits: QualitySettings) -> Re
 
 
 def look_for_flicker(events: Events) -> Refusal | None:
-    """Name the lamps that make most of the events of about a second; None where none do."""
+    """Name the lamps that make most of the events of about a second; None if none do."""
     flicker = measure_flicker(events)
     if not flicker.is_storm:
         return None

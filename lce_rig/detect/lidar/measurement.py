@@ -35,7 +35,7 @@ class RingEnds:
         side: (E,) -1 or +1.
         gap: (E, 2) from one beam to the next along the ring at that end, outwards, in the plane view, m.
         beyond: (E,) index in the scan of the next return outwards.
-        behind_m: (E,) how far behind the plane it lies, inf where there is none.
+        behind_m: (E,) how far behind the plane it lies, inf if there is none.
         is_border: (E,) whether the surface itself ends there: no occluder before it, no plane behind it.
     """
 
@@ -231,7 +231,7 @@ def refine(
         max_beyond: most returns in the plane beyond the outline, per return inside, to look closer.
 
     Returns:
-        The beams about the plate and the outline among them, with its error; None where too few returns lie
+        The beams about the plate and the outline among them, with its error; None if too few returns lie
         on the plane inside the outline, or too many beyond it.
     """
     radius_m = float(np.hypot(*placement.half_m)) + SURROUND_M
@@ -279,7 +279,7 @@ def build_board(
         beam: light spot of the LiDAR.
 
     Returns:
-        The board, None where hardly a return lies inside the outline.
+        The board, None if hardly a return lies inside the outline.
     """
     distance_m = float(np.linalg.norm(view.origin))
     beyond_m = beam.half_width_m(distance_m)
