@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
+from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment, sight_ahead
 from lce_rig.collect.offline.stillness import StillnessOptions, find_still_moments
 from lce_rig.core.geometry import transform
 from lce_rig.core.results import Refusal
@@ -98,3 +98,29 @@ def test_a_moment_is_confirmed_by_the_search_that_check_makes() -> None:
     gone = replace(sighting, frame=replace(sighting.frame, images=(blank,)))
     refused = watcher.confirm(CaptureMoment(gone, {}))
     assert isinstance(refused, Refusal) and refused.stage == "image"
+
+
+def test_other_things_in_the_scan_are_not_the_board_once_nominal_extrinsics_have_fitted() -> None:
+    watcher = BoardTracker(rig(), 0.0)
+    whole = see(watcher, 0, 0.0)
+    (scan,) = whole.frame.scans
+    # As if the LiDAR had missed the board, and seen another plate of its size.
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=np.float32)
+    elsewhere = replace(whole, frame=replace(whole.frame, scans=(replace(scan, points=scan.points @ turn),)))
+    assert isinstance(watcher.confirm(CaptureMoment(elsewhere, {})), CaptureMoment)
+    assert isinstance(watcher.confirm(CaptureMoment(whole, {})), CaptureMoment)
+    refused = watcher.confirm(CaptureMoment(elsewhere, {}))
+    assert isinstance(refused, Refusal) and refused.code == "lidar.elsewhere"
+    assert float(refused.figures["distance_m"]) > 1
+
+
+def test_images_searched_ahead_give_the_same_detections() -> None:
+    order = (0, 0, 0, 1, 1, 2, 3, 3, 0, 0, 1, 2)
+    frames = [see(BoardTracker(rig(), 0.3), k, 0.1 * i).frame for i, k in enumerate(order)]
+    one, two = BoardTracker(rig(), 0.3), BoardTracker(rig(), 0.3)
+    for alone, ahead in zip(map(one.sight, frames), sight_ahead(two, frames), strict=True):
+        assert ahead.frame is alone.frame
+        assert ahead.images.keys() == alone.images.keys() and ahead.lidars.keys() == alone.lidars.keys()
+        for key, board in alone.images.items():
+            assert np.array_equal(board.corners_px, ahead.images[key].corners_px)
+    assert one.refusals.by_code() == two.refusals.by_code()

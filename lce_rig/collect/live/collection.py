@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
-from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
+from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment, without_samples
 from lce_rig.collect.live.capture_triggers import LiveGate, SlowBoards, StillBoards
 from lce_rig.collect.live.capture_writer import CaptureWriter, Task
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
@@ -22,8 +22,8 @@ from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_u
 from lce_rig.collect.live.options import Ending, Key, LiveOptions, LiveReport
 from lce_rig.collect.live.recorder import SampleRecorder
 from lce_rig.collect.live.state import LiveState
-from lce_rig.collect.live.worker import Worker
 from lce_rig.collect.placement_dedupe import Placements, capture_poses
+from lce_rig.collect.worker import Worker
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.results import Refusal
 from lce_rig.devices.opening import edge_cameras
@@ -78,17 +78,13 @@ class _Search:
         )
 
     def sight(self, frame: Frame) -> BoardDetection:
-        return _without_samples(self._watcher.sight(frame))
+        return without_samples(self._watcher.sight(frame))
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
         found = self._watcher.confirm(moment)
         if isinstance(found, CaptureMoment):
-            return replace(found, sighting=_without_samples(found.sighting))
+            return replace(found, sighting=without_samples(found.sighting))
         return found
-
-
-def _without_samples(sighting: BoardDetection) -> BoardDetection:
-    return replace(sighting, frame=replace(sighting.frame, images=(), scans=()))
 
 
 _WAIT_S = 0.1

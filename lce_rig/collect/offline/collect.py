@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from lce_rig.collect.board_tracker import BoardTracker, CaptureMoment, ImageKey
+from lce_rig.collect.board_tracker import BoardTracker, CaptureMoment, ImageKey, sight_ahead
 from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.collect.offline.slow_motion import find_moving_moments
@@ -25,6 +25,8 @@ from lce_rig.words import describe
 
 # How often an image without a board is searched thoroughly, which takes most of a second.
 _THOROUGH_S = 1.0
+# A process of its own for images takes a second to start.
+_LONG_SAMPLES = 200
 
 
 @dataclass
@@ -39,6 +41,7 @@ class MomentSearch:
         stillness: when a board stands still; None takes the profile's `quality.max_motion_m`.
         motion: how a moving board is judged.
         min_move_m, min_turn_deg: how far placements of a moving board must be apart.
+        n_samples: images and scans to come, about.
     """
 
     rig: Rig
@@ -47,6 +50,7 @@ class MomentSearch:
     motion: MotionOptions
     min_move_m: float
     min_turn_deg: float
+    n_samples: int = 0
     _pairing: PairingCounts = field(default_factory=PairingCounts)
     _tally: RefusalCounts = field(default_factory=RefusalCounts)
 
@@ -79,7 +83,8 @@ class MomentSearch:
         interval_s = self.motion.search_interval_s if self.has_events else stillness.search_interval_s
         watcher = BoardTracker(self.rig, interval_s, self._tally, _THOROUGH_S)
         frames = pair_by_time(samples, self.rig, self._pairing)
-        sightings = (watcher.sight(frame) for frame in frames)
+        is_long = self.n_samples >= _LONG_SAMPLES
+        sightings = sight_ahead(watcher, frames) if is_long else map(watcher.sight, frames)
         if self.has_events:
             taken = Placements(self.min_move_m, self.min_turn_deg)
             moments = find_moving_moments(sightings, self.rig, self.motion, taken, self._tally)
@@ -258,6 +263,7 @@ class _Collector:
             options.motion,
             options.min_move_m,
             options.min_turn_deg,
+            recording.n_samples,
         )
         self.report.has_events |= search.has_events
         torn: list[SourceError] = []
