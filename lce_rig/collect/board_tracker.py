@@ -1,14 +1,10 @@
 """The board followed from frame to frame, in every picture and scan."""
 
-from collections import deque
-from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from lce_rig.collect.refusal_counts import RefusalCounts
-from lce_rig.collect.worker import Worker
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, invert
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
@@ -21,8 +17,6 @@ from lce_rig.timing.scan_pairing import Frame
 
 ImageKey = tuple[str, str]
 
-# Frames that wait for their images to be searched; each holds an image of each camera.
-_N_AHEAD = 8
 # A candidate is the camera's board where it lies as far from it as nominal extrinsics may be off, and a half.
 _NOMINAL_MARGIN = 1.5
 
@@ -38,6 +32,7 @@ class BoardDetection:
         unseen: why it was not found, by (camera, channel), where it was looked for.
         unscanned: why there is no such candidate, by LiDAR, where it was looked for.
         unfit: why the profile's limits refuse a board of `images`, by (camera, channel).
+        is_moving: whether images were not searched because nothing that may be the board is at rest there.
     """
 
     frame: Frame
@@ -46,6 +41,7 @@ class BoardDetection:
     unseen: dict[ImageKey, Refusal] = field(default_factory=dict)
     unscanned: dict[str, Refusal] = field(default_factory=dict)
     unfit: dict[ImageKey, Refusal] = field(default_factory=dict)
+    is_moving: bool = False
 
     @property
     def is_usable(self) -> bool:
@@ -130,7 +126,8 @@ class BoardTracker:
                 lidars[scan.sensor] = candidates
         if not sighting.images:
             self._n_candidates.clear()  # A board that comes back is searched for at once.
-            self.refusals.add(Refusal("image.none"))
+            if not sighting.is_moving:
+                self.refusals.add(Refusal("image.none"))
         elif not lidars:
             self.refusals.add(Refusal("lidar.none"))
         return replace(sighting, lidars=lidars, unscanned=unscanned)
@@ -257,40 +254,6 @@ def _apart(T_1: Array, T_2: Array) -> tuple[float, float]:
     return float(np.linalg.norm(T_1[:3, 3] - T_2[:3, 3])), float(np.arccos(cosine))
 
 
-def sight_ahead(tracker: BoardTracker, frames: Iterable[Frame]) -> Iterator[BoardDetection]:
-    """Find the board in frames: in images by another process, while this one reads on and searches scans.
-
-    What is found is what `BoardTracker.sight` finds frame by frame.
-    """
-    arguments = tracker.rig, tracker.search_interval_s, tracker.thorough_interval_s
-    waiting: deque[tuple[Frame, Future[BoardDetection]]] = deque()
-    with Worker("search images", _ImageTracker, *arguments) as images, ThreadPoolExecutor(1) as caller:
-        try:
-            for frame in frames:
-                bare = replace(frame, scans=(), events=())
-                waiting.append((frame, caller.submit(images.call, "sight", bare)))
-                if len(waiting) > _N_AHEAD:
-                    yield _in_scans(tracker, *waiting.popleft())
-            while waiting:
-                yield _in_scans(tracker, *waiting.popleft())
-        finally:
-            caller.shutdown(wait=False, cancel_futures=True)
-
-
 def without_samples(sighting: BoardDetection) -> BoardDetection:
     """Leave out the images and scans that were searched, which take long to send to another process."""
     return replace(sighting, frame=replace(sighting.frame, images=(), scans=()))
-
-
-class _ImageTracker:
-    """What searches images in the other process."""
-
-    def __init__(self, rig: Rig, search_interval_s: float, thorough_interval_s: float) -> None:
-        self._tracker = BoardTracker(rig, search_interval_s, thorough_interval_s=thorough_interval_s)
-
-    def sight(self, frame: Frame) -> BoardDetection:
-        return without_samples(self._tracker.sight_in_images(frame))
-
-
-def _in_scans(tracker: BoardTracker, frame: Frame, images: Future[BoardDetection]) -> BoardDetection:
-    return tracker.sight_in_scans(replace(images.result(), frame=frame))

@@ -3,9 +3,10 @@
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from lce_rig.collect.board_tracker import BoardTracker, CaptureMoment, ImageKey, sight_ahead
+from lce_rig.collect.board_tracker import BoardTracker, CaptureMoment, ImageKey
 from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.event_pictures import with_event_pictures
+from lce_rig.collect.offline.search_ahead import sight_ahead
 from lce_rig.collect.offline.slow_motion import find_moving_moments
 from lce_rig.collect.offline.stillness import StillnessOptions, find_still_moments
 from lce_rig.collect.offline.stored_events import StoredEvents
@@ -27,6 +28,8 @@ from lce_rig.words import describe
 _THOROUGH_S = 1.0
 # A process of its own for images takes a second to start.
 _LONG_SAMPLES = 200
+# Of boards that may move by more while they count as still, no quick look tells that they move.
+_GLANCED_M = 0.01
 
 
 @dataclass
@@ -84,7 +87,9 @@ class MomentSearch:
         watcher = BoardTracker(self.rig, interval_s, self._tally, _THOROUGH_S)
         frames = pair_by_time(samples, self.rig, self._pairing)
         is_long = self.n_samples >= _LONG_SAMPLES
-        sightings = sight_ahead(watcher, frames) if is_long else map(watcher.sight, frames)
+        are_still = not self.has_events and stillness.max_motion_m <= _GLANCED_M
+        ahead = sight_ahead(watcher, frames, is_still_wanted=are_still)
+        sightings = ahead if is_long else map(watcher.sight, frames)
         if self.has_events:
             taken = Placements(self.min_move_m, self.min_turn_deg)
             moments = find_moving_moments(sightings, self.rig, self.motion, taken, self._tally)
