@@ -1,7 +1,7 @@
 """What mkdocs needs beyond the pages of docs/: the files at the top of the repository, and GitHub's lists."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,10 +17,11 @@ TOP_PAGES = {
     "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security.md",
 }
-# Files at the top that the site shows as they are.
-TOP_FILES = {"CITATION.cff": "citation.cff"}
+# Files that the site holds as they are.
+TOP_FILES = {"CITATION.cff": "citation.cff", "docs/site/site.css": "site.css"}
 _ALL = {**TOP_PAGES, **TOP_FILES}
 _LINK = re.compile(r"(\]\(|src=\")([^)#\"\s]+)")
+_CODE = re.compile(r"`[^`]*`")
 _ITEM = re.compile(r"\s*([-*]|\d+\.) ")
 _ROW = re.compile(r"\|")
 
@@ -40,7 +41,12 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     depth = "../" * (len(PurePosixPath(page.file.src_uri).parts))
     for name, target in TOP_PAGES.items():
         markdown = markdown.replace(f"]({depth}{name}", f"]({depth[3:]}{target}")
-    return "\n".join(_open_lists(markdown.splitlines()))
+    return "\n".join(_open_lists(_plain_pipes(line) for line in markdown.splitlines()))
+
+
+def _plain_pipes(line: str) -> str:
+    r"""Take the backslash off `\|` in code in a table, which GitHub wants and Python-Markdown shows."""
+    return _CODE.sub(lambda code: code[0].replace("\\|", "|"), line) if line.startswith("|") else line
 
 
 def _within_docs(match: re.Match[str]) -> str:
@@ -49,7 +55,7 @@ def _within_docs(match: re.Match[str]) -> str:
     return opening + _ALL.get(target, target.removeprefix("docs/"))
 
 
-def _open_lists(lines: list[str]) -> Iterator[str]:
+def _open_lists(lines: Iterable[str]) -> Iterator[str]:
     """Put an empty line before each list and table that follows a paragraph at once; Markdown wants one."""
     before, is_code = "", False
     for line in lines:

@@ -4,9 +4,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, invert
+from lce_rig.core.losses import Losses
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.detect.finder import BoardFinder, ImageSearch
 from lce_rig.detect.image.search import NOT_SEEN_AT_ONCE
@@ -76,7 +76,7 @@ class BoardTracker:
 
     rig: Rig
     search_interval_s: float
-    refusals: RefusalCounts = field(default_factory=RefusalCounts)
+    refusals: Losses = field(default_factory=Losses)
     thorough_interval_s: float = 0.0
     rescan_interval_s: float = 0.0
     _seen: dict[ImageKey, ImageBoard] = field(default_factory=dict)

@@ -18,7 +18,7 @@ from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
 from lce_rig.detect.events.event_limits import explain_missing_board, look_for_flicker, too_fast
-from lce_rig.detect.events.figures import MEMORY_NS, event_figures, outline_px
+from lce_rig.detect.events.figures import MEMORY_NS, event_quality, outline_px
 from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.rig_time import rig_time_ns
@@ -137,7 +137,7 @@ def _events_on_board(
     """Count the events a pixel of the board in the second before its picture."""
     camera, board = rig.cameras[key[0]], sighting.images[key]
     outline = outline_px(board.T_cam_board, rig.board.to_board(), camera.to_intrinsics())
-    return event_figures(recent, stamp_ns, outline)["events_px"]
+    return event_quality(recent, stamp_ns, outline).events_px
 
 
 def _explain_unseen(sighting: BoardDetection, cuts: Mapping[str, EventCut], rig: Rig) -> Refusal | None:

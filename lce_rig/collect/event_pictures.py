@@ -3,8 +3,8 @@
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 
-from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
+from lce_rig.core.losses import Losses
 from lce_rig.core.results import Refusal
 from lce_rig.detect.events.search import reconstructor_for
 from lce_rig.rig import Rig
@@ -16,7 +16,7 @@ _GONE_BY = Refusal("read.events_gone_by")
 
 
 def with_event_pictures(
-    samples: Iterable[Sample], rig: Rig, cameras: Collection[str], tally: RefusalCounts
+    samples: Iterable[Sample], rig: Rig, cameras: Collection[str], tally: Losses, *, is_live: bool = False
 ) -> Iterator[Sample]:
     """Pass samples on, and add a picture of each camera for the middle of every sweep.
 
@@ -27,12 +27,14 @@ def with_event_pictures(
         rig: says how pictures are made.
         cameras: of whose events pictures are wanted.
         tally: receives why a scan got none.
+        is_live: make each picture a step of the network instead of an extra run, which is quicker; pictures
+            then depend on which scans came.
 
     Raises:
         ProfileError: a network cannot be used.
         SourceError: onnxruntime is not installed; or, from the samples, they are torn.
     """
-    darkrooms = [_Darkroom(rig, camera, tally) for camera in sorted(cameras)]
+    darkrooms = [_Darkroom(rig, camera, tally, is_live) for camera in sorted(cameras)]
     for sample in samples:
         yield sample
         for darkroom in darkrooms:
@@ -44,11 +46,12 @@ def with_event_pictures(
 class _Darkroom:
     """Events of one camera that wait until it is known which pictures are wanted of them."""
 
-    def __init__(self, rig: Rig, camera: str, tally: RefusalCounts) -> None:
+    def __init__(self, rig: Rig, camera: str, tally: Losses, is_live: bool) -> None:
         channel = event_channel(rig, camera) or ""
         self._rig = rig
         self._camera = camera
         self._tally = tally
+        self._is_live = is_live
         self._reconstructor = reconstructor_for(rig.cameras[camera].channels[channel].reconstruction, channel)
         self._offset_ns = rig_offset_ns(Stream(camera, channel, "events"), rig)
         self._wanted: deque[int] = deque()
@@ -89,7 +92,9 @@ class _Darkroom:
         if self._fed_ns is not None and stamp_ns < self._fed_ns:
             return _GONE_BY
         self._feed(stamp_ns)
-        return _NOT_BEGUN if self._fed_ns is None else self._reconstructor.picture_at(stamp_ns)
+        if self._fed_ns is None:
+            return _NOT_BEGUN
+        return self._reconstructor.picture_at(stamp_ns, is_step=self._is_live)
 
     def _can_feed(self, time_ns: int) -> bool:
         has_passed = bool(self._packets) and self._packets[-1].t_ns[-1] + self._offset_ns >= time_ns

@@ -1,6 +1,8 @@
 """Errors that the user can repair; each states what happened, where, and an action."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 
 
 class LceRigError(Exception):
@@ -8,7 +10,7 @@ class LceRigError(Exception):
 
     Args:
         what: what is wrong and where (file and key, sensor, capture), one line.
-        hint: what to do about it; empty where `what` says it already.
+        hint: what to do about it; empty if `what` says it already.
     """
 
     exit_code = 1
@@ -56,6 +58,23 @@ class ResultRefusedError(LceRigError):
     """A computed result that must not be used."""
 
     exit_code = 7
+
+
+@contextmanager
+def reading(path: Path, kind: type[LceRigError], hint: str = "") -> Iterator[None]:
+    """Turn what prevents a block from reading a file into an error of one kind that names the file.
+
+    Args:
+        path: the file.
+        kind: of the error raised for an OSError, and for a ValueError, whose words follow the file's name.
+        hint: what to do about content that is not what it should be.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{path}: cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise kind(f"{path}: {error}", hint) from error
 
 
 def join_shortages(errors: Sequence[NotEnoughDataError]) -> NotEnoughDataError:

@@ -57,29 +57,21 @@ def encode_events(events: Events) -> bytes:
     return buffer.getvalue()
 
 
-def decode_events(data: bytes, sensor: str, resolution_px: tuple[int, int] | None = None) -> Events:
-    """Read an archive of this program or another's from memory; see `read_events`."""
-    return read_events(io.BytesIO(data), sensor, resolution_px)
+def decode_events(data: bytes, sensor: str) -> Events:
+    """Read an archive of this program or another's from memory; see `EventArchive`.
 
-
-def read_events(file: BinaryIO, sensor: str, resolution_px: tuple[int, int] | None = None) -> Events:
-    """Read an archive of this program or another's whole; see `EventArchive`.
-
-    Args:
-        file: the archive.
-        sensor: name of the camera.
-        resolution_px: (width, height) where the archive does not say; None takes the events' extent.
+    Its resolution is the events' extent where it does not say.
 
     Raises:
         ValueError: what is wrong with the file, in words.
     """
-    archive = EventArchive(file)
+    archive = EventArchive(io.BytesIO(data))
     # A capture of many events is a large file, too: pixels hardly shrink. What is small stays small.
-    n_bytes = min(_MAX_COLUMN_RATIO * file.seek(0, io.SEEK_END), limits.MAX_FILE_BYTES)
+    n_bytes = min(_MAX_COLUMN_RATIO * len(data), limits.MAX_FILE_BYTES)
     limits.check_size(archive.largest_column_bytes, "a column", max(n_bytes, limits.MAX_CHUNK_BYTES))
     t_ns, x, y, polarity = next(archive.stretches(max(archive.n_events, 1)))
     extent_px = (int(x.max()) + 1, int(y.max()) + 1) if len(x) else (0, 0)
-    width, height = archive.resolution_px or resolution_px or extent_px
+    width, height = archive.resolution_px or extent_px
     if width * height > limits.MAX_EVENT_PIXELS:
         raise ValueError(f"its pixels are beyond any sensor: {width}x{height}")
     return Events(sensor, t_ns, x, y, polarity, width, height, archive.host_ns)
@@ -93,8 +85,8 @@ class EventArchive:
     Attributes:
         n_events: how many there are.
         largest_column_bytes: of the columns with the events, in memory.
-        resolution_px: (width, height); None where the archive does not say.
-        host_ns: host time of the first event; None where the archive does not say.
+        resolution_px: (width, height); None if the archive does not say.
+        host_ns: host time of the first event; None if the archive does not say.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -122,7 +114,7 @@ class EventArchive:
     def stretches(
         self, n_events: int
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]]:
-        """Yield times (ns), x, y and polarity of so many events at a time; once where there is none.
+        """Yield times (ns), x, y and polarity of so many events at a time; once if there is none.
 
         Raises:
             ValueError: what is wrong with the file, in words.

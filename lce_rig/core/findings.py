@@ -33,7 +33,7 @@ class Finding:
         return self.code.partition(".")[0]
 
     def figure(self, name: str) -> float:
-        """Give a figure as a number.
+        """Return a figure as a number.
 
         Raises:
             KeyError: the finding has no such figure.
@@ -46,12 +46,12 @@ class Finding:
 
 
 def about(subject: str, findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Give findings with the subject that whoever found them did not know."""
+    """Return findings with the subject that whoever found them did not know."""
     return tuple(replace(finding, subject=subject) for finding in findings)
 
 
 def worst(findings: Iterable[Finding]) -> Severity:
-    """Give the highest severity; "note" where nothing was found."""
+    """Return the highest severity; "note" where nothing was found."""
     return max((finding.severity for finding in findings), key=_ORDER.index, default="note")
 
 

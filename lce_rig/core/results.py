@@ -1,7 +1,8 @@
 """The data passed between stages, as frozen dataclasses."""
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Literal, cast
 
 import numpy as np
@@ -37,6 +38,94 @@ class Refusal(Finding):
         return Refusal(f"{stage}.error", figures={"what": error.what, "hint": error.hint}, action=action)
 
 
+@dataclass(frozen=True)
+class ImageQuality:
+    """What an image shows of the pattern.
+
+    Attributes:
+        mean_grey: of the whole image, grey values.
+        contrast: white minus black squares, grey values.
+        noise: standard deviation, grey values.
+        square_px: shortest side of a square.
+        edge_width_px: of the squares' edges, 10-90 %.
+        sharpness: edge widths in a square: 1 is unreadable, above 5 is crisp.
+        border_px: outermost corner to the border of the image.
+        n_corners: that could be fitted.
+    """
+
+    mean_grey: float
+    contrast: float
+    noise: float
+    square_px: float
+    edge_width_px: float
+    sharpness: float
+    border_px: float
+    n_corners: int
+
+
+@dataclass(frozen=True)
+class EventQuality:
+    """What events show of the board and of its motion; NaN if it could not be measured.
+
+    Attributes:
+        events_px_s: events per second and pixel of the board, just before the image.
+        events_px: events per pixel of the board in the time that the network remembers.
+        speed_mps, turn_deg_s: of the board about the time of the image.
+        speed_sigma_mps, turn_sigma_deg_s: standard deviation of these.
+        smear_m: how far the board moves while the LiDAR scans it.
+        smear_depth_m: the part of it along the board's normal, which thickens or tilts the plane.
+    """
+
+    events_px_s: float
+    events_px: float
+    speed_mps: float = math.nan
+    speed_sigma_mps: float = math.nan
+    turn_deg_s: float = math.nan
+    turn_sigma_deg_s: float = math.nan
+    smear_m: float = math.nan
+    smear_depth_m: float = math.nan
+
+
+@dataclass(frozen=True)
+class LidarQuality:
+    """What a scan shows of the plate.
+
+    Attributes:
+        width_m, height_m: of the plate as measured.
+        width_sigma_m, height_sigma_m: standard deviation of these.
+        size_ratio: both sides together over the nominal ones.
+        n_rings, n_points: on the plate.
+        n_ring_ends: at its outline.
+        n_ring_ends_dropped: that do not fit the outline.
+        thickness_m: range of the points' heights over the plane without the outer 5 %.
+        plane_rms_m: of those heights.
+        edge_rms_m: of the ring ends' distances from the outline; NaN without ring ends.
+        template_m: error of the nominal outline.
+        beyond_share: returns in the plane beyond the outline over those on the plate.
+        distance_m: of the plate's middle.
+        incidence_deg: between the beam and the plate's normal there.
+        range_noise_m: of the whole scan.
+    """
+
+    width_m: float
+    height_m: float
+    width_sigma_m: float
+    height_sigma_m: float
+    size_ratio: float
+    n_rings: int
+    n_points: int
+    n_ring_ends: int
+    n_ring_ends_dropped: int
+    thickness_m: float
+    plane_rms_m: float
+    edge_rms_m: float
+    template_m: float
+    beyond_share: float
+    distance_m: float
+    incidence_deg: float
+    range_noise_m: float
+
+
 @dataclass(frozen=True, eq=False)
 class ImageBoard:
     """The board detected in one image.
@@ -45,15 +134,16 @@ class ImageBoard:
         corners_px: (rows * cols, 2) in the order of `Board.corners()`.
         T_cam_board: (4, 4), the pose with the smaller reprojection error.
         cov: (6, 6) of T_cam_board, tangent (translation m, rotation rad).
-        T_cam_board_alternative: (4, 4) second local minimum; None where there is none in front of the camera.
+        T_cam_board_alternative: (4, 4) second local minimum; None if there is none in front of the camera.
         chi2_gap: by how much the alternative's cost is higher, in units of the corner variance.
-        is_ambiguous: whether the picture alone cannot decide between the two (chi2_gap < 9).
+        is_ambiguous: whether the image alone cannot decide between the two (chi2_gap < 9).
         reprojection_px: rms of the corner residuals.
         sigma_px: corner noise per coordinate, from the residuals and their degrees of freedom.
-        quality: figures by name: sharpness, tilt_deg, distance_m, square_px, border_px, ...
-        stamp_ns: of the picture; None where the recording carries no time.
-        track_ns: (K,) int64 stamps of further pictures of this channel, shortly before and after, in which
-            the board was followed; None where there are none.
+        quality: figures of the pattern in the image; None if only its corners are known.
+        events: figures of the board's events; None if the image was not reconstructed from known events.
+        stamp_ns: of the image; None if the recording carries no time.
+        track_ns: (K,) int64 timestamps of further images of this channel, shortly before and after, in which
+            the board was tracked; None if there are none.
         track_T_cam_board: (K, 4, 4) its poses there, corners in the same order as here.
         track_cov: (K, 6, 6) of those poses, as `cov`.
     """
@@ -66,11 +156,31 @@ class ImageBoard:
     is_ambiguous: bool
     reprojection_px: float
     sigma_px: float
-    quality: Mapping[str, float] = field(default_factory=dict)
+    quality: ImageQuality | None = None
+    events: EventQuality | None = None
     stamp_ns: int | None = None
     track_ns: NDArray[np.int64] | None = None
     track_T_cam_board: Array | None = None
     track_cov: Array | None = None
+
+    @property
+    def distance_m(self) -> float:
+        """Distance of the pattern's middle from the camera."""
+        return float(np.linalg.norm(self.T_cam_board[:3, 3]))
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle between the board's normal and the line of sight."""
+        cosine = abs(float(self.T_cam_board[:3, 2] @ self.T_cam_board[:3, 3])) / self.distance_m
+        return float(np.degrees(np.arccos(min(cosine, 1.0))))
+
+    def figures(self) -> dict[str, float]:
+        """List every figure by name, for tables and programs."""
+        figures = {} if self.quality is None else asdict(self.quality)
+        figures["corner_rms_px"] = self.reprojection_px
+        figures |= {"tilt_deg": self.tilt_deg, "distance_m": self.distance_m}
+        measured = {} if self.events is None else asdict(self.events)
+        return figures | {name: value for name, value in measured.items() if not math.isnan(value)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,17 +195,16 @@ class LidarBoard:
         edge_side: (M,) int8, -1 where the board ends towards smaller azimuth, +1 towards larger
             (azimuth = atan2(y, x), counter-clockwise).
         edge_behind_m: (M,) how far behind the board's plane the ring's next return beyond the edge lies;
-            inf where there is none. What stands close behind blends into the beam's return.
+            inf if there is none. What stands close behind blends into the beam's return.
         edge_echo: (M,) share 0..1 of the received power that comes from there where a beam meets it and the
             board alike; 0 where nothing is there. A beam that meets both reports the stronger echo.
         azimuth_step_rad: angle between neighbouring firings of one ring.
         plane: (4,) as (n, d), n.p + d = 0, unit n towards the LiDAR (d > 0).
         sigma_m: rms distance of `points` from the plane.
         T_lidar_board: (4, 4) from the template; known up to the symmetries of a rectangle.
-        offset_ns: (N,) int64 firing time of each point after the scan's stamp; None without.
-        quality: figures by name: n_rings, n_points, thickness_m, width_m, height_m, edge_rms_m, template_m,
-            distance_m, ...
-        stamp_ns: of the scan; None where the recording carries no time.
+        offset_ns: (N,) int64 firing time of each point after the scan's timestamp; None without.
+        quality: figures of the plate in the scan.
+        stamp_ns: of the scan; None if the recording carries no time.
     """
 
     points: Array
@@ -109,9 +218,13 @@ class LidarBoard:
     plane: Array
     sigma_m: float
     T_lidar_board: Array
+    quality: LidarQuality
     offset_ns: NDArray[np.int64] | None = None
-    quality: Mapping[str, float] = field(default_factory=dict)
     stamp_ns: int | None = None
+
+    def figures(self) -> dict[str, float]:
+        """List every figure of the quality by name, for tables and programs."""
+        return asdict(self.quality)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,13 +277,13 @@ class ChannelResult:
     Attributes:
         channel: its name.
         n_captures: captures in which it shows the board and agrees with the others.
-        noise_px: corner noise per coordinate, from the residuals of all its pictures.
-        T_cam_lidar: (4, 4) extrinsic from this channel's pictures; from others' only how boards moved.
+        noise_px: corner noise per coordinate, from the residuals of all its images.
+        T_cam_lidar: (4, 4) extrinsic from this channel's images; from others' only how boards moved.
         cov: (6, 6) of it, as `Calibration.cov`.
         depth_scatter_m: standard deviation over captures of the LiDAR's distance from the board's plane.
         depth_scatter_still_m: the same if boards are taken to have stood still.
-        time_offset_s: what to add to its stamps beyond the profile's expected offset to come to the LiDAR's
-            time; pictures without stamps count from the scan's first firing. None where nothing moved.
+        time_offset_s: what to add to its timestamps beyond the profile's expected offset to come to the
+            LiDAR's time; images without timestamps count from the scan's first firing. None if nothing moved.
         time_offset_sigma_s: standard deviation of that.
     """
 
@@ -191,7 +304,7 @@ class PointUncertainty:
 
     Attributes:
         distance_m: of the point from the camera.
-        centre_px, centre_m: in the middle of the picture; in it, and in space.
+        centre_px, centre_m: in the middle of the image; in it, and in space.
         corner_px, corner_m: in the least certain corner.
     """
 
@@ -210,9 +323,9 @@ class OtherCamera:
         camera: name of the other one.
         n_captures: that both used.
         T_cam_other: (4, 4) to which the extrinsics of both with the LiDAR compose, p_cam = R p_other + t.
-        cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the camera; None where the
+        cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the camera; None if the
             extrinsics were not estimated together.
-        T_cam_other_pictures: (4, 4) from the pictures of both alone; None where too few boards tell.
+        T_cam_other_pictures: (4, 4) from the images of both alone; None if too few boards tell.
         apart_rotation_deg, apart_translation_m: how far that lies from what the extrinsics compose to, each
             estimated by itself.
         board_rms_m: how far apart those put the middle of the same board, rms.
@@ -230,7 +343,7 @@ class OtherCamera:
 
 @dataclass(frozen=True)
 class CaptureResidual:
-    """How well one capture fits an extrinsic.
+    """How well one capture fits extrinsics.
 
     Attributes:
         capture: its name.
@@ -251,9 +364,9 @@ class CaptureResidual:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The extrinsic of one camera and one LiDAR, with everything needed to judge it.
+    """The extrinsics of one camera and one LiDAR, with everything needed to judge it.
 
-    result.json keeps all of it but the last four attributes, which are empty where it is read back.
+    result.json keeps all of it but the last four attributes, which are empty if it is read back.
 
     Attributes:
         channel: of the camera, or several joined by "+".
@@ -267,12 +380,12 @@ class Calibration:
         captures_used: names of the captures behind the estimate.
         captures_refused: why each other capture is not.
         diagnostics: further figures by name.
-        method: that found the extrinsic, as `CalibrateOptions.method`.
-        uncertainty: what `cov` means for points at several distances; empty where no lens was at hand.
+        method: that found the extrinsics, as `CalibrateOptions.method`.
+        uncertainty: what `cov` means for points at several distances; empty if no lens was at hand.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         other_cameras: those that saw the same boards held still.
         weak_direction: the least certain motion, with its standard deviation.
-        held_out_m: rms residual of captures where they were not fitted; NaN where no method knows it.
+        held_out_m: rms residual of captures where they were not fitted; NaN if no method knows it.
         residuals: of each capture used.
         observations: capture -> the boards that were paired, as measured, for each capture used.
     """

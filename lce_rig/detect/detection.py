@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import Image
 from lce_rig.core.documents import parse_json
-from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, Refusal
+from lce_rig.core.results import (
+    Calibration,
+    EventQuality,
+    ImageBoard,
+    ImageQuality,
+    LidarBoard,
+    LidarQuality,
+    Refusal,
+)
 from lce_rig.words import is_renderable
 
 # What the fields of a detection hold: an entry of a cache may come from somebody else, or be of old.
@@ -21,7 +29,7 @@ _Check = Callable[[Any, _Sizes], bool]
 
 
 def check_fields(kind: type, fields: Mapping[str, Any]) -> None:
-    """Make sure that fields can be those of a detection.
+    """Check that fields can be those of a detection.
 
     Args:
         kind: ImageBoard, LidarBoard, Refusal or Image.
@@ -86,8 +94,11 @@ def _text(value: Any, _: _Sizes) -> bool:
     return isinstance(value, str)
 
 
-def _figures(value: Any, sizes: _Sizes) -> bool:
-    return isinstance(value, dict) and all(_figure(each, sizes) for each in value.values())
+def _figures_of(record: type) -> _Check:
+    def check(value: Any, sizes: _Sizes) -> bool:
+        return isinstance(value, record) and all(_figure(each, sizes) for _, each in _fields(value))
+
+    return check
 
 
 def _plane(value: NDArray[Any], sizes: _Sizes) -> bool:
@@ -131,7 +142,8 @@ _CHECKS: dict[type, dict[str, _Check]] = {
         "is_ambiguous": _figure,
         "reprojection_px": _figure,
         "sigma_px": _figure,
-        "quality": _figures,
+        "quality": _or_none(_figures_of(ImageQuality)),
+        "events": _or_none(_figures_of(EventQuality)),
         "stamp_ns": _or_none(_whole),
         "track_ns": _or_none(_array("i", "tracked")),
         "track_T_cam_board": _or_none(_pose("tracked")),
@@ -150,7 +162,7 @@ _CHECKS: dict[type, dict[str, _Check]] = {
         "sigma_m": _figure,
         "T_lidar_board": _pose(),
         "offset_ns": _or_none(_array("i", "points")),
-        "quality": _figures,
+        "quality": _figures_of(LidarQuality),
         "stamp_ns": _or_none(_whole),
     },
 }
@@ -160,6 +172,10 @@ Arrays = dict[str, NDArray[Any]]
 LidarDetection = list[LidarBoard] | Refusal
 ImageDetection = ImageBoard | Refusal
 
+_RECORDS: dict[type, dict[str, type]] = {
+    ImageBoard: {"quality": ImageQuality, "events": EventQuality},
+    LidarBoard: {"quality": LidarQuality},
+}
 _KINDS: dict[str, Any] = {kind.__name__: kind for kind in (Image, ImageBoard, LidarBoard, Refusal)}
 
 
@@ -167,7 +183,7 @@ def to_arrays(detection: ImageDetection | LidarDetection | Image) -> Arrays:
     """Flatten a detection into named arrays; figures and names travel as one JSON text.
 
     Args:
-        detection: one image board, the LiDAR candidates of a scan, a refusal, or the picture of one.
+        detection: one image board, the LiDAR candidates of a scan, a refusal, or the image of one.
     """
     items = detection if isinstance(detection, list) else [detection]
     arrays: Arrays = {}
@@ -178,7 +194,7 @@ def to_arrays(detection: ImageDetection | LidarDetection | Image) -> Arrays:
             if isinstance(value, np.ndarray):
                 arrays[f"{index}.{name}"] = value
             else:
-                head[name] = dict(value) if isinstance(value, Mapping) else value
+                head[name] = _plain(value)
         heads.append(head)
     text = json.dumps({"is_list": isinstance(detection, list), "items": heads}, default=float)
     arrays["head"] = np.frombuffer(text.encode(), dtype=np.uint8)
@@ -199,12 +215,20 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> ImageDetection | LidarDet
         raise ValueError(f"not a detection: {error!r}") from error
 
 
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    return dict(value) if isinstance(value, Mapping) else value
+
+
 def _fields(item: Any) -> Sequence[tuple[str, Any]]:
     return [(field.name, getattr(item, field.name)) for field in dataclasses.fields(item)]
 
 
 def _rebuild(index: int, head: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Any:
     kind = _KINDS[head.pop("kind")]
+    for name, record in _RECORDS.get(kind, {}).items():
+        head[name] = None if head[name] is None else record(**head[name])
     prefix = f"{index}."
     own = {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)}
     check_fields(kind, {**head, **own})
@@ -229,7 +253,7 @@ class Pair:
 
     @property
     def folder_name(self) -> str:
-        """What a folder of this pair's files is called where there are several."""
+        """What a folder of this pair's files is called if there are several."""
         return f"{self.camera}.{self.channel}.{self.lidar}"
 
     def __str__(self) -> str:
@@ -263,5 +287,5 @@ class Detections:
         return sorted(self.images[pair.camera, pair.channel].keys() & self.lidars[pair.lidar].keys())
 
     def of(self, pair: Pair, capture: str) -> tuple[ImageDetection, LidarDetection]:
-        """Give what both sensors of a pair saw in one capture."""
+        """Return what both sensors of a pair saw in one capture."""
         return self.images[pair.camera, pair.channel][capture], self.lidars[pair.lidar][capture]

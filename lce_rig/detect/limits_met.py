@@ -9,26 +9,25 @@ from lce_rig.rig import QualitySettings
 
 
 def gate_image_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:
-    """Hold a board found in a picture against the profile's limits.
+    """Hold a board found in an image against the profile's limits.
 
     Args:
-        found: with the figures of its quality record.
+        found: one without quality is judged by its pose alone.
         limits: `quality` of the rig profile.
     """
     q = found.quality
-    distance_m, square_px = q["distance_m"], q["square_px"]
-    if square_px < limits.min_square_px:
-        closer_m = distance_m * (1 - square_px / limits.min_square_px)
-        figures = {"square_px": square_px, "min_square_px": limits.min_square_px, "closer_m": closer_m}
+    if q is not None and q.square_px < limits.min_square_px:
+        closer_m = found.distance_m * (1 - q.square_px / limits.min_square_px)
+        figures = {"square_px": q.square_px, "min_square_px": limits.min_square_px, "closer_m": closer_m}
         return Refusal("image.small_squares", figures=figures)
-    if q["border_px"] < limits.min_border_px:
-        figures = {"border_px": q["border_px"], "min_border_px": limits.min_border_px}
+    if q is not None and q.border_px < limits.min_border_px:
+        figures = {"border_px": q.border_px, "min_border_px": limits.min_border_px}
         return Refusal("image.near_border", figures=figures)
-    if q["tilt_deg"] > limits.max_tilt_deg:
-        turn_deg = q["tilt_deg"] - limits.max_tilt_deg + 5
-        figures = {"tilt_deg": q["tilt_deg"], "max_tilt_deg": limits.max_tilt_deg, "turn_deg": turn_deg}
+    if found.tilt_deg > limits.max_tilt_deg:
+        turn_deg = found.tilt_deg - limits.max_tilt_deg + 5
+        figures = {"tilt_deg": found.tilt_deg, "max_tilt_deg": limits.max_tilt_deg, "turn_deg": turn_deg}
         return Refusal("image.tilted", figures=figures)
-    return _gate_distance("image", distance_m, limits) or found
+    return _gate_distance("image", found.distance_m, limits) or found
 
 
 def gate_lidar_boards(
@@ -48,24 +47,26 @@ def gate_lidar_boards(
 
 def _lidar_problem(found: LidarBoard, board: Board, limits: QualitySettings) -> Refusal | None:
     q = found.quality
-    if q["n_points"] < limits.min_points:
-        closer_m = max(0.1, q["distance_m"] * (1 - (q["n_points"] / limits.min_points) ** 0.5))
+    if q.n_points < limits.min_points:
+        closer_m = max(0.1, q.distance_m * (1 - (q.n_points / limits.min_points) ** 0.5))
         return Refusal(
             "lidar.too_few_points",
-            figures={"n_points": int(q["n_points"]), "min_points": limits.min_points, "closer_m": closer_m},
+            figures={"n_points": q.n_points, "min_points": limits.min_points, "closer_m": closer_m},
         )
-    for side, wanted_m in (("width", board.width_m), ("height", board.height_m)):
-        measured_m, sigma_m = q[f"{side}_m"], q[f"{side}_sigma_m"]
+    for side, wanted_m, measured_m, sigma_m in (
+        ("width", board.width_m, q.width_m, q.width_sigma_m),
+        ("height", board.height_m, q.height_m, q.height_sigma_m),
+    ):
         excess = abs(measured_m - wanted_m) - 3 * sigma_m - limits.max_size_error * wanted_m
         if excess > 0:
             return Refusal(
                 "lidar.other_size",
                 figures={"side": side, "measured_m": measured_m, "sigma_m": sigma_m, "profile_m": wanted_m},
             )
-    if q["edge_rms_m"] > limits.max_edge_rms_m:
-        figures = {"rms_m": q["edge_rms_m"], "max_rms_m": limits.max_edge_rms_m}
+    if q.edge_rms_m > limits.max_edge_rms_m:
+        figures = {"rms_m": q.edge_rms_m, "max_rms_m": limits.max_edge_rms_m}
         return Refusal("lidar.ragged_edges", figures=figures)
-    return _gate_distance("lidar", q["distance_m"], limits)
+    return _gate_distance("lidar", q.distance_m, limits)
 
 
 def _gate_distance(

@@ -1,7 +1,6 @@
 """The attached sensors of a rig: one line a driver, imported when wanted."""
 
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 from lce_rig.core.errors import SourceError
@@ -21,14 +20,13 @@ LIDAR_TYPES, CAMERA_TYPES = ("vlp16",), ("v4l2", "command", "davis")
 _TYPE_BY_MODEL = {"VLP-16": "vlp16", "PUCK": "vlp16", "DAVIS": "davis"}
 
 
-def open_live(rig: Rig, record_to: Path | None = None) -> list[LiveSource]:
+def open_live(rig: Rig) -> list[LiveSource]:
     """Build the source of every attached sensor: LiDARs, cameras, then the sync board.
 
     None is open yet: each opens with its `with` block.
 
     Args:
         rig: the profile.
-        record_to: folder in which LiDARs record their packets, each in LIDAR.pcap; it is there by then.
 
     Raises:
         SourceError: a driver's type is unknown, or belongs to another kind of sensor.
@@ -36,8 +34,7 @@ def open_live(rig: Rig, record_to: Path | None = None) -> list[LiveSource]:
     sources = []
     for name, lidar in rig.lidars.items():
         kind = driver_type("lidar", name, lidar.model, lidar.driver)
-        file = None if record_to is None else record_to / f"{name}.pcap"
-        sources.append(_source(kind, name, lidar, record_to=file))
+        sources.append(_source(kind, name, lidar))
     for name, camera in rig.cameras.items():
         sources.append(_source(driver_type("camera", name, camera.model, camera.driver), name, camera))
     if rig.sync is not None:
@@ -84,7 +81,7 @@ def _by_model(model: str) -> str | None:
     return next((kind for begin, kind in _TYPE_BY_MODEL.items() if model.upper().startswith(begin)), None)
 
 
-def _source(kind: str, *arguments: Any, **options: Any) -> LiveSource:
+def _source(kind: str, *arguments: Any) -> LiveSource:
     module, name = LIVE[kind].split(":")
-    source: LiveSource = getattr(import_module(module), name)(*arguments, **options)
+    source: LiveSource = getattr(import_module(module), name)(*arguments)
     return source

@@ -7,11 +7,13 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 
 from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
+from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.protocol import SourceStatus, Waiting
 
 _TAKE_S = 0.2
@@ -154,6 +156,14 @@ class LiveSource(ABC):
     @abstractmethod
     def describe(self) -> SourceStatus:
         """Say how the device does; asked from any thread, open or not. What was taken is counted here."""
+
+    def record_packets(self, folder: Path, disk: DiskWriter) -> bool:
+        """Have what the device sends recorded as it comes, from opening on; False where it sends no packets.
+
+        Raises:
+            SourceError: the file exists already, or cannot be made.
+        """
+        return False
 
     def explain_silence(self, *, has_sent: bool) -> SourceError:
         """Say what to check where nothing has come for `silence_s`, since it was opened or since it sent."""

@@ -74,7 +74,7 @@ def _by_matching(matcher: TriggerMatcher, board: ObservedSensor, seen: ObservedS
     """Match frames to pulses by their numbers, and give what comes of it."""
     pulses = [pulse for pulse in board.pulses if pulse.sensor == seen.sensor]
     delays_ms = np.array([_delay_ms(each, board) for each in _matched(matcher, pulses, seen.frames)])
-    counts: dict[str, Figure] = dict(vars(matcher.counts))
+    counts = matcher.figures()
     if matcher.problem is not None or not len(delays_ms):
         yield Finding("pulses.not_matched", figures=counts)
         if matcher.problem is not None:
@@ -84,7 +84,7 @@ def _by_matching(matcher: TriggerMatcher, board: ObservedSensor, seen: ObservedS
     scatter_ms = _SIGMA_PER_MAD * float(np.median(np.abs(delays_ms - middle_ms)))
     delay: dict[str, Figure] = {"delay_ms": middle_ms, "delay_scatter_ms": scatter_ms}
     yield Finding("pulses.delay", "note", figures=counts | delay)
-    if matcher.counts.n_slips or matcher.counts.n_missed:
+    if matcher.losses.n("pulses.slip", "pulses.missed_by_camera"):
         yield Finding("pulses.missed", figures=counts)
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from lce_rig.core import velodyne
+from lce_rig.core.data import join_events
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Figure, Finding, Severity
 from lce_rig.core.results import Refusal
@@ -16,7 +17,6 @@ from lce_rig.doctor.observing import ObservedSensor
 from lce_rig.doctor.sensor_report import SensorReport
 from lce_rig.doctor.sensor_sources import driver_of
 from lce_rig.rig import Rig
-from lce_rig.timing.event_buffer import join_events
 
 # A VLP-16: how its web page says that it is set, and whether pulses and sentences give it UTC.
 

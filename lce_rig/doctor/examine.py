@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, join_events
 from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.core.results import Refusal
@@ -38,7 +38,6 @@ from lce_rig.doctor.sensor_report import SensorReport
 from lce_rig.doctor.sensor_sources import driver_of, sensors, source_of
 from lce_rig.rig import Rig
 from lce_rig.rig.sync_settings import BOARD
-from lce_rig.timing.event_buffer import join_events
 
 SensorCheck = Callable[[SensorReport, str], Check | None]
 
@@ -138,7 +137,7 @@ def _sight_in_scan(rig: Rig, seen: ObservedSensor) -> Finding:
     if isinstance(found, Refusal):
         return found
     best = found[0].quality
-    figures = {name: best[name] for name in ("distance_m", "n_rings", "n_points")}
+    figures = {"distance_m": best.distance_m, "n_rings": best.n_rings, "n_points": best.n_points}
     return Finding("board.in_scan", "note", figures={**figures, "n_candidates": len(found)})
 
 
@@ -149,8 +148,8 @@ def _sight_in_picture(rig: Rig, image: Image) -> Finding:
         found = Refusal.of_error("image", error)
     if isinstance(found, Refusal):
         return found
-    names = ("distance_m", "n_corners", "corner_rms_px", "sharpness")
-    return Finding("board.in_image", "note", figures={name: found.quality[name] for name in names})
+    names, figures = ("distance_m", "n_corners", "corner_rms_px", "sharpness"), found.figures()
+    return Finding("board.in_image", "note", figures={name: figures[name] for name in names})
 
 
 def _sight_in_events(rig: Rig, seen: ObservedSensor) -> Finding:
@@ -173,4 +172,4 @@ def _sight_in_events(rig: Rig, seen: ObservedSensor) -> Finding:
         found = Refusal.of_error("image", error)
     if isinstance(found, Refusal):
         return found
-    return Finding("board.in_events", "note", figures={"distance_m": found.quality["distance_m"]})
+    return Finding("board.in_events", "note", figures={"distance_m": found.distance_m})

@@ -1,10 +1,10 @@
-"""Results as files that other programs read; each is read back before it is handed out."""
+"""Write results as files for other programs; each is read back and checked."""
 
 from collections.abc import Callable, Iterable, Sequence
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 
-from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError
+from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError, reading
 from lce_rig.core.results import Calibration
 from lce_rig.export.frames import require_known
 from lce_rig.rig import Rig
@@ -29,9 +29,8 @@ def load_exporter(name: str) -> Exporter:
         UsageError: no such format.
     """
     if name not in EXPORTS:
-        raise UsageError(f"no export format is called {name}", f"there is {', '.join(EXPORTS)}")
-    module, function = EXPORTS[name].split(":")
-    exporter: Exporter = getattr(import_module(module), function)
+        raise UsageError(f"no export format is called {name}", f"Choose one of: {', '.join(EXPORTS)}")
+    exporter: Exporter = resolve_name(EXPORTS[name])
     return exporter
 
 
@@ -45,13 +44,13 @@ def export(
 ) -> list[Path]:
     """Write all formats (or those named) into a folder, each read back and checked by probe points.
 
-    Exports of an earlier run are removed first, also when this one is refused: a file that stays behind would
-    pass for this result.
+    Exports of an earlier run are removed first, even if this one is refused, so that they are not mistaken
+    for this result.
 
     Args:
         calibrations: what to write, one for each camera channel and LiDAR.
         rig: the profile the calibrations belong to.
-        folder: as a rule the session's `calibration/`.
+        folder: usually the session's `calibration/`.
         formats: keys of EXPORTS; all by default.
         is_forced: write failed calibrations too; every file then says so.
 
@@ -59,9 +58,9 @@ def export(
         The files written, in the order of the formats.
 
     Raises:
-        LceRigError: a calibration is about sensors that the rig does not have.
+        LceRigError: a calibration names sensors that the rig does not have.
         ResultRefusedError: a verdict is "fail"; nothing is written.
-        LceRigError: a file does not say what was calibrated; it and all others are removed again.
+        LceRigError: a file reads back differently; it and all others are removed again.
     """
     folder = Path(folder)
     for calibration in calibrations:
@@ -84,7 +83,7 @@ def export(
 
 
 def remove_exports(folder: Path) -> None:
-    """Remove the exports that lce-rig wrote into a folder earlier, known by their first lines.
+    """Remove exports of earlier runs from a folder, recognised by their first lines.
 
     Raises:
         SessionError: one cannot be removed.
@@ -107,8 +106,5 @@ def is_export(path: Path) -> bool:
     """
     if path.suffix not in (".yaml", ".urdf", ".txt") or not path.is_file() or path.is_symlink():
         return False
-    try:
-        with path.open("rb") as file:
-            return b", written by lce-rig " in file.read(300)
-    except OSError as error:
-        raise SessionError(f"{path}: cannot be read: {error.strerror}") from error
+    with reading(path, SessionError), path.open("rb") as file:
+        return b", written by lce-rig " in file.read(300)

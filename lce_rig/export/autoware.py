@@ -7,11 +7,12 @@ import numpy as np
 
 from lce_rig.core.geometry import Array, invert, pose
 from lce_rig.core.results import Calibration
-from lce_rig.export.files import header, number, quoted, reads_back, write_atomically
+from lce_rig.export.files import header, number, quoted, reads_back
 from lce_rig.export.frames import T_BODY_OPTICAL, FrameTree, build_trees, choose_channels
 from lce_rig.export.probes import check_pose
 from lce_rig.export.rotations import rotation_from_rpy, rpy
 from lce_rig.rig import Rig
+from lce_rig.session.durable import write_atomically
 
 FILE_NAME = "sensor_kit_calibration.yaml"
 _KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -21,7 +22,7 @@ def export_autoware(calibrations: Sequence[Calibration], rig: Rig, folder: Path)
     """Write sensor_kit_calibration.yaml, each sensor's pose in its tree's root, and read it back.
 
     Raises:
-        LceRigError: the file does not say what was calibrated.
+        LceRigError: the file reads back differently.
     """
     chosen = choose_channels(calibrations, rig)
     trees = build_trees(calibrations, rig)

@@ -8,19 +8,20 @@ import numpy as np
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert
 from lce_rig.core.results import Calibration
-from lce_rig.export.files import header, numbers, quoted, reads_back, rows, write_atomically
+from lce_rig.export.files import header, numbers, quoted, reads_back, rows
 from lce_rig.export.frames import choose_channels
 from lce_rig.export.probes import check_projection
 from lce_rig.rig import Rig
+from lce_rig.session.durable import write_atomically
 
 
 def export_kalibr(calibrations: Sequence[Calibration], rig: Rig, folder: Path) -> list[Path]:
     """Write camchain_LIDAR.yaml for each LiDAR whose cameras Kalibr's models describe, and read it back.
 
-    Kalibr knows four radtan coefficients: cameras with k3 or more are skipped.
+    Kalibr supports four radtan coefficients; cameras with k3 or more are skipped.
 
     Raises:
-        LceRigError: a file does not say what was calibrated.
+        LceRigError: a file reads back differently.
     """
     chosen = choose_channels(calibrations, rig)
     paths = []

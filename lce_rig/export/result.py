@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,15 +10,16 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from lce_rig.core.documents import read_json
-from lce_rig.core.errors import ResultRefusedError, SessionError
+from lce_rig.core.errors import ResultRefusedError, SessionError, reading
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.core.geometry import FARTHEST_M, Array
+from lce_rig.core.geometry import FARTHEST_M
 from lce_rig.core.limits import describe
 from lce_rig.core.results import Calibration, ChannelResult, OtherCamera, PointUncertainty, Refusal
-from lce_rig.export.files import MADE_BY, write_atomically
+from lce_rig.export.files import MADE_BY
+from lce_rig.session.durable import write_atomically
 from lce_rig.words import as_json, is_renderable, refusal_as_json
 
-# The schema of result.json, strict where it is read.
+# The schema of result.json; reading is strict.
 
 
 def _check_pose(rows: list[list[float]]) -> list[list[float]]:
@@ -42,7 +43,7 @@ def _check_cov(rows: list[list[float]]) -> list[list[float]]:
     return rows
 
 
-# Products of such figures stay far from overflow; a direction that is open has a variance beyond a million.
+# Products of such figures stay far from overflow; an undetermined direction has a variance above 1e6.
 _Figure = Annotated[float, Field(ge=-1e100, le=1e100)]
 _Row4 = Annotated[list[_Figure], Field(min_length=4, max_length=4)]
 _Row6 = Annotated[list[_Figure], Field(min_length=6, max_length=6)]
@@ -62,7 +63,7 @@ def _check_figures(figures: dict[str, Any]) -> dict[str, Figure]:
 
 def _read_figure(value: Any) -> Figure:
     if isinstance(value, dict):
-        raise ValueError("a figure is no mapping")
+        raise ValueError("a figure is not a mapping")
     return tuple(_read_figure(each) for each in value) if isinstance(value, list) else value
 
 
@@ -81,7 +82,7 @@ class RefusalRecord(_SavedRecord):
 
     @property
     def refusal(self) -> Refusal:
-        """The refusal; as plain text where this version has no words for its code."""
+        """The refusal; as plain text if this version does not know its code."""
         if self.code.startswith(f"{self.stage}."):
             known = Refusal(self.code, figures=self.figures, action=self.action_code)
             if is_renderable(known):
@@ -102,7 +103,7 @@ class FindingRecord(_SavedRecord):
 
     @property
     def finding(self) -> Finding:
-        """The finding; as plain text where this version has no words for its code."""
+        """The finding; as plain text if this version does not know its code."""
         known = Finding(self.code, self.severity, self.subject, self.figures, self.action_code)
         if is_renderable(known):
             return known
@@ -110,7 +111,7 @@ class FindingRecord(_SavedRecord):
 
 
 class CertificateRecord(_SavedRecord):
-    """Proof of optimality; gap is null where there is no bound."""
+    """Proof of optimality; gap is null if there is no bound."""
 
     is_optimal: bool
     gap: float | None
@@ -193,7 +194,7 @@ class PairRecord(_SavedRecord):
             ("sigma_rotation_deg", self.sigma_rotation_deg, sigma_r),
         ):
             if not np.isclose(value, wanted, rtol=1e-6):
-                raise ValueError(f"{name}: {value:g} does not belong to cov, which gives {wanted:g}")
+                raise ValueError(f"{name}: {value:g} contradicts cov, which gives {wanted:g}")
         if self.n_detected > self.n_captures:
             raise ValueError(f"n_detected: {self.n_detected} of {self.n_captures} captures")
         return self
@@ -228,7 +229,7 @@ class SavedResult:
         rig: its name.
         made_by: the program and its version.
         pairs: one for each camera and LiDAR.
-        inputs_sha256: SHA-256 of the session's files that the result was made from, by their path in it.
+        inputs_sha256: SHA-256 of the result's input files, by their path in the session.
     """
 
     rig: str
@@ -247,7 +248,7 @@ def to_json_dict(
     Args:
         rig_name: of the profile.
         calibrations: one for each camera and LiDAR.
-        inputs_sha256: SHA-256 of the session's files behind the result, by their path in it.
+        inputs_sha256: SHA-256 of the result's input files, by their path in the session.
 
     Raises:
         ResultRefusedError: a pose or covariance is not finite.
@@ -263,98 +264,59 @@ def to_json_dict(
 
 
 def _pair(calibration: Calibration) -> dict[str, Any]:
-    metrics, certificate = calibration.metrics, calibration.certificate
-    refused = {
-        name: refusal_as_json(refusal) for name, refusal in sorted(calibration.captures_refused.items())
+    """List what `PairRecord` holds, in its order."""
+    pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
+    calculated = {
+        **vars(calibration.metrics),
+        "mge_m": calibration.metrics.mge_m,
+        "diagnostics": dict(sorted(calibration.diagnostics.items())),
+        "channels": calibration.channel_results,
     }
-    return {
-        "camera": calibration.camera,
-        "channel": calibration.channel,
-        "lidar": calibration.lidar,
-        "T_cam_lidar": _matrix(calibration.T_cam_lidar, "T_cam_lidar", calibration),
-        "cov": _matrix(calibration.cov, "cov", calibration),
-        "sigma_rotation_deg": calibration.sigma_rotation_deg,
-        "sigma_translation_m": calibration.sigma_translation_m,
-        "n_captures": int(calibration.n_captures),
-        "n_detected": int(calibration.n_detected),
-        "captures_used": list(calibration.captures_used),
-        "captures_refused": refused,
-        "mpe_m": _figure(metrics.mpe_m),
-        "mee_m": _figure(metrics.mee_m),
-        "mge_m": _figure(metrics.mge_m),
-        "reprojection_px": _figure(metrics.reprojection_px),
-        "certificate": {"is_optimal": bool(certificate.is_optimal), "gap": _figure(certificate.gap)},
-        "egt_rotation_deg": _figure(calibration.egt_rotation_deg),
-        "egt_translation_m": _figure(calibration.egt_translation_m),
-        "verdict": calibration.verdict,
-        "reasons": list(calibration.reasons),
+    written = {
+        "captures_refused": {
+            name: refusal_as_json(refusal) for name, refusal in sorted(calibration.captures_refused.items())
+        },
         "findings": [as_json(finding) for finding in calibration.findings],
-        "diagnostics": {name: _figure(value) for name, value in sorted(calibration.diagnostics.items())},
-        "channels": [_channel(result, calibration) for result in calibration.channel_results],
-        "method": calibration.method,
-        "uncertainty": [asdict(each) for each in calibration.uncertainty],
-        "estimated_with": list(calibration.estimated_with),
-        "other_cameras": [_other_camera(other, calibration) for other in calibration.other_cameras],
     }
-
-
-def _channel(result: ChannelResult, calibration: Calibration) -> dict[str, Any]:
     return {
-        "channel": result.channel,
-        "n_captures": int(result.n_captures),
-        "noise_px": float(result.noise_px),
-        "T_cam_lidar": _matrix(result.T_cam_lidar, f"T_cam_lidar of {result.channel}", calibration),
-        "cov": _matrix(result.cov, f"cov of {result.channel}", calibration),
-        "depth_scatter_m": float(result.depth_scatter_m),
-        "depth_scatter_still_m": float(result.depth_scatter_still_m),
-        "time_offset_s": _figure(result.time_offset_s),
-        "time_offset_sigma_s": _figure(result.time_offset_sigma_s),
+        name: written[name]
+        if name in written
+        else _plain(calculated[name] if name in calculated else getattr(calibration, name), name, pair)
+        for name in PairRecord.model_fields
     }
 
 
-def _other_camera(other: OtherCamera, calibration: Calibration) -> dict[str, Any]:
-    def matrix(value: Array | None, name: str) -> list[list[float]] | None:
-        return None if value is None else _matrix(value, f"{name} to {other.camera}", calibration)
-
-    return {
-        "camera": other.camera,
-        "n_captures": int(other.n_captures),
-        "T_cam_other": matrix(other.T_cam_other, "T_cam_other"),
-        "cov": matrix(other.cov, "cov"),
-        "T_cam_other_pictures": matrix(other.T_cam_other_pictures, "T_cam_other_pictures"),
-        "apart_rotation_deg": _figure(other.apart_rotation_deg),
-        "apart_translation_m": _figure(other.apart_translation_m),
-        "board_rms_m": float(other.board_rms_m),
-    }
-
-
-def _matrix(matrix: Array, name: str, calibration: Calibration) -> list[list[float]]:
-    if not np.isfinite(matrix).all():
-        pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
-        raise ResultRefusedError(
-            f"{name} of {pair} is not finite", "the captures leave a direction undetermined: add captures"
-        )
-    return [[float(value) for value in row] for row in np.asarray(matrix) + 0.0]
-
-
-def _figure(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(value)
+def _plain(value: Any, name: str, pair: str) -> Any:
+    """Convert a value to plain types: records and mappings to dicts, arrays to rows, NaN to null."""
+    if is_dataclass(value):
+        value = vars(value)
+    if isinstance(value, Mapping):
+        return {key: _plain(each, f"{name}.{key}", pair) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each, f"{name}[{k}]", pair) for k, each in enumerate(value)]
+    if isinstance(value, np.ndarray):
+        if not np.isfinite(value).all():
+            what = f"{name} of {pair} is not finite"
+            raise ResultRefusedError(what, "Add captures: they leave a direction undetermined.")
+        return (value.astype(np.float64) + 0.0).tolist()
+    value = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def result_text(
     rig_name: str, calibrations: Sequence[Calibration], inputs_sha256: Mapping[str, str] | None = None
 ) -> str:
-    """Write the content of result.json: deterministic, floats to the last digit, a matrix row a line."""
+    """Write the content of result.json: deterministic, floats with all digits, one matrix row per line."""
     return layout(to_json_dict(rig_name, calibrations, inputs_sha256))
 
 
 def layout(document: Mapping[str, Any]) -> str:
-    """Lay the content of result.json out as its text."""
+    """Format the content of result.json as text."""
     return _layout(document, "") + "\n"
 
 
 def _layout(value: Any, indent: str) -> str:
-    """Lay JSON out as json.dumps(indent=2) does, but lists of plain values on one line."""
+    """Format JSON like json.dumps(indent=2), but lists of plain values on one line."""
     deeper = indent + "  "
     if isinstance(value, dict) and value:
         items = (
@@ -373,7 +335,7 @@ def write_result(
     calibrations: Sequence[Calibration],
     inputs_sha256: Mapping[str, str] | None = None,
 ) -> None:
-    """Write result.json, whole or not at all.
+    """Write result.json in one step.
 
     Raises:
         ResultRefusedError: a pose or covariance is not finite.
@@ -386,24 +348,18 @@ def read_result(path: Path | str) -> SavedResult:
     """Read result.json back, exactly as it was written; keys that later versions may add are ignored.
 
     Raises:
-        SessionError: no such file, or not a result that can be trusted; with the key at fault.
+        SessionError: no such file, or not a valid result; with the key at fault.
     """
     path = Path(path)
-    try:
+    if not path.exists():
+        raise SessionError(f"{path}: there is no such file", "`lce-rig calibrate SESSION` writes it")
+    with reading(path, SessionError, "run `lce-rig calibrate SESSION` again"):
         data = read_json(path)
-    except FileNotFoundError as error:
-        raise SessionError(
-            f"{path}: there is no such file", "`lce-rig calibrate SESSION` writes it"
-        ) from error
-    except OSError as error:
-        raise SessionError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise SessionError(f"{path}: {error}", "run `lce-rig calibrate SESSION` again") from error
     version = data.get("format_version") if isinstance(data, dict) else None
     if version != FORMAT_VERSION or isinstance(version, bool):
         raise SessionError(
-            f"{path}: format_version is {describe(version)}, this lce-rig reads {FORMAT_VERSION}",
-            "run `lce-rig calibrate SESSION` again",
+            f"{path}: format_version is {describe(version)}, but this lce-rig reads {FORMAT_VERSION}",
+            "Run `lce-rig calibrate SESSION` again.",
         )
     try:
         record = ResultRecord.model_validate(data)
@@ -413,7 +369,7 @@ def read_result(path: Path | str) -> SavedResult:
         what = (
             f"{path}: {describe(key)[1:-1] + ': ' if key else ''}{first['msg'].removeprefix('Value error, ')}"
         )
-        raise SessionError(what, "run `lce-rig calibrate SESSION` again") from error
+        raise SessionError(what, "Run `lce-rig calibrate SESSION` again.") from error
     calibrations = tuple(_calibration(pair) for pair in record.pairs)
     return SavedResult(record.rig, record.made_by, calibrations, record.inputs_sha256)
 

@@ -9,11 +9,12 @@ import numpy as np
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, pose
 from lce_rig.core.results import Calibration
-from lce_rig.export.files import header, number, reads_back, write_atomically
+from lce_rig.export.files import header, number, reads_back
 from lce_rig.export.frames import Joint, build_trees, choose_channels
 from lce_rig.export.probes import check_pose
 from lce_rig.export.rotations import quaternion_wxyz, rotation_from_quaternion
 from lce_rig.rig import Rig
+from lce_rig.session.durable import write_atomically
 
 FILE_NAME = "static_transforms.txt"
 _NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -23,7 +24,7 @@ def export_static_tf(calibrations: Sequence[Calibration], rig: Rig, folder: Path
     """Write static_transforms.txt and check it by reading it back.
 
     Raises:
-        LceRigError: the file does not say what was calibrated.
+        LceRigError: the file reads back differently.
     """
     chosen = choose_channels(calibrations, rig)
     joints = [joint for tree in build_trees(calibrations, rig) for joint in tree.joints]
@@ -84,7 +85,7 @@ def _check(path: Path, joints: Sequence[Joint], chosen: Sequence[Calibration], r
     wanted = {(joint.parent, joint.child) for joint in joints}
     for version, poses in read_static_tf(path).items():
         if set(poses) != wanted:
-            raise LceRigError(f"{path}: {version}: other frames read back than written")
+            raise LceRigError(f"{path}: {version}: reads back with different frames")
         for calibration in chosen:
             camera, lidar = rig.cameras[calibration.camera], rig.lidars[calibration.lidar]
             T_body_optical = poses[camera.frame, camera.optical_frame]

@@ -10,18 +10,19 @@ import numpy as np
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, pose
 from lce_rig.core.results import Calibration
-from lce_rig.export.files import header, number, reads_back, write_atomically
+from lce_rig.export.files import header, number, reads_back
 from lce_rig.export.frames import RPY_BODY_OPTICAL, FrameTree, build_trees, check_tree, choose_channels
 from lce_rig.export.probes import check_pose
 from lce_rig.export.rotations import rotation_from_rpy, rpy
 from lce_rig.rig import Rig
+from lce_rig.session.durable import write_atomically
 
 
 def export_urdf(calibrations: Sequence[Calibration], rig: Rig, folder: Path) -> list[Path]:
     """Write RIG.urdf, and RIG-ROOT.urdf for sensors not connected with the base, and read them back.
 
     Raises:
-        LceRigError: a file is not a tree or does not say what was calibrated.
+        LceRigError: a file is not a tree or reads back differently.
     """
     chosen = choose_channels(calibrations, rig)
     paths = []
@@ -36,8 +37,9 @@ def export_urdf(calibrations: Sequence[Calibration], rig: Rig, folder: Path) -> 
 
 def _text(tree: FrameTree, head: list[str], name: str) -> str:
     lines = ['<?xml version="1.0" encoding="utf-8"?>']
-    # A double hyphen would end an XML comment early.
-    lines += [f"<!-- {line.replace('--', '- -')} -->" for line in head]
+    # A double hyphen would end an XML comment early. ROS 2 reads a parameter's value as YAML, in which ": "
+    # makes a mapping: `robot_description:="$(cat rig.urdf)"` would be refused.
+    lines += [f"<!-- {line.replace('--', '- -').replace(': ', ' - ')} -->" for line in head]
     lines.append(f"<robot name={quoteattr(name)}>")
     lines += [f"  <link name={quoteattr(frame)}/>" for frame in tree.frames]
     for joint in tree.joints:

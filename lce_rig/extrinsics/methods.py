@@ -1,4 +1,4 @@
-"""One camera and one LiDAR: pairs that agree on one extrinsic, then the method that the options name."""
+"""One camera and one LiDAR: reject pairs that disagree, then apply the method of the options."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -20,7 +20,7 @@ METHODS: Mapping[Method, Estimator] = {
     "ml": calibrate_by_likelihood,
     "paper": calibrate_by_algorithm_1,
 }
-"""Name -> what estimates T_cam_lidar from boards whose pairing is settled."""
+"""Name -> function that estimates T_cam_lidar from matched boards."""
 
 
 def fit_extrinsic(
@@ -29,16 +29,16 @@ def fit_extrinsic(
     options: EstimateSettings | None = None,
     progress: Progress | None = None,
 ) -> CalibrationEstimate:
-    """Estimate T_cam_lidar from what both sensors saw of the board.
+    """Estimate T_cam_lidar from both sensors' detections.
 
     Args:
-        candidates: of each capture in which both sensors saw something; their order does not matter.
+        candidates: of each capture with detections of both sensors, in any order.
         board: its specification.
         options: switches of the algorithm.
         progress: called with (subsets done, subsets in all).
 
     Raises:
-        NotEnoughDataError: too few captures, captures that agree with no extrinsic, or captures that leave a
+        NotEnoughDataError: too few captures, captures that agree with no extrinsics, or captures that leave a
             direction undetermined, which is named.
     """
     options = options or EstimateSettings()
@@ -53,10 +53,10 @@ def calibrate_observations(
     options: EstimateSettings,
     progress: Progress | None = None,
 ) -> CalibrationEstimate:
-    """Estimate T_cam_lidar by the settings' method from boards whose pairing is settled.
+    """Estimate T_cam_lidar by the settings' method from matched boards.
 
     Args:
-        observations: one a capture.
+        observations: one per capture.
         board: its specification.
         options: switches of the algorithm.
         progress: called with (subsets done, subsets in all).
@@ -70,7 +70,7 @@ def calibrate_observations(
 
 
 def with_consensus(estimate: CalibrationEstimate, consensus: Consensus) -> CalibrationEstimate:
-    """Add to an estimate what the consensus had refused before."""
+    """Add the consensus's refusals to an estimate."""
     return replace(
         estimate,
         refused=dict(sorted({**consensus.refused, **estimate.refused}.items())),
@@ -82,19 +82,20 @@ def agree(candidates: Sequence[CaptureCandidates], board: Board) -> Consensus:
     """Find the consensus, or explain why there is none.
 
     Raises:
-        NotEnoughDataError: too few captures, or captures that agree with no extrinsic.
+        NotEnoughDataError: too few captures, or captures that agree with no extrinsics.
     """
     needed = _MIN_CAPTURES
     if len(candidates) < needed:
         raise NotEnoughDataError(
-            f"{len(candidates)} captures show the board in both sensors, {needed} are needed",
-            "add captures: ten or more, with the board at different places and tilts",
+            f"{len(candidates)} captures show the board in both sensors (minimum {needed})",
+            "Add captures: ten or more, with the board at different places and tilts.",
         )
     consensus = find_consensus(candidates, board)
     n_agreeing = 0 if consensus is None else len(consensus.observations)
     if consensus is None or n_agreeing < needed:
         raise NotEnoughDataError(
-            f"only {n_agreeing} of {len(candidates)} captures agree with one extrinsic, {needed} are needed",
-            "check the board's size, the intrinsics and the pairing of pictures with scans; add captures",
+            f"only {n_agreeing} of {len(candidates)} captures agree with one set of extrinsics, {needed} "
+            "are needed",
+            "check the board's size, the intrinsics and the pairing of images with scans; add captures",
         )
     return consensus

@@ -1,4 +1,4 @@
-"""Which motions of the extrinsic the captures determine, and which they leave open, in words."""
+"""Which motions of the extrinsics the captures determine, and which they do not, in words."""
 
 from collections.abc import Sequence
 
@@ -11,9 +11,9 @@ from lce_rig.residuals.moments import Problem, Weights
 from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS
 from lce_rig.solvers.registration import vec_rotation, with_one
 
-# One capture's board plane, camera against LiDAR, is good to about this much.
+# Standard deviation of one capture's board plane between camera and LiDAR.
 PLANE_SIGMA_M = 0.005
-# A motion that moves the board by more than this without a trace in the planes counts as undetermined.
+# A motion that moves the board by more than this without changing the planes counts as undetermined.
 MAX_WEAK_SIGMA_M = 0.1
 _AXES = ("x axis (right)", "y axis (down)", "z axis (line of sight)")
 
@@ -21,7 +21,7 @@ _AXES = ("x axis (right)", "y axis (down)", "z axis (line of sight)")
 def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_cam_lidar: Array) -> None:
     """Check that the boards' planes alone determine all six directions.
 
-    Edges could stand in for planes, but a set that needs them to is fragile: their errors are systematic.
+    Edges could replace planes, but a set that requires this is fragile, as edge errors are systematic.
 
     Args:
         features: of the captures in `problem`.
@@ -29,7 +29,7 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
         T_cam_lidar: (4, 4) estimate.
 
     Raises:
-        NotEnoughDataError: a direction is left open; it is named.
+        NotEnoughDataError: a direction is undetermined; it is named.
     """
     x = with_one(
         np.concatenate([vec_rotation(T_cam_lidar[:3, :3]), T_cam_lidar[:3, 3], np.zeros(problem.n_shift)])
@@ -48,12 +48,12 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
     raise NotEnoughDataError(
         f"{' and '.join(names)} cannot be told from {len(features)} captures: their boards are nearly "
         f"parallel (normals spread by {spread_deg:.1f} deg)",
-        "add captures with the board tilted by 20 deg or more, left and right as well as up and down",
+        "Add captures with the board tilted by 20 deg or more, left and right as well as up and down.",
     )
 
 
 def lever_arm(features: Sequence[CaptureFeatures]) -> float:
-    """Compute the rms distance of the boards from the camera, m: what a rotation of 1 rad moves them by."""
+    """Compute the rms distance of the boards from the camera, m: displacement by a rotation of 1 rad."""
     return float(np.sqrt(np.mean([f.centre @ f.centre for f in features])))
 
 
@@ -73,7 +73,7 @@ def name_direction(direction: Array) -> str:
 
 
 def describe_weakest(cov: Array, features: Sequence[CaptureFeatures]) -> str:
-    """Say which motion is least certain, and how uncertain, from a covariance (6, 6)."""
+    """Name the least determined motion and its standard deviation, from a covariance (6, 6)."""
     lever_m = lever_arm(features)
     scale = np.r_[np.ones(3), np.full(3, lever_m)]
     _, vectors = np.linalg.eigh(cov * np.outer(scale, scale))

@@ -1,4 +1,4 @@
-"""From a solution to an estimate with residuals and figures, the same whatever method found it."""
+"""Turn a solution of any method into an estimate with residuals and figures."""
 
 from collections.abc import Mapping, Sequence
 
@@ -13,12 +13,12 @@ from lce_rig.extrinsics.observability import describe_weakest
 from lce_rig.residuals.features import CaptureFeatures
 from lce_rig.residuals.placements import group_placements
 
-# Of methods that prove nothing about their minimum.
+# For methods without a certificate.
 NO_CERTIFICATE = Certificate(is_optimal=False, gap=float("inf"))
 
 
 def name_sigmas(part: str, cov: Array) -> dict[str, float]:
-    """Name the sizes of a part of a claim, "scatter" or "systematic", as diagnostics: cov (6 + k, 6 + k)."""
+    """Return the sizes of a covariance part, "scatter" or "systematic", as diagnostics: (6 + k, 6 + k)."""
     sigma_deg, sigma_m = sigma_sizes(cov)
     return {f"sigma_{part}_rotation_deg": sigma_deg, f"sigma_{part}_translation_m": sigma_m}
 
@@ -36,18 +36,18 @@ def report_estimate(
     refused: Mapping[str, Refusal],
     diagnostics: Mapping[str, float],
 ) -> CalibrationEstimate:
-    """Measure the residuals of an extrinsic and put everything known about it together.
+    """Measure the residuals of extrinsics and assemble the estimate.
 
     Args:
         T_cam_lidar: (4, 4).
         cov: (6, 6) of it, tangent (translation m, rotation rad).
-        observations: the F captures used, as measured: residuals are of these.
+        observations: the F captures used, as measured; residuals are computed from these.
         features: of each.
         board: the board.
-        fitted: the same as the method's cost takes them, where it moves ring ends; as measured where None.
-        certificate: of the minimum, where the method gives one.
-        held_out_m: (F,) rms residual of each capture where it was not fitted, where the method knows it.
-        refused: captures that the method left out.
+        fitted: the same as used in the method's cost, if it moves ring ends; as measured if None.
+        certificate: of the minimum, if the method gives one.
+        held_out_m: (F,) rms residual of each held-out capture, if the method computes it.
+        refused: captures that the method rejected.
         diagnostics: the method's own figures.
     """
     held_out = np.full(len(observations), np.nan) if held_out_m is None else held_out_m

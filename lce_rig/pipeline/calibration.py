@@ -1,4 +1,4 @@
-"""Estimate and judge the extrinsic of every camera with every LiDAR of a session.
+"""Estimate and judge the extrinsics of every camera with every LiDAR of a session.
 
 detections -> estimate of each camera with each LiDAR -> cameras of one LiDAR, together -> checks, verdict
 """
@@ -34,7 +34,7 @@ from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.result_files import Result
 from lce_rig.rig import Rig
 from lce_rig.session import Session
-from lce_rig.validation.camera_pairs import CameraPair, doubt_cameras, relate
+from lce_rig.validation.camera_pairs import CameraPair, camera_findings, relate
 from lce_rig.validation.reach import point_uncertainties
 from lce_rig.validation.validate import Validation, validate
 from lce_rig.validation.verdict import judge
@@ -43,12 +43,12 @@ from lce_rig.words import sentence
 
 @dataclass(frozen=True, eq=False)
 class _Sensors:
-    """One camera with one LiDAR, and what both saw.
+    """One camera with one LiDAR, and their detections.
 
     Attributes:
         pairs: channels of the camera with the LiDAR.
-        settings: the user's options, with what the profile says of the LiDAR.
-        candidates: by channel, of captures in which both sensors saw something.
+        settings: the user's options, with the LiDAR's properties from the profile.
+        candidates: by channel, of captures with detections of both sensors.
         refused: why the other captures are unusable.
     """
 
@@ -68,12 +68,12 @@ class _Sensors:
 
 @dataclass(frozen=True, eq=False)
 class _Link:
-    """Two cameras that saw the same boards, by their place among all that have an estimate."""
+    """Two cameras that saw the same boards, by their indices among those with an estimate."""
 
     first: int
     second: int
     pair: CameraPair
-    doubts: tuple[Finding, ...]
+    findings: tuple[Finding, ...]
 
 
 def calibrate(
@@ -86,19 +86,20 @@ def calibrate(
     reference: Reference | None = None,
     progress: Progress = silent,
 ) -> Result:
-    """Estimate and judge the extrinsic of every camera with every LiDAR of a session; nothing is written.
+    """Estimate and judge the extrinsics of every camera with every LiDAR of a session; nothing is written.
 
     Args:
         session: open for reading is enough.
         detections: of the session; None detects the board first, as `detect` does by default.
-        options: of the estimate; None takes the usual ones.
-        cameras: to calibrate, as if the session held no others; None takes all.
-        channels: of the cameras, to use; None takes all that the session holds.
+        options: of the estimate; None for the defaults.
+        cameras: the cameras to calibrate, as if the session held no others; None for all.
+        channels: the cameras' channels to use; None for all that the session holds.
         reference: extrinsics to report errors against; they never enter the estimate or the verdict.
         progress: called with (done, total) for each camera and LiDAR in turn.
 
     Raises:
-        NotEnoughDataError: every pair has too few captures or leaves a direction open; the causes are named.
+        NotEnoughDataError: every pair has too few captures or an undetermined direction; the causes are
+            named.
         UsageError: no capture holds one of the channels.
     """
     pairs, shortages = calibrate_detections(
@@ -123,10 +124,10 @@ def calibrate_detections(
     reference: Reference | None = None,
     progress: Progress = silent,
 ) -> tuple[list[Calibration], list[NotEnoughDataError]]:
-    """Estimate and judge the extrinsic of every camera with every LiDAR from what they saw of the board.
+    """Estimate and judge the extrinsics of every camera with every LiDAR from their detections.
 
-    Channels of one camera share pixels and lens: together they give one extrinsic. Cameras that saw the same
-    boards are held against each other, and with method "ml" estimated together.
+    Channels of one camera share pixels and lens: together they give one set of extrinsics. Cameras that saw
+    the same boards are compared with each other, and with method "ml" estimated together.
 
     Args:
         rig: thresholds, targets and nominal extrinsics.
@@ -134,10 +135,11 @@ def calibrate_detections(
         options, cameras, channels, reference, progress: as of `calibrate`.
 
     Returns:
-        The sensors that could be calibrated; and for each other pair why not.
+        The calibrated sensors, and for each other pair the cause.
 
     Raises:
-        NotEnoughDataError: every pair has too few captures or leaves a direction open; the causes are named.
+        NotEnoughDataError: every pair has too few captures or an undetermined direction; the causes are
+            named.
         UsageError: no capture holds one of the channels.
     """
     board = rig.board.to_board()
@@ -159,9 +161,9 @@ def calibrate_detections(
     calibrations = []
     for k, own in enumerate(sensors):
         mine = [link for link in links if k in (link.first, link.second)]
-        doubts = [doubt for link in mine for doubt in link.doubts]
+        contradictions = [finding for link in mine for finding in link.findings]
         others = tuple(_other_camera(sensors, final, checked, k, link, joint) for link in mine)
-        calibration = _judged(rig, detections, own, final[k], checked[k], doubts, others)
+        calibration = _judged(rig, detections, own, final[k], checked[k], contradictions, others)
         truth = reference.of(own.camera, own.lidar) if reference else None
         calibrations.append(calibration if truth is None else _compared(calibration, truth))
     return calibrations, shortages
@@ -170,11 +172,11 @@ def calibrate_detections(
 def _nothing_solved(
     troubles: Sequence[NotEnoughDataError], cameras: Sequence[str] | None
 ) -> NotEnoughDataError:
-    """Say of every pair why it could not be calibrated."""
+    """State for every pair why it could not be calibrated."""
     if not troubles:
         of_cameras = f" of {' or '.join(cameras)}" if cameras else ""
         return NotEnoughDataError(
-            f"the session holds no capture with a picture{of_cameras} and a scan", "Collect captures first."
+            f"the session has no capture with an image{of_cameras} and a scan", "Collect captures first."
         )
     return join_shortages(troubles)
 
@@ -182,12 +184,12 @@ def _nothing_solved(
 def _pairs_by_sensors(
     detections: Detections, cameras: Sequence[str] | None, channels: Sequence[str] | None
 ) -> list[list[Pair]]:
-    """Bring together the pairs of one camera and LiDAR, whose channels are calibrated as one."""
+    """Group the pairs by camera and LiDAR, whose channels are calibrated jointly."""
     held = sorted({pair.channel for pair in detections.pairs})
     unknown = sorted(set(channels or ()) - set(held))
     if unknown:
         raise UsageError(
-            f"no capture of the session holds channel {unknown[0]!r}", f"there is {', '.join(held)}"
+            f"no capture of the session has channel {unknown[0]!r}", f"Choose one of: {', '.join(held)}"
         )
     wanted = [
         pair
@@ -201,10 +203,10 @@ def _pairs_by_sensors(
 
 
 def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: CalibrateOptions) -> _Sensors:
-    """Gather the candidates of each channel that has captures enough, and why other captures are unusable.
+    """Collect the candidates of each channel with enough captures, and why other captures are unusable.
 
     Raises:
-        NotEnoughDataError: no channel has.
+        NotEnoughDataError: no channel has enough.
     """
     candidates: dict[str, list[CaptureCandidates]] = {}
     refused: dict[str, Refusal] = {}
@@ -243,33 +245,33 @@ def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandida
 
 
 def _commonest(refused: dict[str, Refusal]) -> str:
-    """List the commonest causes of refusal, one a line."""
+    """List the most frequent causes of refusal, one per line."""
     counts = Counter(f"{why.stage}: {sentence(why)}" for why in refused.values())
     return "\n".join(f"{n} x {text}" for text, n in counts.most_common(3))
 
 
 def _links(rig: Rig, sensors: Sequence[_Sensors], alone: Sequence[CalibrationEstimate]) -> Iterator[_Link]:
-    """Compare cameras of one LiDAR that saw the same boards held still."""
+    """Compare cameras of one LiDAR that saw the same still boards."""
     for i, j in combinations(range(len(sensors)), 2):
         if sensors[i].lidar == sensors[j].lidar and _is_still(alone[i]) and _is_still(alone[j]):
-            # Captures that contradict each other widen what a method claims: that must not excuse them.
+            # Contradicting captures widen a method's covariance; that must not hide the contradiction.
             pair = relate(alone[i], alone[j])
             if pair is not None:
                 names = sensors[i].camera, sensors[j].camera
-                yield _Link(i, j, pair, tuple(doubt_cameras(pair, names, rig.calibration, rig.verdict)))
+                yield _Link(i, j, pair, tuple(camera_findings(pair, names, rig.calibration, rig.verdict)))
 
 
 def _is_still(estimate: CalibrationEstimate) -> bool:
-    """Tell whether boards stood still, so that images count as they are, whenever they were taken."""
+    """Return whether boards stood still, so that images need no motion compensation."""
     return all(channel.time_offset_s is None for channel in estimate.channels)
 
 
 def _estimate_together(
     rig: Rig, sensors: Sequence[_Sensors], alone: Sequence[CalibrationEstimate], links: Sequence[_Link]
 ) -> dict[int, TogetherEstimate]:
-    """Estimate cameras that agree together, with method "ml", by their place.
+    """Estimate cameras that agree jointly with method "ml"; return the results by index.
 
-    One that contradicts another is not among them, or it would spoil the other's extrinsic.
+    A camera that contradicts another is excluded, as it would corrupt the other's extrinsics.
     """
     joint: dict[int, TogetherEstimate] = {}
     for group in _groups(len(sensors), links):
@@ -281,14 +283,16 @@ def _estimate_together(
 
 
 def _groups(n: int, links: Sequence[_Link]) -> list[list[int]]:
-    """List groups of two or more that sound links connect, without those in which a link is doubted."""
+    """List groups of two or more connected cameras, without those that have a contradicted link."""
     group = list(range(n))
     for link in links:
-        if not link.doubts:
+        if not link.findings:
             mine, other = group[link.first], group[link.second]
             group = [mine if number == other else number for number in group]
-    doubted = {group[link.first] for link in links if link.doubts and group[link.first] == group[link.second]}
-    found = [[k for k in range(n) if group[k] == number] for number in sorted(set(group) - doubted)]
+    contradicted = {
+        group[link.first] for link in links if link.findings and group[link.first] == group[link.second]
+    }
+    found = [[k for k in range(n) if group[k] == number] for number in sorted(set(group) - contradicted)]
     return [members for members in found if len(members) > 1]
 
 
@@ -300,7 +304,7 @@ def _from_all_cameras(
     alone: CalibrationEstimate,
     joint: Mapping[int, TogetherEstimate],
 ) -> CalibrationEstimate:
-    """Give the estimate together with other cameras where there is one, else the camera's own."""
+    """Return the joint estimate if there is one, else the camera's own."""
     if k not in joint:
         return alone
     estimate = joint[k].estimates[sensors.camera]
@@ -323,13 +327,13 @@ def _other_camera(
     link: _Link,
     joint: Mapping[int, TogetherEstimate],
 ) -> OtherCamera:
-    """Say where the other camera of a link sits to camera k."""
+    """State the pose of the other camera of a link relative to camera k."""
     pair, is_second = link.pair, k == link.second
     other = link.first if is_second else link.second
     T, J = relative_pose(estimates[k].T_cam_lidar, estimates[other].T_cam_lidar)
     cov = None
     if k in joint and joint[k] is joint.get(other):
-        # Widened as both extrinsics were.
+        # Widened like both extrinsics.
         J = J * np.repeat([checked[k].widened_by, checked[other].widened_by], 6)
         cov = np.asarray(J @ joint[k].covariance_of(sensors[k].camera, sensors[other].camera) @ J.T)
     seen = None if pair.pictures is None else pair.pictures.T_second_first
@@ -410,7 +414,7 @@ def _judged(
 
 
 def _still_refused(estimate: CalibrationEstimate, refused: Mapping[str, Refusal]) -> dict[str, Refusal]:
-    """List refusals by capture, less what another channel of the same scan made up for."""
+    """List refusals by capture, except those for which another channel of the same scan is usable."""
     used = take_apart(estimate.used)
     every = dict(refused)
     for name, why in estimate.refused.items():
@@ -419,20 +423,20 @@ def _still_refused(estimate: CalibrationEstimate, refused: Mapping[str, Refusal]
 
 
 def _compared(calibration: Calibration, reference: Array) -> Calibration:
-    """Report the error against a T_cam_lidar (4, 4) that somebody else vouches for."""
+    """Report the error from a reference T_cam_lidar (4, 4)."""
     rotation_deg, translation_m = error_to_reference(calibration.T_cam_lidar, reference)
     return replace(calibration, egt_rotation_deg=rotation_deg, egt_translation_m=translation_m)
 
 
 def refusals_of(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refusal]:
-    """Say why captures of a pair cannot be used: a sensor saw no board, or both sensors disagree."""
+    """State why captures of a pair are unusable: a sensor found no board, or both sensors disagree."""
     candidates, refused = _candidates(detections, pair)
     consensus = find_consensus(candidates, rig.board.to_board()) if len(candidates) >= 3 else None
     return dict(sorted({**refused, **(consensus.refused if consensus else {})}.items()))
 
 
 def clocks_of(rig: Rig, camera: str, lidar: str) -> Clocks:
-    """Read what the profile says of the time of a camera and a LiDAR."""
+    """Read the time settings of a camera and a LiDAR from the profile."""
     stamps = {name: channel.timestamps for name, channel in rig.cameras[camera].channels.items()}
     return Clocks(
         sweep_s=1 / rig.lidars[lidar].rate_hz,

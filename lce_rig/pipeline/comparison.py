@@ -1,4 +1,4 @@
-"""The same rig calibrated in several sessions: what each says, and whether they agree."""
+"""Compare the calibrations of one rig in several sessions."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -14,25 +14,24 @@ from lce_rig.core.results import Calibration
 from lce_rig.export.result import read_result
 from lce_rig.pipeline.calibration import calibrate
 from lce_rig.pipeline.detect_session import Progress, silent
-from lce_rig.pipeline.result_files import RESULT
+from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_parts, stored_results
 from lce_rig.session import Session
 from lce_rig.session.identity import DifferingKey, differing_keys
-from lce_rig.session.session import CALIBRATION
 from lce_rig.validation.repeatability import Repeatability, compare_calibrations
 
-# What an extrinsic depends on beside the captures: another lens is another camera.
+# Inputs of the extrinsics besides the captures; another lens is another camera.
 _SAME_SENSORS = frozenset({"intrinsics", "resolution_px", "model"})
 
 
 @dataclass(frozen=True, eq=False)
 class Repeat:
-    """Sessions of one rig, compared.
+    """Sessions of one rig, or results of one session, compared.
 
     Attributes:
         rig: its name.
         comparisons: one for each camera and LiDAR that at least two sessions calibrate.
         calibrated: names of the sessions that held no result and were calibrated for this.
-        findings: errors name sessions whose own calibration must not be used, warnings what else to know.
+        findings: errors name sessions whose own calibration has failed; warnings state limits.
     """
 
     rig: str
@@ -42,17 +41,51 @@ class Repeat:
 
     @property
     def failed(self) -> tuple[Finding, ...]:
-        """Calibrations that must not be used, by session and sensors."""
+        """Failed calibrations, by session and sensors."""
         return tuple(finding for finding in self.findings if finding.severity == "error")
 
 
-def repeat(folders: Sequence[Path | str], *, progress: Progress = silent) -> Repeat:
+def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
+    """Compare the results that one session holds, such as those of frames and of events.
+
+    Args:
+        folder: of the session.
+        names: of the results; all but the previous one where empty.
+
+    Raises:
+        UsageError: fewer than two results; or a name is given twice, or cannot be one.
+        SessionError: there is no result of that name, or one cannot be read.
+    """
+    session = Session.open(folder)
+    stored = {each.name: each for each in stored_results(session)}
+    listed = f"Its results: {', '.join(stored) or 'none'}."
+    for name in names:
+        result_parts(name)
+        if list(names).count(name) > 1:
+            raise UsageError(f"result {name} is given twice")
+        if name not in stored:
+            raise SessionError(f"{session.path} has no result {name!r}", listed)
+    chosen = list(names) or [name for name in stored if name != PREVIOUS]
+    if len(chosen) < 2:
+        raise UsageError(
+            f"{session.path} has no two results to compare",
+            f"{listed} Add one: lce-rig calibrate {session.path} --name NAME, or name a second session.",
+        )
+    results = {name: _read_calibrations(session, stored[name].folder) for name in chosen}
+    comparisons, lonely = _comparisons(results, are_independent=False)
+    _require_some(comparisons, results, "results")
+    outdated = [Finding("results.outdated", "warning", name) for name in chosen if stored[name].is_outdated]
+    return Repeat(session.rig.name, comparisons, (), (*outdated, *lonely, *_failures(results)))
+
+
+def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: Progress = silent) -> Repeat:
     """Compare the results of independent sessions of one rig.
 
-    A session without a result is calibrated with the usual options; nothing is written.
+    A session without a result is calibrated with the default options; nothing is written.
 
     Args:
         folders: of the sessions.
+        name: of the result to take from each; None for the one in calibration/.
         progress: called with (done, total) sessions.
 
     Raises:
@@ -63,7 +96,7 @@ def repeat(folders: Sequence[Path | str], *, progress: Progress = silent) -> Rep
     """
     paths = [Path(folder) for folder in folders]
     if len(paths) < 2:
-        raise UsageError("one session alone has nothing to agree with", "Name two sessions or more.")
+        raise UsageError("a comparison requires two sessions or more, 1 given", "Give two sessions or more.")
     _require_different(paths)
     sessions = dict(zip(_names(paths), (Session.open(path) for path in paths), strict=True))
     _require_one_rig(sessions)
@@ -71,40 +104,50 @@ def repeat(folders: Sequence[Path | str], *, progress: Progress = silent) -> Rep
     results: dict[str, list[Calibration]] = {}
     calibrated: list[str] = []
     troubles: list[Finding] = []
-    for done, (name, session) in enumerate(sessions.items(), start=1):
-        if (session.path / CALIBRATION / RESULT).exists():
-            results[name] = _read_calibrations(session)
+    for done, (label, session) in enumerate(sessions.items(), start=1):
+        where = session.path.joinpath(*result_parts(name))
+        if (where / RESULT).exists() or name not in (None, CURRENT):
+            results[label] = _read_calibrations(session, where)
         else:
-            results[name], own_troubles = _calibrate(name, session)
-            calibrated.append(name)
+            results[label], own_troubles = _calibrate(label, session)
+            calibrated.append(label)
             troubles += own_troubles
         progress(done, len(sessions))
     rig = next(iter(sessions.values())).rig.name
     comparisons, lonely = _comparisons(results)
+    _require_some(comparisons, results, "sessions")
+    findings = (*_other_boards(sessions), *troubles, *lonely, *_failures(results))
+    return Repeat(rig, comparisons, tuple(calibrated), findings)
+
+
+def _require_some(
+    comparisons: Sequence[Repeatability], results: dict[str, list[Calibration]], what: str
+) -> None:
     if not comparisons:
         raise SessionError(
-            "no camera and LiDAR are calibrated in two of the sessions",
+            f"no camera and LiDAR are calibrated in two of the {what}",
             "\n".join(_calibrated_sensors(name, own) for name, own in results.items()),
         )
-    failed = [
+
+
+def _failures(results: dict[str, list[Calibration]]) -> list[Finding]:
+    return [
         Finding("repeat.failed", "error", name, {"camera": c.camera, "lidar": c.lidar})
         for name, own in results.items()
         for c in own
         if c.verdict == "fail"
     ]
-    findings = (*_other_boards(sessions), *troubles, *lonely, *failed)
-    return Repeat(rig, comparisons, tuple(calibrated), findings)
 
 
 def _require_different(paths: Sequence[Path]) -> None:
     resolved = [path.resolve() for path in paths]
     for path, where in zip(paths, resolved, strict=True):
         if resolved.count(where) > 1:
-            raise UsageError(f"{path} is given twice", "A session agrees with itself; name independent ones.")
+            raise UsageError(f"{path} is given twice", "Give independent sessions.")
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Call sessions by their folder's name, or by their path where two have the same."""
+    """Name sessions by their folder, or by their path if two folders have the same name."""
     short = [path.resolve().name for path in paths]
     return short if len(set(short)) == len(short) else [str(path) for path in paths]
 
@@ -114,8 +157,8 @@ def _require_one_rig(sessions: dict[str, Session]) -> None:
     for name, session in others:
         if session.rig.name != first.rig.name:
             raise SessionError(
-                f"{first_name} is of rig {first.rig.name!r}, {name} of rig {session.rig.name!r}",
-                "Only sessions of one rig can be compared.",
+                f"{first_name} belongs to rig {first.rig.name!r}, {name} to rig {session.rig.name!r}",
+                "Compare sessions of one rig.",
             )
         keys = [key for key in differing_keys(first.rig, session.rig) if _is_of_sensors(key)]
         if keys:
@@ -126,18 +169,18 @@ def _require_one_rig(sessions: dict[str, Session]) -> None:
 
 
 def _is_of_sensors(difference: DifferingKey) -> bool:
-    """Tell whether a difference between profiles moves extrinsics."""
+    """Return whether a difference between profiles moves extrinsics."""
     block, *keys = difference.path
     return block in ("cameras", "lidars") and not _SAME_SENSORS.isdisjoint(keys)
 
 
 def _require_independent(sessions: dict[str, Session]) -> None:
-    """Refuse sessions that share pictures or scans: a copy agrees with its original whatever is wrong."""
+    """Refuse sessions that share images or scans: a copy agrees with its original despite any error."""
     hashes: dict[str, list[frozenset[str]]] = {}
     for name, session in sessions.items():
         hashes[name] = []
         for capture in session.captures:
-            # A damaged capture is named where it is read.
+            # A damaged capture is reported when it is read.
             with suppress(SessionError):
                 hashes[name].append(capture.file_hashes)
     for one, other in combinations(sessions, 2):
@@ -146,7 +189,7 @@ def _require_independent(sessions: dict[str, Session]) -> None:
         if n_shared:
             raise SessionError(
                 f"{one} and {other} share {n_shared} captures: they are not independent",
-                "Collect each session anew, best with the board put up again.",
+                "Collect each session separately, with the board mounted again.",
             )
 
 
@@ -160,10 +203,10 @@ def _other_boards(sessions: dict[str, Session]) -> list[Finding]:
 
 
 def _calibrate(name: str, session: Session) -> tuple[list[Calibration], list[Finding]]:
-    """Calibrate a session; and say which of its sensors could not be, and why.
+    """Calibrate a session, and report sensors that could not be calibrated.
 
     Raises:
-        NotEnoughDataError: none of them could; the session is named.
+        NotEnoughDataError: no sensors could be calibrated; the session is named.
     """
     try:
         result = calibrate(session)
@@ -180,12 +223,12 @@ def _calibrated_sensors(name: str, calibrations: Sequence[Calibration]) -> str:
     return f"{name}: {sensors or 'its result holds no sensors'}"
 
 
-def _read_calibrations(session: Session) -> list[Calibration]:
-    path = session.path / CALIBRATION / RESULT
+def _read_calibrations(session: Session, folder: Path) -> list[Calibration]:
+    path = folder / RESULT
     saved = read_result(path)
     if saved.rig != session.rig.name:
         raise SessionError(
-            f"{path} is of rig {saved.rig!r}, its session of rig {session.rig.name!r}",
+            f"{path} belongs to rig {saved.rig!r}, its session to rig {session.rig.name!r}",
             "Run `lce-rig calibrate` again.",
         )
     for calibration in saved.pairs:
@@ -197,8 +240,10 @@ def _read_calibrations(session: Session) -> list[Calibration]:
     return list(saved.pairs)
 
 
-def _comparisons(results: dict[str, list[Calibration]]) -> tuple[tuple[Repeatability, ...], list[Finding]]:
-    """Compare camera by camera and LiDAR by LiDAR; and say what only one session calibrates."""
+def _comparisons(
+    results: dict[str, list[Calibration]], *, are_independent: bool = True
+) -> tuple[tuple[Repeatability, ...], list[Finding]]:
+    """Compare each camera and LiDAR, and report those that only one session calibrates."""
     groups: dict[tuple[str, str], dict[str, Calibration]] = {}
     for name, calibrations in results.items():
         for calibration in calibrations:
@@ -209,7 +254,11 @@ def _comparisons(results: dict[str, list[Calibration]]) -> tuple[tuple[Repeatabi
                     "Run `lce-rig calibrate` again.",
                 )
             group[name] = calibration
-    comparisons = [compare_calibrations(group) for _, group in sorted(groups.items()) if len(group) > 1]
+    comparisons = [
+        compare_calibrations(group, are_independent=are_independent)
+        for _, group in sorted(groups.items())
+        if len(group) > 1
+    ]
     lonely = [
         Finding("repeat.only_one", "warning", next(iter(group)), {"camera": camera, "lidar": lidar})
         for (camera, lidar), group in sorted(groups.items())

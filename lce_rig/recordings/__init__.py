@@ -2,13 +2,13 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.folder.recorded_folder import list_parts
 from lce_rig.recordings.protocol import Recording, SourceOptions
-from lce_rig.recordings.ros.bag_file import is_bag_file
+from lce_rig.recordings.ros.bag_file import kind_of
 from lce_rig.rig import Rig
 
 RECORDINGS = {
@@ -38,13 +38,12 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
     path = Path(path)
     if not path.exists():
         raise SourceError(f"{path} does not exist")
-    kind = _kind(path)
+    kind = kind_of(path)
     if kind not in RECORDINGS:
         known = ", ".join(suffix for suffix in RECORDINGS if suffix != "folder")
         hint = f"Give a folder with img/ and pcd/, a bag, or a file of events ({known})."
-        raise SourceError(f"{path} is no recording this program reads", hint)
-    module, name = RECORDINGS[kind].split(":")
-    recording: Recording = getattr(import_module(module), name)(path, rig, options or SourceOptions())
+        raise SourceError(f"{path} is not a recording that lce-rig reads", hint)
+    recording: Recording = resolve_name(RECORDINGS[kind])(path, rig, options or SourceOptions())
     return recording
 
 
@@ -71,7 +70,7 @@ def open_recordings(
 
 
 def _open_parts(parts: list[tuple[Path, SourceOptions]], rig: Rig) -> list[Recording]:
-    """Open the recordings of one folder; a file that a killed recorder left empty is passed over."""
+    """Open the recordings of one folder; a file that a killed recorder left empty is skipped."""
     opened: list[Recording] = []
     failures: list[SourceError] = []
     for path, options in parts:
@@ -81,11 +80,5 @@ def _open_parts(parts: list[tuple[Path, SourceOptions]], rig: Rig) -> list[Recor
             failures.append(error)
     if not opened:
         raise failures[0]
-    opened[0].notes.extend(f"left out: {error.what}" for error in failures)
+    opened[0].notes.extend(f"skipped: {error.what}" for error in failures)
     return opened
-
-
-def _kind(path: Path) -> str:
-    if not path.is_dir():
-        return path.suffix.lower()
-    return ".bag" if any(is_bag_file(file) for file in path.iterdir()) else "folder"

@@ -39,12 +39,12 @@ def require_sensors(recording: ContinuousRecording) -> None:
     if "scans" not in kinds:
         raise SourceError(
             f"{recording.path}: no scans of a LiDAR; it holds {holds}",
-            "Give the LiDAR's recording of the same moment as well: --from lidar.bag --from events.aedat4",
+            "Also give the LiDAR's recording of the same time: --from lidar.bag --from events.aedat4",
         )
     if kinds == {"scans"}:
         raise SourceError(
-            f"{recording.path}: no pictures and no events; it holds {holds}",
-            "Give the camera's recording of the same moment as well: --from lidar.bag --from events.aedat4",
+            f"{recording.path}: no images and no events; it holds {holds}",
+            "Also give the camera's recording of the same time: --from lidar.bag --from events.aedat4",
         )
 
 

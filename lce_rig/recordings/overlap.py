@@ -9,7 +9,7 @@ from lce_rig.rig import Rig
 from lce_rig.timing.rig_time import rig_offset_ns
 
 _MAX_OFFSET_S = 3600.0
-# Spans are told from a recording's ends, without reading what lies between.
+# Spans are read from a recording's ends, without reading what lies between.
 _ROUGH_S = 0.2
 # Sensors are switched on and off one after the other.
 _USUAL_LAG_S = 2.0
@@ -55,14 +55,14 @@ def _compare(camera: Stream, camera_ns: Span, lidar: Stream, lidar_ns: Span) -> 
 def _apart(camera: Stream, camera_ns: Span, lidar: Stream, lidar_ns: Span, apart_s: float) -> SourceError:
     key = f"cameras.{camera.sensor}.channels.{camera.channel}.timestamps.expected_offset_s"
     starts_s = (lidar_ns[0] - camera_ns[0]) * 1e-9
-    hint = f"Are they of one moment? Then add to {key} in the profile what their clocks differ by"
+    hint = f"If they were recorded together, add the difference of their clocks to {key} in the profile"
     if abs(starts_s) <= _MAX_OFFSET_S:
         hint += f" ({starts_s:+.1f} s if both were started at once)."
     else:
-        hint = "Are they of one moment? Then record both on one computer's clock, best into one bag."
+        hint = "Record both at the same time on one computer's clock, preferably into one bag."
     return SourceError(
         f"{camera}: {camera.kind} run from {_said(camera_ns[0])} to {_said(camera_ns[1])} s, "
-        f"scans from {_said(lidar_ns[0])} to {_said(lidar_ns[1])} s: they lie {apart_s:.1f} s apart",
+        f"scans from {_said(lidar_ns[0])} to {_said(lidar_ns[1])} s: {apart_s:.1f} s apart",
         hint,
     )
 

@@ -9,7 +9,7 @@ from lce_rig.core.data import Image, Sample, Scan, Stream
 
 PairMethod: TypeAlias = Literal["auto", "stem", "order", "time"]
 Span: TypeAlias = tuple[int, int]
-"""First and last stamp, ns, the sensor's own clock."""
+"""First and last timestamp, ns, the sensor's own clock."""
 
 
 @dataclass(frozen=True)
@@ -17,9 +17,9 @@ class SourceOptions:
     """Options for reading a recording; they override the profile.
 
     Attributes:
-        camera, channel, lidar: whose pictures and clouds a folder holds; None takes the rig's first channel
-            and LiDAR, and its camera where it has one only or folders are named after them.
-        pair: how a folder's pictures and clouds are matched.
+        camera, channel, lidar: of a folder's images and point clouds; None takes the rig's first channel and
+            LiDAR, and its camera where it has one only or folders are named after them.
+        pair: how a folder's images and point clouds are matched.
         pair_tolerance_s: largest difference in time of a pair; None takes the profile's.
         topics: topic by sensor ("cam", "cam.events", "lidar"), in place of the profile's.
         is_part: whether other recordings of the same moment hold what this one lacks.
@@ -41,7 +41,7 @@ class RecordedPair:
     Attributes:
         label: the files it came from, for messages: "00003.png + 00003.pcd".
         key: fingerprint of those files; the same files give the same key wherever they lie.
-        notes: what had to be assumed or left out on the way, in words.
+        notes: what was assumed or skipped, in words.
     """
 
     label: str
@@ -93,8 +93,8 @@ class ContinuousRecording(Recording, Protocol):
 
     Attributes:
         key: fingerprint of the recording.
-        n_samples: number of pictures and scans to come, for progress.
-        streams: what is in it, with the span of its stamps where that is known without reading everything.
+        n_samples: number of images and scans to come, for progress.
+        streams: what is in it, with the span of its timestamps where they need not all be read.
     """
 
     key: str

@@ -28,7 +28,7 @@ def choose_camera(
     if channel not in channels:
         raise SourceError(f"camera {camera!r} has no channel {channel!r}; it has {', '.join(channels)}")
     if len(channels) > 1 and not options.channel:
-        notes.append(f"pictures taken as camera {camera}, channel {channel}")
+        notes.append(f"images assigned to camera {camera}, channel {channel}")
     return camera, channel
 
 
@@ -41,8 +41,8 @@ def _only_camera(rig: Rig) -> str:
     first, *others = rig.cameras
     if others:
         raise SourceError(
-            f"rig {rig.name!r} has cameras {', '.join(rig.cameras)}: whose are these pictures?",
-            f"Say so with --camera {first}, or keep those of each camera in a folder of its name: "
+            f"rig {rig.name!r} has cameras {', '.join(rig.cameras)}: the images' camera is not known",
+            f"Name it with --camera {first}, or put each camera's images into a folder of its name: "
             f"img/{first}/, img/{others[0]}/ and pcd/.",
         )
     return first
@@ -58,7 +58,7 @@ def choose_lidar(rig: Rig, options: SourceOptions, notes: list[str]) -> str:
     if lidar not in rig.lidars:
         raise SourceError(f"rig {rig.name!r} has no lidar {lidar!r}; it has {', '.join(rig.lidars)}")
     if len(rig.lidars) > 1 and not options.lidar:
-        notes.append(f"clouds taken as lidar {lidar}")
+        notes.append(f"point clouds assigned to lidar {lidar}")
     return lidar
 
 
@@ -79,5 +79,5 @@ def choose_event_camera(rig: Rig, options: SourceOptions, notes: list[str]) -> t
         raise SourceError(f"rig {rig.name!r} has no event camera {options.camera!r}; it has {has}")
     camera = options.camera or next(iter(with_events))
     if len(with_events) > 1 and not options.camera:
-        notes.append(f"events taken as camera {camera}")
+        notes.append(f"events assigned to camera {camera}")
     return camera, with_events[camera]

@@ -1,1 +1,1 @@
-"""What boards say of an extrinsic: plane and ring-end residuals, their derivatives, quadratics by capture."""
+"""What boards say of extrinsics: plane and ring-end residuals, their derivatives, quadratics by capture."""

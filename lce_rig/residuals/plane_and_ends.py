@@ -159,7 +159,7 @@ class FeatureSigmas:
 
 
 def feature_sigmas(features: Sequence[CaptureFeatures], board: Board, T_cam_lidar: Array) -> FeatureSigmas:
-    """Take the typical errors of captures' planes and ring ends under an extrinsic (4, 4)."""
+    """Take the typical errors of captures' planes and ring ends under extrinsics (4, 4)."""
     planes_m = [np.sqrt(np.mean(plane_residuals(f, T_cam_lidar) ** 2)) for f in features]
     inside_m = np.concatenate([end_residuals(f, T_cam_lidar, board)[0] for f in features])
     # Ring ends reach beyond the plate by the beam's width, which is no error.

@@ -5,8 +5,8 @@ once, with P the information of the priors and g_P half the gradient of theirs, 
 
     x(w) = -(P + sum_k w_k H_k)^-1 (g_P + sum_k w_k g_k)                                                 (1)
 
-Whatever weighs residuals (Algorithm 1, the likelihood, the validation's second opinion) ends here, and every
-covariance from the scatter between captures starts here. What errs independently are placements of the
+Whatever weighs residuals (Algorithm 1, the likelihood, the validation's independent check) ends here, and
+every covariance from the scatter between captures starts here. What errs independently are placements of the
 board, not captures that repeat one.
 """
 

@@ -3,7 +3,7 @@
 Layout, every file plain: rig.yaml, session.json, journal.jsonl, detections/ and
 captures/000012/{meta.json, cam.frames.png, lidar.pcd, cam.events.npz}. A capture is written to
 captures/.new-000012/, its files are flushed, the folder is renamed and its parent flushed: it exists whole or
-not at all, whenever the power goes.
+not at all, whenever the power goes. A rejected capture is its folder moved to rejected/.
 """
 
 import errno
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lce_rig import __version__
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.documents import parse_json
-from lce_rig.core.errors import LceRigError, SessionError
+from lce_rig.core.errors import LceRigError, SessionError, reading
 from lce_rig.core.limits import MAX_DOCUMENT_BYTES, MAX_FILE_BYTES, open_regular
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import cache
@@ -36,10 +36,10 @@ from lce_rig.session.replacing import recover, replacing
 
 
 def read_entries(path: Path) -> list[dict[str, Any]]:
-    """List the entries of a journal; lines that are none, such as one torn by a crash, are skipped.
+    """List the entries of a journal; skip invalid lines, such as one torn by a crash.
 
     Args:
-        path: its file; one that is not there has no entries.
+        path: its file; a missing file has no entries.
 
     Raises:
         OSError: it cannot be read.
@@ -62,9 +62,9 @@ def read_entries(path: Path) -> list[dict[str, Any]]:
 
 
 PROFILE, JOURNAL, LOCK = "rig.yaml", "journal.jsonl", ".lock"
-CAPTURES, DETECTIONS, DRAFT_PREFIX = "captures", "detections", ".new-"
-CALIBRATION, INTRINSICS, DEBUG = "calibration", "intrinsics", "debug"
-_WRITTEN = (JOURNAL, LOCK, CAPTURES, DETECTIONS, CALIBRATION, INTRINSICS, DEBUG)
+CAPTURES, REJECTED, DETECTIONS, DRAFT_PREFIX = "captures", "rejected", "detections", ".new-"
+CALIBRATION, RESULTS, INTRINSICS, DEBUG = "calibration", "results", "intrinsics", "debug"
+_WRITTEN = (JOURNAL, LOCK, CAPTURES, REJECTED, DETECTIONS, CALIBRATION, RESULTS, INTRINSICS, DEBUG)
 
 
 class Session:
@@ -89,7 +89,7 @@ class Session:
         """Start a session in a new or empty folder and open it for writing.
 
         Raises:
-            SessionError: the folder holds something already, or cannot be written.
+            SessionError: the folder is not empty, or cannot be written.
         """
         path = Path(path)
         if (path / MARKER).exists():
@@ -101,7 +101,7 @@ class Session:
             others = {entry.name for entry in path.iterdir()} - {PROFILE, LOCK, JOURNAL, CAPTURES}
             if any(not name.startswith((f".{PROFILE}.", f".{MARKER}.")) for name in others):
                 raise SessionError(
-                    f"{path} is not empty and no session: it holds {sorted(others)[0]}",
+                    f"{path} is not empty and not a session: it holds {sorted(others)[0]}",
                     "Choose another folder.",
                 )
             lock = _take_lock(path)
@@ -126,7 +126,7 @@ class Session:
         path = Path(path)
         check_marker(path)
         _check_links(path)
-        with suppress(OSError):  # without permission to write nothing was ever put aside
+        with suppress(OSError):  # without permission to write, nothing was put aside
             recover(path)
         try:
             rig = load_rig(path / PROFILE)
@@ -180,13 +180,13 @@ class Session:
         self.close()
 
     def close(self) -> None:
-        """Let the next writer in; reading goes on working."""
+        """Release the lock for the next writer; reading continues to work."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None
 
     def _adopt(self, rig: Rig) -> None:
-        """Take over what may differ in the profile: how attached sensors are reached."""
+        """Adopt what may differ in the profile: the addresses of attached sensors."""
         if rig == self.rig:
             return
         try:
@@ -198,19 +198,21 @@ class Session:
 
     @property
     def captures(self) -> list[Capture]:
-        """Every whole capture, by name.
+        """All complete captures, sorted by name.
 
         Raises:
             SessionError: their folder may not be read.
         """
-        folder = self.path / CAPTURES
-        try:
-            names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
-        except OSError as error:
-            raise SessionError(f"{folder} cannot be read: {error.strerror or error}") from error
-        numbered = [name for name in names if re.fullmatch(r"[0-9]{6,}", name)]
-        # By number: 1000000 follows 999999.
-        return [Capture(folder / name) for name in sorted(numbered, key=lambda name: (len(name), name))]
+        return _captures_in(self.path / CAPTURES)
+
+    @property
+    def rejected(self) -> list[Capture]:
+        """Every capture that was rejected, by name: nothing uses them, and `restore` takes one back.
+
+        Raises:
+            SessionError: their folder may not be read.
+        """
+        return _captures_in(self.path / REJECTED)
 
     def capture(self, name: str) -> Capture:
         """Find one capture.
@@ -221,12 +223,55 @@ class Session:
         for capture in self.captures:
             if capture.name == name:
                 return capture
+        if any(capture.name == name for capture in self.rejected):
+            raise SessionError(
+                f"{self.path}: capture {name} is rejected",
+                f"Restore it: lce-rig captures {self.path} --restore {name}",
+            )
         raise SessionError(f"{self.path} has no capture {name!r}; it has {len(self.captures)}")
+
+    def reject(self, name: str, reason: str = "") -> None:
+        """Put a capture aside: it is used no more, and not collected again.
+
+        Args:
+            name: of the capture.
+            reason: kept in the journal.
+
+        Raises:
+            SessionError: there is no capture of that name, the session is open read-only, or the disk is.
+        """
+        self.capture(name)
+        self._move(name, CAPTURES, REJECTED)
+        self.journal("rejected", capture=name, reason=reason)
+
+    def restore(self, name: str) -> None:
+        """Take a rejected capture back; raises as `reject`."""
+        if all(capture.name != name for capture in self.rejected):
+            names = ", ".join(capture.name for capture in self.rejected) or "none"
+            raise SessionError(
+                f"{self.path} has no rejected capture {name!r}", f"Rejected captures: {names}."
+            )
+        self._move(name, REJECTED, CAPTURES)
+        self.journal("restored", capture=name)
+
+    def _move(self, name: str, source: str, target: str) -> None:
+        """Move a capture's folder in one step, so that it is in one place whatever happens."""
+        self._require_lock()
+        old, new = self.own(source, name), self.own(target, name)
+        if new.exists():
+            raise SessionError(f"{new} is in the way of capture {name}", f"Move {new} out of the session.")
+        try:
+            new.parent.mkdir(exist_ok=True)
+            old.rename(new)
+            flush_folder(new.parent)
+            flush_folder(old.parent)
+        except OSError as error:
+            raise _not_writable(new, error) from error
 
     def find_duplicate(
         self, images: Iterable[Image], scans: Iterable[Scan], events: Iterable[Events] = ()
     ) -> str | None:
-        """Name the capture that holds exactly this data already; None where it is new."""
+        """Return the capture, even if rejected, that already holds exactly this data; None if it is new."""
         return self._contents().get(content_hash(images, scans, events))
 
     def add_capture(
@@ -236,7 +281,7 @@ class Session:
         meta: Mapping[str, Any],
         events: Iterable[Events] = (),
     ) -> str:
-        """Store one capture so that it survives whatever happens after this returns.
+        """Store one capture; after the return it survives a crash or power failure.
 
         Args:
             images: at most one for each camera channel.
@@ -249,16 +294,15 @@ class Session:
 
         Raises:
             SessionError: the session is open read-only, a sensor is not in the rig, events are out of
-                order or off their sensor, or the disk is full; what was captured before is not affected.
+                order or outside their sensor, or the disk is full; earlier captures are not affected.
         """
         images, scans, events = list(images), list(scans), list(events)
-        if self._lock is None:
-            raise SessionError(f"{self.path} is open for reading only")
+        self._require_lock()
         check_samples(self.rig, images, scans, events)
         recorded = [(event_channel(self.rig, stretch.sensor), stretch) for stretch in events]
         contents = self._contents()
         captures = self.captures
-        name = f"{int(captures[-1].name) + 1 if captures else 0:06d}"
+        name = self.next_name
         folder = self.own(CAPTURES, name)
         draft = folder.with_name(DRAFT_PREFIX + name)
         try:
@@ -275,8 +319,17 @@ class Session:
         self.journal("captured", capture=name)
         return name
 
+    @property
+    def next_name(self) -> str:
+        """The name of the next capture; that of a rejected one is not given again."""
+        return f"{max((int(each.name) for each in self.captures + self.rejected), default=-1) + 1:06d}"
+
+    def _require_lock(self) -> None:
+        if self._lock is None:
+            raise SessionError(f"{self.path} is open for reading only")
+
     def journal(self, event: str, **fields: Any) -> None:
-        """Append what happened, with the time, to journal.jsonl.
+        """Append an entry with the time to journal.jsonl.
 
         Raises:
             SessionError: the disk is full or read-only.
@@ -289,19 +342,17 @@ class Session:
             raise _not_writable(self.path / JOURNAL, error, len(self.captures)) from error
 
     def read_journal(self) -> list[dict[str, Any]]:
-        """List what happened; a line torn by a crash is skipped.
+        """List the journal's entries; skip a line torn by a crash.
 
         Raises:
             SessionError: the journal cannot be read.
         """
         path = self.path / JOURNAL
-        try:
+        with reading(path, SessionError):
             return read_entries(path)
-        except (OSError, ValueError) as error:
-            raise SessionError(f"{path} cannot be read: {error}") from None
 
     def store_cached(self, key: str, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, Any]) -> bool:
-        """Keep arrays and JSON values under a key such as "3f9a1c/000012" for `load_cached`.
+        """Store arrays and JSON values under a key such as "3f9a1c/000012" for `load_cached`.
 
         Returns:
             Whether it could be written; a full or read-only disk only costs the time saved.
@@ -309,17 +360,17 @@ class Session:
         return cache.store(self._cache_path(key), arrays, values)
 
     def load_cached(self, key: str) -> cache.Cached | None:
-        """Give back what `store_cached` kept; None where there is nothing, or it is damaged."""
+        """Return what `store_cached` stored; None if there is no entry or it is damaged."""
         return cache.load(self._cache_path(key))
 
     def _cache_path(self, key: str) -> Path:
         parts = key.split("/")
         if not all(SAFE_NAME.fullmatch(part) for part in parts):
-            raise ValueError(f"{key!r} is no cache key")
+            raise ValueError(f"{key!r} is not a cache key")
         return self.own(DETECTIONS, *parts[:-1], parts[-1] + ".npz")
 
     def own(self, *parts: str) -> Path:
-        """Give the path of a file or folder of the session that is to be written.
+        """Return the path of a file or folder of the session that is to be written.
 
         Raises:
             SessionError: a link there leads out of the session.
@@ -334,7 +385,7 @@ class Session:
     def replacing(
         self, *parts: str, finish: Callable[[Path, Path], None] = lambda _old, _draft: None
     ) -> Iterator[Path]:
-        """Yield an empty folder that takes the place of one of the session's when the block ends.
+        """Yield an empty folder that replaces one of the session's when the block ends.
 
         Readers find the earlier folder or the new one, whole, whatever happens in between.
 
@@ -356,27 +407,35 @@ class Session:
     def _contents(self) -> dict[str, str]:
         if self._names_by_content is None:
             self._names_by_content = {}
-            for capture in self.captures:
+            for capture in self.captures + self.rejected:
                 try:
                     self._names_by_content.setdefault(capture.content_sha256, capture.name)
                 except SessionError:
-                    # A damaged capture is named when it is read; nothing is a duplicate of it.
+                    # A damaged capture is reported when it is read; nothing is a duplicate of it.
                     continue
         return self._names_by_content
 
 
+def _captures_in(folder: Path) -> list[Capture]:
+    with reading(folder, SessionError):
+        names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+    numbered = [name for name in names if re.fullmatch(r"[0-9]{6,}", name)]
+    # By number: 1000000 follows 999999.
+    return [Capture(folder / name) for name in sorted(numbered, key=lambda name: (len(name), name))]
+
+
 def _check_rig(path: Path, rig: Rig) -> None:
-    """Refuse a session whose marker names another rig than its profile."""
+    """Refuse a session whose marker and profile name different rigs."""
     named = read_marker(path).get("rig")
     if named != rig.name:
         raise SessionError(
             f"{path}: {MARKER} is of rig {named!r}, {PROFILE} of rig {rig.name!r}",
-            "Put back the profile that the session was made with.",
+            "Restore the profile that the session was made with.",
         )
 
 
 def _check_links(path: Path) -> None:
-    """Refuse a session in which what is written here leads elsewhere, before anything is done with it.
+    """Refuse a session with links that lead out of the folders written here.
 
     Raises:
         SessionError: it names the link.

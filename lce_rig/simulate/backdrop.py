@@ -1,6 +1,6 @@
 """The static room in a camera's image: the costly half of rendering, computed once per session."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
 from lce_rig.simulate.light import Mirrors, lamp_light, reached, static_radiance
 from lce_rig.simulate.room import Room
-from lce_rig.simulate.scene import Hits
+from lce_rig.simulate.scene import Hits, join_rows
 
 SHADOW_STEP_PX = 4
 _KNOT_STEP_PX = 4
@@ -162,17 +162,9 @@ def _render(room: Room, origin: Array, rays: Array) -> tuple[Array, Hits, Mirror
         radiance, hits, mirrors = static_radiance(
             room.raycaster, room.lamps, origin, rays[start : start + _CHUNK]
         )
-        pieces.append((radiance, hits, mirrors, mirrors.index + start))
-    hits = Hits(
-        *(np.concatenate([getattr(p[1], k) for p in pieces]) for k in ("range_m", "surface", "normals"))
-    )
-    fields = ("starts", "directions", "weight", "image", "range_m")
-    joined = [np.concatenate([getattr(p[2], k) for p in pieces]) for k in fields]
-    return (
-        np.concatenate([p[0] for p in pieces]),
-        hits,
-        Mirrors(np.concatenate([p[3] for p in pieces]), *joined),
-    )
+        pieces.append((radiance, hits, replace(mirrors, index=mirrors.index + start)))
+    radiances, hits_of, mirrors_of = zip(*pieces, strict=True)
+    return np.concatenate(radiances), join_rows(hits_of), join_rows(mirrors_of)
 
 
 def _smooth_edges(radiance: Array, corners: Array, room: Room, origin: Array) -> None:

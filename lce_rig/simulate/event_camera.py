@@ -16,6 +16,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array
 from lce_rig.simulate.options import EventNoise
+from lce_rig.simulate.scene import join_rows
 
 _NS_PER_US = 1000
 _LEAST_THRESHOLD = 0.05
@@ -181,11 +182,9 @@ class EventCamera:
         """Return the events since the last call, in order of time, noise included."""
         raw = [*self._raw, self._noise_events(self._taken_s, self._now_s)]
         self._raw, self._taken_s = [], self._now_s
-        t_s, pixel, polarity = (
-            np.concatenate([getattr(r, k) for r in raw]) for k in ("t_s", "pixel", "polarity")
-        )
-        order = np.lexsort((polarity, pixel, t_s))
-        t_s, pixel, polarity = t_s[order], pixel[order], polarity[order]
+        together = join_rows(raw)
+        order = np.lexsort((together.polarity, together.pixel, together.t_s))
+        t_s, pixel, polarity = together.t_s[order], together.pixel[order], together.polarity[order]
         keep = self._outlasts_refractory(t_s, pixel)
         t_ns = self._start_ns + self._offset_ns + np.rint(1e9 * t_s[keep]).astype(np.int64)
         row, column = np.divmod(pixel[keep], self._pixels.width_px)

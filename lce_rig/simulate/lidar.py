@@ -1,7 +1,7 @@
 """A spinning LiDAR: beam table, firing times, finite beams with mixed pixels, and the errors of real ones."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.options import LidarNoise
-from lce_rig.simulate.scene import Hits, Scene
+from lce_rig.simulate.scene import Hits, Scene, join_rows, put_rows
 
 # Beams of finite width: the surfaces that a beam hits, and the single range that it reports.
 
@@ -46,13 +46,7 @@ def receive(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) 
         return returns
     is_split = _touches_several(scene, hits, origins, directions, noise)
     split = np.flatnonzero(is_split)
-    mixed = _mix(scene, origins[split], directions[split], noise)
-    out = [getattr(returns, name).copy() for name in ("range_m", "energy", "reflectivity", "surface")]
-    for whole, part in zip(
-        out, (mixed.range_m, mixed.energy, mixed.reflectivity, mixed.surface), strict=True
-    ):
-        whole[split] = part
-    return Returns(*out)
+    return put_rows(returns, split, _mix(scene, origins[split], directions[split], noise))
 
 
 def _echoes(scene: Scene, hits: Hits, origins: Array, directions: Array) -> Returns:
@@ -202,49 +196,6 @@ VLP16 = LidarModel(
 )
 
 
-def simulate_scan(
-    scene: Scene,
-    T_world_lidar: Array,
-    model: LidarModel,
-    noise: LidarNoise,
-    rng: np.random.Generator,
-    *,
-    board_at: Callable[[NDArray[np.int64]], Array] | None = None,
-    laser_bias_m: Array | None = None,
-    sensor: str = "lidar",
-    stamp_ns: int = 0,
-    min_range_m: float = 0.4,
-    max_range_m: float = 100.0,
-) -> Scan:
-    """Simulate one revolution.
-
-    Args:
-        scene: what the beams meet.
-        T_world_lidar: (4, 4).
-        model: the LiDAR's geometry and timing.
-        noise: its errors.
-        rng: source of the azimuth phase and of all noise.
-        board_at: T_world_board (N, 4, 4) at times (N,) ns of the timestamp's clock; None for the scene's.
-        laser_bias_m: (L,) constant range offset of each laser in firing order; zeros by default.
-        sensor: name in the rig profile.
-        stamp_ns: device time of the first firing.
-        min_range_m: nearer returns are not reported.
-        max_range_m: farther returns are not reported.
-    """
-    sweep = sweep_scene(scene, T_world_lidar, model, noise, rng, stamp_ns, board_at)
-    return measure_sweep(
-        sweep,
-        model,
-        noise,
-        rng,
-        laser_bias_m=laser_bias_m,
-        sensor=sensor,
-        stamp_ns=stamp_ns,
-        min_range_m=min_range_m,
-        max_range_m=max_range_m,
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Sweep:
     """The surfaces hit by the beams of one revolution, without measurement errors.
@@ -273,7 +224,17 @@ def sweep_scene(
     stamp_ns: int = 0,
     board_at: Callable[[NDArray[np.int64]], Array] | None = None,
 ) -> Sweep:
-    """Send the beams of one revolution; for the arguments see `simulate_scan`."""
+    """Send the beams of one revolution.
+
+    Args:
+        scene: what the beams meet.
+        T_world_lidar: (4, 4).
+        model: the LiDAR's geometry and timing.
+        noise: its errors.
+        rng: source of the azimuth phase.
+        stamp_ns: device time of the first firing.
+        board_at: T_world_board (N, 4, 4) at times (N,) ns of the timestamp's clock; None for the scene's.
+    """
     laser, offset_ns, azimuth_rad = _firings(model, rng)
     origins_world, directions_world = _beams(model, T_world_lidar, laser, azimuth_rad)
     if board_at is None:
@@ -300,12 +261,9 @@ def sweep_again(
     near = np.flatnonzero(_may_meet(scene, T_world_lidar, empty.azimuth_rad))
     origins, directions = _beams(model, T_world_lidar, empty.laser[near], empty.azimuth_rad[near])
     part = receive(scene, origins, directions, noise)
-    whole = [getattr(empty.returns, each.name).copy() for each in fields(Returns)]
-    for values, each in zip(whole, fields(Returns), strict=True):
-        values[near] = getattr(part, each.name)
     is_rim = empty.is_rim.copy()
     is_rim[near] = _near_border(scene, origins, directions, part, noise)
-    return replace(empty, returns=Returns(*whole), is_rim=is_rim)
+    return replace(empty, returns=put_rows(empty.returns, near, part), is_rim=is_rim)
 
 
 def _may_meet(scene: Scene, T_world_lidar: Array, azimuth_rad: Array) -> NDArray[np.bool_]:
@@ -334,7 +292,17 @@ def measure_sweep(
     min_range_m: float = 0.4,
     max_range_m: float = 100.0,
 ) -> Scan:
-    """Measure the surfaces hit by the beams; for the arguments see `simulate_scan`."""
+    """Measure the surfaces hit by the beams.
+
+    Args:
+        sweep: the surfaces.
+        model, noise: as for the sweep.
+        rng: source of all noise.
+        laser_bias_m: (L,) constant range offset of each laser in firing order; zeros by default.
+        sensor: name in the rig profile.
+        stamp_ns: device time of the first firing.
+        min_range_m, max_range_m: nearer and farther returns are not reported.
+    """
     laser, returns = sweep.laser, sweep.returns
     bias_m = np.zeros(len(model.elevations_rad)) if laser_bias_m is None else laser_bias_m
     range_m, intensity = _measure(returns, bias_m[laser], noise, rng)
@@ -346,13 +314,11 @@ def measure_sweep(
     threshold = _THRESHOLD * np.maximum(returns.range_m / _FULL_RANGE_M, 1.0) ** 2
     keep = np.isfinite(range_m) & (returns.energy > threshold) & ~is_lost
     keep &= (range_m >= min_range_m) & (range_m <= max_range_m)
-    origins = np.zeros((len(laser), 3))
-    origins[:, 2] = model.vertical_offsets_m[laser]
-    rays = _directions(model.elevations_rad[laser[keep]], azimuth_rad[keep])
+    origins, rays = _beams(model, np.eye(4), laser[keep], azimuth_rad[keep])
     return Scan(
         sensor=sensor,
         stamp_ns=stamp_ns,
-        points=(origins[keep] + range_m[keep, None] * rays).astype(np.float32),
+        points=(origins + range_m[keep, None] * rays).astype(np.float32),
         intensity=intensity[keep].astype(np.float32),
         ring=model.rings[laser[keep]],
         offset_ns=sweep.offset_ns[keep],
@@ -378,10 +344,7 @@ def _receive_moving(
     for beams, scene in instants:
         parts.append(receive(scene, origins[beams], directions[beams], noise))
         rims.append(_near_border(scene, origins[beams], directions[beams], parts[-1], noise))
-    fields = ("range_m", "energy", "reflectivity", "surface")
-    return Returns(*(np.concatenate([getattr(p, name) for p in parts]) for name in fields)), np.concatenate(
-        rims
-    )
+    return join_rows(parts), np.concatenate(rims)
 
 
 def _measure(
@@ -404,7 +367,11 @@ def _beams(
     """Find where beams (N,) begin and where they go, (N, 3) each, world."""
     origins = np.zeros((len(laser), 3))
     origins[:, 2] = model.vertical_offsets_m[laser]
-    directions = _directions(model.elevations_rad[laser], azimuth_rad)
+    elevation_rad = model.elevations_rad[laser]
+    level = np.cos(elevation_rad)
+    directions = np.stack(
+        [level * np.cos(azimuth_rad), level * np.sin(azimuth_rad), np.sin(elevation_rad)], axis=-1
+    )
     return transform(T_world_lidar, origins), directions @ T_world_lidar[:3, :3].T
 
 
@@ -421,17 +388,6 @@ def _firings(
     start_rad = model.cut_azimuth_rad - model.step_rad * rng.uniform()
     azimuth_rad = start_rad - 2 * np.pi * offset_ns / model.period_ns
     return laser, offset_ns, azimuth_rad
-
-
-def _directions(elevation_rad: Array, azimuth_rad: Array) -> Array:
-    return np.stack(
-        [
-            np.cos(elevation_rad) * np.cos(azimuth_rad),
-            np.cos(elevation_rad) * np.sin(azimuth_rad),
-            np.sin(elevation_rad),
-        ],
-        axis=-1,
-    )
 
 
 def _near_border(

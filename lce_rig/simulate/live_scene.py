@@ -7,15 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.data import Image, Scan
-from lce_rig.core.geometry import Array, exp_so3, log_so3, pose
+from lce_rig.core.geometry import Array, pose
 from lce_rig.rig import Rig
 from lce_rig.simulate.carriers import build_carrier
-from lce_rig.simulate.lidar import Sweep, measure_sweep, sweep_again, sweep_scene
+from lce_rig.simulate.lidar import Sweep, sweep_again, sweep_scene
 from lce_rig.simulate.options import SimulationOptions
 from lce_rig.simulate.poses import can_be_held, count_rings
 from lce_rig.simulate.rendering import SUBPIXELS, develop, focus, render_radiance, shot_noise_e
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import CARRIER, OF_SESSION, set_stage
+from lce_rig.simulate.trajectory import between
 
 _NOISE_STREAM = 102
 # A place that no beam reaches.
@@ -132,7 +133,7 @@ class LiveScene:
         return noisy
 
     def _take_scan(self, lidar: str, stamp_ns: int) -> Scan:
-        stage, settings = self.stage, self.stage.rig.lidars[lidar]
+        stage = self.stage
         model, noise = stage.models[lidar], stage.options.lidar_noise
         if lidar not in self._sweeps:
             T_world_lidar = stage.T_world_sensor[lidar]
@@ -141,17 +142,7 @@ class LiveScene:
                 self._rooms[lidar] = sweep_scene(empty, T_world_lidar, model, noise, self._noise)
             room = self._rooms[lidar]
             self._sweeps[lidar] = sweep_again(room, self._render(), T_world_lidar, model, noise)
-        return measure_sweep(
-            self._sweeps[lidar],
-            model,
-            noise,
-            self._noise,
-            laser_bias_m=stage.laser_bias_m[lidar],
-            sensor=lidar,
-            stamp_ns=stamp_ns,
-            min_range_m=settings.min_range_m,
-            max_range_m=settings.max_range_m,
-        )
+        return stage.measure(lidar, self._sweeps[lidar], self._noise, stamp_ns)
 
     def _render(self) -> Scene:
         if self._scene is None:
@@ -161,10 +152,3 @@ class LiveScene:
             raycaster, reflectivity = stage.room.raycaster, options.print_reflectivity
             self._scene = Scene(raycaster, carrier, stage.board, self.T_world_board, reflectivity)
         return self._scene
-
-
-def between(start: Array, end: Array, share: float) -> Array:
-    """Interpolate between two poses (4, 4) at a fraction of the way, turning evenly."""
-    turn = log_so3(start[:3, :3].T @ end[:3, :3])
-    place = (1 - share) * start[:3, 3] + share * end[:3, 3]
-    return pose(start[:3, :3] @ exp_so3(share * turn), place)

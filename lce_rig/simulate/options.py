@@ -97,7 +97,7 @@ class EventNoise:
         noise_hz: further events of each pixel, of either polarity, twice as many in the dark.
         hot_share: share of the pixels that fire all the time ...
         hot_hz: ... at rates between these.
-        dark_radiance: radiance that a black pixel seems to see: light strayed in the lens, and dark current.
+        dark_radiance: apparent radiance of a black pixel: stray light in the lens, and dark current.
     """
 
     threshold_on: float = 0.30

@@ -131,7 +131,7 @@ def can_be_held(view: CameraView, board: Board, room: Room, T_world_board: Array
 def _stands_free(view: CameraView, board: Board, room: Room, T_world_board: Array) -> bool:
     centre, normal = T_world_board[:3, 3], T_world_board[:3, 2]
     if abs(normal[2]) > 0.7:
-        return False  # nobody holds a board flat
+        return False  # no person holds a board flat
     to_lidar = view.T_world_lidar[:3, 3] - centre
     if normal @ to_lidar < 0.45 * np.linalg.norm(to_lidar):
         return False

@@ -6,40 +6,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.backdrop import SHADOW_STEP_PX, Backdrop, beside_changes, pixel_rays, sub_rays
 from lce_rig.simulate.light import irradiance, reached
 from lce_rig.simulate.options import CameraNoise
-from lce_rig.simulate.scene import Hits, Scene
+from lce_rig.simulate.scene import Scene
 
 SUBPIXELS = 5
 _GAMMA = 1 / 2.2
-
-
-def render_image(
-    scene: Scene,
-    backdrop: Backdrop,
-    noise: CameraNoise,
-    rng: np.random.Generator,
-    *,
-    sensor: str = "cam",
-    channel: str = "frames",
-    stamp_ns: int = 0,
-) -> Image:
-    """Render one image.
-
-    Args:
-        scene: the room of the backdrop, with the board and its carrier.
-        backdrop: the camera and its image of the static room.
-        noise: the camera's errors.
-        rng: source of the sensor's noise.
-        sensor: name in the rig profile.
-        channel: channel of that camera.
-        stamp_ns: device time of mid exposure.
-    """
-    radiance = render_radiance(scene, backdrop)
-    return Image(sensor, channel, stamp_ns, expose(radiance, noise, rng), stamp_ns)
 
 
 def render_radiance(scene: Scene, backdrop: Backdrop, n_subpixels: int = SUBPIXELS) -> Array:
@@ -109,7 +83,7 @@ def _paint_mirror_images(radiance: Array, scene: Scene, backdrop: Backdrop) -> N
     hits = scene.cast_moving(mirrors.starts[near], mirrors.directions[near])
     seen = np.flatnonzero(hits.range_m < mirrors.range_m[near])
     chosen = near[seen]
-    kept = Hits(hits.range_m[seen], hits.surface[seen], hits.normals[seen])
+    kept = hits.select(seen)
     points = reached(mirrors.starts[chosen], mirrors.directions[chosen], kept)
     image = scene.colour(kept, points) * irradiance(backdrop.lamps, points, kept.normals, scene.occluders)
     radiance[v[chosen], u[chosen]] += mirrors.weight[chosen] * (image - mirrors.image[chosen])
@@ -162,7 +136,7 @@ def _look_through_centres(
     hits = scene.cast_moving(backdrop.origin, rays)
     label = np.where(hits.range_m < window.backdrop_range_m.ravel(), hits.surface, -1).astype(np.int32)
     seen = np.flatnonzero(label >= 0)
-    kept = Hits(hits.range_m[seen], hits.surface[seen], hits.normals[seen])
+    kept = hits.select(seen)
     points = reached(backdrop.origin, rays[seen], kept)
     colour, light = np.zeros((len(rays), 3)), np.zeros((len(rays), 3))
     colour[seen] = scene.colour(kept, points)
@@ -181,12 +155,12 @@ def _look_through(
     rays: Array,
     with_carrier: bool,
 ) -> Array:
-    """Average what n rays (M, n, 3) a pixel see: (M, 3), lit as carrier and board are lit there."""
+    """Average what n rays (M, n, 3) a pixel see: (M, 3), with the light on carrier and board there."""
     v, u = (np.repeat(index, rays.shape[1]) for index in pixels)
     flat = rays.reshape(-1, 3)
     hits = scene.cast_moving(origin, flat, with_carrier=with_carrier)
     near = np.flatnonzero(hits.range_m < window.backdrop_range_m[v, u])
-    kept = Hits(hits.range_m[near], hits.surface[near], hits.normals[near])
+    kept = hits.select(near)
     on_carrier, on_board = (light[v[near], u[near]] for light in lights)
     light = np.where((kept.surface == scene.board_index)[:, None], on_board, on_carrier)
     samples = window.backdrop[v, u]

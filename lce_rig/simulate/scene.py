@@ -1,9 +1,9 @@
 """The scene for ray casting: static meshes, meshes that move with the board, and the board."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,10 @@ from lce_rig.core.interrupts import without_interrupt
 from lce_rig.simulate.materials import Material, albedo, checker
 from lce_rig.simulate.shapes import Mesh, rectangle
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+_Rows = TypeVar("_Rows", bound="DataclassInstance")
 PLATE = Material((0.86, 0.87, 0.88), 0.95)
 PRINT_ALBEDO = 0.035
 PLATE_BACK = Material((0.30, 0.38, 0.45), 0.6)
@@ -42,6 +46,24 @@ class Hits:
     range_m: Array
     surface: NDArray[np.int32]
     normals: Array
+
+    def select(self, rows: NDArray[np.intp]) -> "Hits":
+        """Keep some hits by index."""
+        return Hits(self.range_m[rows], self.surface[rows], self.normals[rows])
+
+
+def put_rows(record: _Rows, rows: NDArray[Any], part: _Rows) -> _Rows:
+    """Replace rows of a record of arrays of equal length by those of another."""
+    values = {each.name: getattr(record, each.name).copy() for each in fields(record)}
+    for name, value in values.items():
+        value[rows] = getattr(part, name)
+    return replace(record, **values)
+
+
+def join_rows(parts: Sequence[_Rows]) -> _Rows:
+    """Join records of arrays, at least one, one behind the other."""
+    names = [each.name for each in fields(parts[0])]
+    return replace(parts[0], **{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
 
 class Raycaster:
@@ -169,7 +191,7 @@ class Scene:
     def cast_moving(
         self, origins: Array, directions: Array, *, with_carrier: bool = True, with_normals: bool = True
     ) -> Hits:
-        """Find what each ray meets first of the carrier and the board, whatever stands before them."""
+        """Find what each ray meets first of the carrier and the board, ignoring what stands before them."""
         hits = self.cast_board(origins, directions)
         if not with_carrier or not self.moving.surfaces:
             return hits
@@ -198,11 +220,8 @@ class Scene:
 
     @staticmethod
     def _nearer(one: Hits, other: Hits) -> Hits:
-        is_other = np.flatnonzero(other.range_m < one.range_m)
-        range_m, surface, normals = one.range_m.copy(), one.surface.copy(), one.normals.copy()
-        range_m[is_other], surface[is_other] = other.range_m[is_other], other.surface[is_other]
-        normals[is_other] = other.normals[is_other]
-        return Hits(range_m, surface, normals)
+        nearer = np.flatnonzero(other.range_m < one.range_m)
+        return put_rows(one, nearer, other.select(nearer))
 
     def is_dark(self, points_world: Array) -> NDArray[np.bool_]:
         """Find which points (N, 3), taken straight onto the board, lie on a dark square."""

@@ -7,12 +7,13 @@ from typing import Literal
 import numpy as np
 
 from lce_rig.core.board import Board
+from lce_rig.core.data import Scan
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array, invert, perturb, pose
 from lce_rig.rig import Rig
 from lce_rig.simulate.backdrop import Backdrop, build_backdrop
 from lce_rig.simulate.event_camera import EventPixels, draw_pixels
-from lce_rig.simulate.lidar import VLP16, LidarModel
+from lce_rig.simulate.lidar import VLP16, LidarModel, Sweep, measure_sweep
 from lce_rig.simulate.options import SimulationOptions
 from lce_rig.simulate.poses import CameraView, place_board
 from lce_rig.simulate.room import Room, build_room
@@ -67,6 +68,21 @@ class Stage:
     def rng(self, *stream: int) -> np.random.Generator:
         """Begin a stream of random numbers of this session or of one of its captures."""
         return np.random.default_rng([self.seed, *stream])
+
+    def measure(self, lidar: str, sweep: Sweep, rng: np.random.Generator, stamp_ns: int) -> Scan:
+        """Measure what the beams of a LiDAR hit, with its own errors."""
+        settings = self.rig.lidars[lidar]
+        return measure_sweep(
+            sweep,
+            self.models[lidar],
+            self.options.lidar_noise,
+            rng,
+            laser_bias_m=self.laser_bias_m[lidar],
+            sensor=lidar,
+            stamp_ns=stamp_ns,
+            min_range_m=settings.min_range_m,
+            max_range_m=settings.max_range_m,
+        )
 
     def place(self, index: int, rng: np.random.Generator) -> Array:
         """Choose T_world_board (4, 4) of a placement.

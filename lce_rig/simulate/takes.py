@@ -10,7 +10,7 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array
 from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.event_camera import EventCamera
-from lce_rig.simulate.lidar import simulate_scan
+from lce_rig.simulate.lidar import sweep_scene
 from lce_rig.simulate.rendering import expose, render_radiance
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import EVENTS, IMAGE, SCAN, Stage
@@ -38,20 +38,10 @@ def take_scan(
     board_at: Callable[[NDArray[np.int64]], Array] | None = None,
 ) -> Scan:
     """Take a scan that begins at a time of the rig's clock; of a moving board where `board_at` is given."""
-    settings = stage.rig.lidars[lidar]
-    return simulate_scan(
-        scene,
-        stage.T_world_sensor[lidar],
-        stage.models[lidar],
-        stage.options.lidar_noise,
-        stage.rng(*_numbered(stream, SCAN, list(stage.models).index(lidar))),
-        board_at=board_at,
-        laser_bias_m=stage.laser_bias_m[lidar],
-        sensor=lidar,
-        stamp_ns=stamp_ns,
-        min_range_m=settings.min_range_m,
-        max_range_m=settings.max_range_m,
-    )
+    rng = stage.rng(*_numbered(stream, SCAN, list(stage.models).index(lidar)))
+    T_world_lidar, model = stage.T_world_sensor[lidar], stage.models[lidar]
+    sweep = sweep_scene(scene, T_world_lidar, model, stage.options.lidar_noise, rng, stamp_ns, board_at)
+    return stage.measure(lidar, sweep, rng, stamp_ns)
 
 
 @dataclass(frozen=True, eq=False)

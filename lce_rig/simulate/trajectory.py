@@ -73,11 +73,15 @@ class Trajectory:
         k = np.clip(np.searchsorted(self.arrival_ns, t_ns, side="right") - 1, 0, len(self.arrival_ns) - 2)
         since_ns = t_ns - self.departure_ns[k]
         u = np.clip(since_ns / (self.arrival_ns[k + 1] - self.departure_ns[k]), 0.0, 1.0)
-        s = (u**3 * (10 + u * (6 * u - 15)))[..., None]
-        start, end = self.T_world_placement[k], self.T_world_placement[k + 1]
-        turn = log_so3(np.swapaxes(start[..., :3, :3], -1, -2) @ end[..., :3, :3])
-        R = start[..., :3, :3] @ exp_so3(s * turn)
-        return pose(R, (1 - s) * start[..., :3, 3] + s * end[..., :3, 3])
+        s = u**3 * (10 + u * (6 * u - 15))
+        return between(self.T_world_placement[k], self.T_world_placement[k + 1], s)
+
+
+def between(start: Array, end: Array, share: float | Array) -> Array:
+    """Interpolate between two poses (..., 4, 4) at a fraction (...) of the way, turning evenly."""
+    s = np.asarray(share)[..., None]
+    turn = log_so3(np.swapaxes(start[..., :3, :3], -1, -2) @ end[..., :3, :3])
+    return pose(start[..., :3, :3] @ exp_so3(s * turn), (1 - s) * start[..., :3, 3] + s * end[..., :3, 3])
 
 
 def hold_board(T_world_board: Array) -> Trajectory:

@@ -146,13 +146,3 @@ def _write(block: Events, start: int, events: Events) -> None:
     place = slice(start, start + len(events))
     block.t_ns[place], block.x[place], block.y[place] = events.t_ns, events.x, events.y
     block.polarity[place] = events.polarity
-
-
-def join_events(parts: list[Events] | tuple[Events, ...]) -> Events:
-    """Put packets of one camera together, at least one; arrival at the host is not kept."""
-    joined = _block_like(parts[0], sum(map(len, parts)))
-    n = 0
-    for part in parts:
-        _write(joined, n, part)
-        n += len(part)
-    return joined

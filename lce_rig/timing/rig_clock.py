@@ -206,11 +206,10 @@ class RigClock:
 
     def account(self) -> list[Finding]:
         """List the cameras whose counts slipped against their pulses so far."""
-        counts = {name: matcher.counts for name, matcher in self._matchers.items()}
         return [
-            Finding("pulses.slipped", "note", name, dict(vars(each)))
-            for name, each in counts.items()
-            if each.n_slips or each.n_restarts
+            Finding("pulses.slipped", "note", name, matcher.figures())
+            for name, matcher in self._matchers.items()
+            if matcher.losses.n("pulses.slip", "pulses.restart")
         ]
 
     def verdict(self) -> SyncVerdict:

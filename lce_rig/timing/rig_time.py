@@ -22,7 +22,7 @@ def stream_of(sample: Sample, rig: Rig) -> Stream:
     if isinstance(sample, Events):
         return Stream(sample.sensor, event_channel(rig, sample.sensor) or "", "events")
     if isinstance(sample, Image):
-        return Stream(sample.sensor, sample.channel, "pictures")
+        return Stream(sample.sensor, sample.channel, "images")
     return Stream(sample.sensor, "", "scans")
 
 

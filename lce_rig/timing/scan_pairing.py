@@ -6,13 +6,15 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from lce_rig.core.data import Events, Image, Sample, Scan
+from lce_rig.core.losses import Losses
+from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import AFTER_NS, BEFORE_NS, EventBuffer, EventCut
 from lce_rig.timing.rig_time import rig_time_ns
 
 PATIENCE_NS = 1_000_000_000
-# Scans wait for others and come late in bags; what lies this far back no scan asks for any more.
-_KEPT_NS = BEFORE_NS + AFTER_NS + 3 * PATIENCE_NS
+#: How long events wait for a scan: in a bag, scans are late by up to two seconds beside their own waiting.
+IN_BAGS_NS, LIVE_NS = 3 * PATIENCE_NS, 3 * PATIENCE_NS // 2
 _Buffers: TypeAlias = dict[tuple[str, str], deque[tuple[int, Image | Scan]]]
 
 
@@ -33,20 +35,9 @@ class Frame:
     events: tuple[EventCut, ...] = ()
 
 
-@dataclass
-class PairingCounts:
-    """How pairing went.
-
-    Attributes:
-        n_alone: scans with no picture within the tolerance.
-        nearest_ns: smallest difference in time of any picture to one of those; None where there was none.
-    """
-
-    n_alone: int = 0
-    nearest_ns: int | None = None
-
-
-def pair_by_time(samples: Iterable[Sample], rig: Rig, counts: PairingCounts) -> Iterator[Frame]:
+def pair_by_time(
+    samples: Iterable[Sample], rig: Rig, losses: Losses, events_wait_ns: int = IN_BAGS_NS
+) -> Iterator[Frame]:
     """Give each scan of the first LiDAR heard the nearest picture of each camera channel, and its events.
 
     Samples come in order of receipt: a scan waits until every other sensor has passed its time, or a second
@@ -55,9 +46,10 @@ def pair_by_time(samples: Iterable[Sample], rig: Rig, counts: PairingCounts) -> 
     Args:
         samples: pictures, scans and packets of events; each sensor's stamps rise.
         rig: its timestamps say what to add to stamps, and how far pairs may lie apart.
-        counts: filled as frames are made.
+        losses: receives the scans without an image within the tolerance, and how near the nearest was.
+        events_wait_ns: how long events are kept for scans that wait or come late.
     """
-    pairing = _Pairing(rig, counts)
+    pairing = _Pairing(rig, losses, BEFORE_NS + AFTER_NS + events_wait_ns)
     for sample in samples:
         pairing.take(sample)
         yield from pairing.due_frames()
@@ -67,9 +59,11 @@ def pair_by_time(samples: Iterable[Sample], rig: Rig, counts: PairingCounts) -> 
 class _Pairing:
     """Scans that wait, and what has come of the other sensors."""
 
-    def __init__(self, rig: Rig, counts: PairingCounts) -> None:
+    def __init__(self, rig: Rig, losses: Losses, kept_ns: int) -> None:
         self._rig = rig
-        self._counts = counts
+        self._losses = losses
+        self._kept_ns = kept_ns
+        self._nearest_ns: int | None = None
         self._waiting: deque[tuple[int, int, Scan]] = deque()
         self._buffers: _Buffers = {}
         self._events = EventBuffer(rig)
@@ -90,7 +84,7 @@ class _Pairing:
             time_ns += half_ns
             self._take_frame_part(sample, time_ns, half_ns)
         self._position_ns = max(self._position_ns, time_ns)
-        self._events.forget_before(self._position_ns - _KEPT_NS)
+        self._events.forget_before(self._position_ns - self._kept_ns)
 
     def due_frames(self) -> Iterator[Frame]:
         """Yield the frames that nothing more can come for."""
@@ -146,10 +140,13 @@ class _Pairing:
             events = self._events.cut(time_ns - half_ns - BEFORE_NS, time_ns + half_ns + AFTER_NS)
             yield Frame(time_ns, tuple(images), tuple(scans), events)
         else:
-            self._counts.n_alone += 1
-            known_ns = self._counts.nearest_ns
-            if nearest_ns is not None:
-                self._counts.nearest_ns = nearest_ns if known_ns is None else min(nearest_ns, known_ns)
+            self._count_alone(nearest_ns)
+
+    def _count_alone(self, nearest_ns: int | None) -> None:
+        is_best = nearest_ns is not None and nearest_ns < (self._nearest_ns or 2**62)
+        nearest_s = None if nearest_ns is None else nearest_ns * 1e-9
+        self._nearest_ns = nearest_ns if is_best else self._nearest_ns
+        self._losses.add(Refusal("read.no_image_at_scan", figures={"nearest_s": nearest_s}), is_best=is_best)
 
 
 def middle_of_sweep_ns(scan: Scan, rig: Rig) -> int | None:

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from statistics import median
 
 from lce_rig.core.data import Image, Pulse
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.losses import Losses
 from lce_rig.timing.clock import ClockModel
 
 # VersaVIS, too, asks for four in a row.
@@ -30,6 +31,15 @@ _SLIP_WINDOW = 200
 _N_PULSES = 1024
 _N_RECENT = 8
 _MAX_INTERPOLATED = 8
+_LOSSES = {
+    "n_unmatched": "pulses.image_unmatched",
+    "n_lost_frames": "pulses.image_lost",
+    "n_lost_pulses": "pulses.message_lost",
+    "n_missed": "pulses.missed_by_camera",
+    "n_repeated": "pulses.repeated",
+    "n_slips": "pulses.slip",
+    "n_restarts": "pulses.restart",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,31 +61,6 @@ class TriggeredImage:
     is_interpolated: bool
 
 
-@dataclass
-class TriggerCounts:
-    """How matching went.
-
-    Attributes:
-        n_matched: pictures matched.
-        n_unmatched: pictures that no pulse could be given to.
-        n_lost_frames: frames that the camera numbered and that never came.
-        n_lost_pulses: pulses whose lines never came, of pictures that did.
-        n_missed: pulses that the camera made no frame of; they shift its numbers.
-        n_repeated: pictures and pulses that came twice.
-        n_slips: how often the constant had to be corrected.
-        n_restarts: how often the camera or the board began to count anew.
-    """
-
-    n_matched: int = 0
-    n_unmatched: int = 0
-    n_lost_frames: int = 0
-    n_lost_pulses: int = 0
-    n_missed: int = 0
-    n_repeated: int = 0
-    n_slips: int = 0
-    n_restarts: int = 0
-
-
 @dataclass(frozen=True, eq=False)
 class _Waiting:
     image: Image
@@ -87,7 +72,8 @@ class TriggerMatcher:
     """Pulses and pictures of one camera in, matched pictures out, each stream in its own order.
 
     Attributes:
-        counts: how matching went.
+        n_matched: images matched.
+        losses: images and pulses lost, sent twice or not matched; corrections of the constant.
         problem: why images are not matched now; None while they are.
     """
 
@@ -99,7 +85,8 @@ class TriggerMatcher:
             max_delay_ns: latest stamp of a picture after its pulse, on the board's clock.
             min_delay_ns: earliest; below 0 where the two clocks are tied loosely.
         """
-        self.counts = TriggerCounts()
+        self.n_matched = 0
+        self.losses = Losses()
         self.problem: Finding | None = Finding("pulses.nothing_yet", "error", camera)
         self._camera = camera
         self._window_ns = (min_delay_ns, max_delay_ns)
@@ -122,7 +109,7 @@ class TriggerMatcher:
         """Take a pulse, and give the pictures that waited for it."""
         if len(self._pulses) and pulse.count <= self._pulses.last_count:
             if pulse.stamp_ns <= self._pulses.last_ns and pulse.stamp_ns in self._pulses:
-                self.counts.n_repeated += 1
+                self._lose("n_repeated")
                 return []
             self._begin_anew("pulses.board_restarted")
             self._pulses.clear()
@@ -132,21 +119,21 @@ class TriggerMatcher:
     def take_image(self, image: Image) -> list[TriggeredImage]:
         """Take a picture, and give those whose pulses are now known."""
         if image.count is None or image.stamp_ns is None or self._clock is None:
-            self.counts.n_unmatched += 1
+            self._lose("n_unmatched")
             code = "pulses.images_not_numbered" if image.count is None else "pulses.clock_not_tied"
             self.problem = Finding(code, "error", self._camera)
             return []
         if self._last is not None and image.count <= self._last[0]:
             if image.stamp_ns <= self._last[1]:
-                self.counts.n_repeated += 1
+                self._lose("n_repeated")
                 return []
             self._begin_anew("pulses.camera_restarted")
         elif self._last is not None:
-            self.counts.n_lost_frames += image.count - self._last[0] - 1
+            self._lose("n_lost_frames", image.count - self._last[0] - 1)
         self._last = image.count, image.stamp_ns
         if len(self._waiting) == _N_WAITING:
             self._waiting.popleft()
-            self.counts.n_unmatched += 1
+            self._lose("n_unmatched")
             self.problem = Finding("pulses.none", "error", self._camera)
         self._waiting.append(_Waiting(image, image.count, self._clock.convert(image.stamp_ns)))
         return list(self._proceed())
@@ -180,7 +167,7 @@ class TriggerMatcher:
             self._drop(self._agreeing)
             self._candidate = constant
         if constant is None:
-            self.counts.n_unmatched += 1
+            self._lose("n_unmatched")
             return
         self._agreeing = [*self._agreeing, frame]
         if len(self._agreeing) == N_AGREE:
@@ -197,7 +184,7 @@ class TriggerMatcher:
         """Match by number, and keep an eye on the time."""
         assert self._constant is not None
         if self._pulses.time_of(frame.number - self._constant) is None:
-            self.counts.n_unmatched += 1
+            self._lose("n_unmatched")
             return
         shift = self._shift(frame)
         if shift == 0:
@@ -224,8 +211,8 @@ class TriggerMatcher:
             return
         assert self._constant is not None
         self._constant -= shift
-        self.counts.n_slips += 1
-        self.counts.n_missed += max(shift, 0)
+        self._lose("n_slips")
+        self._lose("n_missed", max(shift, 0))
         self._slipped_at.append(doubtful[-1].number)
         for frame in doubtful:
             yield from self._emit(frame)
@@ -250,25 +237,32 @@ class TriggerMatcher:
         number = frame.number - self._constant
         found = self._pulses.time_of(number)
         if found is None:
-            self.counts.n_unmatched += 1
+            self._lose("n_unmatched")
             return
         time_ns, is_interpolated = found
-        self.counts.n_lost_pulses += is_interpolated
-        self.counts.n_matched += 1
+        self._lose("n_lost_pulses", is_interpolated)
+        self.n_matched += 1
         stamp_ns = time_ns + round(median(self._delays_ns))
         yield TriggeredImage(frame.image, number, time_ns, stamp_ns, is_interpolated)
 
     def _begin_anew(self, code: str) -> None:
         self.problem = Finding(code, "error", self._camera)
-        self.counts.n_restarts += 1
+        self._lose("n_restarts")
         for frames in (self._waiting, self._agreeing, self._doubtful):
             self._drop(frames)
         self._constant = self._candidate = self._last = None
         self._delays_ns.clear()
         self._slipped_at.clear()
 
+    def figures(self) -> dict[str, Figure]:
+        """Give how matching went: n_matched, and what was lost by its name."""
+        return {"n_matched": self.n_matched, **{name: self.losses.n(code) for name, code in _LOSSES.items()}}
+
+    def _lose(self, name: str, n: int = 1) -> None:
+        self.losses.add(Finding(_LOSSES[name], "note", self._camera), n)
+
     def _drop(self, frames: list[_Waiting] | deque[_Waiting]) -> None:
-        self.counts.n_unmatched += len(frames)
+        self._lose("n_unmatched", len(frames))
         frames.clear()
 
 

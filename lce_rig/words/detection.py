@@ -1,11 +1,11 @@
-"""Why a capture, an image or a scan is not used: codes begin with the stage that refuses."""
+"""Phrases for refused captures, images and scans; codes begin with the stage that refuses."""
 
 from dataclasses import replace
 
 from lce_rig.core.findings import Finding
 from lce_rig.words.rendering import Phrase, Template, describe, recommend
 
-MOVE_SLOWLY = "move the board sideways slowly, about 10 cm/s, from a second before the capture on"
+MOVE_SLOWLY = "move the board sideways slowly, about 10 cm/s, from 1 s before the capture"
 _SLOWER = "move it slower, about 10 cm/s"
 _CORNERS = "{n_cols}x{n_rows} inner corners"
 _OTHER = _CORNERS + " expected, {n_cols_seen}x{n_rows_seen} detected"
@@ -14,7 +14,7 @@ _UNCOVER = "uncover the whole pattern; if it has these corners, correct board.in
 _FOCUS = "hold the board still, expose shorter, come closer, focus the lens"
 _LENS = "check the camera's intrinsics ({model} at {width_px}x{height_px} px) and that the board is flat"
 _CLOCKS = "check that both sensors' clocks agree"
-_NO_FLICKER = "record by daylight or under lamps that do not flicker"
+_NO_FLICKER = "record in daylight or under lamps that do not flicker"
 _PLATE = "{board_width_m:.2f} x {board_height_m:.2f} m"
 _HOLD_STILL = "hold the board still while capturing, with nothing in front of it or close behind its rim"
 _REMOVE_OTHERS = "remove other things of the board's size, or cover them"
@@ -25,6 +25,13 @@ def _flicker(finding: Finding) -> str:
     frequency_hz = finding.figures["frequency_hz"]
     rhythm = f" at {frequency_hz:.0f} Hz" if frequency_hz else ""
     return f"most events come from light that flickers{rhythm}"
+
+
+def _no_image(finding: Finding) -> str:
+    """No image at the time of the scan; the nearest was {nearest_s} away."""
+    nearest_s = finding.figures.get("nearest_s")
+    nearest = f" (nearest: {nearest_s:.3f} s away)" if isinstance(nearest_s, float) else ""
+    return f"no image at the time of the scan{nearest}"
 
 
 def _lost(finding: Finding) -> str:
@@ -78,20 +85,20 @@ PHRASES: dict[str, Phrase] = {
         "start the event camera first, or check that both sensors' clocks agree",
     ),
     "read.events_gone_by": Phrase(
-        "the scan comes after the events that follow it",
+        "the scan arrived after the events that follow it",
         "split the recording where the LiDAR's clock was set back",
     ),
     "read.no_events_at_scan": Phrase(
         "no events at the time of the scan",
         "record events while the LiDAR runs and check that the clocks agree",
     ),
-    "read.no_image_at_scan": Phrase("no image at the time of the scan"),
+    "read.no_image_at_scan": Phrase(_no_image),
     "image.none": Phrase("no board in any image"),
     "lidar.none": Phrase("no board in the scan"),
-    "calibrate.same_placement": Phrase("the board stood as in a capture before"),
+    "calibrate.same_placement": Phrase("same placement as in an earlier capture"),
     "image.text": Phrase("{text}", "{advice}"),
     "image.error": Phrase("{what}", "{hint}"),
-    "image.not_at_first_sight": Phrase("no board at first sight", "search the image thoroughly"),
+    "image.not_at_first_sight": Phrase("no board found by the quick search", "search the image thoroughly"),
     "image.too_dark": Phrase(
         "too dark: 99 % of the image below grey {grey_99:.0f}", "expose longer or add light"
     ),
@@ -115,7 +122,7 @@ PHRASES: dict[str, Phrase] = {
         {"events": f"{_WHOLE}; {MOVE_SLOWLY}"},
     ),
     "image.unclear": Phrase(
-        "the " + _CORNERS + " are there but too unclear to measure",
+        "the " + _CORNERS + " are too unclear to measure",
         "hold the board still, closer and better lit",
         {"events": f"{MOVE_SLOWLY}; come closer"},
     ),
@@ -183,7 +190,7 @@ PHRASES: dict[str, Phrase] = {
     "image.made_few_events": Phrase(
         "the board made few events at {speed_mps:.2f} m/s: {events_px:.1f} events/px in 1 s "
         "(minimum {min_events_px:g})",
-        "move it sideways slowly, about 10 cm/s, rather than to and fro, and in better light",
+        "move it sideways slowly, about 10 cm/s, in one direction, and in better light",
     ),
     "lidar.text": Phrase("{text}", "{advice}"),
     "lidar.no_returns": Phrase(
@@ -207,7 +214,7 @@ PHRASES: dict[str, Phrase] = {
     "lidar.outline": Phrase(
         "plate outline at {distance_m:.1f} m: error {error_m:mm} (limit {max_error_m:mm}), "
         "{hidden_share:percent} of the board occluded",
-        "show the whole board, with nothing before it and nothing at its edges",
+        "show the whole board, with nothing in front of it or at its edges",
     ),
     "lidar.other_plate": Phrase(
         "the plate nearest to the board's size is {width_m:.2f} x {height_m:.2f} m, at {distance_m:.1f} m; "
@@ -241,7 +248,7 @@ PHRASES: dict[str, Phrase] = {
     ),
     "pair.text": Phrase("{text}", "{advice}"),
     "pair.no_candidate": Phrase(
-        "no place in the scan looks like the board", "move the board clear of other things"
+        "no surface in the scan fits the board", "move the board clear of other things"
     ),
     "pair.elsewhere": Phrase(
         _candidates,
@@ -249,7 +256,7 @@ PHRASES: dict[str, Phrase] = {
         {"hold_still": "hold the board still and clear of other things while capturing"},
     ),
     "pair.two_places": Phrase(
-        "{first} and {second} put the board at different places of the scan", _REMOVE_OTHERS
+        "{first} and {second} give different board positions in the scan", _REMOVE_OTHERS
     ),
     "calibrate.text": Phrase("{text}", "{advice}"),
     "calibrate.outlier": Phrase(
@@ -262,12 +269,13 @@ PHRASES: dict[str, Phrase] = {
         "check with `lce-rig check --debug-images` whether the board is bent, cut off or moving",
     ),
     "calibrate.known_placement": Phrase(
-        "the board stands where capture {capture} shows it",
+        "the board is at the placement of capture {capture}",
         "{instruction}",
-        {"nowhere": "no other place is left, you may stop"},
+        {"nowhere": "stop the collection: no new placement is left"},
     ),
     "calibrate.little_gain": Phrase(
-        "this placement makes the result {gain:1percent} better, another {best_gain:percent}", "{instruction}"
+        "this placement improves the result by {gain:1percent}, another by {best_gain:percent}",
+        "{instruction}",
     ),
 }
 for _stage, _unit in (("image", "camera"), ("lidar", "LiDAR")):

@@ -1,4 +1,4 @@
-"""Why an extrinsic is doubted: the reasons of a verdict, its notes, other captures, other sessions."""
+"""Phrases for extrinsics: reasons and notes of a verdict, checks on other captures and sessions."""
 
 import math
 
@@ -43,7 +43,7 @@ def _intrinsics(finding: Finding) -> str:
     """Intrinsics do not fit: {rms_px}, {possible_px}, {displacement_px}, {turn_deg}, {focal_ratio}."""
     q = finding.figures
     how = "do not fit" if finding.severity == "error" else "fit only roughly"
-    parts = ["corners fit, but only because the boards' poses are off"]
+    parts = ["corners fit, but only with wrong board poses"]
     if q["is_visible"]:
         rms_px, possible_px = finding.figure("rms_px"), finding.figure("possible_px")
         parts = [f"reprojection error {rms_px:.2f} px, possible {possible_px:.2f} px"]
@@ -146,14 +146,14 @@ PHRASES: dict[str, Phrase] = {
     ),
     "verdict.channels_differ": Phrase(
         "{first} and {second} of one camera differ by " + _APART + ", beyond their uncertainty",
-        "calibrate each alone (--channels) and see which captures contradict it",
+        "calibrate each alone (--channels) and find the captures that contradict it",
     ),
     "verdict.sensors_disagree": Phrase(
         "the sensors disagree in {n_refused} of {n_captures} captures ({captures})",
         "look for a moving board, a second board, or wrong matching",
     ),
     "verdict.few_used": Phrase(
-        "{n_used} of {n_captures} captures could be used", "see the causes with `lce-rig check`"
+        "{n_used} of {n_captures} captures could be used", "run `lce-rig check` for the causes"
     ),
     "verdict.few_placements": Phrase(
         "{n_used} captures show {n_placements} different placements (minimum {n_needed})",
@@ -197,39 +197,54 @@ PHRASES: dict[str, Phrase] = {
         "correct them in the LiDAR's driver",
     ),
     "verdict.camera_changed": Phrase(
-        "{subject}, by their images alone, change significantly at capture {capture}, by " + _APART,
+        "{subject}: relative pose from the images changes significantly at capture {capture}, by " + _APART,
         "fasten the cameras, one may have moved, and collect again",
     ),
     "verdict.camera_shares_differ": Phrase(
-        "{subject}, by their images alone: {first} and {second} boards differ significantly, by " + _APART,
+        "{subject}: relative poses from images of {first} and {second} boards differ significantly, by "
+        + _APART,
         _LENS,
         {"near": "check the squares' size and the focal length, and that the board is flat"},
     ),
     "verdict.cameras_scatter": Phrase(
-        "{subject}: images put the same board {rms_m:mm} apart, rms, wherever the cameras sit "
+        "{subject}: board positions from the images differ by {rms_m:mm} rms for any relative pose "
         "({scatter:.1f} times the typical value)",
         "hold the board still between the images and check the intrinsics",
     ),
     "verdict.cameras_differ": Phrase(
-        "{subject}: the same board {rms_m:mm} apart ({images_rms_m:mm} by the images alone), "
-        "extrinsics and images differ by " + _APART,
+        "{subject}: board positions differ by {rms_m:mm} rms ({images_rms_m:mm} from the images alone), "
+        "relative poses from extrinsics and images by " + _APART,
         "check whether a camera has moved, and the intrinsics",
     ),
     "verdict.widened": Phrase(_widened),
     "verify.elsewhere": Phrase(
-        "in {n_elsewhere} of {n_captures} captures nothing in the scan is where the extrinsics put the board"
+        "in {n_elsewhere} of {n_captures} captures the scan has no surface where the extrinsics place the "
+        "board"
     ),
-    "verify.unseen": Phrase("no capture shows the board to both sensors"),
+    "verify.unseen": Phrase("both sensors detect the board in no capture"),
+    "results.agree": Phrase(
+        "the {n_sessions} results of {camera} and {lidar} agree: they differ by up to {rotation_deg:3deg} "
+        "and {translation_m:1mm}; common errors stay hidden, as they share captures",
+    ),
+    "results.disagree": Phrase(
+        "{first} and {second} of {camera} and {lidar} disagree: results differ by up to {rotation_deg:3deg} "
+        "and {translation_m:1mm}, more than their uncertainties allow",
+        "compare the overlays of both (`lce-rig verify --name NAME`) and collect more captures",
+    ),
+    "results.outdated": Phrase(
+        "{subject}: the profile or the captures that it used have changed since",
+        "run `lce-rig calibrate` again with the same options",
+    ),
     "repeat.agree": Phrase(_agree),
     "repeat.disagree": Phrase(
         "the {n_sessions} calibrations of {camera} and {lidar} disagree: they differ by up to "
         "{rotation_deg:3deg} and {translation_m:1mm}, {ratio:.1f} times as much as predicted",
-        "use none of them before the cause is known",
-        {"odd_one": "find out what is wrong with {odd_one}, without it the others agree"},
+        "do not use any of them until the cause is known",
+        {"odd_one": "find the fault in {odd_one}, without it the others agree"},
     ),
     "repeat.failed": Phrase(
-        "the calibration of {subject} ({camera} and {lidar}) failed by itself",
-        "see its reasons with `lce-rig calibrate`",
+        "the calibration of {subject} ({camera} and {lidar}) failed",
+        "run `lce-rig calibrate` for its reasons",
     ),
     "repeat.not_calibrated": Phrase("{subject}: {what}", "{hint}"),
     "repeat.only_one": Phrase("{camera} and {lidar} are calibrated in {subject} only"),

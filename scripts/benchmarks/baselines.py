@@ -55,7 +55,6 @@ from lce_rig.solvers.registration import (
     eliminate_linear,
     linear_unknowns,
     minimise_on_so3,
-    moment_matrix,
     rotation_from_directions,
     tangent_basis,
     vec_rotation,
@@ -341,7 +340,7 @@ def calibrate_by_corners(
     corners_cam = np.stack([transform(o.image.T_cam_board, outline) for o in observations])
     T, paired = align_corners(corners_lidar, corners_cam, T_planes)
     rows = np.stack([point_rows(c, p) for c, p in zip(paired, corners_lidar, strict=True)])
-    moments = moment_matrix(rows, np.ones(rows.shape[:2]))
+    moments = np.swapaxes(rows, -1, -2) @ rows
     distances_m = np.linalg.norm(paired - (corners_lidar @ T[:3, :3].T + T[:3, 3]), axis=-1)
     return report_estimate(
         T,

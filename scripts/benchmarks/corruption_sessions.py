@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.fault_sessions import nearly_parallel
+from benchmarks.fault_sessions import nearly_parallel, rig_with_drawing
 from benchmarks.recordings import RecordedSet
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import ProfileError
@@ -18,7 +18,7 @@ from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import Refusal
 from lce_rig.detect.detection import Detections, ImageDetection
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures, truth_extrinsics
 from lce_rig.simulate.captures import capture_at
@@ -79,7 +79,7 @@ def simulated_samples(rig_name: str, seed: int = SEED, n_captures: int = N_CAPTU
         seed: of everything random.
         n_captures: of the session, and of its variants with moving boards.
     """
-    rig = load_rig(rig_name)
+    rig = rig_with_drawing(rig_name)
     options = SimulationOptions.for_rig(rig.name)
     stage = set_stage(rig, seed, options)
     truth = truth_extrinsics(rig, seed, options)[next(iter(rig.cameras)), next(iter(rig.lidars))]

@@ -18,7 +18,7 @@ from benchmarks.still_sessions import scan_held_board, with_small_pictures
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
 from lce_rig.detect.detection import LidarDetection, from_arrays, to_arrays
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.rig import Rig
+from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.poses import can_be_held, count_rings, seen_share
 from lce_rig.simulate.stage import PLACEMENT, Stage, set_stage, truth_extrinsics
@@ -33,6 +33,13 @@ WRONG_PLATES_M = {
 # A further stream of random numbers; the simulation itself uses the lower ones.
 _PARALLEL = 90
 _N_PLACES = 4000
+
+
+def rig_with_drawing(name: str) -> Rig:
+    """Load a shipped profile as of a user who has a CAD model: it holds the nominal extrinsics."""
+    rig = load_rig(name)
+    drawn = tuple(entry.model_copy(update={"source": "cad"}) for entry in rig.nominal_extrinsics)
+    return rig.model_copy(update={"nominal_extrinsics": drawn})
 
 
 @dataclass(frozen=True, eq=False)

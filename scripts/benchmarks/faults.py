@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.fault_kinds import KINDS, Case
-from benchmarks.fault_sessions import simulated_scans
+from benchmarks.fault_sessions import rig_with_drawing, simulated_scans
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig import pipeline
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.extrinsics import CalibrateOptions
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import Rig
 
 _RIG = "rlfs"
 _N_DRAWS = 20
@@ -45,7 +45,7 @@ def bench_faults(n_seeds: int, folder: Path | None = None, n_sessions: int = 100
         n_sessions: simulated; with fewer than seeds, several seeds share the scans of one.
     """
     folder = folder or Path(tempfile.gettempdir()) / "lce-rig-benchmarks" / "faults"
-    rig = load_rig(_RIG)
+    rig = rig_with_drawing(_RIG)
     outcomes: dict[str, list[Outcome]] = {kind: [] for kind in KINDS}
     for seed in range(n_seeds):
         scans = simulated_scans(rig, seed % n_sessions, folder)

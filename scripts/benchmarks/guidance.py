@@ -64,7 +64,7 @@ class Outcome:
 
 def bench_guidance(n_seeds: int, n_captures: int = 15, rigs: Sequence[str] = RIGS) -> None:
     """Tabulate the errors of random and guided sessions, and of guided ones a third shorter."""
-    head = "rig, placements, seeds, captures, offset, rms deg, rms mm, predicted deg / mm, claimed deg / mm"
+    head = "rig, placements, seeds, captures, offset, rms deg, rms mm, predicted deg / mm, reported deg / mm"
     print_head(*head.split(", "))
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     for name in rigs:

@@ -368,7 +368,7 @@ def _payloads(events: Events) -> dict[str, bytes]:
 
 def pcap(samples: Samples) -> list[Files]:
     """A pcap file of two revolutions of a VLP-16, position packets between them."""
-    from lce_rig.devices.vlp16.packet_recorder import PcapWriter
+    from lce_rig.recordings.velodyne.datagrams import PcapWriter
 
     def write(path: Path) -> None:
         with PcapWriter(path) as writer:
@@ -399,8 +399,9 @@ def pcapng(samples: Samples) -> list[Files]:
 
 
 def _datagrams(samples: Samples) -> list[Any]:
+    from wire.vlp16_packets import Vlp16Packets
+
     from lce_rig.recordings.velodyne.datagrams import Datagram
-    from lce_rig.simulate.vlp16_packets import Vlp16Packets
 
     packets = Vlp16Packets()
     sent = [packet for scan in samples.whole_scans for packet in packets.feed(scan)] + packets.finish()

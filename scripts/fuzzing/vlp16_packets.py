@@ -93,9 +93,8 @@ def fuzz_packets(n_damaged: int, seed: int) -> PacketReport:
             early_bytes = _resident_bytes()
     report.grown_bytes = _resident_bytes() - early_bytes
     report.packets_per_s = first / (time.perf_counter() - began_s)
-    report.refused = stream.counts.bad + positions.counts.bad_positions
-    for reason in ("n_late", "n_astray", "n_steps"):
-        report.refused[reason] = getattr(stream.counts.order, reason)
+    stream.losses.update(positions.losses)
+    report.refused = Counter(stream.losses.by_code())
     return report
 
 

@@ -16,8 +16,8 @@ from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
 from lce_rig.simulate.stage import PLACEMENT
-from lce_rig.simulate.vlp16_packets import STREAMED_VLP16, Vlp16Packets
 from wire.timing import PACKETS_PER_LOOP, SCANS_PER_LOOP
+from wire.vlp16_packets import STREAMED_VLP16, Vlp16Packets
 
 _T0_NS = 1_700_000_000_000_000_000
 _N_PICTURES = 4

@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 
 from lce_rig.core import velodyne
-from lce_rig.simulate.vlp16_packets import gprmc
 from wire.timing import PACKET_NS, PACKETS_PER_LOOP, placement_at
+from wire.vlp16_packets import gprmc
 
 _DATA_PER_POSITION = 14
 _SENTENCE_DELAY_NS = 300_000_000

@@ -15,10 +15,10 @@ import time
 from pathlib import Path
 
 import pytest
+from wire.vlp16_packets import Vlp16Clock
 
 from lce_rig.core.findings import Finding
 from lce_rig.rig import dump_rig
-from lce_rig.simulate.vlp16_packets import Vlp16Clock
 from lce_rig.words import sentence
 from tests.doctor.attached import Attached, attach, picture_of, scan_of
 from tests.doctor.observed import make_rig

@@ -118,7 +118,7 @@ def test_other_rigs_and_other_lenses_are_refused_and_another_board_is_remarked(l
     other = made("other", [0] * 6, set_value(RLES, "name", "rles02"))
     outcome = lce_rig("repeat", a, other)
     assert outcome.code == 4
-    assert "monday is of rig 'rles', other of rig 'rles02'" in outcome.err
+    assert "monday belongs to rig 'rles', other to rig 'rles02'" in outcome.err
     refocused = made("refocused", [0] * 6, set_value(RLES, "cameras.davis.intrinsics.fx_px", "355.0"))
     outcome = lce_rig("repeat", a, refocused)
     assert outcome.code == 4
@@ -149,7 +149,7 @@ def test_a_session_that_cannot_be_calibrated_is_named(lce_rig, made, tmp_path):
         pass
     outcome = lce_rig("repeat", a, tmp_path / "empty")
     assert outcome.code == 6
-    assert "error: empty: the session holds no capture with a picture and a scan" in outcome.err
+    assert "error: empty: the session has no capture with an image and a scan" in outcome.err
     uncalibrated = made("unfinished", [0] * 6)
     shutil.rmtree(uncalibrated / "calibration")
     outcome = lce_rig("repeat", a, uncalibrated)

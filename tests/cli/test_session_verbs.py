@@ -4,6 +4,7 @@ import json
 import subprocess
 
 import numpy as np
+import yaml
 
 
 def read(path):
@@ -154,7 +155,8 @@ def test_another_result_moves_the_earlier_one_and_its_overlays_to_previous(lce_r
     assert "earlier result" in outcome.err and str(folder / "previous") in outcome.err.replace("\n", "")
     kept = folder / "previous"
     assert {path.relative_to(kept): path.read_bytes() for path in kept.rglob("*") if path.is_file()} == before
-    assert not (folder / "overlays").exists()
+    drawn = {path.name for path in (folder / "overlays").iterdir()}
+    assert drawn == {path.name for path in before if path.parent.name == "overlays"}
 
 
 def test_verify_again_leaves_what_the_user_put_beside_the_overlays(lce_rig, calibrated_few):
@@ -203,17 +205,15 @@ def test_a_session_whose_profile_was_exchanged_is_refused(lce_rig, session):
 
 def test_a_nominal_extrinsic_far_off_fails_with_7_and_nothing_is_exported(lce_rig, session):
     profile = session / "rig.yaml"
-    text = profile.read_text()
-    turned = text.replace("quaternion_wxyz: [0.5, 0.5, -0.5, 0.5]", "rpy_deg: [0.0, 0.0, 0.0]")
-    if turned == text:
-        import yaml
-
-        document = yaml.safe_load(text)
-        nominal = document["nominal_extrinsics"][0]
-        nominal.pop("quaternion_wxyz", None)
-        nominal["rpy_deg"] = [0.0, 0.0, 0.0]
-        turned = yaml.safe_dump(document)
-    profile.write_text(turned)
+    document = yaml.safe_load(profile.read_text())
+    nominal = document["nominal_extrinsics"][0]
+    del nominal["quaternion_wxyz"]
+    nominal["rpy_deg"] = [0.0, 0.0, 0.0]
+    profile.write_text(yaml.safe_dump(document))
+    # How such rigs are built is no test of this one; its own CAD model is.
+    assert lce_rig("calibrate", session).code == 0
+    nominal["source"] = "cad"
+    profile.write_text(yaml.safe_dump(document))
     outcome = lce_rig("calibrate", session)
     assert outcome.code == 7
     (pair,) = read(session / "calibration" / "result.json")["pairs"]

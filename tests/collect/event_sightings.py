@@ -10,6 +10,7 @@ from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import AFTER_NS, BEFORE_NS, EventBuffer
 from lce_rig.timing.scan_pairing import Frame
+from tests.extrinsics.boards import measured_plate
 
 T0_NS = 1_700_000_000 * 10**9
 S = 10**9
@@ -83,4 +84,5 @@ def plate() -> LidarBoard:
     none, nothing = np.zeros((0, 3)), np.zeros(0)
     ring, side = np.zeros(0, np.int16), np.zeros(0, np.int8)
     plane = np.array([0, 0, 1.0, -3.0])
-    return LidarBoard(none, ring, none, ring, side, nothing, nothing, 0.003, plane, 0.01, np.eye(4))
+    quality = measured_plate(0.8, 0.6, none)
+    return LidarBoard(none, ring, none, ring, side, nothing, nothing, 0.003, plane, 0.01, np.eye(4), quality)

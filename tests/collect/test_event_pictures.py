@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.event_pictures import with_event_pictures
-from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.data import Events, Image, Sample, Scan
+from lce_rig.core.losses import Losses
 from lce_rig.detect.events.search import reconstructor_for
 from lce_rig.recordings.merging import merge_by_time
 from lce_rig.rig import ReconstructionSettings, Rig, load_rig
@@ -43,8 +43,8 @@ EVENTS = event_stream([(0.0, 2.0, 0.5)])
 MIDDLES_MS = range(150, 1950, 100)
 
 
-def pictures(samples: Iterable[Sample], rig: Rig, tally: RefusalCounts | None = None) -> list[Image]:
-    found = list(with_event_pictures(samples, rig, ["davis"], tally or RefusalCounts()))
+def pictures(samples: Iterable[Sample], rig: Rig, tally: Losses | None = None) -> list[Image]:
+    found = list(with_event_pictures(samples, rig, ["davis"], tally or Losses()))
     return [sample for sample in found if isinstance(sample, Image)]
 
 
@@ -77,7 +77,7 @@ def test_scans_that_come_late_and_packets_of_any_length_change_nothing(late_ms: 
 def test_every_sample_is_passed_on_and_pictures_follow_the_events_they_are_made_of() -> None:
     rig = rig_with()
     given = list(merge_by_time([EVENTS, map(scan, MIDDLES_MS)], rig))
-    found = list(with_event_pictures(given, rig, ["davis"], RefusalCounts()))
+    found = list(with_event_pictures(given, rig, ["davis"], Losses()))
     assert [s for s in found if not isinstance(s, Image)] == given
     last_ns = 0
     for sample in found:
@@ -95,7 +95,7 @@ def test_pictures_carry_stamps_of_the_events_own_clock() -> None:
 
 
 def test_scans_before_the_first_event_get_no_picture_and_are_counted() -> None:
-    rig, tally = rig_with(), RefusalCounts()
+    rig, tally = rig_with(), Losses()
     scans = [scan(t) for t in range(-2950, 500, 100)]
     found = pictures(merge_by_time([EVENTS, scans], rig), rig, tally)
     assert [i.stamp_ns for i in found] == [T0_NS + t * MS for t in range(50, 500, 100)]
@@ -104,7 +104,7 @@ def test_scans_before_the_first_event_get_no_picture_and_are_counted() -> None:
 
 
 def test_scans_of_a_clock_that_was_set_back_get_no_picture_of_other_times() -> None:
-    rig, tally = rig_with(), RefusalCounts()
+    rig, tally = rig_with(), Losses()
     given = [*EVENTS[:30], scan(1050), scan(1150), *EVENTS[30:], scan(550), scan(1950)]
     found = pictures(given, rig, tally)
     assert [i.stamp_ns for i in found] == [T0_NS + t * MS for t in (1050, 1150, 1950)]

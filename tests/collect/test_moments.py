@@ -1,6 +1,7 @@
 """A continuous recording is cut where the board stands still and differs from what is there."""
 
 import os
+import shutil
 
 import numpy as np
 import pytest
@@ -38,6 +39,14 @@ def test_two_stands_become_two_captures_and_the_way_between_none(collected, path
         assert capture.meta["motion_m"] < 0.005
         image, scan = capture.image("cam", "frames"), capture.scan("lidar")
         assert abs(image.stamp_ns - scan.stamp_ns - 50_000_000) < 1_000_000 and len(scan.points) == 28_800
+
+
+def test_a_rejected_placement_is_not_captured_again_from_its_recording(collected, bag, rig, tmp_path):
+    shutil.copytree(collected[0], tmp_path / "s")
+    with Session.resume(tmp_path / "s", rig) as session:
+        session.reject("000001")
+        report = collect(session, [open_recording(bag, rig)])
+    assert (report.captured, report.n_resumed, report.n_rejected, len(session.captures)) == ([], 1, 1, 1)
 
 
 def test_a_second_run_captures_nothing_again(collected, bag, rig):
@@ -83,8 +92,9 @@ def test_clocks_that_are_apart_are_said_and_bridged_by_the_profile(tmp_path, sta
     bag = write_bag(tmp_path / "a.bag", samples)
     with Session.create(tmp_path / "apart", rig) as session:
         report = collect(session, [open_recording(bag, rig)])
-    assert report.captured == [] and report.counts.by_code()["read.no_image_at_scan"] == 9
-    assert any(note.startswith("9 scans") and " 2.2" in note for note in report.notes)
+    assert report.captured == []
+    ((alone, n),) = [each for each in report.counts.counts() if each[0].code == "read.no_image_at_scan"]
+    assert n == 9 and 2.2 <= alone.figure("nearest_s") < 2.3
     channel = rig.cameras["cam"].channels["frames"]
     stamps = channel.timestamps.model_copy(update={"expected_offset_s": -3.0})
     channels = {"frames": channel.model_copy(update={"timestamps": stamps})}

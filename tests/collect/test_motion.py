@@ -11,7 +11,7 @@ from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
 from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.offline.slow_motion import _Neighbours, find_moving_moments
 from lce_rig.collect.placement_dedupe import Placements
-from lce_rig.collect.refusal_counts import RefusalCounts
+from lce_rig.core.losses import Losses
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig, load_rig
 from lce_rig.timing.scan_pairing import Frame
@@ -28,7 +28,7 @@ def rig() -> Rig:
 
 
 def choose(sightings: Iterable[BoardDetection], rig: Rig) -> tuple[list[CaptureMoment], dict[str, int]]:
-    tally = RefusalCounts()
+    tally = Losses()
     moments = find_moving_moments(sightings, rig, MotionOptions(), Placements(0.15, 10.0), tally)
     return list(moments), tally.by_code()
 
@@ -126,7 +126,7 @@ def test_the_moments_are_the_same_however_often_they_are_sought(rig: Rig) -> Non
     first, again = (times_s(choose(sightings, rig)[0]) for _ in range(2))
     assert first == again and first
     # Whoever stops early has had the first of them.
-    moments = find_moving_moments(sightings, rig, MotionOptions(), Placements(0.15, 10.0), RefusalCounts())
+    moments = find_moving_moments(sightings, rig, MotionOptions(), Placements(0.15, 10.0), Losses())
     assert times_s([next(moments)]) == first[:1]
 
 

@@ -57,6 +57,19 @@ def test_every_pair_becomes_a_capture_and_a_second_run_adds_none(tmp_path, folde
     assert [e["event"] for e in session.read_journal()][-1] == "collected"
 
 
+def test_a_rejected_pair_is_not_collected_again(tmp_path, folder, rig):
+    with Session.create(tmp_path / "s", rig) as session:
+        run(session, folder, rig)
+        session.reject("000003")
+        again = run(session, folder, rig)
+        assert (again.captured, again.n_resumed, again.n_rejected) == ([], N_PAIRS - 1, 1)
+        # Nor under another name.
+        (folder / "img" / "00003.png").rename(folder / "img" / "00009.png")
+        (folder / "pcd" / "00003.pcd").rename(folder / "pcd" / "00009.pcd")
+        renamed = run(session, folder, rig)
+    assert (renamed.captured, renamed.n_rejected) == ([], 1)
+
+
 def test_the_same_data_in_another_file_is_a_duplicate(tmp_path, folder, rig):
     pixels = cv2.imread(str(folder / "img" / "00003.png"), cv2.IMREAD_UNCHANGED)
     cv2.imwrite(str(folder / "img" / "00007.bmp"), pixels)
@@ -151,5 +164,5 @@ def test_a_recording_by_others_becomes_a_session(tmp_path, recordings):
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, recordings / "rlfs01", rig)
     assert len(report.captured) == 18 and not report.refused and not report.duplicates
-    assert any("ring field" in note and "elevations" in note for note in report.notes)
+    assert any("ring field" in note and "elevation" in note for note in report.notes)
     assert Session.open(tmp_path / "s").captures[17].scan("lidar").ring.max() == 15

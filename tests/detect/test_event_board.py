@@ -91,20 +91,20 @@ def test_speed_and_smear_are_those_of_the_true_motion(sighting):
     places = np.array([truth_m(stamp) for stamp in stamps])
     seconds = (stamps - STAMP) * 1e-9
     velocity = np.polyfit(seconds, places, 1)[0]
-    quality = sighting.board.quality
-    assert quality["speed_mps"] == pytest.approx(np.linalg.norm(velocity), abs=0.02)
-    assert quality["smear_m"] == pytest.approx(0.02 * quality["speed_mps"])
-    assert quality["smear_depth_m"] < 0.3 * quality["smear_m"]
-    assert quality["turn_deg_s"] < 25
+    quality = sighting.board.events
+    assert quality.speed_mps == pytest.approx(np.linalg.norm(velocity), abs=0.02)
+    assert quality.smear_m == pytest.approx(0.02 * quality.speed_mps)
+    assert quality.smear_depth_m < 0.3 * quality.smear_m
+    assert quality.turn_deg_s < 25
 
 
 def test_events_are_counted_on_the_board_only(stream, sighting):
-    quality = sighting.board.quality
+    quality = sighting.board.events
     on_board = (BOARD.width_m * BOARD.height_m) * (FOCAL_PX / DEPTH_M) ** 2
     recent = stream.between(STAMP - 100 * MS, STAMP)
     # Nothing but the board makes events here, less 0.3 noise events a second and pixel.
-    assert quality["events_px_s"] * on_board == pytest.approx(len(recent) / 0.1, rel=0.1)
-    assert quality["events_px"] > 3
+    assert quality.events_px_s * on_board == pytest.approx(len(recent) / 0.1, rel=0.1)
+    assert quality.events_px > 3
 
 
 def test_the_track_ends_with_the_stream(stream):
@@ -198,7 +198,9 @@ def test_speeds_that_could_be_noise_are_not_held_against_a_board(sighting):
         ({"turn_deg_s": 90.0, "turn_sigma_deg_s": 20.0}, ""),
         ({"turn_deg_s": 90.0, "turn_sigma_deg_s": 5.0}, "image.turning"),
     ):
-        board = gate_event_board(replace(sighting.board, quality=sighting.board.quality | figures), LIMITS)
+        board = gate_event_board(
+            replace(sighting.board, events=replace(sighting.board.events, **figures)), LIMITS
+        )
         assert (board.code if isinstance(board, Refusal) else "") == code
 
 

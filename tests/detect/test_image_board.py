@@ -130,8 +130,8 @@ def test_corners_are_found_in_order_to_a_twentieth_of_a_pixel(
     offset = difference(result.T_cam_board, T)
     assert np.linalg.norm(offset[:3]) < 1e-3
     assert np.degrees(np.linalg.norm(offset[3:])) < 0.15
-    assert result.quality["distance_m"] == pytest.approx(np.linalg.norm(T[:3, 3]), rel=0.01)
-    assert result.quality["n_corners"] == board.cols * board.rows
+    assert result.distance_m == pytest.approx(np.linalg.norm(T[:3, 3]), rel=0.01)
+    assert result.quality.n_corners == board.cols * board.rows
 
 
 @pytest.mark.parametrize("roll_deg", range(0, 360, 60))
@@ -173,7 +173,7 @@ def test_fitted_crossings_beat_corner_sub_pix_on_small_noisy_squares() -> None:
 def test_a_board_of_ten_grey_values_contrast_in_event_pictures_is_found() -> None:
     T = looking(25, 30, 45, (0.0, 0.0, 1.8))
     pixels = draw(ASYMMETRIC, DAVIS, T, black=105, white=135, noise=2.5)
-    assert found(pixels, ASYMMETRIC, DAVIS).quality["contrast"] == pytest.approx(30, abs=6)
+    assert found(pixels, ASYMMETRIC, DAVIS).quality.contrast == pytest.approx(30, abs=6)
 
 
 def test_the_region_of_the_last_picture_gives_the_same_corners() -> None:

@@ -103,7 +103,7 @@ def test_board_is_found_at_every_noise_level_of_the_paper(sigma_m):
     assert_is_board(
         found, T, within_m=0.03, within_deg=3, normal_deg=0.1 + 5 * np.degrees(sigma_m / 0.18 / 24)
     )
-    assert found[0].quality["range_noise_m"] == pytest.approx(max(sigma_m, 0.004), rel=0.1)
+    assert found[0].quality.range_noise_m == pytest.approx(max(sigma_m, 0.004), rel=0.1)
 
 
 @pytest.mark.parametrize("behind_m", [0.1, 0.2, 0.4])
@@ -148,7 +148,7 @@ def test_hands_over_the_border_cost_ring_ends_and_move_nothing():
         hands.append(Box(hand, (0.1, 0.1, 0.06)))
     found = find(cast([board_plate(T), *hands, *ROOM], sigma_m=0.008))
     assert_is_board(found, T)
-    assert found[0].quality["n_ring_ends_dropped"] >= 2
+    assert found[0].quality.n_ring_ends_dropped >= 2
     assert np.abs(outline_distance(found[0].edge_points, T)).max() < 0.025
 
 
@@ -184,8 +184,8 @@ def test_normal_edges_and_size_are_unbiased_over_many_boards():
         board = found[0]
         errors.append((T[:3, :3].T @ board.plane[:3])[:2])
         residuals.append(outline_distance(board.edge_points, T).mean())
-        sizes.append([board.quality["width_m"] - BOARD.width_m, board.quality["height_m"] - BOARD.height_m])
-        sigmas.append([board.quality["width_sigma_m"], board.quality["height_sigma_m"]])
+        sizes.append([board.quality.width_m - BOARD.width_m, board.quality.height_m - BOARD.height_m])
+        sigmas.append([board.quality.width_sigma_m, board.quality.height_sigma_m])
     errors, sizes = np.array(errors), np.array(sizes)
     standard_error = errors.std(axis=0) / np.sqrt(len(errors))
     assert (np.abs(errors.mean(axis=0)) < 4 * standard_error).all()
@@ -200,7 +200,7 @@ def test_normal_edges_and_size_are_unbiased_over_many_boards():
 def test_board_of_another_size_is_measured_not_cut_to_size(scale):
     T = place(2.3, 30)
     board = find(cast([board_plate(T, scale=scale), *ROOM], sigma_m=0.01))[0]
-    assert board.quality["size_ratio"] == pytest.approx(scale, abs=0.007)
+    assert board.quality.size_ratio == pytest.approx(scale, abs=0.007)
 
 
 def test_light_spot_is_taken_off_the_measured_size():
@@ -208,8 +208,8 @@ def test_light_spot_is_taken_off_the_measured_size():
     spot = Beam(0.0127, 0.003)
     wider = Plate(T, BOARD.width_m + 2 * spot.half_width_m(2.3), BOARD.height_m + 2 * spot.half_width_m(2.3))
     board = find_lidar_boards(cast([wider, *ROOM], sigma_m=0.01), BOARD, beam=spot)[0]
-    assert board.quality["width_m"] == pytest.approx(BOARD.width_m, abs=0.006)
-    assert board.quality["width_sigma_m"] > spot.half_width_m(2.3) / 2
+    assert board.quality.width_m == pytest.approx(BOARD.width_m, abs=0.006)
+    assert board.quality.width_sigma_m > spot.half_width_m(2.3) / 2
 
 
 def test_fields_describe_the_returns_they_come_from():

@@ -11,20 +11,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from wire.vlp16_packets import SensorPacket, Vlp16Clock
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
+from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.vlp16.driver import Reception, Vlp16Source, to_status
-from lce_rig.devices.vlp16.packet_recorder import PcapRecorder
 from lce_rig.devices.vlp16.socket import N_AT_ONCE, UdpPort
 from lce_rig.recordings.protocol import SourceOptions
-from lce_rig.recordings.velodyne.datagrams import Datagram
 from lce_rig.recordings.velodyne.pcap import PcapRecording
 from lce_rig.recordings.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.rig.sensors import DriverSettings
-from lce_rig.simulate.vlp16_packets import SensorPacket, Vlp16Clock
 from tests.recordings.vlp16_room import PERIOD_NS, T0_NS, packets_of, push, room_scans, settings
 
 HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"
@@ -107,12 +106,18 @@ class Sender:
 
 @contextmanager
 def streaming(
-    lidar: LidarSettings, make_packets: Callable[[int], list[SensorPacket]], **options: Any
+    lidar: LidarSettings,
+    make_packets: Callable[[int], list[SensorPacket]],
+    record_to: Path | None = None,
+    **options: Any,
 ) -> Iterator[Vlp16Source]:
     """An open source that packets come to."""
     source = Vlp16Source("lidar", lidar, **{"silence_s": PATIENT_S, "n_slots": 100, **options})
-    with Sender(lidar, source).sending(make_packets), source:
-        yield source
+    with DiskWriter() as disk:
+        if record_to is not None:
+            assert source.record_packets(record_to, disk)
+        with Sender(lidar, source).sending(make_packets), source:
+            yield source
 
 
 class Room:
@@ -296,8 +301,8 @@ def test_a_port_that_another_program_holds_is_named(lidar: LidarSettings) -> Non
 
 
 def test_what_was_recorded_replays_to_the_same_scans(lidar: LidarSettings, rig: Rig, tmp_path: Path) -> None:
-    path = tmp_path / "raw.pcap"
-    with streaming(lidar, Room(6), record_to=path) as source:
+    path = tmp_path / "lidar.pcap"
+    with streaming(lidar, Room(6), record_to=tmp_path) as source:
         live = take(source, 5)
     replayed = list(PcapRecording(path, rig, SourceOptions()).samples())[:5]
     for a, b in zip(live, replayed, strict=True):
@@ -307,9 +312,11 @@ def test_what_was_recorded_replays_to_the_same_scans(lidar: LidarSettings, rig: 
 
 
 def test_a_recording_is_never_written_over(lidar: LidarSettings, tmp_path: Path) -> None:
-    path = tmp_path / "raw.pcap"
+    path = tmp_path / "lidar.pcap"
     path.write_bytes(b"kept")
-    assert str(path) in explain(lidar, record_to=path).what
+    with DiskWriter() as disk, pytest.raises(SourceError) as caught:
+        Vlp16Source("lidar", lidar).record_packets(tmp_path, disk)
+    assert str(path) in caught.value.what
     assert path.read_bytes() == b"kept"
 
 
@@ -317,23 +324,12 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(lidar: LidarSettings, t
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
     try:
-        with streaming(lidar, Room(6), record_to=tmp_path / "raw.pcap") as source:
+        with streaming(lidar, Room(6), record_to=tmp_path) as source:
             scans = take(source, 5)
             wait_for(lambda: any(p.code == "device.recording_stopped" for p in source.status().problems))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert len(scans) == 5
-
-
-def test_a_disk_that_stalls_costs_recorded_packets_and_no_scans(tmp_path: Path) -> None:
-    recorder = PcapRecorder(tmp_path / "raw.pcap")
-    datagram = Datagram(T0_NS, HERE, 2368, 2368, bytes(1206))
-    for _ in range(40_000):
-        recorder.put(datagram)
-    recorder.close()
-    assert recorder.n_written + recorder.n_dropped == 40_000
-    n_bytes = (tmp_path / "raw.pcap").stat().st_size
-    assert n_bytes == 24 + recorder.n_written * (16 + 42 + 1206)
 
 
 # What is said

@@ -13,13 +13,13 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from wire.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets
 
 from lce_rig.core import velodyne
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import exp_so3, pose
 from lce_rig.rig import Rig
-from lce_rig.simulate.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets
 from tests.detect.scans import Plate
 from tests.devices.fake_board import FakeBoard
 from tests.devices.test_vlp16_web import PAGES, serving

@@ -157,7 +157,7 @@ def set_in(document: Any, path: str, value: Any) -> None:
         ("pairs.0.T_cam_lidar.0.0", "1", "pairs.0.T_cam_lidar.0.0"),
         ("pairs.0.cov.0.1", 1.0, "not symmetric"),
         ("pairs.0.cov.0.0", -1.0, "negative"),
-        ("pairs.0.sigma_rotation_deg", 3.0, "does not belong to cov"),
+        ("pairs.0.sigma_rotation_deg", 3.0, "contradicts cov"),
         ("pairs.0.n_detected", 5, "5 of 4 captures"),
         ("pairs.0.verdict", "great", "pairs.0.verdict"),
         ("pairs.0.captures_refused.000001", {"stage": "moon"}, "pairs.0.captures_refused.000001.stage"),
@@ -229,7 +229,7 @@ def test_a_folder_that_cannot_be_written_is_a_session_error(make: Make, tmp_path
 WRITER = """
 import sys
 from pathlib import Path
-from lce_rig.export.files import write_atomically
+from lce_rig.session.durable import write_atomically
 print("ready", flush=True)
 while True:
     for letter in "ab":

@@ -9,8 +9,8 @@ import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import exp_so3, fit_plane, invert, pose, project_to_so3, transform
-from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.core.geometry import Array, exp_so3, fit_plane, invert, pose, project_to_so3, transform
+from lce_rig.core.results import ImageBoard, LidarBoard, LidarQuality
 from lce_rig.detect.image.search import board_from_pose
 from lce_rig.extrinsics import CaptureCandidates
 from lce_rig.solvers.pnp import solve_planar_pose
@@ -176,6 +176,32 @@ def scan_board(
         plane=plane,
         sigma_m=rms,
         T_lidar_board=template,
+        quality=measured_plate(BOARD.width_m, BOARD.height_m, points[is_hit]),
+    )
+
+
+def measured_plate(
+    width_m: float, height_m: float, points: Array, *, sigma_m: float = np.inf, n_rings: int = 8
+) -> LidarQuality:
+    """What a detector says of a plate; by default it does not know its size."""
+    return LidarQuality(
+        width_m=width_m,
+        height_m=height_m,
+        width_sigma_m=sigma_m,
+        height_sigma_m=sigma_m,
+        size_ratio=1.0,
+        n_rings=n_rings,
+        n_points=len(points),
+        n_ring_ends=2 * n_rings,
+        n_ring_ends_dropped=0,
+        thickness_m=0.03,
+        plane_rms_m=0.01,
+        edge_rms_m=0.01,
+        template_m=0.01,
+        beyond_share=0.0,
+        distance_m=2.0,
+        incidence_deg=10.0,
+        range_noise_m=0.01,
     )
 
 

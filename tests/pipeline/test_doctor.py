@@ -5,13 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from wire.vlp16_packets import Vlp16Clock
 
 from lce_rig.core.findings import worst
 from lce_rig.doctor import Check
 from lce_rig.doctor.examine import DoctorOptions, examine, look_for_boards
 from lce_rig.doctor.observing import ObservedSensor
 from lce_rig.rig import Rig
-from lce_rig.simulate.vlp16_packets import Vlp16Clock
 from lce_rig.words import recommend
 from tests.detect.moving_board import CENTRE_PX, HEIGHT_PX, WIDTH_PX, Motion, board_events
 from tests.doctor.attached import Attached, attach, picture_of, scan_of

@@ -70,7 +70,7 @@ def test_the_board_is_found_and_followed_at_the_middle_of_the_sweep(seen):
     board = found_in(seen)
     assert board.stamp_ns == SCAN_NS + 50 * MS
     assert len(board.track_ns) == 4
-    assert board.quality["events_px_s"] > 5
+    assert board.events.events_px_s > 5
 
 
 def test_what_was_found_and_its_picture_are_remembered(seen):

@@ -68,7 +68,7 @@ def test_the_streams_are_told_with_their_spans_before_anything_is_read(tmp_path:
     recording = opened(record(tmp_path / "r.bag", rig, one_second()), rig)
     spans = {str(stream): (stream.kind, span) for stream, span in recording.streams.items()}
     assert {name: kind for name, (kind, _) in spans.items()} == {
-        "davis.events": "events", "davis.frames": "pictures", "lidar": "scans"
+        "davis.events": "events", "davis.frames": "images", "lidar": "scans"
     }  # fmt: skip
     for _, span in spans.values():
         assert span[0] == pytest.approx(T0_NS, abs=1_000_000)
@@ -79,7 +79,7 @@ def test_a_topic_of_pictures_that_others_reconstructed_is_read_as_such(tmp_path:
     images = [replace(picture(k), channel="events") for k in range(3)]
     recording = opened(record(tmp_path / "r.bag", rig, [*images, sweep(0), sweep(1)]), rig)
     assert [s.channel for s in recording.samples() if isinstance(s, Image)] == ["events"] * 3
-    assert recording.streams.keys() == {Stream("davis", "events", "pictures"), Stream("lidar", "", "scans")}
+    assert recording.streams.keys() == {Stream("davis", "events", "images"), Stream("lidar", "", "scans")}
 
 
 def test_the_only_topic_of_events_is_taken_where_the_profile_names_none(tmp_path: Path, rig: Rig) -> None:
@@ -106,7 +106,7 @@ def test_a_bag_with_a_lidar_and_events_alone_is_enough(tmp_path: Path, rig: Rig)
 
 def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_path: Path, rig: Rig) -> None:
     samples = one_second(50)
-    for name, kind in (("events", Events), ("scans", Scan), ("pictures", Image)):
+    for name, kind in (("events", Events), ("scans", Scan), ("images", Image)):
         path = record(tmp_path / f"{name}.bag", rig, [s for s in samples if isinstance(s, kind)])
         with pytest.raises(SourceError, match="no topic"):
             opened(path, rig)
@@ -121,7 +121,8 @@ def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_pat
 
 
 def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path: Path, rig: Rig) -> None:
-    from lce_rig.recordings.ros.bag_recorder import add_event_topic, encode_image, encode_scan, typestore
+    from lce_rig.recordings.ros.bag_recorder import add_event_topic, encode_image, encode_scan
+    from lce_rig.recordings.ros.message_fields import typestore
 
     def write(path: Path, has_pictures: bool) -> Path:
         with open_bag_writer(path) as writer:
@@ -203,7 +204,7 @@ def test_clocks_that_do_not_overlap_are_refused_with_how_far_they_lie_apart(tmp_
     moved = [replace(s, t_ns=s.t_ns + late_ns) if isinstance(s, Events) else s for s in given]
     path = record(tmp_path / "r.bag", rig, moved)
     with pytest.raises(
-        SourceError, match=r"events run from \d+\.\d+ to .* scans from .*: they lie 1234\.[4-7] s apart"
+        SourceError, match=r"events run from \d+\.\d+ to .* scans from .*: 1234\.[4-7] s apart"
     ) as caught:
         opened(path, rig)
     assert "cameras.davis.channels.events.timestamps.expected_offset_s" in caught.value.hint
@@ -253,7 +254,7 @@ def test_pictures_stamped_at_the_start_of_an_exposure_that_is_not_told_are_said(
     for profile, is_said in ((rig, False), (start, True)):
         recording = opened(path, profile)
         assert [s.stamp_ns for s in recording.samples() if isinstance(s, Image)] == [picture(0).stamp_ns]
-        assert has_note(recording.notes, "its start", "taken") == is_said
+        assert has_note(recording.notes, "its start", "used") == is_said
 
 
 @pytest.mark.dataset

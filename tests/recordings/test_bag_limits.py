@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from lce_rig.core import limits
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Image, Scan, join_events
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings import open_recording
-from lce_rig.recordings.events.stream import DamageCounts, join
+from lce_rig.recordings.events.stream import DamageCounts
 from lce_rig.recordings.events.word_codec import EVT3, WordDecoder
 from lce_rig.recordings.protocol import ContinuousRecording
 from lce_rig.recordings.ros.bag_file import BagFile
@@ -363,7 +363,7 @@ def test_a_piece_of_a_bag_that_metadata_lists_and_that_is_not_there_is_told(tmp_
     listed = "  relative_file_paths:\n    - a_0.db3\n    - a_1.db3\n"
     (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n{listed}")
     n_read, what = read_damaged(folder)
-    assert n_read == 1 and has_note([what], "metadata.yaml", "'a_1.db3'", "not there")
+    assert n_read == 1 and has_note([what], "metadata.yaml", "'a_1.db3'", "missing")
 
 
 def test_clouds_and_pictures_of_absurd_sizes_are_left_out_and_the_others_read(
@@ -446,5 +446,5 @@ def test_a_packet_whose_words_hold_many_events_each_is_decoded_in_pieces() -> No
     pieces = [*decoder.decode(packet), *decoder.finish()]
     whole = WordDecoder(EVT3).decode(words.astype(np.uint16))
     assert len(pieces) > 2 and max(map(len, pieces)) < len(whole) / 2
-    together = join(pieces)
+    together = join_events(pieces)
     assert np.array_equal(together.t_ns, whole.t_ns) and np.array_equal(together.x, whole.x)

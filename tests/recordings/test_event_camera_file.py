@@ -24,7 +24,7 @@ EVENTS = replace(random_events(20_000, 3, start_us=T0_US, step_us=250), sensor="
 PIECES = [EVENTS.select(slice(k, k + 500)) for k in range(0, 20_000, 500)]
 GREY = np.random.default_rng(0).integers(0, 256, (260, 346), dtype=np.uint8)
 FRAMES = [RawFrame(T0_US + 40_000 * k, 8000, GREY) for k in range(5)]
-EVENT_STREAM, FRAME_STREAM = Stream("davis", "events", "events"), Stream("davis", "frames", "pictures")
+EVENT_STREAM, FRAME_STREAM = Stream("davis", "events", "events"), Stream("davis", "frames", "images")
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_a_davis_file_gives_its_events_and_its_frames_at_mid_exposure(tmp_path: 
     assert [(i.sensor, i.channel) for i in images] == [("davis", "frames")] * 5
     assert [i.stamp_ns for i in images] == [(T0_US + 40_000 * k + 4000) * 1000 for k in range(5)]
     assert all(np.array_equal(i.pixels, GREY) for i in images)
-    assert has_note(recording.notes, "a.aedat4", "davis.frames", "middle", "8.0 ms")
+    assert has_note(recording.notes, "a.aedat4", "davis.frames", "mid exposure", "8.0 ms")
     assert recording.streams[EVENT_STREAM] == (int(EVENTS.t_ns[0]), int(EVENTS.t_ns[-1]))
     assert recording.streams[FRAME_STREAM] == (images[0].stamp_ns, images[-1].stamp_ns)
 
@@ -80,7 +80,7 @@ def test_frames_of_a_camera_without_such_a_channel_are_left_out_and_it_is_said(
         rig.model_copy(update={"cameras": {"davis": only_events}}),
     )
     assert images_of(recording) == [] and events_of(recording) == listed(EVENTS)
-    assert has_note(recording.notes, "frames left", "davis", "no channel")
+    assert has_note(recording.notes, "frames skipped", "davis", "no channel")
 
 
 def test_frames_out_of_order_are_left_out_and_counted(tmp_path: Path, rig: Rig) -> None:
@@ -144,7 +144,7 @@ def test_the_first_of_several_event_cameras_is_taken_and_it_is_said(tmp_path: Pa
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
     davis = rig.cameras["davis"]
     both = rig.model_copy(update={"cameras": {"davis": davis, "right": davis}})
-    assert has_note(opened(tmp_path / "a.aedat4", both).notes, "events taken", "camera davis")
+    assert has_note(opened(tmp_path / "a.aedat4", both).notes, "events assigned", "camera davis")
     right = opened(tmp_path / "a.aedat4", both, camera="right")
     assert {s.sensor for s in right.samples()} == {"right"} and next(iter(right.streams)).sensor == "right"
 

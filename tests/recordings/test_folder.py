@@ -73,7 +73,7 @@ def test_channel_and_sensors_can_be_chosen(make_folder):
     camera = next(iter(rig.cameras))
     recording = open_recording(make_folder(), rig, SourceOptions(channel="events"))
     assert recording.pairs[0].read().images[0].channel == "events"
-    assert has_note(open_recording(make_folder(), rig).notes, "pictures taken", f"camera {camera}")
+    assert has_note(open_recording(make_folder(), rig).notes, "images assigned", f"camera {camera}")
     for options, cause in [
         (SourceOptions(camera="side"), f"no camera 'side'; it has {camera}"),
         (SourceOptions(channel="depth"), "no channel 'depth'; it has frames, events"),
@@ -86,20 +86,20 @@ def test_channel_and_sensors_can_be_chosen(make_folder):
 def test_missing_folders_and_kinds_are_named(make_folder, rig, tmp_path):
     with pytest.raises(SourceError, match="nowhere does not exist"):
         open_recording(tmp_path / "nowhere", rig)
-    with pytest.raises(SourceError, match=r"recording/pcd: no clouds there"):
+    with pytest.raises(SourceError, match=r"recording/pcd: no point clouds found"):
         open_recording(make_folder(clouds=[]), rig)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(SourceError, match="empty: no pictures there"):
+    with pytest.raises(SourceError, match="empty: no images found"):
         open_recording(tmp_path / "empty", rig)
     (tmp_path / "a.avi").touch()
-    with pytest.raises(SourceError, match=r"a\.avi is no recording this program reads"):
+    with pytest.raises(SourceError, match=r"a\.avi is not a recording"):
         open_recording(tmp_path / "a.avi", rig)
 
 
 def test_two_folders_of_clouds_without_telling_names_are_not_guessed(make_folder, rig):
     path = make_folder(names=("img", "one"))
     make_folder(names=("img", "two"))
-    with pytest.raises(SourceError, match="clouds lie in one, two: which"):
+    with pytest.raises(SourceError, match="point clouds lie in several folders: one, two"):
         open_recording(path, rig)
 
 
@@ -124,8 +124,8 @@ def test_pictures_in_folders_named_after_cameras_go_with_the_same_cloud(make_fol
     folder = Path(names[1]).name
     assert recording.pairs[1].label == f"{Path(names[0]).name}/00001.png + {folder}/00001.png + 00001.pcd"
     of_left, of_right, lone = recording.notes
-    assert has_note([of_left], "left: 2 pairs", "0 pictures", "1 clouds")
-    assert has_note([of_right], "right: 2 pairs", "1 pictures", "1 clouds")
+    assert has_note([of_left], "left: 2 pairs", "0 images", "1 point clouds")
+    assert has_note([of_right], "right: 2 pairs", "1 images", "1 point clouds")
     assert "without" in lone and lone.endswith(f" {folder}/00003.png")
 
 
@@ -135,13 +135,13 @@ def test_one_of_several_cameras_can_be_read_by_itself(make_folder):
     (pair, _) = open_recording(path, TWO, SourceOptions(camera="right")).pairs
     assert [image.sensor for image in pair.read().images] == ["right"]
     shutil.rmtree(path / "img" / "right")
-    with pytest.raises(SourceError, match="pictures of left lie there, none of right"):
+    with pytest.raises(SourceError, match="images of left found, none of right"):
         open_recording(path, TWO, SourceOptions(camera="right"))
 
 
 def test_pictures_are_not_taken_for_those_of_a_camera_that_nobody_named(make_folder):
     path = make_folder()
-    with pytest.raises(SourceError, match="has cameras left, right: whose are these pictures") as caught:
+    with pytest.raises(SourceError, match="has cameras left, right: the images") as caught:
         open_recording(path, TWO)
     assert "--camera left" in caught.value.hint and "img/right/" in caught.value.hint
     (pair, _) = open_recording(path, TWO, SourceOptions(camera="right")).pairs

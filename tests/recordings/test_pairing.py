@@ -18,7 +18,7 @@ def test_equal_names_are_paired_whatever_their_order():
 
 def test_a_few_without_partner_are_left_out_and_said():
     pairing = pair_names(COUNTERS * 2 + ["x"], [*(COUNTERS * 2)[:-1], "y"])
-    assert has_note([pairing.explanation], "equal file", "1 pictures", "6 clouds")
+    assert has_note([pairing.explanation], "equal file", "1 images", "6 point clouds")
     assert 12 in pairing.lone_images and 11 in pairing.lone_clouds
 
 
@@ -47,15 +47,15 @@ def test_different_counters_of_equal_number_are_paired_in_order():
 
 
 def test_nothing_is_paired_by_guesswork():
-    with pytest.raises(SourceError, match="3 pictures and 2 clouds cannot be paired"):
+    with pytest.raises(SourceError, match="3 images and 2 point clouds cannot be paired"):
         pair_names(["a1", "a2", "a3"], ["b1", "b2"])
-    with pytest.raises(SourceError, match="as many pictures as clouds: there are 3 and 2"):
+    with pytest.raises(SourceError, match="3 and 2"):
         pair_names(["a1", "a2", "a3"], ["b1", "b2"], "order")
-    with pytest.raises(SourceError, match="no picture matches a cloud by stem"):
+    with pytest.raises(SourceError, match="no image matches a point cloud by stem"):
         pair_names(["a1"], ["b1"], "stem")
-    with pytest.raises(SourceError, match="no times"):
+    with pytest.raises(SourceError, match="not times"):
         pair_names(["a1"], ["b1"], "time")
-    with pytest.raises(SourceError, match="no picture matches a cloud by time"):
+    with pytest.raises(SourceError, match="no image matches a point cloud by time"):
         pair_names(["1.5"], ["9.5"], "time")
 
 

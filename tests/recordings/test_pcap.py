@@ -6,17 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wire.vlp16_packets import SensorPacket
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.vlp16.packet_recorder import PcapWriter
 from lce_rig.recordings import open_recording
 from lce_rig.recordings.protocol import ContinuousRecording, SourceOptions
-from lce_rig.recordings.velodyne.datagrams import Datagram, build_frame
+from lce_rig.recordings.velodyne.datagrams import Datagram, PcapWriter, build_frame
 from lce_rig.recordings.velodyne.pcap import PcapFile, PcapRecording
 from lce_rig.rig import Rig
-from lce_rig.simulate.vlp16_packets import SensorPacket
 from tests.notes import has_note
 
 from .vlp16_room import NETWORK_NS, T0_NS, packets_of, room_scans
@@ -253,7 +252,7 @@ def test_a_file_damaged_anywhere_gives_scans_or_an_error(
 
 REFUSED: dict[str, tuple[bytes, str]] = {
     "empty": (b"", "is empty"),
-    "a text": (b"some text, longer than a header of pcap\n", "no pcap or pcapng file"),
+    "a text": (b"some text, longer than a header of pcap\n", "not a pcap or pcapng file"),
     "a torn header": (struct.pack("<IHH", 0xA1B2C3D4, 2, 4), "nothing was recorded"),
     "without frames": (struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1), "no UDP packets at all"),
     "of a wireless card": (struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 127), "802.11 radiotap"),

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from wire.vlp16_packets import SensorPacket, Vlp16Clock
 
 from lce_rig.rig.sensors import TimestampSettings
-from lce_rig.simulate.vlp16_packets import SensorPacket, Vlp16Clock
 
 from .vlp16_room import (
     HOUR_NS,
@@ -32,7 +32,7 @@ def test_time_goes_on_over_the_full_hour() -> None:
     scans = push(stream, packets_of(truth))
     assert stream.clock.is_utc
     assert np.abs(np.array(stamps(scans), np.int64) - np.array(stamps(truth), np.int64)).max() < 1000
-    assert stream.counts.order.n_lost == 0
+    assert stream.losses.n("packet.lost") == 0
 
 
 UNSYNCHRONISED = {

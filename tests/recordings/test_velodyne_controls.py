@@ -32,7 +32,7 @@ def test_the_seam_lies_where_the_profile_wants_it(cut_deg: float) -> None:
     driver = DriverSettings(controls={"cut_deg": cut_deg})
     stream = Vlp16Stream("lidar", settings(driver=driver))
     scans = push(stream, packets_of(room_scans(4)))
-    assert len(scans) == 3 and stream.counts.n_partial == 2
+    assert len(scans) == 3 and stream.losses.n("scan.partial") == 2
     for scan in scans:
         azimuth_deg = np.degrees(np.unwrap(np.arctan2(scan.points[:, 1], scan.points[:, 0])))
         off_deg = (azimuth_deg[0] - cut_deg + 180) % 360 - 180

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from wire.vlp16_packets import SensorPacket, Vlp16Packets
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.velodyne.points import Vlp16Decoder, keep_brighter
-from lce_rig.simulate.vlp16_packets import SensorPacket, Vlp16Packets
 
 from .vlp16_room import (
     T0_NS,

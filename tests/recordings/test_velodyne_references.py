@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wire.vlp16_packets import STREAMED_VLP16
 
 from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
@@ -13,7 +14,6 @@ from lce_rig.recordings.protocol import SourceOptions
 from lce_rig.recordings.velodyne.pcap import PcapFile, PcapRecording
 from lce_rig.recordings.velodyne.points import Vlp16Decoder, keep_brighter
 from lce_rig.rig import Rig
-from lce_rig.simulate.vlp16_packets import STREAMED_VLP16
 
 from .vlp16_room import (
     decode_by_manual,
@@ -43,7 +43,7 @@ def test_the_einride_payloads_make_whole_scans_without_a_loss(recordings: Path) 
     stream = stream_of()
     fields = einride(recordings)
     scans = [scan for packet in fields if (scan := stream.push_data(packet.tobytes(), 0)) is not None]
-    assert (len(scans), stream.counts.order.n_lost, stream.counts.bad.total()) == (13, 0, 0)
+    assert (len(scans), stream.losses.n("packet.lost"), stream.flaws()) == (13, 0, [])
 
 
 def nebula_packets(recordings: Path) -> list[tuple[int, bytes]]:

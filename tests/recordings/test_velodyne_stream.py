@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from wire.vlp16_packets import SensorPacket, Vlp16Clock
 
 from lce_rig.core import velodyne
-from lce_rig.simulate.vlp16_packets import SensorPacket, Vlp16Clock
 
 from .vlp16_room import (
     PERIOD_NS,
@@ -55,8 +55,8 @@ def test_a_stream_that_begins_and_ends_anywhere_loses_only_the_broken_revolution
     scans = push(stream, packets[30:-30])
     assert stream.finish() is None
     assert len(scans) == 3
-    assert stream.counts.n_partial == 2
-    assert stream.counts.order.n_lost == 0
+    assert stream.losses.n("scan.partial") == 2
+    assert stream.losses.n("packet.lost") == 0
 
 
 def test_losses_are_counted_by_the_sensors_counter_whatever_the_hosts_clock_does(
@@ -69,7 +69,7 @@ def test_losses_are_counted_by_the_sensors_counter_whatever_the_hosts_clock_does
     late = [replace(p, sent_ns=p.sent_ns + int(rng.integers(20_000_000))) for p in kept]
     stream = stream_of()
     scans = push(stream, late)
-    assert stream.counts.order.n_lost == len(only_data(packets)) - len(only_data(kept))
+    assert stream.losses.n("packet.lost") == len(only_data(packets)) - len(only_data(kept))
     assert len(scans) == 5
     share = sum(len(s.points) for s in scans) / sum(len(s.points) for s in room_scans(5))
     assert share == pytest.approx(len(only_data(kept)) / len(only_data(packets)), abs=0.01)
@@ -79,8 +79,8 @@ def test_a_scan_of_which_more_than_half_is_lost_is_left_out(packets: list[Sensor
     gap = slice(90, 135)
     stream = stream_of()
     scans = push(stream, packets[: gap.start] + packets[gap.stop :])
-    assert (len(scans), stream.counts.n_thin) == (4, 1)
-    assert stream.counts.order.n_lost == len(only_data(packets[gap]))
+    assert (len(scans), stream.losses.n("scan.thin")) == (4, 1)
+    assert stream.losses.n("packet.lost") == len(only_data(packets[gap]))
 
 
 def test_packets_sent_twice_or_late_change_nothing(packets: list[SensorPacket]) -> None:
@@ -89,7 +89,7 @@ def test_packets_sent_twice_or_late_change_nothing(packets: list[SensorPacket]) 
     arrived.insert(200, packets[198])
     stream = stream_of()
     scans = push(stream, arrived)
-    assert stream.counts.order.n_late == 2
+    assert stream.losses.n("packet.late") == 2
     for truth, scan in zip(room_scans(5), scans, strict=True):
         assert len(scan.points) == len(truth.points)
 
@@ -100,8 +100,8 @@ def test_a_damaged_time_costs_its_packet_only(us: int, packets: list[SensorPacke
     arrived[100] = shifted_us(arrived[100], us)
     stream = stream_of()
     scans = push(stream, arrived)
-    order = stream.counts.order
-    assert (order.n_late + order.n_astray, order.n_lost, order.n_steps) == (1, 1, 0)
+    n = stream.losses.n
+    assert (n("packet.late", "packet.astray"), n("packet.lost"), n("packet.clock_set")) == (1, 1, 0)
     n_points = [len(scan.points) for scan in scans]
     assert len(scans) == 5 and sum(n_points) == pytest.approx(
         sum(len(s.points) for s in room_scans(5)) - 346, abs=20
@@ -115,9 +115,9 @@ def test_a_sensor_whose_clock_is_set_loses_one_revolution(shift_us: int) -> None
     at = 140
     stream = stream_of()
     scans = push(stream, before[:at] + after[at:])
-    assert stream.counts.order.n_steps == 1
+    assert stream.losses.n("packet.clock_set") == 1
     assert len(scans) == 5
-    assert stream.counts.n_partial == 1
+    assert stream.losses.n("scan.partial") == 1
     for stamp_ns in stamps(scans):
         assert min(abs(int(stamp_ns or 0) - int(s.stamp_ns or 0)) for s in room_scans(6)) < 1_000_000
 
@@ -145,4 +145,4 @@ def test_mutated_packets_never_make_a_scan_that_breaks_its_own_rules() -> None:
             assert np.isfinite(scan.points).all() and 0 <= scan.ring.min() <= scan.ring.max() <= 15
             assert scan.offset_ns is not None and np.all(np.diff(scan.offset_ns) > -100_000)
             assert scan.offset_ns[0] >= 0 and scan.offset_ns[-1] < 101_000_000
-    assert n_scans == 10 and stream.counts.bad.total() > 20
+    assert n_scans == 10 and sum(flaw.figure("n") for flaw in stream.flaws()) > 20

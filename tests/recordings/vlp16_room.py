@@ -3,12 +3,12 @@
 from collections.abc import Iterable
 
 import numpy as np
+from wire.vlp16_packets import STREAMED_VLP16, SensorPacket, Vlp16Clock, Vlp16Packets
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.recordings.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings, load_rig
-from lce_rig.simulate.vlp16_packets import STREAMED_VLP16, SensorPacket, Vlp16Clock, Vlp16Packets
 
 PERIOD_NS = STREAMED_VLP16.period_ns
 #: 14 November 2023, 22:13:20 UTC.

@@ -17,7 +17,7 @@ def test_damaged_packets_make_no_point_that_was_not_sent():
         "unknown_pps",
     )
     assert {f"packet.{kind}" for kind in kinds} <= report.refused.keys()
-    assert report.refused["n_astray"] > 50
+    assert report.refused["packet.astray"] > 50
 
 
 @pytest.mark.slow

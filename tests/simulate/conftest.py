@@ -1,16 +1,23 @@
 """Small rigs and scenes that render fast."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.rig import Rig
 from lce_rig.simulate.backdrop import Backdrop, build_backdrop
+from lce_rig.simulate.lidar import LidarModel, measure_sweep, sweep_scene
+from lce_rig.simulate.options import CameraNoise, LidarNoise
+from lce_rig.simulate.rendering import expose, render_radiance
 from lce_rig.simulate.room import Room, build_room
+from lce_rig.simulate.scene import Scene
 
 FACING_LIDAR = np.array(
     [[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
@@ -83,3 +90,23 @@ LENSES = {
 @pytest.fixture(scope="session", params=sorted(LENSES))
 def backdrop(request: pytest.FixtureRequest, room: Room, T_world_cam: Array) -> Backdrop:
     return build_backdrop(room, T_world_cam, LENSES[request.param])
+
+
+def render_image(scene: Scene, backdrop: Backdrop, noise: CameraNoise, rng: np.random.Generator) -> Image:
+    return Image("cam", "frames", 0, expose(render_radiance(scene, backdrop), noise, rng))
+
+
+def simulate_scan(
+    scene: Scene,
+    T_world_lidar: Array,
+    model: LidarModel,
+    noise: LidarNoise,
+    rng: np.random.Generator,
+    *,
+    stamp_ns: int = 0,
+    board_at: Callable[[NDArray[np.int64]], Array] | None = None,
+    **measured: Any,
+) -> Scan:
+    """One revolution; what is measured is told as to `measure_sweep`."""
+    sweep = sweep_scene(scene, T_world_lidar, model, noise, rng, stamp_ns, board_at)
+    return measure_sweep(sweep, model, noise, rng, stamp_ns=stamp_ns, **measured)

@@ -10,11 +10,10 @@ from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.simulate.backdrop import Backdrop, lens_reach, pixel_corner_rays, pixel_rays
 from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.options import CameraNoise
-from lce_rig.simulate.rendering import render_image
 from lce_rig.simulate.room import Room
 from lce_rig.simulate.scene import Scene
 
-from .conftest import FACING_LIDAR, LENSES
+from .conftest import FACING_LIDAR, LENSES, render_image
 
 QUIET = replace(CameraNoise.none(), blur_px=0.6)
 

@@ -9,13 +9,13 @@ from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.carriers import build_carrier
-from lce_rig.simulate.lidar import VLP16, simulate_scan
+from lce_rig.simulate.lidar import VLP16
 from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M, LidarNoise, SimulationOptions
 from lce_rig.simulate.room import Room
 from lce_rig.simulate.scene import PLATE, Raycaster, Scene, Surface
 from lce_rig.simulate.shapes import merge, rectangle
 
-from .conftest import board_before_lidar
+from .conftest import board_before_lidar, simulate_scan
 
 EXACT = LidarNoise.none()
 BEAM = replace(EXACT, divergence_rad=LidarNoise().divergence_rad, exit_size_m=LidarNoise().exit_size_m)
@@ -23,7 +23,7 @@ FOOTPRINT_REACH_M = 0.010  # half the beam's exit plus half its divergence at 3 
 
 
 def scan_of(scene: Scene, T_world_lidar: Array, noise: LidarNoise, seed: int = 0, **changes: float) -> Scan:
-    return simulate_scan(scene, T_world_lidar, VLP16, noise, np.random.default_rng(seed), **changes)  # type: ignore[arg-type]
+    return simulate_scan(scene, T_world_lidar, VLP16, noise, np.random.default_rng(seed), **changes)
 
 
 @pytest.fixture(scope="module")

@@ -10,12 +10,13 @@ from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.backdrop import Backdrop
 from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.options import CameraNoise, Carrier, HandMotion
-from lce_rig.simulate.rendering import render_image, render_radiance
+from lce_rig.simulate.rendering import render_radiance
 from lce_rig.simulate.room import Room
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.subframes import GREY, MovingView, speed_px_s
 from lce_rig.simulate.trajectory import Trajectory, hold_board, sway_board
 
+from .conftest import render_image
 from .test_camera import PLACEMENTS, QUIET
 
 T_NS = 1_700_000_000_123_000_000

@@ -11,10 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.data import Events, Image, Sample, Scan
+from lce_rig.core.losses import Losses
 from lce_rig.rig import Rig, load_rig
 from lce_rig.timing.event_buffer import AFTER_NS, BEFORE_NS
 from lce_rig.timing.rig_time import rig_time_ns
-from lce_rig.timing.scan_pairing import Frame, PairingCounts, pair_by_time
+from lce_rig.timing.scan_pairing import Frame, pair_by_time
 
 T0_NS = 1_700_000_000 * 10**9
 MS = 1_000_000
@@ -57,7 +58,7 @@ def packets(events: Events, edges: Sequence[int]) -> list[Events]:
 
 def frames_of(samples: list[Sample], rig: Rig) -> list[Frame]:
     ordered = sorted(samples, key=lambda sample: rig_time_ns(sample, rig) or 0)
-    return list(pair_by_time(ordered, rig, PairingCounts()))
+    return list(pair_by_time(ordered, rig, Losses()))
 
 
 def is_cut_exactly(frame: Frame, events: Events, begin_ms: float) -> bool:
@@ -97,14 +98,14 @@ def test_a_frame_waits_for_its_events_but_not_for_ever(rig: Rig) -> None:
     events = stream(0, 1500, 3000)
     first, *others = packets(events, range(50, 3000, 50))
     early = [first, scan(1000), image(1050), image(1200), *others]
-    (frame,) = list(pair_by_time(early, rig, PairingCounts()))
+    (frame,) = list(pair_by_time(early, rig, Losses()))
     assert is_cut_exactly(frame, events, 1000)
     silent = [*packets(events, [1500]), *(scan(t) for t in range(1000, 5000, 100))]
     ordered = sorted(
         [*silent, *(image(t + 50) for t in range(1000, 5000, 100))], key=lambda s: rig_time_ns(s, rig) or 0
     )
     taken = iter(ordered)
-    earliest = next(pair_by_time(taken, rig, PairingCounts()))
+    earliest = next(pair_by_time(taken, rig, Losses()))
     assert earliest.time_ns == T0_NS + 1050 * MS and next(taken).stamp_ns < T0_NS + 2500 * MS
 
 
@@ -142,7 +143,7 @@ def test_events_from_before_the_clocks_were_set_back_are_forgotten(rig: Rig) -> 
     before = [scan(9000), image(9050), *packets(stream(8000, 9500, 1000), [500])]
     after = [*packets(stream(0, 2000, 1000), range(100, 1000, 100)), scan(1000), image(1050)]
     ordered = [*sorted(before, key=lambda s: rig_time_ns(s, rig) or 0), image(0), *after, image(2000)]
-    frames = list(pair_by_time(ordered, rig, PairingCounts()))
+    frames = list(pair_by_time(ordered, rig, Losses()))
     assert frames[-1].time_ns == T0_NS + 1050 * MS
     assert frames[-1].events[0].events.t_ns[-1] < T0_NS + 2000 * MS
 
@@ -157,7 +158,7 @@ def test_memory_holds_some_seconds_of_a_long_stream_also_while_the_lidar_is_sile
 
     packet = stream(0, 20, 4000)
     tracemalloc.start()
-    n_frames = sum(1 for _ in pair_by_time(samples(2400), rig, PairingCounts()))
+    n_frames = sum(1 for _ in pair_by_time(samples(2400), rig, Losses()))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     n_bytes = sum(column.nbytes for column in (packet.t_ns, packet.x, packet.y, packet.polarity))

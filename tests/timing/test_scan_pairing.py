@@ -3,7 +3,8 @@
 import numpy as np
 
 from lce_rig.core.data import Image, Scan
-from lce_rig.timing.scan_pairing import PATIENCE_NS, PairingCounts, pair_by_time
+from lce_rig.core.losses import Losses
+from lce_rig.timing.scan_pairing import PATIENCE_NS, pair_by_time
 
 MS = 1_000_000
 
@@ -22,9 +23,16 @@ def scan(time_ms, has_times=True):
 
 
 def pairs(samples, rig):
-    counts = PairingCounts()
+    counts = Losses()
     frames = list(pair_by_time(samples, rig, counts))
     return [(f.time_ns // MS, [i.stamp_ns // MS for i in f.images]) for f in frames], counts
+
+
+def alone(losses):
+    """Give how many scans found no image, and how near the nearest was, s."""
+    ((finding, n),) = losses.counts()
+    assert finding.code == "read.no_image_at_scan"
+    return n, round(finding.figures["nearest_s"], 9)
 
 
 def test_each_scan_gets_the_picture_nearest_to_its_middle(rig):
@@ -43,16 +51,16 @@ def test_pictures_that_come_much_later_than_their_scan_still_find_it(rig):
 
 
 def test_what_lies_outside_the_tolerance_is_left_alone_and_measured(rig):
-    found, counts = pairs([image(900), scan(1000), image(1080)], rig)
-    assert found == [] and counts.n_alone == 1 and counts.nearest_ns == 80 * MS
+    found, losses = pairs([image(900), scan(1000), image(1080)], rig)
+    assert found == [] and alone(losses) == (1, 0.08)
 
 
 def test_a_camera_that_falls_silent_does_not_hold_up_the_rest(rig):
     samples = [image(1000), *(scan(1000 + 100 * k) for k in range(30))]
-    counts = PairingCounts()
+    counts = Losses()
     frames = pair_by_time(samples, rig, counts)
     assert next(frames).time_ns == 1000 * MS
-    assert list(frames) == [] and counts.n_alone == 29
+    assert list(frames) == [] and alone(counts)[0] == 29
     assert PATIENCE_NS < 29 * 100 * MS
 
 
@@ -70,6 +78,6 @@ def test_samples_without_a_stamp_are_passed_over(rig):
 
 def test_the_nearest_picture_is_told_of_scans_that_found_none(rig):
     samples = sorted([image(1000), scan(1000), scan(1100), scan(1200)], key=lambda s: s.stamp_ns)
-    found, counts = pairs(samples, rig)
+    found, losses = pairs(samples, rig)
     assert found == [(1000, [1000])]
-    assert (counts.n_alone, counts.nearest_ns) == (2, 100 * MS)
+    assert alone(losses) == (2, 0.1)

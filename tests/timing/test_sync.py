@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from lce_rig.core.data import Events, Image, Pulse, Scan
+from lce_rig.core.losses import Losses
 from lce_rig.rig import load_rig
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.clock_fit import TimePairs, fit_clock
-from lce_rig.timing.scan_pairing import Frame, PairingCounts, pair_by_time
+from lce_rig.timing.scan_pairing import Frame, pair_by_time
 from lce_rig.timing.sync import CommonClock, judge_sync, pair_times
 
 MS, S = 1_000_000, 1_000_000_000
@@ -47,7 +48,7 @@ def test_pairs_are_found_on_the_common_clock_and_say_how_far_apart_they_are(rlfs
     for time_ns in true_ns:
         samples += [scan(time_ns - 50 * MS), image(stamp_of(time_ns + 7 * MS))]
     placed = [clock.place(sample) for sample in samples]
-    frames = list(pair_by_time(placed, rlfs, PairingCounts()))
+    frames = list(pair_by_time(placed, rlfs, Losses()))
     assert len(frames) == 10
     for frame in frames:
         (pair,) = pair_times(frame, rlfs, clock)

@@ -129,5 +129,30 @@ def test_the_part_that_can_differ_is_reported_where_all_say_it():
 
 
 def test_one_calibration_is_not_compared_with_nothing():
-    with pytest.raises(ValueError, match="nothing to be compared with"):
+    with pytest.raises(ValueError, match="requires two calibrations"):
         compare_calibrations({"a": calibration(TRUTH)})
+
+
+@pytest.mark.parametrize("correlation", [-1.0, 0.0, 0.7])
+def test_results_of_the_same_captures_are_not_accused_whatever_their_correlation(correlation):
+    root = np.linalg.cholesky(COV)
+    rng = np.random.default_rng(5)
+    n_refused = 0
+    for _ in range(300):
+        one, own = rng.standard_normal((2, 6))
+        other = correlation * one + np.sqrt(1 - correlation**2) * own
+        group = {
+            name: calibration(perturb(TRUTH, root @ noise)) for name, noise in (("a", one), ("b", other))
+        }
+        compared = compare_calibrations(group, are_independent=False)
+        n_refused += not compared.agrees
+    # Opposite errors reach the bound: one of a hundred, within 3 sigma of the count.
+    assert n_refused <= 3 + 3 * np.sqrt(3)
+
+
+def test_results_of_the_same_captures_that_differ_beyond_any_correlation_are_named():
+    far = perturb(TRUTH, 12 * ROOT @ np.eye(6)[0])
+    group = {"current": calibration(TRUTH), "ml": calibration(TRUTH), "events": calibration(far)}
+    found = compare_calibrations(group, are_independent=False).finding
+    assert (found.code, found.severity) == ("results.disagree", "error")
+    assert "events" in (found.figures["first"], found.figures["second"])

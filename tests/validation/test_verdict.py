@@ -1,4 +1,4 @@
-"""The verdict: a sound result passes, and each kind of doubt is named with its figure."""
+"""The verdict: a sound result passes, and each kind of finding is named with its figure."""
 
 import functools
 from dataclasses import replace
@@ -111,7 +111,7 @@ def test_few_usable_captures_of_many_are_a_doubt(estimate, verdict_of):
 @pytest.mark.parametrize(("factor", "expected"), [(1.01, "pass"), (1.04, "marginal"), (0.9, "fail")])
 def test_a_plate_of_another_size_than_the_profiles_is_named(estimate, factor, expected, verdict_of):
     def resized(seen):
-        quality = {"width_m": factor * BOARD.width_m, "width_sigma_m": 0.01}
+        quality = replace(seen.lidar.quality, width_m=factor * BOARD.width_m, width_sigma_m=0.01)
         return replace(seen, lidar=replace(seen.lidar, quality=quality))
 
     other = {name: resized(seen) for name, seen in estimate.observations.items()}

@@ -17,6 +17,7 @@ from lce_rig.verify.canvas import MAGENTA, ORANGE, PANEL, Picture, round_ticks, 
 from lce_rig.verify.debug_image import draw_debug
 from lce_rig.verify.overlay import draw_overlay
 from lce_rig.verify.overlay_files import contact_sheet, write_overlays, write_picture
+from tests.extrinsics.boards import measured_plate
 
 BOARD = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)
 FOLDING = Intrinsics(300.0, 300.0, 172.5, 129.5, 346, 260, "radtan", (-0.4, 0.0, 0.0, 0.0, 0.0))
@@ -42,9 +43,7 @@ def grey(camera: Intrinsics) -> NDArray[np.uint8]:
 
 def image_board(camera: Intrinsics) -> ImageBoard:
     corners, _ = camera.project(transform(T_CAM_BOARD, BOARD.corners()))
-    return ImageBoard(
-        corners, T_CAM_BOARD, np.eye(6) * 1e-6, None, np.inf, False, 0.1, 0.07, {"tilt_deg": 3.0}
-    )
+    return ImageBoard(corners, T_CAM_BOARD, np.eye(6) * 1e-6, None, np.inf, False, 0.1, 0.07)
 
 
 def lidar_board(points: Array) -> LidarBoard:
@@ -62,7 +61,7 @@ def lidar_board(points: Array) -> LidarBoard:
         plane=np.array([-1.0, 0, 0, 2.0]),
         sigma_m=0.01,
         T_lidar_board=T_lidar_board,
-        quality={"n_rings": 8.0, "n_points": float(len(points)), "thickness_m": 0.03},
+        quality=measured_plate(BOARD.width_m, BOARD.height_m, points),
     )
 
 

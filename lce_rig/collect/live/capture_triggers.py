@@ -9,8 +9,8 @@ from lce_rig.collect.live.narration import Narration, narrate_moving, narrate_st
 from lce_rig.collect.offline.slow_motion import MotionGate
 from lce_rig.collect.offline.stillness import StillnessGate, StillnessOptions
 from lce_rig.collect.placement_dedupe import Placements
-from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.geometry import Array
+from lce_rig.core.losses import Losses
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import EventCut
@@ -80,7 +80,7 @@ class SlowBoards:
 
     def __init__(self, rig: Rig, novelty: Placements) -> None:
         self._options = MotionOptions(patience_s=LIVE_PATIENCE_S)
-        self._gate = MotionGate(rig, self._options, novelty, RefusalCounts())
+        self._gate = MotionGate(rig, self._options, novelty, Losses())
 
     def take(self, sighting: BoardDetection) -> list[CaptureMoment]:
         """Take the next sighting."""

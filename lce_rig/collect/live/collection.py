@@ -10,22 +10,23 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment, without_samples
 from lce_rig.collect.live.capture_triggers import LiveGate, SlowBoards, StillBoards
-from lce_rig.collect.live.capture_writer import CaptureWriter, Task
+from lce_rig.collect.live.capture_writer import CaptureWriter, Task, record_streams
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
 from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.live.monitor import Monitor
 from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_unseen
 from lce_rig.collect.live.options import Ending, Key, LiveOptions, LiveReport
-from lce_rig.collect.live.recorder import SampleRecorder
 from lce_rig.collect.live.state import LiveState
 from lce_rig.collect.placement_dedupe import Placements, capture_poses
 from lce_rig.collect.worker import Worker
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.results import Refusal
+from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.opening import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.rig import Rig
@@ -41,6 +42,8 @@ from lce_rig.words import describe, sentence
 THOROUGH_S = 3.0
 #: How often a scan is searched for other things of the board's size while all that are known are followed.
 RESCAN_S = 1.0
+# Such searches are as many times rarer than the longest of the last frames took, forgotten by this a frame.
+_RARE, _FORGET = 6.0, 0.95
 
 
 class BoardSearch(Worker):
@@ -73,15 +76,23 @@ class _Search:
     """What runs there: what was searched is not sent back."""
 
     def __init__(self, rig: Rig, search_interval_s: float) -> None:
-        self._watcher = BoardTracker(
+        self._tracker = BoardTracker(
             rig, search_interval_s, thorough_interval_s=THOROUGH_S, rescan_interval_s=RESCAN_S
         )
+        self._longest_s = 0.0
 
     def sight(self, frame: Frame) -> BoardDetection:
-        return without_samples(self._watcher.sight(frame))
+        began_s = time.monotonic()
+        found = self._tracker.sight(frame)
+        # On a busy computer a thorough search may take longer than the time to the next one: rare searches
+        # must stay rare, or every frame waits for one.
+        self._longest_s = max(time.monotonic() - began_s, _FORGET * self._longest_s)
+        self._tracker.thorough_interval_s = max(THOROUGH_S, _RARE * self._longest_s)
+        self._tracker.rescan_interval_s = max(RESCAN_S, _RARE * self._longest_s)
+        return without_samples(found)
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
-        found = self._watcher.confirm(moment)
+        found = self._tracker.confirm(moment)
         if isinstance(found, CaptureMoment):
             return replace(found, sighting=without_samples(found.sighting))
         return found
@@ -98,7 +109,7 @@ def collect_live(
     options: LiveOptions | None = None,
     show: Callable[[LiveState], None] = lambda _state: None,
     keys: Callable[[], Key | None] = lambda: None,
-    recorder: SampleRecorder | None = None,
+    record_to: Path | None = None,
 ) -> LiveReport:
     """Collect from attached sensors until there is enough.
 
@@ -108,10 +119,10 @@ def collect_live(
         options: how it goes.
         show: told the state after every frame, and twice a second without one; must not block.
         keys: asked what the user wants.
-        recorder: takes every sample too; open.
+        record_to: a new folder for the raw streams; None where they are not recorded.
 
     Raises:
-        SourceError: a sensor cannot be opened.
+        SourceError: a sensor cannot be opened, or the folder of the raw streams not be made.
         SessionError: a capture cannot be written; those before are safe.
         ProfileError: the profile cannot be used, such as a network of its.
     """
@@ -121,21 +132,24 @@ def collect_live(
     guides = make_guides(rig)
     for capture in session.captures:
         _count_in(capture, session, guides)
-    # Leaving closes in turn: nothing new comes, what was decided is written, the devices are let go.
-    search = BoardSearch(rig, options.search_interval_s)
-    with _swift_turns(), search, AttachedSensors(sources) as sensors:
-        clock = RigClock(rig, has_board=board is not None, edge_cameras=edge_cameras(rig))
-        with (
-            Learning(rig, guides) as learning,
-            CaptureWriter(session, learning) as keeper,
-            FrameFeed(rig, sensors, clock, board, None if recorder is None else recorder.put) as feed,
-        ):
-            loop = _Loop(
-                session, options, sensors, clock, feed, search, learning, keeper, guides, show, recorder
-            )
-            report = loop.run(keys)
-        loop.take_kept()
-        loop.close_books()
+    # Leaving closes in turn: nothing new comes, then what was decided is written.
+    with DiskWriter() as disk:
+        record, recorded = None, None
+        if record_to is not None:
+            record, recorded = record_streams(record_to, rig, sources, disk)
+        search = BoardSearch(rig, options.search_interval_s)
+        with _swift_turns(), search, Learning(rig, guides) as learning:
+            keeper = CaptureWriter(session, learning, disk)
+            clock = RigClock(rig, has_board=board is not None, edge_cameras=edge_cameras(rig))
+            with AttachedSensors(sources) as sensors, FrameFeed(rig, sensors, clock, board, record) as feed:
+                loop = _Loop(session, options, sensors, clock, feed, search, learning, keeper, guides, show)
+                loop.run(keys)
+            disk.close()
+            loop.take_kept()
+            report = loop.close_books()
+    if recorded is not None:
+        report.n_recorded = recorded.n_written
+        report.notes += [sentence(each) for each in recorded.findings()]
     return report
 
 
@@ -183,14 +197,12 @@ class _Loop:
         keeper: CaptureWriter,
         guides: Sequence[Guide],
         show: Callable[[LiveState], None],
-        recorder: SampleRecorder | None,
     ) -> None:
         self.report = LiveReport()
         self._session, self._rig, self._options = session, session.rig, options
         self._sensors, self._clock, self._feed, self._keeper = sensors, clock, feed, keeper
         self._guides = guides
         self._show = show
-        self._recorder = recorder
         self._began_s = time.monotonic()
         self._search, self._learning = search, learning
         self._gate: LiveGate | None = None
@@ -202,8 +214,8 @@ class _Loop:
         self._monitor = Monitor(session, options, sensors, clock)
         self._last: BoardDetection | None = None
 
-    def run(self, keys: Callable[[], Key | None]) -> LiveReport:
-        """Go on until something ends it."""
+    def run(self, keys: Callable[[], Key | None]) -> None:
+        """Go on until something ends it; what was lost until then is noted while the sensors are open."""
         while True:
             frame = self._feed.take(_WAIT_S)
             self.take_kept()
@@ -220,7 +232,10 @@ class _Loop:
             if ending is not None:
                 self.report.ending = ending
                 self.report.is_enough = all(guide.is_usable for guide in self._guides)
-                return self.report
+                self.report.lost = {name: error for name, (error, _) in self._sensors.lost().items()}
+                for name, status in self._sensors.statuses().items():
+                    self.report.n_lost[name] = status.n_lost + status.n_dropped
+                return
 
     def take_kept(self) -> None:
         """Count the captures that have become safe, and take what they taught."""
@@ -231,21 +246,16 @@ class _Loop:
             self.report.latencies_s.append(kept.latency_s)
             self._monitor.cue("captured", f"captured {kept.name} ({kept.latency_s:.2f} s)")
 
-    def close_books(self) -> None:
-        """Gather what was lost on the way, and write it into the session's journal."""
+    def close_books(self) -> LiveReport:
+        """Gather what is to be reported, and write it into the session's journal."""
         report = self.report
         report.n_skipped = self._feed.n_skipped
-        report.lost = {name: error for name, (error, _) in self._sensors.lost().items()}
-        for name, status in self._sensors.statuses().items():
-            report.n_lost[name] = status.n_lost + status.n_dropped
         if report.ending == "exhausted":
             waited_s = time.monotonic() - self._captured_s
             report.notes.append(f"no capture in the last {waited_s:.0f} s, {self._monitor.last_words()}")
         ties = self._clock.problems() + self._clock.account()
         report.notes += self._keeper.notes() + self._learning.notes()
         report.notes += [f"{each.subject}: {sentence(each)}" for each in ties]
-        if self._recorder is not None:
-            report.notes += self._recorder.problems()
         self._session.journal(
             "collected live",
             ending=report.ending,
@@ -254,6 +264,7 @@ class _Loop:
             lost=report.n_lost,
             error="" if report.error is None else report.error.what,
         )
+        return report
 
     def _see(self, sighting: BoardDetection) -> None:
         """Look for a moment in a sighting, and put into words what goes on."""

@@ -7,16 +7,16 @@ from types import TracebackType
 from typing import Protocol, runtime_checkable
 
 from lce_rig.collect.event_pictures import with_event_pictures
-from lce_rig.collect.refusal_counts import RefusalCounts
 from lce_rig.core.data import Sample
 from lce_rig.core.errors import LceRigError, SourceError
+from lce_rig.core.losses import Losses
 from lce_rig.devices.protocol import Mailbox
 from lce_rig.devices.reading import AttachedSensors
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.rig_clock import SLOW_TRIGGERS_HZ, RigClock
 from lce_rig.timing.rig_time import event_channel
-from lce_rig.timing.scan_pairing import Frame, PairingCounts, pair_by_time
+from lce_rig.timing.scan_pairing import LIVE_NS, Frame, pair_by_time
 
 _WAIT_S = 0.1
 _REFRESH_S = 0.5
@@ -47,7 +47,7 @@ class FrameFeed:
     """Reads the sensors, places samples on the rig's clock and pairs them; open while its `with` block lasts.
 
     Attributes:
-        counts: how pairing goes.
+        losses: scans without an image of their time, and without events to make one of.
         n_skipped: frames that nobody took before the next one came.
     """
 
@@ -68,7 +68,7 @@ class FrameFeed:
             board: the sync board; None where there is none.
             record: takes every sample too, as it came but for its time; must not block.
         """
-        self.counts = PairingCounts()
+        self.losses = Losses()
         self._rig = rig
         self._sensors = sensors
         self._clock = clock
@@ -109,7 +109,7 @@ class FrameFeed:
 
     def _run(self) -> None:
         try:
-            for frame in pair_by_time(self._with_pictures(), self._rig, self.counts):
+            for frame in pair_by_time(self._with_pictures(), self._rig, self.losses, LIVE_NS):
                 self._frames.put(frame)
         except BaseException as error:  # Whoever takes frames is told, of bugs too.
             self._failure = error
@@ -126,7 +126,7 @@ class FrameFeed:
         }
         if not cameras:
             return self._samples()
-        return with_event_pictures(self._samples(), self._rig, cameras, RefusalCounts())
+        return with_event_pictures(self._samples(), self._rig, cameras, self.losses, is_live=True)
 
     def _refresh_clock(self) -> None:
         """Let the clock take what sensors and board know, and the board's lines run as it needs them."""

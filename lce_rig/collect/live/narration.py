@@ -95,14 +95,12 @@ def stream_name(key: ImageKey) -> str:
 
 def image_figures(board: ImageBoard) -> str:
     """Sum a board in a picture up in few words."""
-    distance_m = board.quality.get("distance_m", float(board.T_cam_board[2, 3]))
-    return f"{distance_m:.1f} m, {board.reprojection_px:.2f} px"
+    return f"{board.distance_m:.1f} m, {board.reprojection_px:.2f} px"
 
 
 def scan_figures(board: LidarBoard) -> str:
     """Sum a board in a scan up in few words."""
-    n_rings = int(board.quality.get("n_rings", len(set(board.ring.tolist()))))
-    return f"{n_rings} rings, {len(board.points)} points"
+    return f"{board.quality.n_rings} rings, {len(board.points)} points"
 
 
 def _next(guide: Guide, present: Array, otherwise: str) -> str:

@@ -59,6 +59,7 @@ class LiveReport:
         lost: sensors that were lost when it ended, and why, by name.
         error: the sensor that is lost for good; None where none is.
         notes: what else was odd.
+        n_recorded: samples of the raw streams on the disk; None where they were not recorded.
     """
 
     ending: Ending = "stopped"
@@ -71,3 +72,4 @@ class LiveReport:
     lost: dict[str, SourceError] = field(default_factory=dict)
     error: SourceError | None = None
     notes: list[str] = field(default_factory=list)
+    n_recorded: int | None = None

@@ -27,7 +27,8 @@ from lce_rig.devices.protocol import ClockState, Mailbox, SourceStatus
 from lce_rig.devices.reading import LiveSource
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
-from lce_rig.simulate.live_scene import LiveScene, between
+from lce_rig.simulate.live_scene import LiveScene
+from lce_rig.simulate.trajectory import between
 
 # Whether this computer simulates as fast as sensors sense: where it does not, low rates are its doing.
 

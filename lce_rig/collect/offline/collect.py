@@ -1,6 +1,7 @@
 """Build a session from recordings, unattended: what is new becomes a capture, the rest is counted."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from lce_rig.collect.board_tracker import BoardTracker, CaptureMoment, ImageKey
@@ -10,16 +11,16 @@ from lce_rig.collect.offline.search_ahead import sight_ahead
 from lce_rig.collect.offline.slow_motion import find_moving_moments
 from lce_rig.collect.offline.stillness import StillnessOptions, find_still_moments
 from lce_rig.collect.offline.stored_events import StoredEvents
-from lce_rig.collect.placement_dedupe import Placements, board_figures, known_placements
-from lce_rig.collect.refusal_counts import RefusalCounts
+from lce_rig.collect.placement_dedupe import Placements, board_figures, capture_poses, known_placements
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
-from lce_rig.core.errors import SessionError, SourceError
+from lce_rig.core.errors import LceRigError, SessionError, SourceError
+from lce_rig.core.losses import Losses
 from lce_rig.core.results import Refusal
 from lce_rig.recordings.joining import join_recordings, require_sensors
 from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording, PairFiles, Recording
 from lce_rig.rig import Rig
 from lce_rig.session import Session
-from lce_rig.timing.scan_pairing import PairingCounts, pair_by_time
+from lce_rig.timing.scan_pairing import pair_by_time
 from lce_rig.words import describe
 
 # The moments of a recording that are worth a capture.
@@ -44,6 +45,7 @@ class MomentSearch:
         stillness: when a board stands still; None takes the profile's `quality.max_motion_m`.
         motion: how a moving board is judged.
         min_move_m, min_turn_deg: how far placements of a moving board must be apart.
+        losses: what became no moment so far.
         n_samples: images and scans to come, about.
     """
 
@@ -54,8 +56,7 @@ class MomentSearch:
     min_move_m: float
     min_turn_deg: float
     n_samples: int = 0
-    _pairing: PairingCounts = field(default_factory=PairingCounts)
-    _tally: RefusalCounts = field(default_factory=RefusalCounts)
+    losses: Losses = field(default_factory=Losses)
 
     @property
     def has_events(self) -> bool:
@@ -65,7 +66,7 @@ class MomentSearch:
     @property
     def reconstructed(self) -> frozenset[ImageKey]:
         """(camera, channel) of the pictures that are made of events to watch the board."""
-        with_pictures = {stream.sensor for stream in self.streams if stream.kind == "pictures"}
+        with_pictures = {stream.sensor for stream in self.streams if stream.kind == "images"}
         return frozenset(
             (stream.sensor, stream.channel)
             for stream in self.streams
@@ -81,24 +82,25 @@ class MomentSearch:
         """
         cameras = {camera for camera, _ in self.reconstructed}
         if cameras:
-            samples = with_event_pictures(samples, self.rig, cameras, self._tally)
+            samples = with_event_pictures(samples, self.rig, cameras, self.losses)
         stillness = self.stillness or StillnessOptions(max_motion_m=self.rig.quality.max_motion_m)
         interval_s = self.motion.search_interval_s if self.has_events else stillness.search_interval_s
-        watcher = BoardTracker(self.rig, interval_s, self._tally, _THOROUGH_S)
-        frames = pair_by_time(samples, self.rig, self._pairing)
+        watcher = BoardTracker(self.rig, interval_s, self.losses, _THOROUGH_S)
+        # Why a scan got no image made of events is counted where it was not made.
+        frames = pair_by_time(samples, self.rig, Losses() if cameras else self.losses)
         is_long = self.n_samples >= _LONG_SAMPLES
         are_still = not self.has_events and stillness.max_motion_m <= _GLANCED_M
         ahead = sight_ahead(watcher, frames, is_still_wanted=are_still)
         sightings = ahead if is_long else map(watcher.sight, frames)
         if self.has_events:
             taken = Placements(self.min_move_m, self.min_turn_deg)
-            moments = find_moving_moments(sightings, self.rig, self.motion, taken, self._tally)
+            moments = find_moving_moments(sightings, self.rig, self.motion, taken, self.losses)
         else:
             moments = find_still_moments(sightings, self.rig.board.to_board(), stillness)
         for moment in moments:
             confirmed = watcher.confirm(moment)
             if isinstance(confirmed, Refusal):
-                self._tally.add(confirmed)
+                self.losses.add(confirmed)
             else:
                 yield confirmed
 
@@ -106,24 +108,6 @@ class MomentSearch:
         """List the pictures of a moment that its capture keeps: all but those that its events give again."""
         images = moment.sighting.frame.images
         return [image for image in images if (image.sensor, image.channel) not in self.reconstructed]
-
-    def counts(self) -> RefusalCounts:
-        """Count what became no moment so far."""
-        # Why a picture could not be made of events is in the tally.
-        n_alone = 0 if self.reconstructed else self._pairing.n_alone
-        total = RefusalCounts()
-        total.add(Refusal("read.no_image_at_scan"), n_alone)
-        total.update(self._tally)
-        return total
-
-    def notes(self) -> list[str]:
-        """Say how scans and pictures came together."""
-        if self._pairing.n_alone == 0 or self.reconstructed:
-            return []
-        if self._pairing.nearest_ns is None:
-            return ["no picture could be compared with a scan: one of the two has none"]
-        apart_s = self._pairing.nearest_ns * 1e-9
-        return [f"{self._pairing.n_alone} scans without a picture; the nearest was {apart_s:.3f} s away"]
 
 
 Progress = Callable[[int, int, str], None]
@@ -158,6 +142,7 @@ class CollectReport:
     Attributes:
         captured: names of the new captures.
         n_resumed: pairs and moments that an earlier run had captured already.
+        n_rejected: those whose captures were rejected since.
         duplicates: capture that holds the same data, by label.
         refused: why something became no capture, by label.
         counts: what kept moments of a continuous recording from becoming captures.
@@ -169,9 +154,10 @@ class CollectReport:
 
     captured: list[str] = field(default_factory=list)
     n_resumed: int = 0
+    n_rejected: int = 0
     duplicates: dict[str, str] = field(default_factory=dict)
     refused: dict[str, Refusal] = field(default_factory=dict)
-    counts: RefusalCounts = field(default_factory=RefusalCounts)
+    counts: Losses = field(default_factory=Losses)
     notes: list[str] = field(default_factory=list)
     errors: list[SourceError] = field(default_factory=list)
     n_missing: int = 0
@@ -221,6 +207,7 @@ class _Collector:
         self._options = options
         self._progress = progress
         self._stored = StoredEvents()
+        self._rejected = {capture.name: capture for capture in session.rejected}
         self._names_by_key = _known_keys(session)
         self._n_captures = len(session.captures)
 
@@ -261,6 +248,11 @@ class _Collector:
         require_sensors(recording)
         rig, options = self._session.rig, self._options
         known = known_placements(self._session, options.min_move_m, options.min_turn_deg)
+        # Where a capture of this recording was rejected, another moment of that placement is not wanted.
+        for key, name in self._names_by_key.items():
+            if name in self._rejected and key.startswith(f"{recording.key}:"):
+                with suppress(LceRigError):
+                    known.add_poses(name, capture_poses(self._rejected[name], self._session))
         search = MomentSearch(
             rig,
             frozenset(recording.streams),
@@ -278,8 +270,7 @@ class _Collector:
                 self.note(["stopped early: the session has as many captures as wanted"])
                 break
             self._take_moment(recording.key, moment, search.kept_images(moment), known)
-        self.report.counts.update(search.counts())
-        self.note(search.notes())
+        self.report.counts.update(search.losses)
         if torn:
             raise torn[0]
 
@@ -301,6 +292,7 @@ class _Collector:
             "collected",
             captured=len(report.captured),
             resumed=report.n_resumed,
+            rejected=report.n_rejected,
             duplicates=report.duplicates,
             refused={label: describe(refusal) for label, refusal in report.refused.items()},
             counts=report.counts.by_code(),
@@ -313,8 +305,7 @@ class _Collector:
     def _take_pair(self, files: PairFiles) -> str:
         key = files.key()
         if key in self._names_by_key:
-            self.report.n_resumed += 1
-            return f"{files.label} is capture {self._names_by_key[key]} already"
+            return self._count_known(files.label, self._names_by_key[key])
         pair = files.read()
         self.note(pair.notes)
         self._note_sizes(pair.images)
@@ -328,7 +319,7 @@ class _Collector:
         key = f"{recording_key}:{'/'.join(str(stamp) for stamp in stamps)}"
         label = f"at {stamps[0]} ns"
         if key in self._names_by_key:
-            self.report.n_resumed += 1
+            self._count_known(label, self._names_by_key[key])
             return
         if known.find_like(boards) is not None:
             self.report.counts.add(Refusal("calibrate.same_placement"))
@@ -350,6 +341,8 @@ class _Collector:
         events: Sequence[Events] = (),
     ) -> str:
         duplicate = self._session.find_duplicate(images, scans, events)
+        if duplicate in self._rejected:
+            return self._count_known(label, duplicate)
         if duplicate is not None:
             self.report.duplicates[label] = duplicate
             return f"{label} is a duplicate of {duplicate}"
@@ -359,6 +352,14 @@ class _Collector:
         self._n_captures += 1
         self.report.captured.append(name)
         return f"{label} captured as {name}"
+
+    def _count_known(self, label: str, name: str) -> str:
+        """Count what an earlier run captured as this capture; rejected captures stay rejected."""
+        if name in self._rejected:
+            self.report.n_rejected += 1
+            return f"{label} is capture {name}, which is rejected"
+        self.report.n_resumed += 1
+        return f"{label} is capture {name} already"
 
     def _is_full(self) -> bool:
         limit = self._options.max_captures
@@ -396,8 +397,9 @@ def _until_torn(samples: Iterable[Sample], torn: list[SourceError]) -> Iterator[
 
 
 def _known_keys(session: Session) -> dict[str, str]:
+    """Name the captures, rejected ones included, by the key of what they were made from."""
     keys = {}
-    for capture in session.captures:
+    for capture in session.captures + session.rejected:
         try:
             source = capture.meta.get("source", {})
         except SessionError:

@@ -13,7 +13,7 @@ import numpy as np
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
 from lce_rig.collect.event_moment import MotionOptions, judge_sighting
 from lce_rig.collect.placement_dedupe import Placements
-from lce_rig.collect.refusal_counts import RefusalCounts
+from lce_rig.core.losses import Losses
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
 
@@ -26,7 +26,7 @@ def find_moving_moments(
     rig: Rig,
     options: MotionOptions,
     taken: Placements,
-    tally: RefusalCounts,
+    tally: Losses,
 ) -> Iterator[CaptureMoment]:
     """Yield the best moment of every place that the board passes, each place once.
 
@@ -53,7 +53,7 @@ class MotionGate:
             no camera of events saw the board.
     """
 
-    def __init__(self, rig: Rig, options: MotionOptions, taken: Placements, tally: RefusalCounts) -> None:
+    def __init__(self, rig: Rig, options: MotionOptions, taken: Placements, tally: Losses) -> None:
         """Begin without sightings; for the arguments see `find_moving_moments`."""
         self.judged: CaptureMoment | Refusal | None = None
         self._rig = rig

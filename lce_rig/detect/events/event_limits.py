@@ -19,28 +19,27 @@ _SLOW_EVENTS_PX = 4.0
 def gate_event_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:
     """Hold a board seen through events against the profile's limits on events and motion.
 
-    A figure that could not be measured, as of pictures that others reconstructed, is not judged; speeds count
+    A figure that could not be measured, and images that others reconstructed, are not judged; speeds count
     from where two standard deviations leave no doubt.
 
     Args:
-        found: with the figures of its quality record.
+        found: with what its events show.
         limits: `quality` of the rig profile.
     """
-    q = found.quality
-    events_px = q.get("events_px")
-    if events_px is not None and events_px < limits.min_events_px:
-        figures = {"events_px": events_px, "min_events_px": limits.min_events_px}
+    q = found.events
+    if q is None:
+        return found
+    if q.events_px < limits.min_events_px:
+        figures = {"events_px": q.events_px, "min_events_px": limits.min_events_px}
         return Refusal("image.hardly_moved", figures=figures)
-    speed_mps = q.get("speed_mps", 0.0)
-    if speed_mps - 2 * q.get("speed_sigma_mps", 0.0) > limits.max_board_speed_mps:
-        return too_fast(speed_mps, limits)
-    turn_deg_s = q.get("turn_deg_s", 0.0)
-    if turn_deg_s - 2 * q.get("turn_sigma_deg_s", 0.0) > limits.max_turn_deg_s:
-        figures = {"turn_deg_s": turn_deg_s, "max_turn_deg_s": limits.max_turn_deg_s}
+    # Comparisons with a figure that is not known are false.
+    if q.speed_mps - 2 * q.speed_sigma_mps > limits.max_board_speed_mps:
+        return too_fast(q.speed_mps, limits)
+    if q.turn_deg_s - 2 * q.turn_sigma_deg_s > limits.max_turn_deg_s:
+        figures = {"turn_deg_s": q.turn_deg_s, "max_turn_deg_s": limits.max_turn_deg_s}
         return Refusal("image.turning", figures=figures)
-    smear_m = q.get("smear_m", 0.0)
-    if smear_m > limits.max_smear_m:
-        return Refusal("image.smeared", figures={"smear_m": smear_m, "max_smear_m": limits.max_smear_m})
+    if q.smear_m > limits.max_smear_m:
+        return Refusal("image.smeared", figures={"smear_m": q.smear_m, "max_smear_m": limits.max_smear_m})
     return found
 
 
@@ -54,9 +53,9 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
     """Say what about the events keeps the board from being found; what was seen where they are not to blame.
 
     Args:
-        events: about the picture.
-        stamp_ns: of the picture.
-        seen: why there is no picture, or no board in it.
+        events: about the image.
+        stamp_ns: of the image.
+        seen: why there is no image, or no board in it.
         limits: `quality` of the rig profile.
     """
     if len(events) and seen.stage == "read":
@@ -65,7 +64,7 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
 
 
 def events_problem(events: Events, stamp_ns: int, limits: QualitySettings) -> Refusal | None:
-    """Say what about the events before a stamp keeps a board from being found; None where nothing does."""
+    """Say what about the events before a timestamp keeps a board from being found; None if nothing does."""
     if not len(events):
         return Refusal("image.no_events")
     recent = events.between(stamp_ns - MEMORY_NS, stamp_ns)
@@ -86,7 +85,7 @@ def events_problem(events: Events, stamp_ns: int, limits: QualitySettings) -> Re
 
 
 def look_for_flicker(events: Events) -> Refusal | None:
-    """Name the lamps that make most of the events of about a second; None where none do."""
+    """Name the lamps that make most of the events of about a second; None if none do."""
     flicker = measure_flicker(events)
     if not flicker.is_storm:
         return None

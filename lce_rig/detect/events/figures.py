@@ -1,6 +1,7 @@
-"""What events and a board followed through their pictures tell: event rate, speed, and smear in the LiDAR."""
+"""What events and a board followed through their images tell: event rate, speed, and smear in the LiDAR."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -10,13 +11,13 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array, difference, transform
-from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.core.results import EventQuality, ImageBoard, LidarBoard
 
 #: What the network has seen longer ago no longer shows.
 MEMORY_NS = 1_000_000_000
 _JUST_NS = 100_000_000
 _BLOCK_PX = 16
-# A board of 0.8 x 0.6 m takes up about this share of a DAVIS346's picture at 3.5 m.
+# A board of 0.8 x 0.6 m takes up about this share of a DAVIS346's image at 3.5 m.
 _BUSY_SHARE = 0.05
 _SUBPIXEL_BITS = 4
 # From poses nearer in time than this no speed can be told.
@@ -26,7 +27,7 @@ _ALONG = np.linspace(0, 1, 24)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class BoardMotion:
-    """How the board moves about the time of its main picture.
+    """How the board moves about the time of its main image.
 
     Attributes:
         velocity_mps: (3,) of the board's middle, frame camera.
@@ -41,24 +42,20 @@ class BoardMotion:
 
 
 def outline_px(T_cam_board: Array, board: Board, intrinsics: Intrinsics) -> Array:
-    """Draw the plate's outline as the lens bends it: (96, 2) px, NaN where it cannot be seen."""
+    """Draw the plate's outline as the lens bends it: (96, 2) px, NaN if it cannot be seen."""
     corners = board.outline()
     edges = [a + _ALONG * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     pixels, _ = intrinsics.project(transform(T_cam_board, np.concatenate(edges)))
     return pixels
 
 
-def event_figures(events: Events, stamp_ns: int, around_px: Array) -> dict[str, float]:
-    """Measure how many events a board made.
+def event_quality(events: Events, stamp_ns: int, around_px: Array) -> EventQuality:
+    """Measure how many events a board made; its motion stays unknown.
 
     Args:
-        events: about the picture.
-        stamp_ns: of the picture.
+        events: about the image.
+        stamp_ns: of the image.
         around_px: (M, 2) the board's outline in it.
-
-    Returns:
-        events_px_s: events a second and pixel of the board, just before the picture; events_px: a pixel, in
-        the time that the network remembers.
     """
     outline = around_px[np.isfinite(around_px).all(axis=1)]
     mask = np.zeros((events.height_px, events.width_px), dtype=np.uint8)
@@ -69,7 +66,7 @@ def event_figures(events: Events, stamp_ns: int, around_px: Array) -> dict[str, 
     recent = remembered.between(stamp_ns - _JUST_NS, stamp_ns)
     n_remembered, n_recent = (_count_within(mask, part) for part in (remembered, recent))
     n_pixels = max(int(mask.sum()), 1)
-    return {"events_px_s": n_recent / n_pixels / (1e-9 * _JUST_NS), "events_px": n_remembered / n_pixels}
+    return EventQuality(n_recent / n_pixels / (1e-9 * _JUST_NS), n_remembered / n_pixels)
 
 
 def _count_within(mask: NDArray[np.uint8], events: Events) -> int:
@@ -81,7 +78,7 @@ def _count_within(mask: NDArray[np.uint8], events: Events) -> int:
 def busiest_events(events: Events, stamp_ns: int) -> float:
     """Count the events a pixel in the time that the network remembers, where most of them are.
 
-    Of a picture in which no board was found: blocks of pixels together as large as a board, busiest first.
+    Of an image in which no board was found: blocks of pixels together as large as a board, busiest first.
     """
     recent = events.between(stamp_ns - MEMORY_NS, stamp_ns)
     n_cols, n_rows = -(-events.width_px // _BLOCK_PX), -(-events.height_px // _BLOCK_PX)
@@ -92,7 +89,7 @@ def busiest_events(events: Events, stamp_ns: int) -> float:
 
 
 def board_motion(found: ImageBoard) -> BoardMotion | None:
-    """Fit a steady motion to the poses of a board that was followed; None where it was not."""
+    """Fit a steady motion to the poses of a board that was followed; None if it was not."""
     track_ns, track, track_cov = found.track_ns, found.track_T_cam_board, found.track_cov
     if track_ns is None or track is None or track_cov is None or found.stamp_ns is None:
         return None
@@ -121,31 +118,29 @@ def sweep_time_s(lidar: LidarBoard, period_s: float) -> float:
     return float(span) / (2 * np.pi) * period_s
 
 
-def motion_figures(found: ImageBoard, sweep_s: float | None) -> dict[str, float]:
-    """List what the board's motion amounts to.
+def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None) -> EventQuality:
+    """Add what the board's motion amounts to; nothing without a track.
 
     Args:
+        measured: what the board's events show.
         found: with its track.
-        sweep_s: how long the LiDAR sees the board; None where it does not.
-
-    Returns:
-        speed_mps, turn_deg_s and their standard deviations; smear_m, how far the board moves while it is
-        swept, and smear_depth_m, along its normal, which thickens or tilts the plane. Empty without a track.
+        sweep_s: how long the LiDAR sees the board; None if it does not.
     """
     motion = board_motion(found)
     if motion is None:
-        return {}
+        return measured
     speed_mps = float(np.linalg.norm(motion.velocity_mps))
-    figures = {
-        "speed_mps": speed_mps,
-        "speed_sigma_mps": motion.speed_sigma_mps,
-        "turn_deg_s": float(np.degrees(np.linalg.norm(motion.turn_rad_s))),
-        "turn_sigma_deg_s": float(np.degrees(motion.turn_sigma_rad_s)),
-    }
-    if sweep_s is not None:
-        along_normal_mps = abs(float(motion.velocity_mps @ found.T_cam_board[:3, 2]))
-        figures |= {"smear_m": speed_mps * sweep_s, "smear_depth_m": along_normal_mps * sweep_s}
-    return figures
+    along_normal_mps = abs(float(motion.velocity_mps @ found.T_cam_board[:3, 2]))
+    swept_s = math.nan if sweep_s is None else sweep_s
+    return replace(
+        measured,
+        speed_mps=speed_mps,
+        speed_sigma_mps=motion.speed_sigma_mps,
+        turn_deg_s=float(np.degrees(np.linalg.norm(motion.turn_rad_s))),
+        turn_sigma_deg_s=float(np.degrees(motion.turn_sigma_rad_s)),
+        smear_m=speed_mps * swept_s,
+        smear_depth_m=along_normal_mps * swept_s,
+    )
 
 
 def _slope(time_s: Array, values: Array, cov: Array) -> tuple[Array, Array]:

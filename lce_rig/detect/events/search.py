@@ -1,4 +1,4 @@
-"""The board in a stream of events: a picture at the time asked for, and the board followed through others."""
+"""The board in a stream of events: an image at the time asked for, and the board followed through others."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,26 +13,26 @@ from lce_rig.core.data import Events, Image
 from lce_rig.core.geometry import Array, exp_so3, pose, rotation_angle, skew
 from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.detect.events.event_limits import explain_missing_board, gate_event_board
-from lce_rig.detect.events.figures import event_figures, motion_figures, outline_px
+from lce_rig.detect.events.figures import event_quality, outline_px, with_motion
 from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
 from lce_rig.detect.image.search import find_image_board, region_around
 from lce_rig.detect.limits_met import gate_image_board
 from lce_rig.rig import QualitySettings, ReconstructionSettings
 from lce_rig.solvers.pnp import pose_covariance
 
-# One order of corners, and one of the two poses, for all pictures of the same board.
+# One order of corners, and one of the two poses, for all images of the same board.
 
 
 def align_corner_order(found: ImageBoard, reference: ImageBoard, board: Board) -> ImageBoard:
-    """Count the corners from the same end of the print as another picture of about the same time does.
+    """Count the corners from the same end of the print as another image of about the same time does.
 
     The pattern looks the same when it is turned by 180 deg, a square one by 90 deg, but for the colours of
     its squares, and a reconstruction can have those wrong. The turn that brings the two poses nearest to each
-    other is taken; the board may not have turned by half of that between the pictures.
+    other is taken; the board may not have turned by half of that between the images.
 
     Args:
         found: the board whose corners are put in order.
-        reference: the board as another picture of the camera shows it; of frames and events, the frame.
+        reference: the board as another image of the camera shows it; of frames and events, the frame.
         board: the board.
 
     Returns:
@@ -100,7 +100,7 @@ EventImage = Literal["network", "map"]
 
 #: When the board is looked for besides the main picture, ns after it.
 TRACK_NS = (-100_000_000, -50_000_000, 50_000_000, 100_000_000)
-# Between neighbouring pictures no hand turns the board by more: it is another board, or misread.
+# Between neighbouring images no hand turns the board by more: it is another board, or misread.
 _MAX_TURN_RAD = np.radians(45)
 
 
@@ -110,7 +110,7 @@ class EventSighting:
 
     Attributes:
         picture: at the time asked for, or why there is none.
-        board: in that picture and, as its track, in those about it; or why it is not there.
+        board: in that image and, as its track, in those about it; or why it is not there.
     """
 
     picture: Image | Refusal
@@ -124,7 +124,7 @@ def reconstructor_for(
 
     Args:
         settings: the channel's block; None for the shipped network and automatic windows.
-        channel: that the pictures are said to come from.
+        channel: that the images are said to come from.
         method: in place of the profile's.
 
     Raises:
@@ -152,19 +152,19 @@ def find_event_board(
     *,
     sweep_s: float | None = None,
 ) -> EventSighting:
-    """Make a picture of the events up to a stamp, find the board in it and follow it to either side.
+    """Make an image of the events up to a timestamp, find the board in it and follow it to either side.
 
     Args:
-        events: from long enough before the stamp for the network to settle.
+        events: from long enough before the timestamp for the network to settle.
         stamp_ns: on the events' clock.
         reconstructor: is reset.
         board: the board as the profile describes it.
         intrinsics: of the camera.
         limits: `quality` of the rig profile.
-        sweep_s: how long the LiDAR sees the board; None where it does not.
+        sweep_s: how long the LiDAR sees the board; None if it does not.
 
     Raises:
-        ProfileError: the intrinsics or the network are for pictures of another size.
+        ProfileError: the intrinsics or the network are for images of another size.
     """
     last_ns = int(events.t_ns[-1]) if len(events) else stamp_ns
     about = {min(stamp_ns + offset, max(last_ns, stamp_ns)) for offset in TRACK_NS}
@@ -177,9 +177,8 @@ def find_event_board(
     if isinstance(found, Refusal):
         return EventSighting(picture, explain_missing_board(events, stamp_ns, found, limits))
     found = _followed(replace(found, stamp_ns=stamp_ns), picture, pictures, board, intrinsics, limits)
-    made = event_figures(events, stamp_ns, outline_px(found.T_cam_board, board, intrinsics))
-    quality = {**found.quality, **made, **motion_figures(found, sweep_s)}
-    gated = gate_image_board(replace(found, quality=quality), limits)
+    made = event_quality(events, stamp_ns, outline_px(found.T_cam_board, board, intrinsics))
+    gated = gate_image_board(replace(found, events=with_motion(made, found, sweep_s)), limits)
     return EventSighting(picture, gate_event_board(gated, limits) if isinstance(gated, ImageBoard) else gated)
 
 
@@ -190,7 +189,7 @@ def find_in_reconstruction(
     limits: QualitySettings,
     region: tuple[int, int, int, int] | None = None,
 ) -> ImageBoard | Refusal:
-    """Find the board in a picture that was made from events, ours or another's."""
+    """Find the board in an image that was made from events, ours or another's."""
     return find_image_board(
         picture,
         board,
@@ -211,7 +210,7 @@ def _followed(
     intrinsics: Intrinsics,
     limits: QualitySettings,
 ) -> ImageBoard:
-    """Follow the board from its main picture to either side, and keep its poses as the track."""
+    """Follow the board from its main image to either side, and keep its poses as the track."""
     assert main.stamp_ns is not None
     track: dict[int, tuple[Array, Array]] = {}
     stamps = sorted(others)

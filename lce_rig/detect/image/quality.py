@@ -1,13 +1,11 @@
-"""What a picture shows of the board in numbers, and why where it shows too little."""
-
-from collections.abc import Mapping
+"""What an image shows of the board in numbers, and why where it shows too little."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Refusal
+from lce_rig.core.results import ImageQuality, Refusal
 from lce_rig.detect.image.corners import seen_grid, square_values
 from lce_rig.detect.image.saddle import Crossings
 
@@ -15,14 +13,8 @@ from lce_rig.detect.image.saddle import Crossings
 _EDGE_WIDTH_PER_SIGMA = 2.56
 
 
-def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> dict[str, float]:
-    """Measure the corners' surroundings.
-
-    Returns:
-        mean_grey; contrast (grey values, white minus black); noise (grey values); square_px (shortest side);
-        edge_width_px (10-90 %); sharpness (edge widths in a square: 1 is unreadable, above 5 is crisp);
-        border_px (outermost corner to the border of the picture); n_corners (fitted).
-    """
+def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
+    """Measure the corners' surroundings."""
     grid = crossings.grid_px
     height, width = grey.shape
     sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1) for axis in (0, 1)]
@@ -32,16 +24,16 @@ def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> dict[str, flo
     alternating *= -1.0 if np.median(alternating) < 0 else 1.0
     contrast = float(np.median(alternating))
     to_border = np.minimum(grid, [width - 1, height - 1] - grid).min()
-    return {
-        "mean_grey": float(grey.mean()),
-        "contrast": contrast,
-        "noise": crossings.noise,
-        "square_px": square_px,
-        "edge_width_px": edge_width_px,
-        "sharpness": square_px / edge_width_px if edge_width_px > 0 else 0.0,
-        "border_px": float(to_border),
-        "n_corners": float(crossings.is_fitted.sum()),
-    }
+    return ImageQuality(
+        mean_grey=float(grey.mean()),
+        contrast=contrast,
+        noise=crossings.noise,
+        square_px=square_px,
+        edge_width_px=edge_width_px,
+        sharpness=square_px / edge_width_px if edge_width_px > 0 else 0.0,
+        border_px=float(to_border),
+        n_corners=int(crossings.is_fitted.sum()),
+    )
 
 
 def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
@@ -110,7 +102,7 @@ def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool 
 def explain_other_grid(
     grey: NDArray[np.uint8], board: Board, seen_px: Array, is_from_events: bool = False
 ) -> Refusal:
-    """Say that another grid of corners is in the picture than the profile's.
+    """Say that another grid of corners is in the image than the profile's.
 
     Args:
         seen_px: (rows, cols, 2).
@@ -130,18 +122,18 @@ def explain_other_grid(
 
 
 def quality_problem(
-    quality: Mapping[str, float], min_contrast: float, min_sharpness: float, is_from_events: bool = False
+    quality: ImageQuality, min_contrast: float, min_sharpness: float, is_from_events: bool = False
 ) -> Refusal | None:
-    """Judge the figures of a grid that was found; None where they will do."""
+    """Judge the figures of a grid that was found; None if they will do."""
     action = _action(is_from_events)
-    if quality["contrast"] < min_contrast:
-        figures = {"contrast": quality["contrast"], "min_contrast": min_contrast}
+    if quality.contrast < min_contrast:
+        figures = {"contrast": quality.contrast, "min_contrast": min_contrast}
         return Refusal("image.low_contrast", figures=figures, action=action)
-    if quality["sharpness"] < min_sharpness:
+    if quality.sharpness < min_sharpness:
         figures = {
-            "edge_px": quality["edge_width_px"],
-            "square_px": quality["square_px"],
-            "sharpness": quality["sharpness"],
+            "edge_px": quality.edge_width_px,
+            "square_px": quality.square_px,
+            "sharpness": quality.sharpness,
             "min_sharpness": min_sharpness,
         }
         return Refusal("image.not_sharp", figures=figures, action=action)
@@ -163,7 +155,7 @@ def _sizes(board: Board, seen_px: Array) -> tuple[tuple[int, int], tuple[int, in
 
 
 def _side_beyond(grey: NDArray[np.uint8], grid_px: Array) -> str:
-    """Name the border within 1.5 squares of the grid; empty where there is none."""
+    """Name the border within 1.5 squares of the grid; empty if there is none."""
     height, width = grey.shape
     square = max(float(np.linalg.norm(np.diff(grid_px, axis=axis), axis=-1).max()) for axis in (0, 1))
     low, high = grid_px.min(axis=(0, 1)), grid_px.max(axis=(0, 1))

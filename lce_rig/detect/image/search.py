@@ -1,6 +1,6 @@
 """The board in a picture: corners, both poses and figures, or why there is none."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array, transform
-from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.core.results import ImageBoard, ImageQuality, Refusal
 from lce_rig.detect.image.corners import find_grid, order_corners, seen_grid
 from lce_rig.detect.image.quality import (
     explain_absence,
@@ -29,7 +29,7 @@ NOT_SEEN_AT_ONCE = Refusal("image.not_at_first_sight")
 
 # The alternative pose is as good as the first where the difference of the costs could be noise (3 sigma).
 _AMBIGUOUS_CHI2 = 9.0
-# A part of the picture may be missing at its end (a cut-off readout); a larger difference is another mode.
+# A part of the image may be missing at its end (a cut-off readout); a larger difference is another mode.
 _CUT_FRACTION = 0.02
 # A canvas is larger than the sensor by as much at most; to look at more than that takes memory.
 _CANVAS_FRACTION = 3.0
@@ -58,28 +58,28 @@ def find_image_board(
     is_from_events: bool = False,
     is_thorough: bool = True,
 ) -> ImageBoard | Refusal:
-    """Find the board's inner corners in one picture and T_cam_board in both its minima.
+    """Find the board's inner corners in one image and T_cam_board in both its minima.
 
     Corners are ordered as `Board.corners()` says. A pattern that is not symmetric under 180 deg is read with
-    the outer square at its top left black; a symmetric one with its top row up in the picture.
+    the outer square at its top left black; a symmetric one with its top row up in the image.
 
     Args:
-        image: the picture.
+        image: the image.
         board: the board as the profile describes it.
-        intrinsics: of the camera, at the picture's resolution.
-        region: (u0, v0, u1, v1) px to search first, from `region_around` the board in the last live picture;
-            the whole picture follows where it is not there.
+        intrinsics: of the camera, at the image's resolution.
+        region: (u0, v0, u1, v1) px to search first, from `region_around` the board in the last live image;
+            the whole image follows where it is not there.
         last: the board in the last live picture: where it is there still, or within a third of a square,
             nothing is searched.
-        max_reprojection_px: refuse where the corners' rms distance from the board's picture is larger.
+        max_reprojection_px: refuse where the corners' rms distance from the board's image is larger.
         min_contrast: refuse where black and white differ by fewer grey values.
         min_sharpness: refuse where fewer edge widths fit into a square.
-        is_from_events: whether the picture was made from events: what is to be done is another thing.
+        is_from_events: whether the image was made from events: what is to be done is another thing.
         is_thorough: whether a board that is not found at once is searched for at other scales, and its
             absence explained, which takes most of a second.
 
     Raises:
-        ProfileError: the intrinsics belong to pictures of another size.
+        ProfileError: the intrinsics belong to images of another size.
     """
     grey = crop_to_intrinsics(image, intrinsics)
     followed = _follow(grey, board, last)
@@ -106,19 +106,17 @@ def find_image_board(
     )
     if solved is None or solved.reprojection_px > max_reprojection_px:
         return _misfit(solved, intrinsics, max_reprojection_px)
-    quality |= {"n_corners": float(crossings.is_fitted.sum()), "corner_rms_px": solved.reprojection_px}
+    quality = replace(quality, n_corners=int(crossings.is_fitted.sum()))
     return board_from_pose(crossings.grid_px.reshape(-1, 2), solved, quality)
 
 
-def board_from_pose(
-    corners_px: Array, solved: PlanarPose, quality: Mapping[str, float] | None = None
-) -> ImageBoard:
-    """Put together what a picture shows of the board, once its pose is solved for.
+def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality | None = None) -> ImageBoard:
+    """Put together what an image shows of the board, once its pose is solved for.
 
     Args:
         corners_px: (rows * cols, 2) in the order of `Board.corners()`.
         solved: both poses that they admit.
-        quality: figures of the picture; those of the pose are added.
+        quality: figures of the image.
     """
     return ImageBoard(
         corners_px=corners_px,
@@ -129,15 +127,15 @@ def board_from_pose(
         is_ambiguous=solved.chi2_gap < _AMBIGUOUS_CHI2,
         reprojection_px=solved.reprojection_px,
         sigma_px=solved.sigma_px,
-        quality={**(quality or {}), **_pose_quality(solved.T_cam_board)},
+        quality=quality,
     )
 
 
 def region_around(found: ImageBoard, image: Image, margin: float = 0.5) -> Region:
-    """Name the part of the next picture to search: the corners' box, larger by `margin` of its size.
+    """Name the part of the next image to search: the corners' box, larger by `margin` of its size.
 
     Returns:
-        (u0, v0, u1, v1) px, within the picture.
+        (u0, v0, u1, v1) px, within the image.
     """
     height, width = image.pixels.shape[:2]
     low, high = found.corners_px.min(axis=0), found.corners_px.max(axis=0)
@@ -148,10 +146,10 @@ def region_around(found: ImageBoard, image: Image, margin: float = 0.5) -> Regio
 
 
 def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:
-    """Return the grey picture at the size the intrinsics belong to.
+    """Return the grey image at the size the intrinsics belong to.
 
     Two harmless differences occur in recordings: a readout that ends a few lines early, and a canvas larger
-    than the sensor, blank beyond it (pictures reconstructed from events).
+    than the sensor, blank beyond it (images reconstructed from events).
 
     Raises:
         ProfileError: any other size, naming both.
@@ -169,16 +167,16 @@ def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8
             return grey[:wanted_height, :wanted_width]
     hint = "use the intrinsics of this mode, or record in the mode the intrinsics were calibrated in"
     if abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width:
-        hint += f"; if the picture is only scaled, multiply fx, fy, cx, cy by {width / wanted_width:.4g}"
+        hint += f"; if the image is only scaled, multiply fx, fy, cx, cy by {width / wanted_width:.4g}"
     raise ProfileError(
-        f"camera {image.sensor}, channel {image.channel}: the picture is {width}x{height} px, the profile's "
+        f"camera {image.sensor}, channel {image.channel}: the image is {width}x{height} px, the profile's "
         f"intrinsics belong to {wanted_width}x{wanted_height} px",
         hint,
     )
 
 
 def _is_blank_beyond(grey: NDArray[np.uint8], width_px: int, height_px: int) -> bool:
-    """Tell whether nothing but a smooth background lies right of and below the sensor's size."""
+    """Return whether nothing but a smooth background lies right of and below the sensor's size."""
     steps = np.abs(np.diff(grey.astype(np.int16), axis=1))
     inside = np.percentile(steps[:height_px, : width_px - 1], 99)
     beyond = np.concatenate([steps[height_px:].ravel(), steps[:height_px, width_px + 8 :].ravel()])
@@ -188,7 +186,7 @@ def _is_blank_beyond(grey: NDArray[np.uint8], width_px: int, height_px: int) -> 
 
 
 def _follow(grey: NDArray[np.uint8], board: Board, last: ImageBoard | None) -> Crossings | None:
-    """Fit the corners from where they were; None where the board is not all there.
+    """Fit the corners from where they were; None if the board is not all there.
 
     A board that moved by a whole square is not taken for itself: on one side squares are missing then.
     """
@@ -245,7 +243,7 @@ def _solve(
     intrinsics: Intrinsics,
     near: Sequence[Array] = (),
 ) -> tuple[PlanarPose | None, Crossings]:
-    """Solve for the pose; corners far from the board's picture are looked for again where they should be.
+    """Solve for the pose; corners far from the board's image are looked for again where they should be.
 
     A finder puts single corners onto an artefact now and then. Few of them are fitted again from where the
     others put them; what cannot be fitted there takes that place and no longer counts in `n_corners`.
@@ -282,13 +280,6 @@ def _solve(
 def _errors(T_cam_board: Array, crossings: Crossings, corners_board: Array, intrinsics: Intrinsics) -> Array:
     predicted, _ = intrinsics.project(transform(T_cam_board, corners_board))
     return np.asarray(np.linalg.norm(predicted - crossings.grid_px.reshape(-1, 2), axis=1))
-
-
-def _pose_quality(T_cam_board: Array) -> dict[str, float]:
-    """Measure tilt_deg (print's normal against the line of sight) and distance_m."""
-    distance_m = float(np.linalg.norm(T_cam_board[:3, 3]))
-    cosine = abs(float(T_cam_board[:3, 2] @ T_cam_board[:3, 3])) / distance_m
-    return {"tilt_deg": float(np.degrees(np.arccos(min(cosine, 1.0)))), "distance_m": distance_m}
 
 
 def _misfit(solved: PlanarPose | None, intrinsics: Intrinsics, max_reprojection_px: float) -> Refusal:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, pose
-from lce_rig.core.results import LidarBoard
+from lce_rig.core.results import LidarBoard, LidarQuality
 from lce_rig.detect.lidar.segments import MAX_STEPS, Indices, OrderedScan
 from lce_rig.detect.lidar.template import (
     Placement,
@@ -35,7 +35,7 @@ class RingEnds:
         side: (E,) -1 or +1.
         gap: (E, 2) from one beam to the next along the ring at that end, outwards, in the plane view, m.
         beyond: (E,) index in the scan of the next return outwards.
-        behind_m: (E,) how far behind the plane it lies, inf where there is none.
+        behind_m: (E,) how far behind the plane it lies, inf if there is none.
         is_border: (E,) whether the surface itself ends there: no occluder before it, no plane behind it.
     """
 
@@ -231,7 +231,7 @@ def refine(
         max_beyond: most returns in the plane beyond the outline, per return inside, to look closer.
 
     Returns:
-        The beams about the plate and the outline among them, with its error; None where too few returns lie
+        The beams about the plate and the outline among them, with its error; None if too few returns lie
         on the plane inside the outline, or too many beyond it.
     """
     radius_m = float(np.hypot(*placement.half_m)) + SURROUND_M
@@ -279,7 +279,7 @@ def build_board(
         beam: light spot of the LiDAR.
 
     Returns:
-        The board, None where hardly a return lies inside the outline.
+        The board, None if hardly a return lies inside the outline.
     """
     distance_m = float(np.linalg.norm(view.origin))
     beyond_m = beam.half_width_m(distance_m)
@@ -303,20 +303,26 @@ def build_board(
     rms_m = float(np.sqrt(np.mean(height**2)))
     incidence = np.arccos(np.clip(view.plane[3] / distance_m, 0.0, 1.0))
     # How much of the light spot counts is not known.
-    quality = _size_figures(2 * np.asarray(fitted.half_m), np.hypot(size_sigma_m, beyond_m), board) | {
-        "n_rings": float(1 + np.count_nonzero(np.diff(scan.ring[kept]))),
-        "n_points": float(len(kept)),
-        "n_ring_ends": float(len(edge)),
-        "n_ring_ends_dropped": float(len(ends.beam) - len(edge)),
-        "thickness_m": float(high_m - low_m),
-        "plane_rms_m": rms_m,
-        "edge_rms_m": float(np.sqrt(np.mean(residual[is_good] ** 2))) if is_good.any() else float("nan"),
-        "template_m": placement.error_m,
-        "beyond_share": float((view.is_on & (away > SLACK_M)).sum()) / max(1, len(kept)),
-        "distance_m": distance_m,
-        "incidence_deg": float(np.degrees(incidence)),
-        "range_noise_m": scan.sigma_m,
-    }
+    size_m, sigma_m = 2 * np.asarray(fitted.half_m), np.hypot(size_sigma_m, beyond_m)
+    quality = LidarQuality(
+        width_m=float(size_m[0]),
+        height_m=float(size_m[1]),
+        width_sigma_m=float(sigma_m[0]),
+        height_sigma_m=float(sigma_m[1]),
+        size_ratio=_size_ratio(size_m, sigma_m, board),
+        n_rings=1 + int(np.count_nonzero(np.diff(scan.ring[kept]))),
+        n_points=len(kept),
+        n_ring_ends=len(edge),
+        n_ring_ends_dropped=len(ends.beam) - len(edge),
+        thickness_m=float(high_m - low_m),
+        plane_rms_m=rms_m,
+        edge_rms_m=float(np.sqrt(np.mean(residual[is_good] ** 2))) if is_good.any() else float("nan"),
+        template_m=placement.error_m,
+        beyond_share=float((view.is_on & (away > SLACK_M)).sum()) / max(1, len(kept)),
+        distance_m=distance_m,
+        incidence_deg=float(np.degrees(incidence)),
+        range_noise_m=scan.sigma_m,
+    )
     return LidarBoard(
         points=points,
         ring=scan.ring[kept],
@@ -334,17 +340,10 @@ def build_board(
     )
 
 
-def _size_figures(size_m: Array, sigma_m: Array, board: Board) -> dict[str, float]:
-    """State width and height (2,) with their sigmas (2,), and how large they are beside the nominal ones."""
+def _size_ratio(size_m: Array, sigma_m: Array, board: Board) -> float:
+    """Compare width and height (2,), with their sigmas (2,), with the nominal ones."""
     weight = 1.0 / sigma_m**2
-    ratio = (weight * size_m / [board.width_m, board.height_m]).sum() / weight.sum()
-    return {
-        "width_m": float(size_m[0]),
-        "height_m": float(size_m[1]),
-        "width_sigma_m": float(sigma_m[0]),
-        "height_sigma_m": float(sigma_m[1]),
-        "size_ratio": float(ratio),
-    }
+    return float((weight * size_m / [board.width_m, board.height_m]).sum() / weight.sum())
 
 
 def _echo_shares(scan: OrderedScan, source: Scan, ends: RingEnds, view: PlaneView, border: Indices) -> Array:

@@ -31,12 +31,12 @@ def no_returns(n_points: int, min_range_m: float) -> Refusal:
 
 def too_few_rings(found: LidarBoard, min_rings: int) -> Refusal:
     """Refuse a board on which too few rings lie; their number goes with 1 / distance."""
-    n_rings, distance_m = found.quality["n_rings"], found.quality["distance_m"]
+    n_rings, distance_m = found.quality.n_rings, found.quality.distance_m
     closer_m = max(0.1, distance_m * (1.0 - n_rings / min_rings))
     return Refusal(
         "lidar.too_few_rings",
         figures={
-            "n_rings": int(n_rings),
+            "n_rings": n_rings,
             "min_rings": min_rings,
             "distance_m": distance_m,
             "closer_m": closer_m,
@@ -192,7 +192,7 @@ def find_lidar_boards(
         min_rings: fewest rings on the board.
         max_template_m: largest mean distance of the outline from where the rings end, without noise.
         max_rms_m: largest rms distance of the board's returns from its plane, without noise.
-        beam: light spot of the LiDAR; that of a VLP-16 where None.
+        beam: light spot of the LiDAR; that of a VLP-16 if None.
 
     Returns:
         At most 4 boards that do not overlap, or why there is none.
@@ -245,11 +245,11 @@ def measure_plate(
         origin: (3,) m, the point of the plane the first guess is counted from.
         start: first guess of the outline.
         limits: with the scan's noise.
-        beam: light spot of the LiDAR; that of a VLP-16 where None.
+        beam: light spot of the LiDAR; that of a VLP-16 if None.
         max_beyond: largest share of returns in the plane beyond the outline, as it is guessed.
 
     Returns:
-        The board, why it is refused, None where there is no plate.
+        The board, why it is refused, None if there is no plate.
     """
     refined = refine(ordered, plane, origin, start, limits.template_m, max_beyond)
     if refined is None:
@@ -260,7 +260,7 @@ def measure_plate(
     measured = build_board(ordered, scan, board, view, placement, beam or Beam())
     if measured is None:
         return None
-    if measured.quality["n_rings"] < limits.min_rings:
+    if measured.quality.n_rings < limits.min_rings:
         return too_few_rings(measured, limits.min_rings)
     if measured.sigma_m > limits.rms_m:
         heights_m = measured.points @ measured.plane[:3] + measured.plane[3]
@@ -270,13 +270,13 @@ def measure_plate(
 
 def _is_clear(found: LidarBoard) -> bool:
     """Return whether a candidate has many rings and its plane almost to itself."""
-    return found.quality["n_rings"] >= CLEAR_RINGS and found.quality["beyond_share"] < CLEAR_SHARE
+    return found.quality.n_rings >= CLEAR_RINGS and found.quality.beyond_share < CLEAR_SHARE
 
 
 def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
     """Rank the candidates and drop those that overlap a better one."""
     distinct: list[LidarBoard] = []
-    for candidate in sorted(found, key=lambda c: _doubt(c, board)):
+    for candidate in sorted(found, key=lambda c: _penalty(c, board)):
         centre = candidate.T_lidar_board[:3, 3]
         away = [float(np.linalg.norm(centre - other.T_lidar_board[:3, 3])) for other in distinct]
         if all(a > min(board.width_m, board.height_m) / 2 for a in away):
@@ -284,17 +284,17 @@ def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
     return distinct[:MAX_CANDIDATES]
 
 
-def _doubt(found: LidarBoard, board: Board) -> float:
+def _penalty(found: LidarBoard, board: Board) -> float:
     """Rate a candidate in m: misfit of outline and size, what no ring shows, what else is in its plane."""
     q = found.quality
-    doubt = q["template_m"] + 0.03 / q["n_rings"] + 0.15 * (q["width_sigma_m"] + q["height_sigma_m"])
-    doubt += 0.05 * q["beyond_share"]
+    penalty = q.template_m + 0.03 / q.n_rings + 0.15 * (q.width_sigma_m + q.height_sigma_m)
+    penalty += 0.05 * q.beyond_share
     for measured_m, sigma_m, wanted_m in (
-        (q["width_m"], q["width_sigma_m"], board.width_m),
-        (q["height_m"], q["height_sigma_m"], board.height_m),
+        (q.width_m, q.width_sigma_m, board.width_m),
+        (q.height_m, q.height_sigma_m, board.height_m),
     ):
-        doubt += 0.5 * max(0.0, abs(measured_m - wanted_m) - 2 * sigma_m - 0.005)
-    return doubt
+        penalty += 0.5 * max(0.0, abs(measured_m - wanted_m) - 2 * sigma_m - 0.005)
+    return penalty
 
 
 # Follow the board from one scan to the next.
@@ -329,7 +329,7 @@ def track_lidar_board(
         min_range_m: nearer returns are ignored.
         min_rings: fewest rings on the board.
         max_rms_m: largest rms distance of the board's returns from its plane, without noise.
-        beam: light spot of the LiDAR; that of a VLP-16 where None.
+        beam: light spot of the LiDAR; that of a VLP-16 if None.
 
     Returns:
         The best candidate in the box, or why there is none.
@@ -387,7 +387,7 @@ def _measure_again(
     width_axis = plane_axes(previous.plane[:3]).T @ T[:3, 0]
     half_m = (board.width_m / 2, board.height_m / 2)
     start = Placement(0.0, 0.0, float(np.arctan2(width_axis[1], width_axis[0])), half_m)
-    limits = replace(limits, template_m=min(limits.template_m, previous.quality["template_m"] + WORSE_M))
+    limits = replace(limits, template_m=min(limits.template_m, previous.quality.template_m + WORSE_M))
     measured = measure_plate(
         ordered, nearby, board, previous.plane, T[:3, 3], start, limits.widened(ordered.sigma_m), beam
     )

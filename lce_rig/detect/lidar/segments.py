@@ -134,7 +134,7 @@ def _by_azimuth(order: Indices, ring: NDArray[np.int16], azimuth: Floats) -> Ind
     """Sort the returns of each ring, given in order of firing, by azimuth; drop those of a second turn.
 
     A scan of slightly more than one turn shows the same directions twice, 0.1 s apart: mixed, they would
-    tear what moves into two. Point clouds that are not in order of firing lose nothing.
+    tear what moves into two. Point point clouds that are not in order of firing lose nothing.
     """
     if len(order) == 0:
         return order

@@ -11,12 +11,12 @@ from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
+from lce_rig.devices.disk_writer import DiskWriter, Sink
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.vlp16.packet_recorder import PcapRecorder
 from lce_rig.devices.vlp16.socket import PACKET_COST_BYTES, UdpPort
 from lce_rig.devices.vlp16.web import VelodyneWeb, WebReport, find_problems
-from lce_rig.recordings.velodyne.datagrams import Datagram
+from lce_rig.recordings.velodyne.datagrams import Datagram, PcapWriter
 from lce_rig.recordings.velodyne.driver_controls import read_controls
 from lce_rig.recordings.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings
@@ -61,20 +61,20 @@ def to_status(
     settings: LidarSettings,
     stream: Vlp16Stream | None,
     reception: Reception,
-    recorder: PcapRecorder | None,
+    recorder: Sink[Datagram] | None,
 ) -> SourceStatus:
     """Gather everything as figures and findings."""
     if stream is None:
         return SourceStatus(sensor)
-    counts, state = stream.counts, stream.clock.state()
+    losses, state = stream.losses, stream.clock.state()
     ahead_ns = stream.clock.ahead_ns()
     figures = {
-        "position_packets": float(counts.n_position),
-        "bad_packets": float(counts.n_bad),
-        "late_packets": float(counts.order.n_late),
+        "position_packets": float(stream.n_position),
+        "bad_packets": float(sum(flaw.figure("n") for flaw in stream.flaws())),
+        "late_packets": float(losses.n("packet.late")),
         "overflowed_packets": float(reception.n_overflowed),
         "stranger_packets": float(reception.n_strange),
-        "clock_steps": float(counts.order.n_steps),
+        "clock_steps": float(losses.n("packet.clock_set")),
         "receive_buffer_bytes": float(reception.granted_bytes),
         "is_dual": float(stream.mode == velodyne.DUAL),
     }
@@ -82,26 +82,26 @@ def to_status(
     if recorder is not None:
         figures["recorded_packets"] = float(recorder.n_written)
         figures["unrecorded_packets"] = float(recorder.n_dropped)
-        problems += [recorder.failure] if recorder.failure is not None else []
+        problems += recorder.findings()
     return SourceStatus(
         sensor,
-        n_lost=counts.order.n_lost,
+        n_lost=losses.n("packet.lost"),
         clock=ClockState(state, stream.clock.is_utc, None if ahead_ns is None else ahead_ns * 1e-9),
         problems=tuple(problems),
         figures=figures,
         device=f"{velodyne.PRODUCTS[velodyne.VLP16]} at {reception.address}" if reception.address else "",
         rates_hz={"scans": stream.rotor_hz} if stream.rotor_hz else {},
-        n_packets=counts.n_data,
+        n_packets=stream.n_data,
     )
 
 
 def _find_problems(settings: LidarSettings, stream: Vlp16Stream, reception: Reception) -> list[Finding]:
-    counts, state = stream.counts, stream.clock.state()
+    state, n_data = stream.clock.state(), stream.n_data
     problems = [] if state.severity == "note" else [state]
     buffer_kib = reception.granted_bytes // 2048
-    n_lost_on_way = counts.order.n_lost - reception.n_overflowed
-    if n_lost_on_way > _MAX_LOST_SHARE * max(counts.n_data, 1):
-        share = n_lost_on_way / (counts.n_data + n_lost_on_way)
+    n_lost_on_way = stream.losses.n("packet.lost") - reception.n_overflowed
+    if n_lost_on_way > _MAX_LOST_SHARE * max(n_data, 1):
+        share = n_lost_on_way / (n_data + n_lost_on_way)
         problems.append(Finding("stream.packets_lost", "warning", figures={"share": share}))
     if reception.n_overflowed:
         overflow = {"n": reception.n_overflowed, "buffer_kib": buffer_kib}
@@ -111,7 +111,7 @@ def _find_problems(settings: LidarSettings, stream: Vlp16Stream, reception: Rece
     if 0 < buffer_s < _MIN_BUFFER_S:
         figures = {"buffer_s": buffer_s, "buffer_kib": buffer_kib}
         problems.append(Finding("buffer.small", "warning", figures=figures))
-    problems += [flaw for flaw in counts.flaws() if flaw.figure("n") > _MAX_LOST_SHARE * counts.n_data]
+    problems += [flaw for flaw in stream.flaws() if flaw.figure("n") > _MAX_LOST_SHARE * n_data]
     if stream.rotor_hz and abs(stream.rotor_hz / settings.rate_hz - 1) > _MAX_OFF_RATE:
         rates = {
             "rotor_hz": stream.rotor_hz,
@@ -140,17 +140,18 @@ def explain_silence(
     """Find the likeliest reason; the sensor's web page is asked."""
     port, address = settings.driver.port or velodyne.DATA_PORT, settings.driver.address
     whose = f" from {address}" if address else ""
-    began = "have stopped" if stream.counts.n_data else "come"
-    none = "" if stream.counts.n_data else "no "
+    began = "have stopped" if stream.n_data else "come"
+    none = "" if stream.n_data else "no "
     what = f"{sensor}: {none}data packets{whose} on UDP port {port} {began} (for {silence_s:g} s)"
-    others = stream.counts.other_models.most_common(1)
+    others = stream.other_models.most_common(1)
     if others:
         return SourceError(
             f"{sensor}: the packets on UDP port {port} come from a {others[0][0]}, not a VLP-16",
             "Only the VLP-16 (Puck, Puck LITE) is read: check driver.address.",
         )
-    if stream.counts.n_bad:
-        bad = ", ".join(describe(flaw) for flaw in stream.counts.flaws()[:_MAX_SHOWN])
+    flaws = stream.flaws()
+    if flaws:
+        bad = ", ".join(describe(flaw) for flaw in flaws[:_MAX_SHOWN])
         return SourceError(f"{what}: only {bad}", "Check which program sends to this port.")
     if reception.strangers:
         there = ", ".join(sorted(reception.strangers))
@@ -200,7 +201,6 @@ class Vlp16Source(LiveSource):
         *,
         silence_s: float = SILENCE_S,
         n_slots: int = N_SLOTS,
-        record_to: Path | None = None,
         web_port: int = 80,
     ) -> None:
         """Take the settings; nothing is opened yet.
@@ -210,42 +210,54 @@ class Vlp16Source(LiveSource):
             settings: its block of the profile.
             silence_s: without packets for so long, it is taken to be gone.
             n_slots: scans that wait for a slow taker; the oldest are dropped.
-            record_to: a pcap file for the raw packets; it must not exist.
             web_port: of the sensor's web server, which is asked when no packets come.
         """
         super().__init__(sensor, sensor, n_slots, silence_s)
         self._settings = settings
-        self._record_to = record_to
         self._web_port = web_port
         self._lock = threading.Lock()
         self._reception = Reception()
         self._stream: Vlp16Stream | None = None
-        self._recorder: PcapRecorder | None = None
+        self._recorder: Sink[Datagram] | None = None
         self._ports: tuple[UdpPort, ...] = ()
         self._early: list[Scan] = []
         self._n_lost_before = 0
+
+    def record_packets(self, folder: Path, disk: DiskWriter) -> bool:
+        """Have all packets written to SENSOR.pcap.
+
+        Raises:
+            SourceError: the file exists already, or cannot be made.
+        """
+        path = folder / f"{self.sensor}.pcap"
+        try:
+            writer = PcapWriter(path)
+        except FileExistsError:
+            raise SourceError(f"{path} exists already", "Move it away, or record elsewhere.") from None
+        except OSError as error:
+            raise SourceError(f"{path} cannot be written: {error.strerror}") from None
+        self._recorder = disk.add(path, writer.write, writer.close)
+        return True
 
     def open(self) -> None:
         """Open the ports and wait for the first packet.
 
         Raises:
             SourceError: no packets come, or those of another model; a port is held by another program;
-                velodyne-decoder is not installed; the recording cannot be made.
+                velodyne-decoder is not installed.
         """
         with self._lock:
-            self._n_lost_before += self._stream.counts.order.n_lost if self._stream is not None else 0
+            self._n_lost_before += self._stream.losses.n("packet.lost") if self._stream is not None else 0
             self._stream, self._reception = Vlp16Stream(self.sensor, self._settings), Reception()
         position_port = read_controls(self.sensor, self._settings).position_port
         data = UdpPort(self._settings.driver.port or velodyne.DATA_PORT, f"{self.sensor}: data packets")
         self._ports = (data,)
         self._ports = data, UdpPort(position_port, f"{self.sensor}: position packets")
-        if self._record_to is not None and self._recorder is None:
-            self._recorder = PcapRecorder(self._record_to)
         self._early = []
         until_s = time.monotonic() + self._silence_s
-        while not self._stream.counts.n_data and not self.is_stopping:
+        while not self._stream.n_data and not self.is_stopping:
             self._early = self.read()
-            if not self._stream.counts.n_data and time.monotonic() > until_s:
+            if not self._stream.n_data and time.monotonic() > until_s:
                 raise self.explain_silence(has_sent=False)
 
     def read(self) -> list[Scan]:
@@ -257,7 +269,7 @@ class Vlp16Source(LiveSource):
         assert self._stream is not None  # it is open
         scans, self._early = self._early, []
         ready, _, _ = select.select(self._ports, (), (), _WAIT_S)
-        n_before = self._stream.counts.n_data
+        n_before = self._stream.n_data
         try:
             for port in ready:
                 for datagram in port.receive_many():
@@ -266,20 +278,17 @@ class Vlp16Source(LiveSource):
         except OSError as error:
             what = f"{self.sensor}: the network failed: {error.strerror}"
             raise SourceError(what, "Check the cable.") from None
-        if self._stream.counts.n_data > n_before:
+        if self._stream.n_data > n_before:
             self.note_heard()
             # The kernel has stamped what comes meanwhile: several packets cost hardly more than one.
             time.sleep(_GATHER_S)
         return scans
 
     def close(self) -> None:
-        """Close the ports; what is recorded goes on when they are opened again."""
+        """Close the ports."""
         for port in self._ports:
             port.close()
         self._ports = ()
-        if self._recorder is not None and self.is_stopping:
-            self._recorder.close()
-            self._recorder = None
 
     def explain_silence(self, *, has_sent: bool) -> SourceError:
         """Find the likeliest reason; the sensor's web page is asked."""
@@ -303,12 +312,12 @@ class Vlp16Source(LiveSource):
             self._reception.see_stranger(datagram.source)
             return None
         if self._recorder is not None:
-            self._recorder.put(datagram)
+            self._recorder.put(datagram, len(datagram.payload))
         with self._lock:
             if not is_data:
                 stream.push_position(datagram.payload, datagram.host_ns)
                 return None
             scan = stream.push_data(datagram.payload, datagram.host_ns)
-            if stream.counts.n_data and not self._reception.address:
+            if stream.n_data and not self._reception.address:
                 self._reception.address = datagram.source
             return scan

@@ -1,4 +1,4 @@
-"""The joint estimate as a method of calibration: Algorithm 1 finds the place, the likelihood the optimum."""
+"""The joint estimate as a method of calibration: Algorithm 1 gives the start, the likelihood the optimum."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ from lce_rig.residuals.features import extract_features
 from lce_rig.residuals.placements import group_placements
 from lce_rig.residuals.quadratics import Quadratics
 
-# A profile that states no error of the ranges is taken at its word.
+# A profile that states no range errors is used as it says.
 _EXACT_M = 1e-6
 
 
@@ -33,15 +33,15 @@ def calibrate_by_likelihood(
     options: EstimateSettings,
     progress: Callable[[int, int], None] | None = None,
 ) -> CalibrationEstimate:
-    """Estimate T_cam_lidar from boards whose pairing is settled.
+    """Estimate T_cam_lidar from matched boards.
 
     Outliers, certificate and held-out residuals are those of Algorithm 1, from whose solution the joint
     estimate starts.
 
     Args:
-        observations: one a capture.
+        observations: one per capture.
         board: its specification.
-        options: switches of Algorithm 1, and what is known of the LiDAR's ranges.
+        options: switches of Algorithm 1, and priors of the LiDAR's range errors.
         progress: called with (subsets done, subsets in all).
 
     Raises:
@@ -65,7 +65,7 @@ def calibrate_by_likelihood(
 
 
 def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
-    """Read off the options what is known of constant errors and of noise before any capture is seen."""
+    """Read the priors of constant errors and noise from the options."""
     priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=EDGE_SHIFT_SIGMA_M)
     return priors, Levels(laser_m=options.laser_bias_sigma_m)
 
@@ -80,17 +80,17 @@ def describe(
     options: EstimateSettings,
     figures: Mapping[str, float],
 ) -> CalibrationEstimate:
-    """Report one camera's extrinsic of a joint estimate.
+    """Report one camera's extrinsics of a joint estimate.
 
     Args:
         joint: of one or several cameras.
         camera: its number there.
-        cov: (6, 6) of its extrinsic.
-        start: Algorithm 1's estimate, or one that stands on it: certificate, held-out residuals, refusals.
+        cov: (6, 6) of its extrinsics.
+        start: Algorithm 1's estimate, or one based on it: certificate, held-out residuals, refusals.
         used: the camera's observations, those that the start used.
         board: the board.
         options: switches of the features.
-        figures: diagnostics; those of the start are overwritten.
+        figures: diagnostics, which replace those of the start.
     """
     features = [extract_features(observation, board, options.parts.features) for observation in used]
     return report_estimate(
@@ -109,7 +109,7 @@ def describe(
 def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp]) -> Quadratics:
     """Expand the cost about a joint estimate, in the extrinsics alone, the camera's own first.
 
-    Constant errors are held where they are.
+    Constant errors are held fixed.
 
     Args:
         joint: of F captures.
@@ -119,13 +119,13 @@ def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp])
     n_cameras = len(joint.T_cam_lidar)
     order = [camera, *(c for c in range(n_cameras) if c != camera)]
     mine = np.concatenate([np.arange(6) + PER_CAMERA * c for c in order])
-    # Shares of captures that another camera did not see leave its extrinsic open: 1 m, 1 rad.
+    # Subsets of captures that another camera did not see leave its extrinsics undetermined: 1 m, 1 rad.
     prior = np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6))
     return replace(joint.cost.of(mine), prior=prior, prior_gradient=np.zeros(len(mine)), placement=placement)
 
 
 def figures_of(joint: JointEstimate, camera: int) -> dict[str, float]:
-    """Name the constant errors and noise levels; those of Algorithm 1 that they replace are overwritten."""
+    """Name the constant errors and noise levels; they replace those of Algorithm 1."""
     levels = joint.levels
     shifts = dict(zip(SHIFTS, joint.shifts.tolist(), strict=True))
     return {
@@ -152,7 +152,7 @@ def figures_of(joint: JointEstimate, camera: int) -> dict[str, float]:
 
 
 def _sigmas(joint: JointEstimate, camera: int) -> dict[str, float]:
-    """Part a camera's claim in what differs between sessions and what priors of constant errors let through.
+    """Split a camera's covariance into the part that differs between sessions and that of constant errors.
 
     With information H = sum_k H_k + P, the covariance H^-1 is H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1.
     """

@@ -17,14 +17,14 @@ from lce_rig.extrinsics.options import EstimateSettings
 from lce_rig.extrinsics.shared_scans import scan_key, take_apart
 from lce_rig.residuals.placements import group_shared_placements
 
-# Diagnostics that hold a camera's pose errors beyond corner noise, by the level that they are.
+# Diagnostics of a camera's pose errors beyond corner noise, by their level.
 _POSE_FIGURES = {
     "tilt_rad": "noise_tilt_deg",
     "spin_rad": "noise_spin_deg",
     "depth_m": "noise_depth_m",
     "across_m": "noise_across_m",
 }
-# Those that say what a camera's own estimate did, and nothing of this one.
+# Diagnostics of a camera's own estimate that do not apply to the joint one.
 _OF_ONE = ("algorithm_1_offset_deg", "algorithm_1_offset_m")
 
 
@@ -44,7 +44,7 @@ class TogetherEstimate:
     cov: Array
 
     def covariance_of(self, first: str, second: str) -> Array:
-        """Take the covariance (12, 12) of two cameras' extrinsics out."""
+        """Return the covariance (12, 12) of two cameras' extrinsics."""
         places = [np.arange(6) + 6 * self.cameras.index(name) for name in (first, second)]
         mine = np.concatenate(places)
         return self.cov[mine[:, None], mine]
@@ -55,15 +55,15 @@ def calibrate_together(
 ) -> TogetherEstimate:
     """Estimate the extrinsics of cameras that share scans of one LiDAR in one likelihood.
 
-    What a camera alone says is where the estimate starts, and how large the errors of its pictures are
-    compared with those of the others'. Scans of which the cameras use different places are left out.
+    Each camera's own estimate gives the start, and the size of its images' errors relative to the others'.
+    Scans in which the cameras use different surfaces are rejected.
 
     Args:
         alone: by camera, its estimate by the joint likelihood without the others; boards stood still.
         board: its specification.
-        options: what is known of the LiDAR's ranges.
+        options: with priors of the LiDAR's range errors.
     """
-    # The order of cameras must not matter to the last digit.
+    # The order of cameras must not change the last digit.
     names = tuple(sorted(alone))
     conflicts = _conflicts(alone)
     starts = [_without(alone[name], conflicts) for name in names]
@@ -94,7 +94,7 @@ def calibrate_together(
 
 
 def _without(start: CalibrationEstimate, conflicts: Mapping[str, Refusal]) -> CalibrationEstimate:
-    """Leave captures out, and figures that hold for the camera alone."""
+    """Remove captures, and figures that apply to the camera alone."""
     singles = [take_apart([name]) for name in start.used]
     kept = [k for k, names in enumerate(singles) if not names & conflicts.keys()]
     mine = {name: why for name, why in conflicts.items() if name in set().union(*singles)}
@@ -108,7 +108,7 @@ def _without(start: CalibrationEstimate, conflicts: Mapping[str, Refusal]) -> Ca
 
 
 def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
-    """Find captures in which cameras put the board at different places of the scan."""
+    """Find captures in which cameras use different surfaces of the scan."""
     seen: dict[str, tuple[str, bytes]] = {}
     found = {}
     for camera, estimate in sorted(alone.items()):
@@ -123,7 +123,7 @@ def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
 
 
 def _label_scans(used: Sequence[Sequence[Observation]]) -> list[list[Observation]]:
-    """Give observations of the same scan the same name, whatever captures they lie in."""
+    """Rename observations so that those of the same scan share a name, in any capture."""
     names: dict[bytes, str] = {}
     labelled = []
     for own in used:

@@ -1,12 +1,11 @@
 """Recordings of event cameras: `open_events` finds the reader for a path."""
 
-from importlib import import_module
 from pathlib import Path
-from typing import Any
+from pkgutil import resolve_name
 
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.events.event_recording import EventRecording
-from lce_rig.recordings.ros.bag_file import is_bag_file
+from lce_rig.recordings.ros.bag_file import kind_of
 
 READERS = {
     ".aedat4": "lce_rig.recordings.events.aedat4:Aedat4Events",
@@ -47,17 +46,10 @@ def open_events(
     path = Path(path)
     if not path.exists():
         raise SourceError(f"{path} does not exist")
-    kind = _kind(path)
+    kind = kind_of(path)
     if kind not in READERS:
         hint = f"Give a ROS 2 bag's folder or a file of one of these kinds: {', '.join(READERS)}."
-        raise SourceError(f"{path} is no recording of events this program reads", hint)
-    module, name = READERS[kind].split(":")
-    reader: Any = getattr(import_module(module), name)
-    stream = reader(path, topic) if name == "BagEvents" else reader(path)
+        raise SourceError(f"{path} is not an event recording that lce-rig reads", hint)
+    reader = resolve_name(READERS[kind])
+    stream = reader(path, topic) if reader.__name__ == "BagEvents" else reader(path)
     return EventRecording(path, stream, sensor, resolution)
-
-
-def _kind(path: Path) -> str:
-    if not path.is_dir():
-        return path.suffix.lower()
-    return ".bag" if any(is_bag_file(file) for file in path.iterdir()) else "folder"

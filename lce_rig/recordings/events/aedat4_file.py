@@ -11,10 +11,10 @@ References:
 import re
 import struct
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 from lce_rig.core import limits, unpacking
 from lce_rig.core.errors import SourceError
@@ -28,6 +28,7 @@ _MAX_HEAD_BYTES = 1 << 20
 _MIN_PACKET_BYTES = 8
 _SEARCH_BYTES = 1 << 24
 _SEARCH_STEP_BYTES = 1 << 16
+_Content = TypeVar("_Content")
 _STREAM_NUMBER = re.compile("[0-9]{1,9}")
 
 
@@ -81,7 +82,7 @@ class Aedat4File:
         self.header = read_header(path)
         self.notes: list[str] = []
         if self.header.end is None:
-            self.notes.append(f"{path.name}: was never closed; read as far as it goes")
+            self.notes.append(f"{path.name}: was never closed; read up to its end")
 
     def first_stream(self, kind: str) -> int | None:
         """Name the first stream of a type, "EVTS" or "FRME"; None where there is none. Others are noted."""
@@ -91,31 +92,36 @@ class Aedat4File:
             self.notes.append(f"{self.path.name}: {what} of stream {numbers[0]}, the first of {len(numbers)}")
         return numbers[0] if numbers else None
 
-    def packets(self, stream: int, findings: DamageCounts) -> Iterator[tuple[str, bytes]]:
-        """Yield the packets of a stream as flatbuffers, with their place; damaged ones are skipped."""
+    def packets(
+        self, stream: int, findings: DamageCounts, decode: Callable[[bytes], _Content]
+    ) -> Iterator[_Content]:
+        """Yield the packets of a stream, decoded from their flatbuffers; damaged ones are skipped."""
         with open_recorded(self.path) as file:
             for place in self._places(file, findings):
                 if place.stream != stream:
                     continue
                 file.seek(place.at)
                 try:
-                    yield place.where, _decompress(file.read(place.n_bytes))[4:]
+                    content = decode(_decompress(file.read(place.n_bytes))[4:])
                 except Exception as error:  # Damage shows in any way: lz4, zstd, struct, sizes.
-                    add_broken(findings, place.where, error)
+                    where = f"{place.where}: {str(error) or type(error).__name__}"
+                    findings.add("broken packets skipped", where)
+                    continue
+                yield content
 
     def n_packets(self, stream: int) -> int:
         """Count the packets of a stream; only their heads are read."""
         with open_recorded(self.path) as file:
             return sum(place.stream == stream for place in self._places(file, DamageCounts()))
 
-    def last_packet(self, stream: int) -> bytes | None:
-        """Read the last whole packet of a stream, not those before it; None where there is none."""
+    def last_packet(self, stream: int, decode: Callable[[bytes], _Content]) -> _Content | None:
+        """Decode the last whole packet of a stream, not those before it; None where there is none."""
         with open_recorded(self.path) as file:
             places = [place for place in self._places(file, DamageCounts()) if place.stream == stream]
             for place in reversed(places):
                 file.seek(place.at)
                 try:
-                    return _decompress(file.read(place.n_bytes))[4:]
+                    return decode(_decompress(file.read(place.n_bytes))[4:])
                 except Exception:  # As above; the one before it will do.
                     continue
         return None
@@ -130,9 +136,9 @@ class Aedat4File:
             if size is None:
                 following = self._next_packet(file, position + 1, end)
                 if following is None:
-                    findings.add("torn ends of the file left out", f"{end - position} bytes, {where}")
+                    findings.add("torn ends of the file skipped", f"{end - position} bytes, {where}")
                     return
-                findings.add("broken packets left out", f"{where}: its head is damaged")
+                findings.add("broken packets skipped", f"{where}: its head is damaged")
                 position, n_packets = following, n_packets + 1
                 continue
             yield PacketPlace(number, position + 8, size, where)
@@ -169,7 +175,9 @@ def read_header(path: Path) -> Aedat4Header:
     """
     with open_recorded(path) as file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise SourceError(f"{path} is no AEDAT4 file", "Convert older files (AEDAT 2, 3) with DV first.")
+            raise SourceError(
+                f"{path} is not an AEDAT4 file", "Convert older files (AEDAT 2, 3) with DV first."
+            )
         try:
             return _parse_header(file)
         except (struct.error, ValueError, ElementTree.ParseError) as error:
@@ -195,11 +203,6 @@ def vector_at(table: bytes, index: int) -> tuple[int, int]:
     at += struct.unpack_from("<I", table, at)[0]
     (length,) = struct.unpack_from("<I", table, at)
     return at + 4, int(length)
-
-
-def add_broken(findings: DamageCounts, where: str, error: Exception) -> None:
-    """Count a packet that cannot be decoded."""
-    findings.add("broken packets left out", f"{where}: {str(error) or type(error).__name__}")
 
 
 def _parse_header(file: BinaryIO) -> Aedat4Header:

@@ -37,7 +37,7 @@ class CameraEvents:
             return self.recording.notes
         tied = (
             f"{self.recording.path.name}: {self.recording.sensor}'s events count from the sensor's start; "
-            f"{self.shift_ns * 1e-9:.6f} s added, by when their packets arrived"
+            f"{self.shift_ns * 1e-9:.6f} s added, from the arrival of their packets"
         )
         return [*self.recording.notes, tied]
 

@@ -1,6 +1,7 @@
 """A recording of events: checked, sorted by time, with a count of faults."""
 
 from collections.abc import Generator, Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -8,17 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits
-from lce_rig.core.data import Events
+from lce_rig.core.data import EventColumns, Events, join_events
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.events.stream import (
     NO_EVENTS,
     NS_PER_US,
     DamageCounts,
-    EventColumns,
     EventStream,
     KnowsItsLength,
     NoEventsError,
-    join,
     seconds_in,
 )
 
@@ -67,7 +66,7 @@ def _on_any_clock(stretch: EventColumns, findings: DamageCounts) -> EventColumns
     if not len(t_ns) or (t_ns.min() > -limit and t_ns.max() < limit):
         return stretch
     is_sound = (t_ns > -limit) & (t_ns < limit)
-    findings.add("events with stamps beyond any clock left out", n=int(np.count_nonzero(~is_sound)))
+    findings.add("events with timestamps beyond any clock skipped", n=int(np.count_nonzero(~is_sound)))
     return stretch.select(is_sound)
 
 
@@ -94,7 +93,7 @@ class _Sorter:
             yield self.held
             self._delivered_ns, together = int(self.held.t_ns[-1]), current
         else:
-            together = join([self.held, current])
+            together = join_events([self.held, current])
         if _never_falls(together.t_ns):
             self.held = together
             return
@@ -116,16 +115,16 @@ class _Sorter:
         """Drop what came before the clock was set, if that is next to nothing; else yield it and give up."""
         before_ns, after_ns = int(together.t_ns[:reset].max()), int(together.t_ns[reset])
         back_s = (before_ns - after_ns) * 1e-9
-        where = f"{seconds_in(before_ns, self._first_ns)} the stamps run back by {back_s:.3f} s"
+        where = f"{seconds_in(before_ns, self._first_ns)} the timestamps decrease by {back_s:.3f} s"
         if self._delivered_ns is None and before_ns - self._first_ns < _MAX_LEAD_NS:
-            self._findings.add("events before the clock was set left out", where, reset)
+            self._findings.add("events before the clock was set skipped", where, reset)
             self._first_ns = after_ns
             return together.select(slice(reset, None))
         sound = self._tidied(together.select(slice(0, reset)))
         if len(sound):
             yield sound
         raise SourceError(
-            f"{self._path}: {where}, and stay there",
+            f"{self._path}: {where} and do not recover",
             "The clock was set, or two recordings were joined: split the recording there.",
         )
 
@@ -135,15 +134,15 @@ class _Sorter:
         n_stray = int(np.count_nonzero(stray))
         if n_stray:
             where = seconds_in(int(events.t_ns[max(int(np.argmax(stray)) - 1, 0)]), self._first_ns)
-            self._findings.add("events with stray stamps left out", where, n_stray)
+            self._findings.add("events with stray timestamps skipped", where, n_stray)
             events = events.select(~stray)
         if self._delivered_ns is not None:
             is_late = events.t_ns < self._delivered_ns
-            self._findings.add("events that came too late left out", n=int(np.count_nonzero(is_late)))
+            self._findings.add("events that came too late skipped", n=int(np.count_nonzero(is_late)))
             events = events.select(~is_late)
         n_back = int(np.count_nonzero(np.diff(events.t_ns) < 0))
         if n_back:
-            self._findings.add("places where stamps run back by up to 20 ms, sorted", n=n_back)
+            self._findings.add("places where timestamps decrease by up to 20 ms, sorted", n=n_back)
             events = events.select(np.argsort(events.t_ns, kind="stable"))
         return events
 
@@ -195,8 +194,8 @@ def _stray(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Find the timestamps that do not fit the others, (N,)."""
     late = np.maximum.accumulate(t_ns) - t_ns > REORDER_NS
     early = t_ns - np.minimum.accumulate(t_ns[::-1])[::-1] > REORDER_NS
-    # A timestamp too far ahead makes all that follow look late, and the other way round: the fewer are
-    # astray.
+    # A timestamp too far ahead makes all that follow look late, and the other way round: the the fewer are
+    # stray.
     return min(late, early, key=np.count_nonzero)
 
 
@@ -219,8 +218,7 @@ class EventRecording:
     """Events of one camera from one file or topic.
 
     Iterating yields stretches of `Events` from the beginning, in the order of time, and holds only a few of
-    them in memory; it may be done again and again. `read` cuts out windows; windows that go forward in time
-    are read in one pass through the file.
+    them in memory; it may be done again and again. `read` cuts out a window.
 
     Attributes:
         path: the file or folder.
@@ -249,7 +247,6 @@ class EventRecording:
         self._findings = DamageCounts()
         self._assumed: list[str] = []
         self._span_ns: tuple[int, int] | None = None
-        self._window = _TimeWindow(self)
         if not any(len(stretch) for stretch in self._stretches(self._findings)):
             said = "; ".join(self._findings.lines())
             raise NoEventsError(f"{path} holds no events" + (f": {said}" if said else ""))
@@ -281,7 +278,7 @@ class EventRecording:
 
     def _unordered(self) -> SourceError:
         said = "; ".join(self._findings.lines())
-        what = f"{self.path} holds no events that could be put in order"
+        what = f"{self.path} holds no events that can be sorted by time"
         return SourceError(what + (f": {said}" if said else ""))
 
     def extent_ns(self) -> tuple[int, int]:
@@ -336,7 +333,14 @@ class EventRecording:
         Raises:
             SourceError: as iterating does.
         """
-        return self._window.read(start_ns, end_ns)
+        parts = [self.to_events(NO_EVENTS)]
+        for stretch in self:
+            if stretch.t_ns[-1] >= start_ns:
+                parts.append(stretch.between(start_ns, end_ns))
+            if stretch.t_ns[-1] >= end_ns:
+                break
+        # Arrival is known of a stretch's first event, not of a window's.
+        return replace(join_events(parts), host_ns=None)
 
     def _stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         """Read the stream; a disk that fails is an error the user can repair."""
@@ -363,7 +367,7 @@ class EventRecording:
             raise SourceError(
                 f"{self.path}: its events are of a sensor of {_size(file_px)} pixels, "
                 f"camera {self.sensor!r} has {_size(profile_px)}",
-                "Is it another camera's recording? Else correct resolution_px in the profile.",
+                "Give this camera's recording, or correct resolution_px in the profile.",
             )
         if file_px and file_px[0] * file_px[1] > limits.MAX_EVENT_PIXELS:
             raise SourceError(
@@ -382,7 +386,7 @@ class EventRecording:
                 f"{self.path} declares no resolution; its events reach column {width - 1}, row {height - 1}",
                 "No event camera has so many pixels: the file is damaged.",
             )
-        self._assumed.append(f"declares no resolution; {width}x{height}, the extent of its events, is taken")
+        self._assumed.append(f"declares no resolution; {width}x{height}, the extent of its events, is used")
         return width, height
 
     def _on_sensor(self, stretch: EventColumns, findings: DamageCounts) -> EventColumns:
@@ -396,38 +400,10 @@ class EventRecording:
             raise SourceError(
                 f"{self.path}: {n_off} of {len(stretch)} events lie off the sensor, up to column {right}, "
                 f"row {bottom}; camera {self.sensor!r} has {_size(self.resolution_px)} pixels",
-                "Is it another camera's recording? Else correct resolution_px in the profile.",
+                "Give this camera's recording, or correct resolution_px in the profile.",
             )
-        findings.add("events off the sensor left out", f"column {right}, row {bottom}", n_off)
+        findings.add("events off the sensor skipped", f"column {right}, row {bottom}", n_off)
         return stretch.select(is_on)
-
-
-class _TimeWindow:
-    """The ranges of the last window, and the pass through the recording that continues there."""
-
-    def __init__(self, recording: EventRecording) -> None:
-        self._recording = recording
-        self._rest: Iterator[Events] = iter(())
-        self._kept: list[Events] = []
-        self._from_ns: int | None = None
-
-    def read(self, start_ns: int, end_ns: int) -> Events:
-        if self._from_ns is None or start_ns < self._from_ns:
-            self._rest, self._kept = iter(self._recording), []
-        self._from_ns = start_ns
-        self._kept = [stretch for stretch in self._kept if stretch.t_ns[-1] >= start_ns]
-        while not self._kept or self._kept[-1].t_ns[-1] < end_ns:
-            stretch = next(self._rest, None)
-            if stretch is None:
-                break
-            if stretch.t_ns[-1] >= start_ns:
-                self._kept.append(stretch)
-        return self._join([stretch.between(start_ns, end_ns) for stretch in self._kept])
-
-    def _join(self, parts: list[Events]) -> Events:
-        # Arrival is known of a stretch's first event, not of a window's.
-        columns = [EventColumns(p.t_ns, p.x, p.y, p.polarity) for p in parts if len(p)]
-        return self._recording.to_events(join(columns or [NO_EVENTS]))
 
 
 def _size(resolution_px: tuple[int, int]) -> str:

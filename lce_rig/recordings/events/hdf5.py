@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits, unpacking
+from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import DamageCounts, EventColumns, open_recorded, to_ns
+from lce_rig.recordings.events.stream import DamageCounts, open_recorded, to_ns
 
 _BLOCK_EVENTS = 1 << 20
 _COLUMNS = ("t", "x", "y", "p")
@@ -36,7 +37,7 @@ class Hdf5Events:
         """Find the columns.
 
         Raises:
-            SourceError: h5py is missing, or the file is none of this layout, or asks for more than it holds.
+            SourceError: h5py is missing, or the file has another layout, or asks for more than it holds.
         """
         self._path = path
         self.notes: list[str] = []
@@ -59,7 +60,7 @@ class Hdf5Events:
         self._n_events = min(lengths.values())
         if self._n_events < max(lengths.values()):
             said = ", ".join(f"{name} {length}" for name, length in lengths.items())
-            self.notes.append(f"{self._path.name}: columns of unequal length ({said}); the shortest is taken")
+            self.notes.append(f"{self._path.name}: columns of unequal length ({said}); the shortest is used")
         n_stored = min(sum(column.id.get_storage_size() for column in columns.values()), _n_bytes(self._path))
         n_bytes = self._n_events * sum(column.dtype.itemsize for column in columns.values())
         if n_bytes > unpacking.unpacked_limit(n_stored):
@@ -86,7 +87,7 @@ class Hdf5Events:
                 except _DAMAGE as error:
                     if begin:
                         lost = f"event {begin}: {error}"
-                        findings.add("torn ends of the file left out", lost)
+                        findings.add("torn ends of the file skipped", lost)
                         return
                     raise _unreadable(self._path, file, error) from None
 
@@ -98,7 +99,7 @@ class Hdf5Events:
                 raise ValueError("events/t holds fractions, not whole microseconds")
         is_pixel = _is_pixel(x) & _is_pixel(y)
         if not np.all(is_pixel):
-            findings.add("events beyond any sensor left out", n=int(np.count_nonzero(~is_pixel)))
+            findings.add("events beyond any sensor skipped", n=int(np.count_nonzero(~is_pixel)))
             t_us, x, y, polarity = (column[is_pixel] for column in (t_us, x, y, polarity))
         t_ns = to_ns(t_us, self._offset_us)
         return EventColumns(t_ns, x.astype(np.uint16), y.astype(np.uint16), polarity > 0)
@@ -141,7 +142,7 @@ class _Hdf5Column:
         return self._latest[1]
 
     def _unpacked(self, start: int) -> NDArray[Any]:
-        """Unpack a chunk; deflate carries a checksum of its own, so that HDF5's is passed over."""
+        """Unpack a chunk; deflate carries a checksum of its own, so that HDF5's is not checked."""
         dtype, (length,) = self._dataset.dtype, self._dataset.chunks
         skipped, packed = self._dataset.id.read_direct_chunk((start,))
         data = unpacking.decompress(_Inflater(), packed, dtype.itemsize * length + _CHECKSUM_BYTES)
@@ -204,7 +205,7 @@ def _child(group: Any, name: str) -> Any:
     import h5py
 
     if not isinstance(group, h5py.Group):
-        raise ValueError(f"{group.name[1:]} is no group")
+        raise ValueError(f"{group.name[1:]} is not a group")
     link = group.get(name, getlink=True)
     if link is None:
         return None
@@ -241,7 +242,7 @@ def _check_dataset(dataset: Any) -> None:
 
     name = dataset.name[1:]
     if not isinstance(dataset, h5py.Dataset):
-        raise ValueError(f"{name} is no dataset")
+        raise ValueError(f"{name} is not a dataset")
     if dataset.is_virtual or dataset.id.get_create_plist().get_external_count():
         raise ValueError(f"{name} lies in other files, which are not followed: copy it in here")
     if dataset.dtype.kind not in "biuf" or dataset.shape is None:
@@ -297,7 +298,7 @@ def _integer(holder: Any, name: str) -> int | None:
         value = dataset[()] if dataset.size == 1 else None
     number = None if value is None else float(np.asarray(value).ravel()[0])
     if number is None or not abs(number) < limits.MAX_TIME_NS // 1000:
-        raise ValueError(f"{name} is no number")
+        raise ValueError(f"{name} is not a number")
     return int(np.asarray(value).ravel()[0])
 
 

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits
+from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.events.counter import WrappingCounter
-from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, EventColumns, open_recorded, parse_size
+from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, open_recorded, parse_size
 from lce_rig.recordings.events.word_codec import EVT3, WordDecoder
 
 # Prophesee's EVT2 (32-bit words) and EVT2.1 (64-bit words, 32 pixels of a row each).
@@ -38,7 +39,7 @@ class Evt2Decoder:
     Attributes:
         has_vectors: EVT2.1, whose events carry 32 pixels each.
         n_untimed: words with events met before any timestamp, skipped.
-        n_unknown: words of no known code, passed over.
+        n_unknown: words of no known code, skipped.
     """
 
     has_vectors: bool
@@ -129,7 +130,7 @@ class PropheseeEvents:
         if self.resolution_px is None and (any(said) or "geometry" in header):
             size = header.get("geometry") or "x".join(said)
             self.notes.append(
-                f"{path.name}: its header's size {limits.describe(size)} is not a sensor's; ignored"
+                f"{path.name}: its header's size {limits.describe(size)} is not a sensor's and is ignored"
             )
 
     def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
@@ -143,14 +144,14 @@ class PropheseeEvents:
                 words: NDArray[Any] = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
                 yield decoder.decode(_swapped(words) if self._is_swapped else words)
                 if n_torn:
-                    findings.add("bytes of a torn last word left out", n=n_torn)
-        findings.add("events before the first stamp left out", n=decoder.n_untimed)
-        findings.add("time words that did not fit repaired", n=decoder.n_repaired)
-        findings.add(f"words of no EVT{self._version} code passed over", n=decoder.n_unknown)
+                    findings.add("bytes of a torn last word skipped", n=n_torn)
+        findings.add("events before the first timestamp skipped", n=decoder.n_untimed)
+        findings.add("inconsistent time words repaired", n=decoder.n_repaired)
+        findings.add(f"words of no EVT{self._version} code skipped", n=decoder.n_unknown)
 
 
 def _read_header(path: Path, file: BinaryIO) -> dict[str, str]:
-    """Read "% key value" lines, up to the first that is none or says "% end".
+    """Read "% key value" lines, up to the first other line, or one that says "% end".
 
     Raises:
         SourceError: there is no end to them.
@@ -196,7 +197,9 @@ def _version(path: Path, header: dict[str, str]) -> str:
     version = named.replace(".0", "").replace(".", "").strip()
     if version not in _WORDS:
         said = f"encoding {limits.describe(named)}" if named else "no encoding in its header"
-        raise SourceError(f"{path} has {said}, not EVT2, EVT2.1 or EVT3", "Is it a Prophesee .raw file?")
+        raise SourceError(
+            f"{path} has {said}, not EVT2, EVT2.1 or EVT3", "Check that it is a Prophesee .raw file."
+        )
     return version
 
 

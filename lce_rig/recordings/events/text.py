@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits, unpacking
+from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import DamageCounts, EventColumns, open_recorded, parse_size, to_ns
+from lce_rig.recordings.events.stream import DamageCounts, open_recorded, parse_size, to_ns
 
 _BLOCK_BYTES = 1 << 18
 _N_COLUMNS = 4
@@ -48,7 +49,7 @@ class TextEvents:
         is_comment = bool(first) and first[0].startswith(b"#")
         if not self._has_size and not is_comment and not len(_parse_lines([line])[0]):
             raise SourceError(
-                f"{path} is no text of events: its first line is neither a size nor an event",
+                f"{path} is not a text file of events: the first line is neither a size nor an event",
                 'Expected "width height", then lines "t x y polarity" with t in seconds.',
             )
         self.resolution_px = parse_size(first[0].decode(), first[1].decode()) if self._has_size else None
@@ -64,14 +65,14 @@ class TextEvents:
                 try:
                     block, is_whole = _read_lines(file)
                 except _ZIP_DAMAGE as error:
-                    findings.add("torn ends of the file left out", f"line {n_lines}: {error}")
+                    findings.add("torn ends of the file skipped", f"line {n_lines}: {error}")
                     return
                 if not block and is_whole:
                     return
                 yield _to_columns(_parse_block(block, n_lines, findings))
                 n_lines += block.count(b"\n")
             said = f"line {n_lines}: it is longer than {limits.MAX_LINE_BYTES} bytes"
-            findings.add("torn ends of the file left out", said)
+            findings.add("torn ends of the file skipped", said)
 
 
 def _read_lines(file: IO[bytes]) -> tuple[bytes, bool]:
@@ -95,7 +96,7 @@ def _open(path: Path) -> Iterator[IO[bytes]]:
             archive = unpacking.open_archive(file)
             texts = [m for m in archive.infolist() if m.filename.lower().endswith((".txt", ".csv"))]
             if len(texts) != 1:
-                raise SourceError(f"{path} holds {len(texts)} texts, not one of events")
+                raise SourceError(f"{path} holds {len(texts)} text files, expected 1")
             n_stored = min(texts[0].compress_size, path.stat().st_size)
             member = unpacking.open_member(archive, texts[0], unpacking.unpacked_limit(n_stored))
         except _ZIP_DAMAGE as error:
@@ -115,7 +116,7 @@ def _parse_block(block: bytes, first_line: int, findings: DamageCounts) -> NDArr
         line = lines[i]
         if line.strip() and not line.lstrip().startswith(b"#"):
             where = f"line {first_line + i}: {line[:60].decode(errors='replace')!r}"
-            findings.add("broken lines left out", where)
+            findings.add("broken lines skipped", where)
     return table
 
 

@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.data import EventColumns
 from lce_rig.recordings.events.counter import WrappingCounter
-from lce_rig.recordings.events.stream import NS_PER_US, EventColumns
+from lce_rig.recordings.events.stream import NS_PER_US
 
 # Time-high words count 4.096 ms each, wrap every 16.8 s, and may step back a little without having wrapped.
 _HIGH_BITS = 12
@@ -33,7 +34,7 @@ class WordLayout:
         single: one event at the other coordinate.
         base: first coordinate and polarity of the vectors that follow.
         vectors: number of bits by code of vector.
-        known: other codes that may occur and are passed over.
+        known: other codes that may occur and are skipped.
         is_line_x: the shared coordinate is the column.
     """
 
@@ -58,7 +59,7 @@ class WordDecoder:
     Attributes:
         layout: what the codes mean.
         n_untimed: events met before any timestamp, skipped.
-        n_unknown: words of no known code, passed over.
+        n_unknown: words of no known code, skipped.
     """
 
     layout: WordLayout

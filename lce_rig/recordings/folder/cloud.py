@@ -55,8 +55,8 @@ def _assign(rho: Array, z: Array) -> NDArray[np.int16]:
         lines = np.concatenate([lines, np.stack([peaks, np.zeros_like(peaks)], axis=1)])
         if not len(lines):
             raise SourceError(
-                f"no rings in the cloud: its {len(rho)} points are too few or too scattered to tell",
-                "give the cloud with its ring field, or as the LiDAR's driver publishes it",
+                f"no rings in the point cloud: its {len(rho)} points are too few or too scattered",
+                "Give the point cloud with its ring field, or as the LiDAR's driver publishes it",
             )
         lines = _refine_lines(rho, z, lines[np.argsort(lines[:, 0])])
         ring, miss = _nearest_line(rho, z, lines)
@@ -66,9 +66,9 @@ def _assign(rho: Array, z: Array) -> NDArray[np.int16]:
     seen, ring_of_seen = np.unique(ring, return_inverse=True)
     if len(seen) > MAX_RINGS or np.mean(is_left) > 0.1:
         raise SourceError(
-            f"no rings in the cloud: {100 * np.mean(is_left):.0f} % of its points lie on none of the "
+            f"no rings in the point cloud: {100 * np.mean(is_left):.0f} % of its points lie on none of the "
             f"{len(seen)} elevations found",
-            "give the cloud with its ring field, or in the frame of the LiDAR as its driver publishes it",
+            "Give the point cloud with its ring field, or in the LiDAR's frame as its driver publishes it",
         )
     return ring_of_seen.astype(np.int16)
 
@@ -131,7 +131,7 @@ TIME_FIELDS = ("time", "t", "timestamp", "offset", "offset_time", "time_offset",
 MIN_RANGE_M = 1e-3
 # Half of a room's or a street's returns come from well within a LiDAR's reach, unless metres are millimetres.
 _FARTHEST_MEDIAN = 3.0
-# A scan lasts 0.02 to 1.5 s whatever the spinning LiDAR; the same figure in another unit is far outside.
+# A scan lasts 0.02 to 1.5 s for any spinning LiDAR; the same figure in another unit is far outside.
 SWEEP_S = (0.02, 1.5)
 _LATEST = 1e19
 _MOST_RINGS = 1024
@@ -184,7 +184,7 @@ def to_scan(
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:
         have = ", ".join(_shown(cloud.dtype, name) for name in cloud.dtype.names or ()) or "none"
-        raise SourceError(f"{where}: the cloud has no field {missing[0]!r}; its fields are {have}")
+        raise SourceError(f"{where}: the point cloud has no field {missing[0]!r}; its fields are {have}")
     points = np.stack([cloud[fields[axis]].astype(np.float32) for axis in "xyz"], axis=1)
     is_finite = np.isfinite(points).all(axis=1)
     range_m, flat_m = np.zeros(len(points)), np.zeros(len(points))
@@ -193,7 +193,7 @@ def to_scan(
     # No laser of a spinning LiDAR looks along its axis: such a point has no ring.
     keep = np.flatnonzero(flat_m > MIN_RANGE_M)
     if len(keep) == 0:
-        raise SourceError(f"{where}: the cloud has no valid point ({len(points)} in all)")
+        raise SourceError(f"{where}: the point cloud has no valid point ({len(points)} in all)")
     _check_unit(float(np.median(range_m[keep])), settings, where)
     points, cloud, notes = points[keep], cloud[keep], list[str]()
     ring = _ring(cloud, fields, points, where, notes)
@@ -208,14 +208,14 @@ def _is_scalar(field: np.dtype[Any]) -> bool:
 
 
 def _shown(kind: np.dtype[Any], name: str) -> str:
-    return name if _is_scalar(kind[name]) else f"{name} (not one number a point)"
+    return name if _is_scalar(kind[name]) else f"{name} (not one number per point)"
 
 
 def _check_unit(median_m: float, settings: LidarSettings, where: str) -> None:
     if median_m > _FARTHEST_MEDIAN * settings.max_range_m:
         raise SourceError(
-            f"{where}: half of the points lie {round(median_m):.9g} m away or farther, the LiDAR reaches "
-            f"{settings.max_range_m:g} m: are the points in millimetres? Metres are needed"
+            f"{where}: median range {round(median_m):.9g} m, the LiDAR reaches "
+            f"{settings.max_range_m:g} m: points in millimetres must be converted to metres"
         )
 
 
@@ -245,7 +245,7 @@ def _ring(
             ring = rings_from_elevation(points)
         except SourceError as error:
             raise SourceError(f"{where}: {error.what}", error.hint) from None
-        notes.append("no ring field: rings told from elevations")
+        notes.append("no ring field: rings inferred from elevation angles")
         return ring
     elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0].astype(np.float64), points[:, 1]))
     mean = np.bincount(ring_of_point, elevation) / np.bincount(ring_of_point)
@@ -281,9 +281,7 @@ def _times(
     ticks = None if name is None else _ticks(cloud[name])
     unit = None if ticks is None else _unit(ticks)
     if ticks is None or unit is None:
-        notes.append(
-            "no time of each point" if name is None else f"field {name!r} carries no time of each point"
-        )
+        notes.append("no times of points" if name is None else f"field {name!r} has no times of points")
         sweep_ns = round(1e9 / settings.rate_hz) if is_last else 0
         return None, None if stamp_ns is None else stamp_ns - sweep_ns
     first = ticks.min()

@@ -1,4 +1,4 @@
-"""Point point clouds from files."""
+"""Point clouds from files."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.limits import MAX_FIELDS, MAX_FILE_BYTES, check_points, check_size, describe, read_file
 from lce_rig.core.pcd import decode_pcd
 from lce_rig.core.text_table import read_table
@@ -56,9 +56,7 @@ def decode_ply(data: bytes) -> NDArray[Any]:
     n_rows_before, start = 0, first
     for element in elements[: names.index("vertex") + 1]:
         if element.has_list:
-            raise ValueError(
-                f"its element {describe(element.name)} has a list, which this program does not read"
-            )
+            raise ValueError(f"its element {describe(element.name)} has a list, which is not supported")
         dtype = _dtype(element, _ORDERS[encoding])
         if element.name != "vertex":
             n_rows_before += element.count
@@ -82,7 +80,7 @@ def _dtype(element: _Element, order: str) -> np.dtype[Any]:
     try:
         return np.dtype([(name, order + kind) for name, kind in element.columns])
     except ValueError as error:
-        raise ValueError(f"its properties cannot be told apart: {error}") from None
+        raise ValueError(f"its properties are ambiguous: {error}") from None
 
 
 def _split_header(data: bytes) -> tuple[str, list[_Element], int]:
@@ -115,7 +113,7 @@ def _is_count(word: str) -> bool:
 
 def _parse_property(words: list[str]) -> tuple[str, str]:
     if len(words) != 3 or words[1] not in _KINDS:
-        raise ValueError(f"its header line {describe(' '.join(words))} cannot be understood")
+        raise ValueError(f"its header line {describe(' '.join(words))} is not understood")
     return words[2], _KINDS[words[1]]
 
 
@@ -131,9 +129,5 @@ def read_cloud(path: Path) -> NDArray[Any]:
     Raises:
         SourceError: the file is missing, empty, truncated or damaged.
     """
-    try:
+    with reading(path, SourceError):
         return DECODERS[path.suffix.lower()](read_file(path))
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise SourceError(f"{path}: {error}") from None

@@ -84,7 +84,7 @@ def pair_names(
     if method == "time":
         if times[0] is None or times[1] is None:
             raise SourceError(
-                "file names are no times, so that pairs cannot be found by time", "Try --pair order."
+                "file names are not times: pairs cannot be matched by time", "Try --pair order."
             )
         return _require_pairs(_by_time(times[0], times[1], tolerance_s))
     return _choose(images, clouds, times, tolerance_s)
@@ -108,8 +108,8 @@ def _choose(
     if best.pairs:
         return best
     raise SourceError(
-        f"{len(images)} pictures and {len(clouds)} clouds cannot be paired: names and numbers differ",
-        "Name each pair alike, or remove what has no partner.",
+        f"{len(images)} images and {len(clouds)} point clouds cannot be paired: names and numbers differ",
+        "Give both files of a pair the same name, or remove files without a partner.",
     )
 
 
@@ -122,8 +122,8 @@ def _by_stem(images: Sequence[str], clouds: Sequence[str]) -> Pairing:
 def _by_order(images: Sequence[str], clouds: Sequence[str]) -> Pairing:
     if len(images) != len(clouds):
         raise SourceError(
-            f"sorted order needs as many pictures as clouds: there are {len(images)} and {len(clouds)}",
-            "Remove what has no partner, or pair by name or time.",
+            f"sorted order needs as many images as point clouds: {len(images)} and {len(clouds)} found",
+            "Remove files without a partner, or pair by name or time.",
         )
     n = len(images)
     times = parse_times(images), parse_times(clouds)
@@ -146,7 +146,7 @@ def _by_time(image_ns: NDArray[np.int64], cloud_ns: NDArray[np.int64], tolerance
 
 def _nearest(times_ns: NDArray[np.int64], others_ns: NDArray[np.int64]) -> NDArray[np.intp]:
     """Find the place of the nearest of `others_ns` to each time; of equally near ones the first."""
-    # Equal timestamps are found at their first place, whatever the order they came in.
+    # Equal timestamps are found at their first place, in any order.
     sorted_ns, place = np.unique(others_ns, return_index=True)
     above = np.clip(np.searchsorted(sorted_ns, times_ns), 0, len(sorted_ns) - 1)
     below = np.maximum(above - 1, 0)
@@ -166,13 +166,13 @@ def _pairing(
     lone_clouds = tuple(sorted(set(range(n_clouds)) - {j for _, j in pairs}))
     text = f"{len(pairs)} pairs, {reason}"
     if lone_images or lone_clouds:
-        text += f"; {len(lone_images)} pictures and {len(lone_clouds)} clouds have no partner"
+        text += f"; {len(lone_images)} images and {len(lone_clouds)} point clouds have no partner"
     return Pairing(method, tuple(pairs), lone_images, lone_clouds, text)
 
 
 def _require_pairs(pairing: Pairing) -> Pairing:
     if not pairing.pairs:
         raise SourceError(
-            f"no picture matches a cloud by {pairing.method}", "Try --pair order, or --pair time."
+            f"no image matches a point cloud by {pairing.method}", "Try --pair order, or --pair time."
         )
     return pairing

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lce_rig.core.data import Image
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.limits import read_file
 from lce_rig.recordings.folder.cloud import to_scan
 from lce_rig.recordings.folder.cloud_file import DECODERS, read_cloud
@@ -34,25 +34,7 @@ CLOUD_FOLDERS = (
 )
 
 
-def list_pictures(folder: Path, notes: list[str]) -> list[Path]:
-    """List the images of one camera, in natural order; what was chosen between is noted.
-
-    Raises:
-        SourceError: there are none, or several folders have some and no name tells which is meant.
-    """
-    return _list(folder, IMAGE_FOLDERS, SUFFIXES, "pictures", notes)
-
-
-def list_clouds(folder: Path, notes: list[str]) -> list[Path]:
-    """List the point clouds, in natural order; what was chosen between is noted.
-
-    Raises:
-        SourceError: as `list_pictures`.
-    """
-    return _list(folder, CLOUD_FOLDERS, frozenset(DECODERS), "clouds", notes)
-
-
-def list_pictures_by_camera(folder: Path, cameras: Collection[str]) -> dict[str, list[Path]]:
+def _images_by_camera(folder: Path, cameras: Collection[str]) -> dict[str, list[Path]]:
     """List the images in folders named after cameras: img/left/ and img/right/, or left/ and right/.
 
     Returns:
@@ -72,7 +54,11 @@ def list_pictures_by_camera(folder: Path, cameras: Collection[str]) -> dict[str,
 def _list(
     folder: Path, names: Sequence[str], suffixes: frozenset[str], what: str, notes: list[str]
 ) -> list[Path]:
-    """List the files of one kind in the folder whose name says so, else in the only one that has any."""
+    """List the files of one kind in the folder whose name says so, else in the only one that has any.
+
+    Raises:
+        SourceError: there are none, or several folders have some and no name says which is meant.
+    """
     folders = _folders(folder)
     holding = {name: files for name, path in folders.items() if (files := _files(path, suffixes))}
     named = [name for name in names if name in holding]
@@ -86,9 +72,9 @@ def _list(
         return next(iter(holding.values()))
     hint = f"Put them into {names[0]}/ below it; {', '.join(sorted(suffixes))} are read."
     if holding:
-        raise SourceError(f"{folder}: {what} lie in {', '.join(sorted(holding))}: which?", hint)
+        raise SourceError(f"{folder}: {what} lie in several folders: {', '.join(sorted(holding))}", hint)
     empty = next((name for name in names if name in folders), None)
-    raise SourceError(f"{folder}{'/' + empty if empty else ''}: no {what} there", hint)
+    raise SourceError(f"{folder}{'/' + empty if empty else ''}: no {what} found", hint)
 
 
 def _folders(folder: Path) -> dict[str, Path]:
@@ -102,7 +88,7 @@ def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
 
 
 @dataclass(frozen=True)
-class PictureOnDisk:
+class ImageOnDisk:
     """An image that has not been read yet; the timestamp comes from its name.
 
     Attributes:
@@ -128,7 +114,7 @@ class PictureOnDisk:
 class PairOnDisk:
     """Images and a point cloud that have not been read yet; the timestamp comes from the file name."""
 
-    pictures: tuple[PictureOnDisk, ...]
+    images: tuple[ImageOnDisk, ...]
     cloud_path: Path
     lidar: str
     settings: LidarSettings
@@ -137,7 +123,7 @@ class PairOnDisk:
     @property
     def label(self) -> str:
         """The files' names, for messages."""
-        return " + ".join([*(picture.label for picture in self.pictures), self.cloud_path.name])
+        return " + ".join([*(image.label for image in self.images), self.cloud_path.name])
 
     def key(self) -> str:
         """Fingerprint the bytes of all files and the sensors they are read for.
@@ -145,15 +131,11 @@ class PairOnDisk:
         Raises:
             SourceError: a file cannot be read.
         """
-        sensors = [f"{picture.camera} {picture.channel}" for picture in self.pictures]
+        sensors = [f"{image.camera} {image.channel}" for image in self.images]
         digest = hashlib.sha256(" ".join([*sensors, self.lidar]).encode())
-        for path in (*(picture.path for picture in self.pictures), self.cloud_path):
-            try:
+        for path in (*(image.path for image in self.images), self.cloud_path):
+            with reading(path, SourceError):
                 digest.update(hashlib.sha256(read_file(path)).digest())
-            except OSError as error:
-                raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-            except ValueError as error:
-                raise SourceError(f"{path}: {error}") from None
         return digest.hexdigest()
 
     def read(self) -> RecordedPair:
@@ -162,13 +144,13 @@ class PairOnDisk:
         Raises:
             SourceError: one is missing, empty, truncated or damaged.
         """
-        images = tuple(picture.read() for picture in self.pictures)
+        images = tuple(image.read() for image in self.images)
         cloud = read_cloud(self.cloud_path)
         reading = to_scan(cloud, self.lidar, self.settings, str(self.cloud_path), self.cloud_stamp_ns)
         notes = list(reading.notes)
         if reading.n_not_finite or reading.n_zero_range:
             n_dropped = reading.n_not_finite + reading.n_zero_range
-            notes.append(f"{self.cloud_path.name}: {n_dropped} points without a return left out")
+            notes.append(f"{self.cloud_path.name}: {n_dropped} points without a return skipped")
         return RecordedPair(self.label, self.key(), images, (reading.scan,), tuple(notes))
 
 
@@ -185,26 +167,26 @@ class FolderRecording:
         """Find the files and pair them; nothing is decoded yet.
 
         Raises:
-            SourceError: no images, no point clouds, no way to pair them, or no telling whose images they are.
+            SourceError: no images, no point clouds, no way to pair them, or images whose camera is not known.
         """
         self.path = path
         self.notes: list[str] = []
         self._rig, self._options = rig, options
         lidar = choose_lidar(rig, options, self.notes)
-        pictures = self._pictures()
-        clouds = list_clouds(path, self.notes)
+        images = self._images()
+        clouds = _list(path, CLOUD_FOLDERS, frozenset(DECODERS), "point clouds", self.notes)
         cloud_ns = parse_times([cloud.stem for cloud in clouds])
         # The second image of one camera that goes with a point cloud makes a pair of its own.
-        together: dict[tuple[int, int], list[PictureOnDisk]] = {}
+        together: dict[tuple[int, int], list[ImageOnDisk]] = {}
         lone = []
-        for own, pairing in zip(pictures, self._pair(pictures, clouds), strict=True):
+        for own, pairing in zip(images, self._pair(images, clouds), strict=True):
             n_held = Counter[int]()
             for i, j in pairing.pairs:
                 together.setdefault((j, n_held[j]), []).append(own[i])
                 n_held[j] += 1
             lone += [own[i].label for i in pairing.lone_images]
-        with_picture = {j for j, _ in together}
-        lone += [cloud.name for j, cloud in enumerate(clouds) if j not in with_picture]
+        with_image = {j for j, _ in together}
+        lone += [cloud.name for j, cloud in enumerate(clouds) if j not in with_image]
         if lone:
             self.notes.append(f"{path.name}: without a partner: {_shorten(lone)}")
         self.pairs = [
@@ -218,27 +200,28 @@ class FolderRecording:
             for (j, _), held in sorted(together.items(), key=lambda item: item[0])
         ]
 
-    def _pictures(self) -> list[list[PictureOnDisk]]:
+    def _images(self) -> list[list[ImageOnDisk]]:
         """List the images of each camera.
 
         Raises:
             SourceError: there are none, or none of the camera that was asked for.
         """
         rig, wanted = self._rig, self._options.camera
-        found = list_pictures_by_camera(self.path, rig.cameras) if len(rig.cameras) > 1 else {}
+        found = _images_by_camera(self.path, rig.cameras) if len(rig.cameras) > 1 else {}
         if not found:
-            return [self._of_camera(list_pictures(self.path, self.notes), None, is_alone=True)]
+            images = _list(self.path, IMAGE_FOLDERS, SUFFIXES, "images", self.notes)
+            return [self._of_camera(images, None, is_alone=True)]
         if wanted in rig.cameras:
             if wanted not in found:
-                raise SourceError(f"{self.path}: pictures of {', '.join(found)} lie there, none of {wanted}")
+                raise SourceError(f"{self.path}: images of {', '.join(found)} found, none of {wanted}")
             found = {wanted: found[wanted]}
         return [self._of_camera(paths, camera, is_alone=len(found) == 1) for camera, paths in found.items()]
 
-    def _of_camera(self, paths: Sequence[Path], camera: str | None, *, is_alone: bool) -> list[PictureOnDisk]:
+    def _of_camera(self, paths: Sequence[Path], camera: str | None, *, is_alone: bool) -> list[ImageOnDisk]:
         camera, channel = choose_camera(self._rig, self._options, self.notes, camera)
         times_ns = parse_times([path.stem for path in paths])
         return [
-            PictureOnDisk(
+            ImageOnDisk(
                 path,
                 path.name if is_alone else f"{path.parent.name}/{path.name}",
                 camera,
@@ -248,26 +231,26 @@ class FolderRecording:
             for i, path in enumerate(paths)
         ]
 
-    def _pair(self, pictures: Sequence[Sequence[PictureOnDisk]], clouds: Sequence[Path]) -> list[Pairing]:
+    def _pair(self, images: Sequence[Sequence[ImageOnDisk]], clouds: Sequence[Path]) -> list[Pairing]:
         """Match each camera's images with the point clouds, all cameras' in one way."""
-        pairings = [self._pair_camera(own, clouds, self._options.pair) for own in pictures]
+        pairings = [self._pair_camera(own, clouds, self._options.pair) for own in images]
         methods = {pairing.method for pairing in pairings}
         if len(methods) > 1:
             # A camera whose names match less well must not be counted off against the others' names.
             method: PairMethod = "stem" if "stem" in methods else "time"
-            pairings = [self._pair_camera(own, clouds, method) for own in pictures]
-        for own, pairing in zip(pictures, pairings, strict=True):
-            whose = f"{own[0].camera}: " if len(pictures) > 1 else ""
+            pairings = [self._pair_camera(own, clouds, method) for own in images]
+        for own, pairing in zip(images, pairings, strict=True):
+            whose = f"{own[0].camera}: " if len(images) > 1 else ""
             self.notes.append(f"{self.path.name}: {whose}{pairing.explanation}")
         return pairings
 
     def _pair_camera(
-        self, pictures: Sequence[PictureOnDisk], clouds: Sequence[Path], method: PairMethod
+        self, images: Sequence[ImageOnDisk], clouds: Sequence[Path], method: PairMethod
     ) -> Pairing:
-        first, tolerance_s = pictures[0], self._options.pair_tolerance_s
+        first, tolerance_s = images[0], self._options.pair_tolerance_s
         if tolerance_s is None:
             tolerance_s = self._rig.cameras[first.camera].channels[first.channel].timestamps.tolerance_s
-        stems = [picture.path.stem for picture in pictures], [cloud.stem for cloud in clouds]
+        stems = [image.path.stem for image in images], [cloud.stem for cloud in clouds]
         try:
             return pair_names(*stems, method, tolerance_s)
         except SourceError as error:

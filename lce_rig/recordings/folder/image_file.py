@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.image_codec import decode_pixels
 from lce_rig.core.limits import read_file
 
@@ -24,12 +24,8 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     Raises:
         SourceError: the file is missing, empty, truncated or no image.
     """
-    try:
+    with reading(path, SourceError):
         return decode_image(read_file(path))
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise SourceError(f"{path}: {error}") from None
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8]:

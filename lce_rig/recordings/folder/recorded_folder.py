@@ -14,7 +14,7 @@ _KINDS = (_BAGS, _PACKETS, _EVENTS)
 
 
 def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path, SourceOptions]]:
-    """List the recordings in a folder, with how each is read; anything else is a recording by itself.
+    """List the recordings in a folder, with how each is read; anything else is one recording.
 
     Bags come first: what several hold is taken from the first. A file named after a LiDAR or a camera of the
     profile belongs to it.

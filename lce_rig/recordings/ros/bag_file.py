@@ -116,7 +116,7 @@ class BagFile:
             parts.append(part)
             self._readable.append(file)
         for name in self._missing():
-            self._damages.add(f"metadata.yaml lists {limits.describe(name)}, which is not there")
+            self._damages.add(f"metadata.yaml lists {limits.describe(name)}, which is missing")
         return sorted(parts, key=lambda part: part.contents.start_ns or 0)
 
     def _open(self, file: Path) -> BagStorage:
@@ -160,6 +160,13 @@ def is_bag_file(path: Path) -> bool:
     return suffixes[-1:] != [] and (suffixes[-1] in SUFFIXES or _is_packed(suffixes))
 
 
+def kind_of(path: Path) -> str:
+    """Name the kind of a recording: its suffix, ".bag" for a folder with bag files, else "folder"."""
+    if not path.is_dir():
+        return path.suffix.lower()
+    return ".bag" if any(is_bag_file(file) for file in path.iterdir()) else "folder"
+
+
 def list_topics(topics: Mapping[str, tuple[str, int]]) -> str:
     """List the topics of a bag, for messages.
 
@@ -169,7 +176,7 @@ def list_topics(topics: Mapping[str, tuple[str, int]]) -> str:
     shown = sorted(topics.items())[:_MAX_LISTED]
     listed = [f"{limits.shorten(name)} ({limits.shorten(kind)}, {n})" for name, (kind, n) in shown]
     listed += [f"and {len(topics) - len(shown)} more"] if len(topics) > len(shown) else []
-    return f"topics there: {', '.join(listed) or 'none'}"
+    return f"topics: {', '.join(listed) or 'none'}"
 
 
 def _is_packed(suffixes: list[str]) -> bool:
@@ -180,7 +187,7 @@ def _end_ns(part: BagStorage, topic: str) -> int | None:
     try:
         return part.end_ns(topic)
     except (OSError, ValueError):
-        return None  # It is said when the bag is read.
+        return None  # Reported when the bag is read.
 
 
 def _describe(path: Path, error: Exception) -> str:

@@ -1,9 +1,8 @@
 """A bag written as samples arrive, on the topics of the rig's profile."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.ros.event_array import encode_event_array
+from lce_rig.recordings.ros.message_fields import typestore
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.timing.rig_time import event_channel
 
@@ -31,26 +31,6 @@ _EVENT = {
 }
 
 
-def write_event_bag(
-    path: Path, stretches: Iterable[Events], topic: str = "/dvs/events", frame_id: str = "event_camera"
-) -> None:
-    """Write a recording of events: as a ROS 1 bag where the path ends in .bag, else as a ROS 2 folder (mcap).
-
-    Raises:
-        FileExistsError: something is there already.
-    """
-    if path.exists():
-        raise FileExistsError(f"{path} exists already")
-    is_ros1 = path.suffix == ".bag"
-    with open_bag_writer(path) as writer:
-        connection = add_event_topic(writer, topic, is_ros1)
-        number = 0
-        for stretch in stretches:
-            for received_ns, message in event_messages(stretch, frame_id, is_ros1, number):
-                writer.write(connection, received_ns, message)
-                number += 1
-
-
 def open_bag_writer(path: Path) -> Any:
     """Begin a bag: ROS 1 where the path ends in .bag, else ROS 2's mcap; a context manager of rosbags'."""
     if path.suffix == ".bag":
@@ -65,9 +45,9 @@ def open_bag_writer(path: Path) -> Any:
 
 def add_event_topic(writer: Any, topic: str, is_ros1: bool) -> Any:
     """Announce a topic of events in a bag that may hold others as well."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    from rosbags.typesys import get_types_from_msg
 
-    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    store = typestore(is_ros1)
     store.register(get_types_from_msg(_EVENT[is_ros1], "dvs_msgs/msg/Event"))
     store.register(get_types_from_msg(_HEADER, MESSAGE_TYPE))
     return writer.add_connection(topic, MESSAGE_TYPE, typestore=store)
@@ -111,14 +91,6 @@ _UINT16, _FLOAT32 = 4, 7
 # velodyne_pointcloud's: times are seconds after the header's timestamp, which float32 holds to 4 ns.
 _POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2")])
 _TIMED_POINT = np.dtype([*_POINT.descr, ("time", "<f4")])
-
-
-@cache
-def typestore(is_ros1: bool) -> Any:
-    """Load the message definitions of ROS 1 or ROS 2."""
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
 
 
 def encode_image(image: Image, frame_id: str, is_ros1: bool, number: int) -> memoryview:

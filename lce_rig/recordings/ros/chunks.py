@@ -191,7 +191,7 @@ class ChunkedBag(ABC):
         yield from messages
 
     def _find_topic(self, reading: Pass, number: int, block: Block) -> Connection | None:
-        """Look up what a message is of; None where nobody wants it, or where that is not known."""
+        """Look up what a message is of; None where it is not wanted or not known."""
         if reading.wanted is not None and number not in reading.wanted:
             return None
         found = self.contents.connections.get(number)

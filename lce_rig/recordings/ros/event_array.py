@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits
-from lce_rig.core.data import Events
-from lce_rig.recordings.events.stream import EventColumns
+from lce_rig.core.data import EventColumns, Events
 from lce_rig.recordings.ros.message_fields import EventHeader, MessageReader, read_header
 
 _FIELDS = [("x", "<u2"), ("y", "<u2"), ("sec", "<u4"), ("nsec", "<u4"), ("polarity", "?")]
@@ -61,7 +60,7 @@ def _cdr_events(reader: MessageReader, n_events: int) -> NDArray[np.void]:
     begin = reader.rest()
     n_bytes = n_events * 16 - _CDR_LEAD_BYTES - _CDR_TAIL_BYTES
     if len(begin) < n_bytes:
-        raise ValueError(f"it says {n_events} events and ends after {len(begin)} bytes")
+        raise ValueError(f"it declares {n_events} events and ends after {len(begin)} bytes")
     padded = np.zeros(n_events * 16, np.uint8)
     padded[_CDR_LEAD_BYTES : _CDR_LEAD_BYTES + n_bytes] = begin[:n_bytes]
     padded[:4] = begin[:4]

@@ -1,6 +1,7 @@
 """Events in ROS 1 and ROS 2 bags."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits
+from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, EventColumns, seconds_in
+from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, seconds_in
 from lce_rig.recordings.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
 from lce_rig.recordings.ros.bag_file import BagFile, list_topics
 from lce_rig.recordings.ros.event_array import decode_event_array
@@ -56,23 +58,10 @@ class EventPacket:
         """
         dtype = np.dtype(f"{'>' if self.is_big_endian else '<'}{kind}")
         if len(self.payload) % dtype.itemsize:
-            raise ValueError(f"{len(self.payload)} bytes are no whole number of {dtype.itemsize}-byte words")
+            raise ValueError(
+                f"{len(self.payload)} bytes are not a whole number of {dtype.itemsize}-byte words"
+            )
         return self.payload.view(dtype)
-
-
-@dataclass(frozen=True, eq=False)
-class Triggers:
-    """Edges on the camera's trigger input.
-
-    Attributes:
-        t_ns: (N,) int64 device time.
-        is_rising: (N,) bool.
-        source: (N,) int16 number of the input.
-    """
-
-    t_ns: NDArray[np.int64]
-    is_rising: NDArray[np.bool_]
-    source: NDArray[np.int16]
 
 
 def parse_packet(data: bytes, encoding: str) -> EventPacket:
@@ -146,14 +135,12 @@ class PacketDecoder:
                 host_ns = None
 
     def account(self, findings: DamageCounts) -> None:
-        """Say what was passed over, and what could not be decoded inside packets."""
-        findings.add("packets of triggers passed over", n=self._n_trigger_packets)
-        findings.add("events before the first stamp left out", n=self._evt3.n_untimed)
+        """Count what was skipped, and what could not be decoded inside packets."""
+        findings.add("packets of triggers skipped", n=self._n_trigger_packets)
+        findings.add("events before the first timestamp skipped", n=self._evt3.n_untimed)
         n_repaired = self._evt3.n_repaired + self._compressed.n_repaired
-        findings.add("time words that did not fit repaired", n=n_repaired)
-        findings.add(
-            "words of no known code passed over", n=self._evt3.n_unknown + self._compressed.n_unknown
-        )
+        findings.add("inconsistent time words repaired", n=n_repaired)
+        findings.add("words of no known code skipped", n=self._evt3.n_unknown + self._compressed.n_unknown)
 
 
 def _pieces(words: NDArray[np.uint16]) -> Iterator[NDArray[np.uint16]]:
@@ -168,31 +155,18 @@ def _shift(events: EventColumns, packet: EventPacket) -> EventColumns:
 
 def _decode_mono(packet: EventPacket) -> EventColumns:
     """Decode polarity 1 | y 15 | x 16 | ns after the time base 32 bits."""
-    t_ns, upper, is_set = _split_mono(packet)
-    x, y = (upper & 0xFFFF).astype(np.uint16), ((upper >> 16) & 0x7FFF).astype(np.uint16)
-    return EventColumns(t_ns, x, y, is_set, packet.header.stamp_ns)
-
-
-def decode_triggers(packets: list[EventPacket]) -> Triggers:
-    """Decode packets of encoding "trigger": mono's layout, with the input's number in place of y."""
-    parts = [_split_mono(packet) for packet in packets]
-    empty = (np.empty(0, np.int64), np.empty(0, np.uint32), np.empty(0, bool))
-    t_ns, upper, is_set = (np.concatenate(column) for column in zip(*([empty] + parts), strict=True))
-    return Triggers(t_ns, is_set, ((upper >> 16) & 0x7FFF).astype(np.int16))
-
-
-def _split_mono(packet: EventPacket) -> tuple[NDArray[np.int64], NDArray[np.uint32], NDArray[np.bool_]]:
     words = packet.words("u8").astype(np.uint64)
     upper = (words >> np.uint64(32)).astype(np.uint32)
     t_ns = packet.time_base_ns + (words & np.uint64(0xFFFFFFFF)).astype(np.int64)
-    return t_ns, upper, (upper >> 31).astype(bool)
+    x, y = (upper & 0xFFFF).astype(np.uint16), ((upper >> 16) & 0x7FFF).astype(np.uint16)
+    return EventColumns(t_ns, x, y, (upper >> 31).astype(bool), packet.header.stamp_ns)
 
 
 def _decode_libcaer(packet: EventPacket) -> EventColumns:
     """Decode x 15 | y 15 | polarity 1 | valid 1 bits, then 31 bits of us, which may wrap inside a packet."""
     pairs = packet.words("u4").astype(np.uint32)
     if len(pairs) % 2:
-        raise ValueError(f"{len(packet.payload)} bytes are no whole number of 8-byte events")
+        raise ValueError(f"{len(packet.payload)} bytes are not a whole number of 8-byte events")
     where, t_us = pairs[0::2], pairs[1::2].astype(np.int64)
     wraps = np.cumsum(np.diff(t_us, prepend=t_us[:1]) < -_LIBCAER_WRAP_US // 2)
     t_ns = packet.time_base_ns + (t_us + wraps * _LIBCAER_WRAP_US) * NS_PER_US
@@ -251,7 +225,7 @@ class BagEvents:
                 yield from decoder.decode(packet)
             except ValueError as error:
                 where = f"message {index}, received {seconds_in(message.log_ns, first_ns)}: {error}"
-                findings.add("broken packets left out", where)
+                findings.add("broken packets skipped", where)
                 continue
             if last_number is not None and packet.number > last_number + 1:
                 lost = packet.number - last_number - 1
@@ -276,32 +250,8 @@ class BagEvents:
         return None
 
 
-def read_triggers(path: Path, topic: str | None = None) -> Triggers:
-    """Read the edges on a camera's trigger input from EventPackets of encoding "trigger"; there may be none.
-
-    Raises:
-        SourceError: the bag cannot be read, or lacks the topic.
-    """
-    bag = BagFile(path)
-    topics = [topic] if topic else [name for name, (kind, _) in bag.topics.items() if kind in PACKET_TYPES]
-    packets = []
-    for name in topics:
-        if name not in bag.topics:
-            raise SourceError(f"{path} has no topic {name}", list_topics(bag.topics))
-        packets += [p for p in _packets(bag, name) if p.encoding == "trigger"]
-    return decode_triggers(packets)
-
-
-def _packets(bag: BagFile, topic: str) -> Iterator[EventPacket]:
-    for _, message in _messages(bag, topic, DamageCounts()):
-        try:
-            yield parse_packet(message.data, message.encoding)
-        except ValueError:
-            continue
-
-
 def _messages(bag: BagFile, topic: str, findings: DamageCounts) -> Iterator[tuple[int, RawMessage]]:
-    """Yield the messages of a topic with their number; where the bag is torn, that is said and all."""
+    """Yield the messages of a topic with their number; a tear in the bag is counted and ends them."""
     messages = bag.messages({topic})
     index = 0
     while True:
@@ -337,5 +287,7 @@ def _choose_topic(bag: BagFile, asked: str | None) -> str:
 def _holds_triggers(bag: BagFile, topic: str) -> bool:
     if bag.topics[topic][0] not in PACKET_TYPES:
         return False
-    first = next(_packets(bag, topic), None)
-    return first is not None and first.encoding == "trigger"
+    for _, message in _messages(bag, topic, DamageCounts()):
+        with suppress(ValueError):
+            return parse_packet(message.data, message.encoding).encoding == "trigger"
+    return False

@@ -28,7 +28,7 @@ class McapBag(ChunkedBag):
     def _begin(self, whole: Pass) -> int:
         self._schemas: dict[int, str] = {}
         if whole.file.read(len(_MAGIC)) != _MAGIC:
-            raise ValueError("it is no mcap file" if whole.n_bytes else "it is empty")
+            raise ValueError("it is not an mcap file" if whole.n_bytes else "it is empty")
         return len(_MAGIC)
 
     def _read_index(self, whole: Pass) -> bool:
@@ -37,7 +37,7 @@ class McapBag(ChunkedBag):
         footer = whole.file.read()
         is_whole = len(footer) == _FOOTER_BYTES and footer.endswith(_MAGIC)
         if not is_whole or _HEAD.unpack_from(footer) != (_FOOTER, 20):
-            raise ValueError("it has no end, its recorder was killed")
+            raise ValueError("it has no end: its recorder was killed")
         (position,) = struct.unpack_from("<Q", footer, _HEAD.size)
         if position == 0:
             return False

@@ -10,9 +10,20 @@ References:
 
 import struct
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+
+@cache
+def typestore(is_ros1: bool) -> Any:
+    """Load rosbags' message definitions of ROS 1 or ROS 2."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+
 
 _SIZES = {"B": 1, "I": 4, "i": 4, "Q": 8}
 
@@ -52,7 +63,7 @@ class MessageReader:
     def block(self, size: int) -> NDArray[np.uint8]:
         """Read `size` bytes, without copying."""
         if self._at + size > len(self._data):
-            raise ValueError(f"it says {size} bytes and ends after {len(self._data) - self._at}")
+            raise ValueError(f"it declares {size} bytes and ends after {len(self._data) - self._at}")
         block = np.frombuffer(self._data, np.uint8, size, self._at)
         self._at += size
         return block

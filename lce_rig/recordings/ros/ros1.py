@@ -24,7 +24,7 @@ class Ros1Bag(ChunkedBag):
 
     def _begin(self, whole: Pass) -> int:
         if whole.file.read(len(_MAGIC)) != _MAGIC:
-            raise ValueError("it is no ROS 1 bag of version 2.0" if whole.n_bytes else "it is empty")
+            raise ValueError("it is not a ROS 1 bag of version 2.0" if whole.n_bytes else "it is empty")
         return len(_MAGIC)
 
     def _read_index(self, whole: Pass) -> bool:
@@ -33,7 +33,7 @@ class Ros1Bag(ChunkedBag):
         (index_at,) = _PLACE.unpack(fields[b"index_pos"])
         n_connections, n_chunks = (_number(fields[name]) for name in (b"conn_count", b"chunk_count"))
         if index_at == 0:
-            raise ValueError("it has no index, its recorder was killed")
+            raise ValueError("it has no index: its recorder was killed")
         if n_chunks == 0:
             return True
         if index_at >= whole.n_bytes:

@@ -1,10 +1,8 @@
 """A bag as a stream of images, scans and events, by the timestamps in their headers."""
 
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,7 @@ from lce_rig.core.data import Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.events.choice import CameraEvents
 from lce_rig.recordings.events.event_recording import EventRecording
-from lce_rig.recordings.events.stream import NoEventsError
+from lce_rig.recordings.events.stream import DamageCounts, NoEventsError
 from lce_rig.recordings.folder.cloud import to_scan
 from lce_rig.recordings.folder.image_file import decode_image, to_8_bit
 from lce_rig.recordings.merging import merge_by_time
@@ -25,7 +23,7 @@ from lce_rig.recordings.overlap import check_overlap
 from lce_rig.recordings.protocol import SourceOptions, Span
 from lce_rig.recordings.ros.bag_file import BagFile, list_topics
 from lce_rig.recordings.ros.event_messages import BagEvents
-from lce_rig.recordings.ros.message_fields import MessageReader, read_header
+from lce_rig.recordings.ros.message_fields import MessageReader, read_header, typestore
 from lce_rig.recordings.ros.storage import RawMessage
 from lce_rig.recordings.ros.topics import CLOUD_TYPES, Target, choose_topics
 from lce_rig.rig import Rig
@@ -73,13 +71,13 @@ def decode_ros_image(message: Any) -> NDArray[np.uint8]:
     n_bytes, n_channels, conversion = _ENCODINGS[encoding]
     width, height = int(message.width), int(message.height)
     if width * height > limits.MAX_PIXELS:
-        raise ValueError(f"it declares {width}x{height} pixels, at most {limits.MAX_PIXELS} are read")
+        raise ValueError(f"it declares {width}x{height} pixels (limit {limits.MAX_PIXELS})")
     n_row = width * n_channels * n_bytes
     step = int(message.step) or n_row
     data = np.ascontiguousarray(message.data, dtype=np.uint8)
     if width * height == 0 or step < n_row or len(data) < (height - 1) * step + n_row:
         raise ValueError(
-            f"{len(data)} bytes are no {width}x{height} picture in {encoding} with rows of {step} bytes"
+            f"{len(data)} bytes are not a {width}x{height} image in {encoding} with rows of {step} bytes"
         )
     kind = np.dtype(f"{'>' if message.is_bigendian else '<'}u{n_bytes}")
     rows = np.ndarray((height, width, n_channels), kind, data.data, 0, (step, n_channels * n_bytes, n_bytes))
@@ -98,7 +96,7 @@ def decode_ros_compressed_image(message: Any) -> NDArray[np.uint8]:
     """
     form = str(message.format).lower()
     if "compresseddepth" in form:
-        raise ValueError("it is a depth image, not a picture")
+        raise ValueError("it is a depth image")
     pixels = decode_image(bytes(message.data))
     mosaic = form.split(";")[0].strip()
     # A camera's raw mosaic may have been compressed as if it were grey.
@@ -137,7 +135,7 @@ def check_field_count(data: bytes, encoding: str) -> None:
     read_header(reader)  # Height and width stand behind the header as they do in messages of events.
     n_fields = reader.number("I")
     if n_fields > limits.MAX_FIELDS:
-        raise ValueError(f"it declares {n_fields} fields a point, at most {limits.MAX_FIELDS} are read")
+        raise ValueError(f"it declares {n_fields} fields per point (limit {limits.MAX_FIELDS})")
 
 
 def decode_pointcloud2(message: Any) -> NDArray[Any]:
@@ -170,7 +168,7 @@ def decode_pointcloud2(message: Any) -> NDArray[Any]:
             offsets.append(int(entry.offset))
     width, height, step = int(message.width), int(message.height), int(message.point_step)
     if width * height > limits.MAX_POINTS:
-        raise ValueError(f"it declares {width * height} points, at most {limits.MAX_POINTS} are read")
+        raise ValueError(f"it declares {width * height} points (limit {limits.MAX_POINTS})")
     # Some drivers leave row_step at zero in point clouds of one row.
     row_step = int(message.row_step) or width * step
     if row_step < width * step:
@@ -181,15 +179,16 @@ def decode_pointcloud2(message: Any) -> NDArray[Any]:
     data = np.ascontiguousarray(message.data, dtype=np.uint8)
     n_needed = (height - 1) * row_step + width * step
     if len(data) < n_needed:
-        raise ValueError(f"{len(data)} of {n_needed} bytes of its points are there")
+        raise ValueError(f"it holds {len(data)} of {n_needed} bytes of points")
     rows: NDArray[Any] = np.ndarray((height, width), dtype, data.data, 0, (row_step, step))
     return rows.reshape(-1)
 
 
 # A timestamp this much earlier than the one before is a clock that was set, not a message that came late.
 CLOCK_JUMP_NS = 1_000_000_000
-# Drivers start within this many messages of each other; who comes later has no span told beforehand.
+# Drivers start within this many messages of each other; the span of a later one is not known beforehand.
 _N_PROBED = 500
+_NOT_DECODED = "could not be decoded"
 
 
 @dataclass
@@ -198,9 +197,8 @@ class _BagStream:
 
     last_ns: int | None = None
     n_yielded: int = 0
-    counts: Counter[str] = field(default_factory=Counter)
+    findings: DamageCounts = field(default_factory=DamageCounts)
     notes: set[str] = field(default_factory=set)
-    first_failure: str = ""
 
 
 class BagRecording:
@@ -269,8 +267,8 @@ class BagRecording:
         finally:
             self._summarise(streams)
         for topic, stream in streams.items():
-            if stream.n_yielded == 0 and stream.counts:
-                cause = stream.first_failure or "its stamps do not rise"
+            if stream.n_yielded == 0 and stream.findings.counts:
+                cause = stream.findings.first.get(_NOT_DECODED, "its timestamps do not increase")
                 raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}")
 
     def _open_events(self) -> dict[Stream, CameraEvents]:
@@ -320,7 +318,7 @@ class BagRecording:
                 if len(found) == len(self._targets):
                     break
         except SourceError:
-            pass  # It is said when everything in front of the damage has been read.
+            pass  # Reported once everything before the damage has been read.
         return found
 
     def _decode(self, message: RawMessage, stream: _BagStream) -> Image | Scan | None:
@@ -329,13 +327,12 @@ class BagRecording:
             content = _deserialize(message)
             stamp_ns = _header_stamp_ns(content)
             if stamp_ns == 0:
-                stream.notes.add("headers carry no stamps: time of receipt taken")
+                stream.notes.add("headers have no timestamps; the time of receipt is used")
                 stamp_ns = message.log_ns
             return self._to_sample(message, content, target, stamp_ns, stream)
         except (SourceError, ValueError) as error:
             cause = error.what if isinstance(error, SourceError) else str(error)
-            stream.first_failure = stream.first_failure or cause
-            stream.counts["could not be decoded"] += 1
+            stream.findings.add(_NOT_DECODED, cause)
             return None
 
     def _to_sample(
@@ -346,24 +343,21 @@ class BagRecording:
             pixels = decode_ros_compressed_image(content) if is_compressed else decode_ros_image(content)
             channel = self._rig.cameras[target.sensor].channels[target.channel]
             if channel.timestamps.reference == "start":
-                stream.notes.add("messages carry no exposure: stamps of its start are taken for its middle")
+                stream.notes.add(
+                    "messages have no exposure time; timestamps of its start are used as its middle"
+                )
             return Image(target.sensor, target.channel, stamp_ns, pixels, message.log_ns)
         settings = self._rig.lidars[target.sensor]
         cloud = decode_pointcloud2(content)
         reading = to_scan(cloud, target.sensor, settings, message.topic, stamp_ns, message.log_ns)
         stream.notes.update(reading.notes)
-        n_dropped = reading.n_not_finite + reading.n_zero_range
-        stream.counts["points without a return"] += n_dropped
+        stream.findings.add("points without a return", n=reading.n_not_finite + reading.n_zero_range)
         return reading.scan
 
     def _summarise(self, streams: dict[str, _BagStream]) -> None:
         for topic, stream in streams.items():
-            for note in sorted(stream.notes):
-                self.notes.append(f"{topic}: {note}")
-            for what, count in sorted(stream.counts.items()):
-                cause = f" ({stream.first_failure})" if what == "could not be decoded" else ""
-                if count:
-                    self.notes.append(f"{topic}: {count} {what}{cause}")
+            lines = sorted(stream.notes) + stream.findings.lines()
+            self.notes += [f"{topic}: {line}" for line in lines]
 
 
 def _header_stamp_ns(content: Any) -> int:
@@ -375,7 +369,7 @@ def _deserialize(message: RawMessage) -> Any:
     is_ros1 = message.encoding == "ros1"
     if message.msgtype in CLOUD_TYPES:
         check_field_count(message.data, message.encoding)
-    store = _typestore(is_ros1)
+    store = typestore(is_ros1)
     msgtype = message.msgtype.replace("/", "/msg/")
     try:
         if is_ros1:
@@ -385,13 +379,6 @@ def _deserialize(message: RawMessage) -> Any:
         raise ValueError(f"a message is damaged: {str(error) or type(error).__name__}") from None
 
 
-@cache
-def _typestore(is_ros1: bool) -> Any:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-
-
 def _is_in_order(sample: Image | Scan, stream: _BagStream) -> bool:
     """Return whether a sample's timestamp is later than its predecessor's; count it where it is not."""
     stamp_ns = sample.stamp_ns
@@ -399,11 +386,11 @@ def _is_in_order(sample: Image | Scan, stream: _BagStream) -> bool:
         stream.last_ns = stamp_ns
         return True
     if stamp_ns == stream.last_ns:
-        stream.counts["sent twice (equal stamps)"] += 1
+        stream.findings.add("sent twice (equal timestamps)")
         return False
     if stream.last_ns - stamp_ns < CLOCK_JUMP_NS:
-        stream.counts["out of order (stamps run backwards)"] += 1
+        stream.findings.add("out of order (timestamps decrease)")
         return False
-    stream.counts["jumps of the clock back by more than a second"] += 1
+    stream.findings.add("jumps of the clock back by more than 1 s")
     stream.last_ns = stamp_ns
     return True

@@ -97,7 +97,7 @@ class SqliteBag:
         return start_ns
 
     def _open(self) -> sqlite3.Connection:
-        # Nothing is written beside the bag, whatever journal lies there.
+        # Nothing is written beside the bag, even if a journal lies there.
         database = sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
         if sys.version_info >= (3, 11):
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.MAX_CHUNK_BYTES)
@@ -115,7 +115,7 @@ class SqliteBag:
 
 
 def _unpacked(data: bytes, n_left: int) -> bytes:
-    """Unpack a message that was compressed by itself: no other begins like that."""
+    """Unpack a message that was compressed separately: no other begins like that."""
     if not data.startswith(_ZSTD_MAGIC):
         return data
     return unpack("zstd", data, max(0, min(n_left, limits.MAX_CHUNK_BYTES)))

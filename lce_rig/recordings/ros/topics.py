@@ -41,7 +41,7 @@ class Target:
         """Name the stream that messages of this type make."""
         if self.channel is None:
             return Stream(self.sensor, "", "scans")
-        return Stream(self.sensor, self.channel, "events" if msgtype in EVENT_TYPES else "pictures")
+        return Stream(self.sensor, self.channel, "events" if msgtype in EVENT_TYPES else "images")
 
     def __str__(self) -> str:
         return self.sensor if self.channel is None else f"{self.sensor}.{self.channel}"
@@ -78,7 +78,7 @@ def choose_topics(
             chosen[topic] = target
             notes.append(f"{path.name}: {target} from {topic} ({count} messages)")
         elif topic in chosen:
-            raise SourceError(f"{path}: {topic} is asked for both {chosen[topic]} and {target}", there)
+            raise SourceError(f"{path}: {topic} is requested for both {chosen[topic]} and {target}", there)
         elif target in asked or target.channel is None:
             wanted = " or ".join(sorted(target.types))
             raise SourceError(f"{path}: {topic} for {target} is {msgtype}, not {wanted}", there)
@@ -135,7 +135,7 @@ def _add_only_candidates(
 ) -> None:
     """Give the rig's first camera and LiDAR the only topic of their kind, where the profile names none."""
     failures = []
-    for is_camera, what in ((True, "picture"), (False, "cloud")):
+    for is_camera, what in ((True, "image"), (False, "point cloud")):
         if any((target.channel is not None) == is_camera for target in chosen.values()):
             continue
         target, wanted_topic = next(

@@ -1,9 +1,10 @@
 """The order of data packets by the sensor's own counter: losses, latecomers, damaged times, set clocks."""
 
-from dataclasses import dataclass
 from enum import Enum
 
 from lce_rig.core import velodyne
+from lce_rig.core.findings import Finding
+from lce_rig.core.losses import Losses
 from lce_rig.recordings.velodyne.packet import DataPacket, max_uneven_steps
 
 # A packet's time is right within this of the grid of firings; a disciplined counter moves by microseconds.
@@ -14,6 +15,8 @@ _MAX_DISAGREEMENT_NS = 20_000_000
 # Over less than a revolution the rotor's speed, averaged over some packets, tells where the next begins.
 _MAX_OFF_SHARE = 0.01
 _SPEED_WEIGHT = 0.1
+_LOST, _LATE = Finding("packet.lost", "warning"), Finding("packet.late", "warning")
+_ASTRAY, _CLOCK_SET = Finding("packet.astray", "warning"), Finding("packet.clock_set", "note")
 
 
 class Place(Enum):
@@ -24,33 +27,18 @@ class Place(Enum):
     AFTER_STEP = "after a step of the sensor's clock"
 
 
-@dataclass
-class OrderCounts:
-    """Counts from the sensor's counter.
-
-    Attributes:
-        n_lost: packets that never arrived.
-        n_late: packets out of order or sent twice; skipped.
-        n_astray: packets whose time fits neither the counter nor the host's clock; skipped.
-        n_steps: how often the sensor's clock was set.
-    """
-
-    n_lost: int = 0
-    n_late: int = 0
-    n_astray: int = 0
-    n_steps: int = 0
-
-
 class PacketOrder:
     """Follows the counter from packet to packet.
 
+    Args:
+        losses: receives packets that never arrived, came late or went astray, and steps of the clock.
+
     Attributes:
-        counts: what was found so far.
         elapsed_ns: of the counter since the first packet; hours are counted on, and steps excluded.
     """
 
-    def __init__(self) -> None:
-        self.counts = OrderCounts()
+    def __init__(self, losses: Losses) -> None:
+        self._losses = losses
         self.elapsed_ns = 0
         self._last: DataPacket | None = None
         self._held: DataPacket | None = None
@@ -71,12 +59,12 @@ class PacketOrder:
             self._drop_held()
             return self._accept(packet, step_ns, Place.NEXT)
         if -_MAX_DISAGREEMENT_NS < step_ns <= 0 and _agrees(self._last, packet, step_ns):
-            self.counts.n_late += 1
+            self._losses.add(_LATE)
             return Place.HELD
         if self._held is not None and 1 <= self._packets_ahead(self._held, packet) <= _MAX_BLIND:
             # The packet held back was sound, but the revolution that it belongs to is broken anyway.
             self._held = None
-            self.counts.n_steps += 1
+            self._losses.add(_CLOCK_SET)
             return self._accept(packet, 0, Place.AFTER_STEP)
         self._drop_held()
         self._held = packet
@@ -85,7 +73,7 @@ class PacketOrder:
     def _accept(self, packet: DataPacket, step_ns: int, place: Place) -> Place:
         if step_ns:
             spacing_ns = velodyne.packet_ns(packet.is_dual)
-            self.counts.n_lost += round(step_ns / spacing_ns) - 1
+            self._losses.add(_LOST, round(step_ns / spacing_ns) - 1)
         weight = _SPEED_WEIGHT if step_ns else 1.0
         self._steps_per_ns += weight * (packet.steps_per_ns - self._steps_per_ns)
         self.elapsed_ns += step_ns
@@ -94,7 +82,7 @@ class PacketOrder:
 
     def _drop_held(self) -> None:
         if self._held is not None:
-            self.counts.n_astray += 1
+            self._losses.add(_ASTRAY)
             self._held = None
 
     def _packets_ahead(self, before: DataPacket, after: DataPacket) -> int:

@@ -9,7 +9,7 @@ from typing import BinaryIO
 
 from lce_rig.core import limits, velodyne
 from lce_rig.core.data import Scan, Stream
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.findings import Finding
 from lce_rig.recordings.fingerprint import fingerprint
 from lce_rig.recordings.protocol import SourceOptions, Span
@@ -69,13 +69,8 @@ class PcapFile:
         self.flaws: Counter[str] = Counter()
         self.damage = ""
         self.n_bytes_read = 0
-        try:
-            with limits.open_regular(path) as file:
-                head = file.read(24)
-        except OSError as error:
-            raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-        except ValueError as error:
-            raise SourceError(f"{path}: cannot be read: {error}") from None
+        with reading(path, SourceError), limits.open_regular(path) as file:
+            head = file.read(24)
         self._order, self._ns_per_tick, self._link = _read_head(path, head)
         if self._link is not None:
             self._check_link(self._link)
@@ -108,7 +103,7 @@ class PcapFile:
         while head := file.read(header.size):
             seconds, fraction, length, _ = header.unpack(_whole(head, header.size))
             if length > _MAX_FRAME_BYTES or fraction * self._ns_per_tick >= 2 * _NS_PER_S:
-                raise _TornError("it holds nonsense in place of a frame")
+                raise _TornError("a frame's header is invalid")
             frame = _whole(file.read(length), length)
             yield link, seconds * _NS_PER_S + fraction * self._ns_per_tick, frame
 
@@ -123,7 +118,7 @@ class PcapFile:
                 file.seek(-4, 1)
                 length, interfaces = struct.unpack(f"{order}I", head[4:])[0], []
             if length < 12 or length % 4 or length > _MAX_BLOCK_BYTES:
-                raise _TornError("it holds nonsense in place of a block")
+                raise _TornError("a block's header is invalid")
             body = _whole(file.read(length - 8), length - 8)[:-4]
             if kind == _INTERFACE:
                 interfaces.append(_read_interface(order, body))
@@ -156,9 +151,9 @@ def _read_head(path: Path, head: bytes) -> tuple[str, int, int | None]:
     if magic == struct.pack("<I", _SECTION):
         return "<", 1, None
     if not head:
-        raise SourceError(f"{path} is empty", "Was the recorder started on the right card?")
+        raise SourceError(f"{path} is empty", "Record the network card that the LiDAR is on.")
     hint = "Unpack it with gunzip first." if magic[:2] == b"\x1f\x8b" else ""
-    raise SourceError(f"{path} is no pcap or pcapng file", hint)
+    raise SourceError(f"{path} is not a pcap or pcapng file", hint)
 
 
 def _section_order(magic: bytes) -> str:
@@ -279,9 +274,9 @@ class PcapRecording:
                 yield scan
         finally:
             self._summarise(stream)
-        if stream.counts.n_scans == 0:
-            said = "; ".join(_account(stream)) or f"{stream.counts.n_data} packets are less than a revolution"
-            raise SourceError(f"{self.path}: no whole revolution in it: {said}", "Record a second or more.")
+        if stream.n_scans == 0:
+            said = "; ".join(_account(stream)) or f"{stream.n_data} packets are less than a revolution"
+            raise SourceError(f"{self.path}: no whole revolution in it: {said}", "Record at least 1 s.")
 
     def _survey(self) -> _Survey:
         survey = _Survey()
@@ -328,7 +323,7 @@ class PcapRecording:
             models = ", ".join(f"{n} of {model}" for model, n in survey.others.most_common())
             raise SourceError(
                 f"{self.path}: holds packets of another LiDAR ({models}), not of a VLP-16",
-                "Only the VLP-16 (Puck, Puck LITE) is read from packets; record another's clouds as a bag.",
+                "Only VLP-16 packets (Puck, Puck LITE) are read. Record another LiDAR's scans in a bag.",
             )
         raise SourceError(f"{self.path}: holds no packets of a VLP-16: {self._what_is_there(survey)}")
 
@@ -362,20 +357,8 @@ def _push(stream: Vlp16Stream, datagram: Datagram) -> Scan | None:
 
 def _account(stream: Vlp16Stream) -> list[str]:
     """Say what was lost or skipped, in words."""
-    counts, order = stream.counts, stream.counts.order
-    figures = {
-        "data packets lost on the way": order.n_lost,
-        "data packets late or sent twice, left out": order.n_late,
-        "data packets with a damaged time, left out": order.n_astray,
-        "times the sensor's clock was set": order.n_steps,
-        "revolutions cut off at an end or where the clock was set, left out": counts.n_partial,
-        "revolutions with more than half of their packets lost, left out": counts.n_thin,
-        "revolutions without any return": counts.n_empty,
-        "scans whose stamps do not rise, left out": counts.n_not_rising,
-    }
-    lines = [f"{n} {what}" for what, n in figures.items() if n]
-    return lines + [describe(flaw) for flaw in counts.flaws()]
+    return [describe(each) for each in stream.losses.findings()]
 
 
 def _flaw(code: str, n: int) -> Finding:
-    return Finding(code, "warning", figures={"n": n, "of": "data"})
+    return Finding(code, "warning", subject="data", figures={"n": n})

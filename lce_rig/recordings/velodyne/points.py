@@ -1,6 +1,6 @@
 """From data packets to points, by velodyne-decoder.
 
-What it does is kept, and said where it matters: it adds the vertical offsets of the lasers (up to 11 mm,
+Two of its choices matter: it adds the vertical offsets of the lasers (up to 11 mm,
 which ROS 1 drivers omit), and between two azimuths takes the rotor's mean speed over the packet, where
 drivers interpolate block by block (up to 0.025 deg apart).
 """
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lce_rig.core.errors import SourceError
 
 #: What a recording made elsewhere may lack.
-OFFSETS_NOTE = "points include the lasers' vertical offsets (up to 11 mm), which ROS 1 drivers leave out"
+OFFSETS_NOTE = "points include the lasers' vertical offsets (up to 11 mm), which ROS 1 drivers omit"
 DUAL_NOTE = "dual returns: of each firing the brighter one is kept"
 
 

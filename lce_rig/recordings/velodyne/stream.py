@@ -1,13 +1,14 @@
 """From a stream of VLP-16 packets, live or recorded, to scans of one revolution each."""
 
 from collections import Counter, deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.losses import Losses
 from lce_rig.recordings.velodyne.driver_controls import read_controls
 from lce_rig.recordings.velodyne.packet import (
     BadPacketError,
@@ -17,7 +18,7 @@ from lce_rig.recordings.velodyne.packet import (
     read_data_packet,
     read_position_packet,
 )
-from lce_rig.recordings.velodyne.packet_order import OrderCounts, PacketOrder, Place
+from lce_rig.recordings.velodyne.packet_order import PacketOrder, Place
 from lce_rig.recordings.velodyne.points import Vlp16Decoder, keep_brighter
 from lce_rig.rig import LidarSettings
 from lce_rig.timing.clock import resolve_hour
@@ -33,7 +34,7 @@ MAX_DISAGREEMENT_NS = 100_000_000
 # Position packets come 50 to 150 times per second; a sentence stays until the next, a second later.
 _MAX_AGE_S = 3
 _SENTENCE_LAG_S = (0, 1)
-# The least delayed arrival of a tenth of a second tells the host's time of a firing best. Of twenty of them
+# The least delayed arrival of a tenth of a second gives the host's time of a firing best. Of twenty of them
 # the lower quartile is safe from late arrivals and from a damaged packet.
 _WINDOW_NS = 100_000_000
 _N_WINDOWS = 20
@@ -81,7 +82,7 @@ class VelodyneClock:
     def ahead_ns(self) -> int | None:
         """Give by how much the sensor's time is ahead of the host's; None where there is no host's time.
 
-        The hour is the host's. A packet arrives after its last firing, so its length is taken off the
+        The hour is the host's. A packet arrives after its last firing, so its length is subtracted from the
         arrival; what is left is the host's time of the first firing, late by the network's delay.
         """
         host_ns = self._host_ns(self._last_elapsed_ns)
@@ -153,6 +154,8 @@ _MIN_COVERAGE = 0.5
 # Timestamps by arrival and by the sensor may differ by a tenth of a second when one takes over from the
 # other.
 _MAX_OVERLAP_NS = 1_000_000_000
+_PARTIAL, _THIN = Finding("scan.partial", "note"), Finding("scan.thin", "warning")
+_EMPTY, _NOT_RISING = Finding("scan.empty", "warning"), Finding("scan.not_rising", "warning")
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,56 +179,14 @@ class _Piece:
         return self.elapsed_ns + velodyne.BLOCK_NS * n_before
 
 
-@dataclass
-class StreamCounts:
-    """Counts of received packets and scans.
-
-    Attributes:
-        n_data: data packets that passed the checks.
-        n_position: position packets that did.
-        n_scans: revolutions handed on.
-        n_partial: revolutions skipped because they began before, or the sensor's clock was set.
-        n_thin: revolutions skipped because more than half of their packets were lost.
-        n_empty: revolutions without a single return.
-        n_not_rising: scans skipped because it turned out that those before were timestamped late.
-        bad: data packets skipped, by the code of what is wrong with them.
-        bad_positions: position packets skipped, likewise.
-        other_models: data packets of other models, by name.
-        order: packet order by the sensor's counter.
-    """
-
-    n_data: int = 0
-    n_position: int = 0
-    n_scans: int = 0
-    n_partial: int = 0
-    n_thin: int = 0
-    n_empty: int = 0
-    n_not_rising: int = 0
-    bad: Counter[str] = field(default_factory=Counter)
-    bad_positions: Counter[str] = field(default_factory=Counter)
-    other_models: Counter[str] = field(default_factory=Counter)
-    order: OrderCounts = field(default_factory=OrderCounts)
-
-    @property
-    def n_bad(self) -> int:
-        """Packets of both kinds skipped."""
-        return self.bad.total() + self.bad_positions.total()
-
-    def flaws(self) -> list[Finding]:
-        """List what was wrong with packets, each with how many."""
-        kinds = (("data", self.bad), ("position", self.bad_positions))
-        return [
-            Finding(code, "warning", figures={"n": n, "of": kind})
-            for kind, bad in kinds
-            for code, n in sorted(bad.items())
-        ]
-
-
 class Vlp16Stream:
     """Assembles the packets of one sensor into scans.
 
     Attributes:
-        counts: what came so far.
+        n_data, n_position: data and position packets that passed the checks.
+        n_scans: revolutions handed on.
+        losses: packets and revolutions lost or skipped, and steps of the sensor's clock.
+        other_models: data packets of other models, by name.
         clock: what scans are timestamped with.
         mode: return mode of the packet that came last, of velodyne.RETURN_MODES; 0 before the first.
         rotor_hz: speed of the rotor as it was last; 0 before the first packet.
@@ -235,13 +196,14 @@ class Vlp16Stream:
     """
 
     def __init__(self, sensor: str, settings: LidarSettings) -> None:
-        self.counts = StreamCounts()
+        self.n_data = self.n_position = self.n_scans = 0
+        self.losses = Losses()
+        self.other_models: Counter[str] = Counter()
         self.clock = VelodyneClock(settings.timestamps.clock != "host")
         self.mode = 0
         self.rotor_hz = 0.0
         self._sensor = sensor
-        self._order = PacketOrder()
-        self.counts.order = self._order.counts
+        self._order = PacketOrder(self.losses)
         self._decoder = Vlp16Decoder(settings.min_range_m, settings.max_range_m)
         # The sensor counts clockwise.
         cut_rad = -read_controls(sensor, settings).cut_azimuth_rad
@@ -250,14 +212,18 @@ class Vlp16Stream:
         self._is_from_cut = False
         self._last_stamp_ns: int | None = None
 
+    def flaws(self) -> list[Finding]:
+        """List what was wrong with single packets of either kind."""
+        return [each for each in self.losses.findings() if each.subject]
+
     def push_position(self, payload: bytes | memoryview, host_ns: int) -> None:
         """Take a position packet; a bad one is counted."""
         try:
             packet = read_position_packet(payload, host_ns)
         except BadPacketError as error:
-            self.counts.bad_positions[error.code] += 1
+            self.losses.add(Finding(error.code, "warning", "position"))
             return
-        self.counts.n_position += 1
+        self.n_position += 1
         self.clock.see_position(packet)
 
     def push_data(self, payload: bytes | memoryview, host_ns: int) -> Scan | None:
@@ -270,14 +236,14 @@ class Vlp16Stream:
         try:
             packet = read_data_packet(payload, host_ns)
         except BadPacketError as error:
-            self.counts.bad[error.code] += 1
+            self.losses.add(Finding(error.code, "warning", "data"))
             if isinstance(error, OtherModelError):
-                self.counts.other_models[error.model] += 1
+                self.other_models[error.model] += 1
             return None
         place = self._order.place(packet)
         if place is Place.HELD:
             return None
-        self.counts.n_data += 1
+        self.n_data += 1
         if place is Place.AFTER_STEP:
             # What is left of the revolution is counted when the rotor passes the cut.
             self._pieces, self._is_from_cut = [], False
@@ -295,7 +261,7 @@ class Vlp16Stream:
         if to_go <= 2 * last.packet.steps_per_ns * velodyne.BLOCK_NS:
             return self._close()
         self._pieces, self._is_from_cut = [], False
-        self.counts.n_partial += 1
+        self.losses.add(_PARTIAL)
         return None
 
     def _add(self, packet: DataPacket, elapsed_ns: int) -> Scan | None:
@@ -332,13 +298,13 @@ class Vlp16Stream:
         """Build the scan of the revolution that has ended."""
         pieces, self._pieces = self._pieces, []
         if not self._is_from_cut:
-            self.counts.n_partial += 1
+            self.losses.add(_PARTIAL)
             return None
         n_blocks = sum(piece.blocks.stop - piece.blocks.start for piece in pieces)
         packet = pieces[-1].packet
         n_wanted = velodyne.AZIMUTH_STEPS / (packet.steps_per_ns * velodyne.BLOCK_NS) * (1 + packet.is_dual)
         if n_blocks < _MIN_COVERAGE * n_wanted:
-            self.counts.n_thin += 1
+            self.losses.add(_THIN)
             return None
         return self._decode(pieces)
 
@@ -351,14 +317,14 @@ class Vlp16Stream:
             keep_brighter(packets)
         batch = self._decoder.decode(packets, [piece.elapsed_ns for piece in pieces])
         if len(batch.points) == 0:
-            self.counts.n_empty += 1
+            self.losses.add(_EMPTY)
             return None
         first_ns = pieces[0].start_ns
         stamp_ns = self.clock.stamp_ns(first_ns)
         if not self._rises(stamp_ns):
-            self.counts.n_not_rising += 1
+            self.losses.add(_NOT_RISING)
             return None
-        self.counts.n_scans += 1
+        self.n_scans += 1
         return Scan(
             self._sensor,
             stamp_ns,

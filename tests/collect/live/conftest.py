@@ -1,15 +1,11 @@
 """A rig on the wire: its senders are scripts, so that benchmarks use them, too."""
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-
 from wire.reel import Reel, make_reel
 from wire.rig import WireRig, small_rig
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lce_rig.recordings.events.aedat4 import Aedat4Image, decode_frame
 from lce_rig.recordings.events.aedat4_file import Aedat4File
-from lce_rig.recordings.events.camera_file import Aedat4Frames, Aedat4Image, decode_frame
 from lce_rig.recordings.events.stream import DamageCounts
 from tests.notes import kinds
 from tests.recordings.events.aedat4_files import RawFrame, flatbuffer, write_davis
@@ -24,7 +24,7 @@ def read(path: Path, findings: DamageCounts | None = None) -> list[Aedat4Image]:
     file = Aedat4File(path)
     number = file.first_stream("FRME")
     assert number is not None
-    return list(Aedat4Frames(file, number).frames(findings or DamageCounts()))
+    return list(file.packets(number, findings or DamageCounts(), decode_frame))
 
 
 @pytest.mark.parametrize("style", ["dv", "dv-processing", "exposure only"])
@@ -98,12 +98,12 @@ def test_pictures_that_contradict_themselves_are_refused_by_what_is_wrong() -> N
     assert np.array_equal(decode_frame(flatbuffer(b"FRME", sound)[4:]).pixels, GREY)
     for wrong, cause in [
         ({5: ("b", 17)}, "OpenCV's type 17"),
-        ({6: ("h", 347)}, "89960 bytes are no picture of 347x260 pixels"),
-        ({7: ("h", 0)}, "no picture of 346x0 pixels"),
+        ({6: ("h", 347)}, "89960 bytes .*347x260"),
+        ({7: ("h", 0)}, "346x0"),
     ]:
         with pytest.raises(ValueError, match=cause):
             decode_frame(flatbuffer(b"FRME", sound | wrong)[4:])
-    with pytest.raises(ValueError, match="no frame"):
+    with pytest.raises(ValueError, match="not a frame"):
         decode_frame(flatbuffer(b"IMUS", sound)[4:])
 
 

@@ -14,9 +14,9 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.event_file import encode_events
 from lce_rig.recordings.events import EventRecording, open_events
 from lce_rig.recordings.events.aedat4_writer import Aedat4Writer, write_aedat4
-from lce_rig.recordings.ros.bag_recorder import write_event_bag
 from tests.notes import has_note
 from tests.recordings.events import encoders
+from tests.recordings.events.bags import write_event_bag
 from tests.recordings.events.encoders import listed, random_events
 
 START_US = 1_700_000_000_000_000
@@ -321,5 +321,5 @@ def test_paths_that_are_no_recording_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").touch()
     (tmp_path / "img").mkdir()
     for name in ("a.mp4", "img"):
-        with pytest.raises(SourceError, match="no recording of events"):
+        with pytest.raises(SourceError, match="not an event recording"):
             open_events(tmp_path / name)

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.core.event_file import encode_events
 from lce_rig.recordings.events import open_events
-from lce_rig.recordings.events.camera_file import decode_frame
-from lce_rig.recordings.events.stream import DamageCounts, EventColumns, parse_size, to_ns
+from lce_rig.recordings.events.aedat4 import decode_frame
+from lce_rig.recordings.events.stream import DamageCounts, parse_size, to_ns
 from lce_rig.recordings.events.text import TextEvents
 from tests.notes import has_note, kinds
 from tests.recordings.events import encoders
@@ -101,7 +102,7 @@ def test_links_out_of_an_hdf5_file_are_never_followed(tmp_path: Path) -> None:
         ("null", "not numbers"),
         ("2-D", "2 dimensions"),
         ("scalar", "0 dimensions"),
-        ("group", "is no dataset"),
+        ("group", "is not a dataset"),
         ("fractions", "not whole microseconds"),
         ("nan", "beyond any sensor"),
     ],
@@ -134,7 +135,7 @@ def test_attributes_of_hdf5_that_are_no_numbers_are_refused_by_name(tmp_path: Pa
         WRITERS["a.h5"](tmp_path / "a.h5", EVENTS)
         with h5py.File(tmp_path / "a.h5", "a") as file:
             file.attrs["width"] = value
-        assert has_note([refusal(tmp_path / "a.h5")], "width is", "no number")
+        assert has_note([refusal(tmp_path / "a.h5")], "width is", "not a number")
 
 
 @pytest.mark.parametrize("chunks", [None, (1 << 16,)])
@@ -239,7 +240,7 @@ def test_frames_of_absurd_sizes_and_times_are_refused() -> None:
         with pytest.raises(ValueError, match=cause):
             decode_frame(late[4:])
     absurd = flatbuffer(b"FRME", {6: ("h", 32767), 7: ("h", 32767), 10: bytes(24)})
-    with pytest.raises(ValueError, match="no picture of 32767x32767"):
+    with pytest.raises(ValueError, match="32767x32767"):
         decode_frame(absurd[4:])
 
 
@@ -316,7 +317,7 @@ def test_a_size_in_a_raw_header_that_no_sensor_has_is_left_aside_and_said(tmp_pa
     (tmp_path / "a.raw").write_bytes(head + encoders.evt3(truth))
     recording = open_events(tmp_path / "a.raw", resolution=(346, 260))
     assert everything(recording) == truth
-    assert has_note(recording.notes, "sensor's; ignored")
+    assert has_note(recording.notes, "is ignored")
 
 
 def test_a_raw_header_without_an_end_is_refused(tmp_path: Path) -> None:
@@ -386,5 +387,5 @@ def test_a_recording_whose_every_stamp_is_beyond_any_clock_says_so(tmp_path: Pat
     assert "any clock" in refusal(tmp_path / "a.npz")
     zeros = np.zeros(3, np.uint16)
     recording = record(EventColumns(np.full(3, T_MAX), zeros, zeros, zeros > 0))
-    with pytest.raises(SourceError, match="could be put in order: 3 events with stamps beyond"):
+    with pytest.raises(SourceError, match="3 events"):
         _ = recording.start_ns

@@ -68,7 +68,7 @@ def without_background_activity(events: Events, support_ns: int = _SUPPORT_NS) -
 
     Time is cut into slices of `support_ns`; an event stays where its 3 x 3 neighbourhood holds another
     pixel's event in the same slice, the one before or the one after: the nearest-neighbour filter of [1] with
-    slices in place of a map of time stamps.
+    slices in place of a map of time timestamps.
 
     References:
         [1] Delbruck, Frame-free dynamic digital vision, ISSE 2008.

@@ -19,14 +19,14 @@ _MAX_MULTIPLE = 256
 
 _EXPECTED = (
     "expected the inputs voxels (1, bins, height, width) and states (1, channels, height_2, width_2) with "
-    "height_2 meaning half of the height and so on, and the outputs picture (1, 1, height, width) and the "
+    "height_2 meaning half of the height and so on, and the outputs image (1, 1, height, width) and the "
     "next states in the same order; docs/model-card.md says how to export such a file"
 )
 
 
 @dataclass(frozen=True)
 class StateSpec:
-    """A recurrent state's channels and its size as a fraction of the picture's: 2 is half."""
+    """A recurrent state's channels and its size as a fraction of the image's: 2 is half."""
 
     name: str
     n_channels: int
@@ -53,10 +53,10 @@ class ReconstructionModel:
             raise self._refused(f"{len(inputs)} inputs and {len(outputs)} outputs")
         self.n_bins = self._check_voxels(inputs[0])
         self.states = tuple(self._read_state(item) for item in inputs[1:])
-        # The picture is padded so that every state has a whole number of rows and columns.
+        # The image is padded so that every state has a whole number of rows and columns.
         self.size_multiple = math.lcm(2, *(state.divisor for state in self.states))
         if self.size_multiple > _MAX_MULTIPLE:
-            raise self._refused(f"pictures would be padded to multiples of {self.size_multiple} px")
+            raise self._refused(f"images would be padded to multiples of {self.size_multiple} px")
 
     def initial_states(self, height_px: int, width_px: int) -> States:
         """Make the states before the first window for a sensor of this size: zeros.
@@ -83,7 +83,7 @@ class ReconstructionModel:
             states: as the last step or `initial_states` gave them.
 
         Returns:
-            picture (H, W), arbitrary scale; next states.
+            image (H, W), arbitrary scale; next states.
         """
         _, height, width = voxels.shape
         rows, cols = self._padded(height) - height, self._padded(width) - width

@@ -17,7 +17,7 @@ class NetworkError(Exception):
 
     Args:
         what: one line.
-        hint: what to do about it; empty where the file is not what is expected.
+        hint: what to do about it; empty if the file is not what is expected.
     """
 
     def __init__(self, what: str, hint: str = "") -> None:

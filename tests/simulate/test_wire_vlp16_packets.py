@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from wire.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets, gprmc
 
 from lce_rig.core import velodyne
 from lce_rig.core.board import Board
@@ -12,11 +13,9 @@ from lce_rig.core.geometry import Array
 from lce_rig.recordings.velodyne.packet import read_data_packet, read_position_packet
 from lce_rig.recordings.velodyne.stream import Vlp16Stream
 from lce_rig.simulate.carriers import build_carrier
-from lce_rig.simulate.lidar import simulate_scan
 from lce_rig.simulate.options import LidarNoise
 from lce_rig.simulate.room import Room
 from lce_rig.simulate.scene import Scene
-from lce_rig.simulate.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets, gprmc
 from tests.recordings.vlp16_room import (
     T0_NS,
     largest_errors,
@@ -27,7 +26,7 @@ from tests.recordings.vlp16_room import (
     settings,
 )
 
-from .conftest import board_before_lidar
+from .conftest import board_before_lidar, simulate_scan
 
 HALF_RANGE_STEP_M = 0.001
 # A block's azimuth is rounded in the packet, each point's once more on decoding.
@@ -117,7 +116,7 @@ def test_a_scan_after_a_break_begins_a_packet_of_its_own() -> None:
     assert int(later.stamp_ns or 0) // 1000 % velodyne.HOUR_US in starts_us
     stream = Vlp16Stream("lidar", settings())
     assert len(push(stream, packets)) == 2
-    assert stream.counts.bad.total() == 0
+    assert stream.flaws() == []
 
 
 def test_a_scan_that_no_vlp16_could_send_is_refused() -> None:

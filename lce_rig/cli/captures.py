@@ -1,0 +1,131 @@
+"""`lce-rig captures`: list the captures of a session, reject or restore them."""
+
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lce_rig.cli import show
+from lce_rig.cli.options import json_option, session_argument
+
+if TYPE_CHECKING:
+    from lce_rig.session import Capture, Session
+
+
+@click.command()
+@session_argument
+@click.option("--reject", metavar="NAME", multiple=True, help="Reject this capture; repeatable.")
+@click.option("--restore", metavar="NAME", multiple=True, help="Restore this capture; repeatable.")
+@click.option("--reason", metavar="TEXT", default="", help="Write this reason into the session's journal.")
+@json_option
+def captures(
+    session: Path, reject: tuple[str, ...], restore: tuple[str, ...], reason: str, as_json: bool
+) -> None:
+    """List the captures of SESSION (default: session/); reject or restore them by name.
+
+    A rejected capture moves to SESSION/rejected/ with all its files. No command uses it, and `collect` does
+    not take it again from the same recording. Restoring moves it back.
+    """
+    import lce_rig as lce
+
+    rejecting, restoring = list(map(_full, reject)), list(map(_full, restore))
+    with lce.Session.open(session, writable=bool(rejecting or restoring)) as opened:
+        _require_there(opened, rejecting, restoring)
+        for name in rejecting:
+            opened.reject(name, reason)
+        for name in restoring:
+            opened.restore(name)
+        records = _records(opened)
+    if as_json:
+        show.print_json({"format_version": 1, "rig": opened.rig.name, "captures": records})
+    else:
+        show.print_table(_table(records))
+        n_rejected = sum(record["state"] == "rejected" for record in records)
+        counts = show.counted(len(records) - n_rejected, "capture")
+        show.say(counts + (f", {n_rejected} rejected" if n_rejected else ""))
+    if any(record["state"] == "rejected" and record["used_by"] for record in records) or (
+        restoring and any(record["used_by"] for record in records)
+    ):
+        show.note("the captures have changed since the result was made: run `lce-rig calibrate` again")
+
+
+def _full(name: str) -> str:
+    """Return a capture's name with its leading zeros, which may be omitted."""
+    return name.zfill(6) if name.isascii() and name.isdigit() else name
+
+
+def _require_there(session: "Session", rejecting: list[str], restoring: list[str]) -> None:
+    """Check every name before any capture is moved.
+
+    Raises:
+        UsageError: a name is given twice, or is not that of a capture to be rejected or restored.
+    """
+    from lce_rig.core.errors import UsageError
+
+    names = [*rejecting, *restoring]
+    there = {capture.name for capture in session.captures}
+    aside = {capture.name for capture in session.rejected}
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"capture {name} is given twice")
+    for name, known, other, state in (
+        *((name, there, aside, "rejected already") for name in rejecting),
+        *((name, aside, there, "not rejected") for name in restoring),
+    ):
+        if name in other:
+            raise UsageError(f"{session.path}: capture {name} is {state}")
+        if name not in known:
+            raise UsageError(
+                f"{session.path} has no capture {name}", f"List them with: lce-rig captures {session.path}"
+            )
+
+
+def _records(session: "Session") -> list[dict[str, Any]]:
+    used = _used(session)
+    states = [(each, "kept") for each in session.captures] + [(each, "rejected") for each in session.rejected]
+    states.sort(key=lambda item: int(item[0].name))
+    return [_record(capture, state, used.get(capture.name, [])) for capture, state in states]
+
+
+def _record(capture: "Capture", state: str, used_by: list[str]) -> dict[str, Any]:
+    from lce_rig.core.errors import SessionError
+
+    record = {"name": capture.name, "state": state, "used_by": used_by}
+    try:
+        source = capture.meta.get("source")
+        streams = [".".join(key) for key in capture.image_keys]
+        streams += [f"{camera}.events" for camera in capture.event_cameras] + capture.lidars
+    except SessionError as error:
+        return {**record, "streams": [], "source": "", "damage": error.what}
+    label = source.get("label", "") if isinstance(source, dict) else ""
+    return {**record, "streams": streams, "source": str(label), "damage": None}
+
+
+def _used(session: "Session") -> dict[str, list[str]]:
+    """Name the cameras whose result in calibration/ used each capture."""
+    import lce_rig as lce
+    from lce_rig.core.errors import LceRigError
+    from lce_rig.pipeline.result_files import RESULT
+    from lce_rig.session.session import CALIBRATION
+
+    used: dict[str, list[str]] = {}
+    with suppress(LceRigError):
+        for calibration in lce.read_result(session.path / CALIBRATION / RESULT).pairs:
+            for name in calibration.captures_used:
+                used.setdefault(name, []).append(calibration.camera)
+    return used
+
+
+def _table(records: list[dict[str, Any]]) -> Any:
+    table = show.plain_table("", "capture", "data", "source", "used by", "")
+    for record in records:
+        state = "[red]rejected[/]" if record["state"] == "rejected" else ""
+        table.add_row(
+            record["name"],
+            show.escape(", ".join(record["streams"])) or "[red]damaged[/]",
+            show.escape(record["source"]),
+            show.escape(", ".join(record["used_by"])) or "-",
+            state,
+        )
+    return table

@@ -1,0 +1,99 @@
+"""`lce-rig results`: list the results of a session with figures and verdicts."""
+
+import math
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lce_rig.cli import show
+from lce_rig.cli.options import json_option, session_argument
+
+if TYPE_CHECKING:
+    from lce_rig.core.results import Calibration
+    from lce_rig.pipeline.result_files import StoredResult
+
+
+@click.command()
+@session_argument
+@json_option
+def results(session: Path, as_json: bool) -> None:
+    """List the results of SESSION (default: session/): the current one, the previous one and named ones.
+
+    `lce-rig calibrate --name NAME` adds a named result, `lce-rig repeat SESSION` compares them.
+    """
+    import lce_rig as lce
+    from lce_rig.pipeline.result_files import stored_results
+
+    opened = lce.Session.open(session)
+    stored = stored_results(opened)
+    if as_json:
+        document = [_document(each, opened.path) for each in stored]
+        show.print_json({"format_version": 1, "rig": opened.rig.name, "results": document})
+        return
+    if stored:
+        show.print_table(_table(stored))
+    else:
+        show.say(f"no results in {session}: run `lce-rig calibrate`")
+    for each in stored:
+        if each.problem:
+            show.warn(each.problem)
+        elif each.is_outdated:
+            show.note(f"{each.name}: the profile or the captures that it used have changed since")
+
+
+def _table(stored: list["StoredResult"]) -> Any:
+    table = show.plain_table("", "result", "sensors", "method", "channels")
+    for heading in ("used", "deg", "mm", "px"):
+        table.add_column(heading, justify="right")
+    table.add_column("verdict")
+    table.add_column("written")
+    for each in stored:
+        written = datetime.fromtimestamp(each.written_s).strftime("%Y-%m-%d %H:%M")
+        name = show.escape(each.name)
+        for calibration in () if each.saved is None else each.saved.pairs:
+            table.add_row(name, *_cells(calibration), written)
+        if each.saved is None:
+            table.add_row(name, "-", "-", "-", "-", "-", "-", "-", "[red]unreadable[/]", written)
+    return table
+
+
+def _cells(c: "Calibration") -> list[str]:
+    px = c.metrics.reprojection_px
+    return [
+        show.escape(f"{c.camera}, {c.lidar}"),
+        c.method,
+        show.escape("+".join(c.channels)),
+        f"{len(c.captures_used)}",
+        f"{c.sigma_rotation_deg:.3f}",
+        f"{1000 * c.sigma_translation_m:.1f}",
+        f"{px:.2f}" if math.isfinite(px) else "-",
+        f"[{show.COLOURS[c.verdict]}]{c.verdict}[/]",
+    ]
+
+
+def _document(stored: "StoredResult", session: Path) -> dict[str, Any]:
+    return {
+        "name": stored.name,
+        "file": str((stored.folder / "result.json").relative_to(session)),
+        "written_s": stored.written_s,
+        "is_outdated": stored.is_outdated,
+        "problem": stored.problem or None,
+        "pairs": [] if stored.saved is None else [_pair(each) for each in stored.saved.pairs],
+    }
+
+
+def _pair(c: "Calibration") -> dict[str, Any]:
+    px = c.metrics.reprojection_px
+    return {
+        "camera": c.camera,
+        "lidar": c.lidar,
+        "method": c.method,
+        "channels": list(c.channels),
+        "n_captures_used": len(c.captures_used),
+        "sigma_rotation_deg": c.sigma_rotation_deg,
+        "sigma_translation_m": c.sigma_translation_m,
+        "reprojection_px": px if math.isfinite(px) else None,
+        "verdict": c.verdict,
+    }

@@ -1,0 +1,170 @@
+"""One thread that writes everything of a live collection to disk: captures first, then recordings."""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from contextlib import nullcontext, suppress
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Generic, TypeVar
+
+from lce_rig.core.errors import LceRigError, SessionError
+from lce_rig.core.findings import Finding
+from lce_rig.core.losses import Losses
+
+#: What may wait for the disk, captures apart.
+MOST_WAITING_BYTES = 512 * 2**20
+
+T = TypeVar("T")
+
+
+class Sink(Generic[T]):
+    """A session, a recording or a file that a `DiskWriter` writes to.
+
+    Attributes:
+        path: where.
+        n_written: items written.
+        n_dropped: items that the disk was too slow for.
+        failure: why nothing more is written; None while it is.
+    """
+
+    def __init__(
+        self, writer: "DiskWriter", path: Path, write: Callable[[T], object], is_vital: bool
+    ) -> None:
+        self.path = path
+        self.n_written = self.n_dropped = 0
+        self.failure: LceRigError | None = None
+        self.is_vital = is_vital
+        self.write = write
+        self._writer = writer
+
+    def put(self, item: T, n_bytes: int = 0) -> None:
+        """Have an item written; never blocks. Where too much waits it is dropped, but for vital sinks."""
+        self._writer.put(self, item, n_bytes)
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether an item is not written yet."""
+        return self._writer.is_writing(self)
+
+    def findings(self) -> list[Finding]:
+        """List what is missing in what was written, and why."""
+        losses = Losses()
+        path = str(self.path)
+        losses.add(Finding("device.recording_incomplete", "warning", figures={"path": path}), self.n_dropped)
+        found = losses.findings()
+        if self.failure is not None:
+            figures = {"path": path, "cause": self.failure.what}
+            found.append(Finding("device.recording_stopped", "warning", figures=figures))
+        return found
+
+
+class DiskWriter:
+    """Writes items of several sinks in the order in which they come, those of vital ones before all others.
+
+    Open while its `with` block lasts; what waits when it ends is written first. A sink that fails takes
+    nothing more, and the others go on.
+    """
+
+    def __init__(self, most_waiting_bytes: int = MOST_WAITING_BYTES) -> None:
+        self._most_waiting_bytes = most_waiting_bytes
+        self._n_waiting_bytes = 0
+        self._sinks: list[tuple[Sink[Any], Callable[[], None]]] = []
+        self._vital: deque[tuple[Sink[Any], Any, int]] = deque()
+        self._others: deque[tuple[Sink[Any], Any, int]] = deque()
+        self._current: Sink[Any] | None = None
+        self._changed = threading.Condition()
+        self._is_closing = False
+        self._thread = threading.Thread(target=self._run, name="write to disk", daemon=True)
+
+    def add(
+        self,
+        path: Path,
+        write: Callable[[T], object],
+        finish: Callable[[], None] = lambda: None,
+        *,
+        is_vital: bool = False,
+    ) -> Sink[T]:
+        """Add a sink.
+
+        Args:
+            path: where it writes, for messages.
+            write: writes an item; called in the writer's thread.
+            finish: called in that thread after the last item.
+            is_vital: its items go first and are never dropped, and its failure is an error.
+        """
+        sink = Sink(self, path, write, is_vital)
+        self._sinks.append((sink, finish))
+        return sink
+
+    def __enter__(self) -> "DiskWriter":
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close, and raise nothing over another error."""
+        with nullcontext() if error is None else suppress(LceRigError):
+            self.close()
+
+    def close(self) -> None:
+        """Write what waits, and finish every sink; does nothing more the second time.
+
+        Raises:
+            LceRigError: a vital sink failed.
+        """
+        with self._changed:
+            self._is_closing = True
+            self._changed.notify()
+        self._thread.join()
+        for sink, _ in self._sinks:
+            if sink.is_vital and sink.failure is not None:
+                raise sink.failure
+
+    def put(self, sink: Sink[T], item: T, n_bytes: int) -> None:
+        """Queue an item; see `Sink.put`."""
+        with self._changed:
+            if sink.failure is not None or (self._is_closing and not sink.is_vital):
+                return
+            if sink.is_vital:
+                self._vital.append((sink, item, 0))
+            elif self._n_waiting_bytes + n_bytes > self._most_waiting_bytes:
+                sink.n_dropped += 1
+                return
+            else:
+                self._others.append((sink, item, n_bytes))
+                self._n_waiting_bytes += n_bytes
+            self._changed.notify()
+
+    def is_writing(self, sink: Sink[T]) -> bool:
+        """Whether an item of a sink is not written yet."""
+        with self._changed:
+            return self._current is sink or any(each is sink for each, _, _ in (*self._vital, *self._others))
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._current = None
+                self._changed.wait_for(lambda: self._vital or self._others or self._is_closing)
+                queue = self._vital or self._others
+                if not queue:
+                    break
+                sink, item, n_bytes = queue.popleft()
+                self._current = sink
+                self._n_waiting_bytes -= n_bytes
+            if sink.failure is None and self._try(sink, partial(sink.write, item)):
+                sink.n_written += 1
+        for sink, finish in self._sinks:
+            self._try(sink, finish)
+
+    def _try(self, sink: Sink[Any], act: Callable[[], object]) -> bool:
+        try:
+            act()
+        except LceRigError as error:
+            sink.failure = sink.failure or error
+        except Exception as error:  # Nothing that goes wrong with one sink may end the thread.
+            cause = getattr(error, "strerror", None) or repr(error)
+            sink.failure = sink.failure or SessionError(f"{sink.path} cannot be written: {cause}")
+        return sink.failure is None

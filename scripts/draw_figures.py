@@ -1,0 +1,82 @@
+#!/usr/bin/env python3
+"""Draw the pictures of docs/images/ that show a rig, with lce-rig itself, on the simulated rig rlfs.
+
+draw_figures.py [NAME...]   only these; the two screens need Chromium and `pip install '.[docs]'`
+"""
+
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+from figures import board, frames, views
+
+from lce_rig.cli.main import run
+from lce_rig.rig import load_rig
+
+FOLDER = Path(__file__).resolve().parents[1] / "docs" / "images"
+
+
+def _save(figure: plt.Figure, name: str) -> None:
+    figure.savefig(FOLDER / name, dpi=110, bbox_inches="tight", pad_inches=0.08)
+    plt.close(figure)
+
+
+def _board() -> None:
+    _save(board.draw_board(load_rig("rlfs")), "board.png")
+
+
+def _placements() -> None:
+    _save(views.draw_placements(load_rig("rlfs"), views.GOOD), "placements.jpg")
+
+
+def _refused() -> None:
+    _save(views.draw_placements(load_rig("rlfs"), views.BAD), "refused.jpg")
+
+
+def _good_and_bad() -> None:
+    _save(views.draw_good_and_bad(load_rig("rlfs"), 1.0, 40.0), "good_and_bad.jpg")
+
+
+def _debug() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        session = str(Path(folder, "session"))
+        assert run(["simulate", session, "--rig", "rlfs", "--captures", "4", "--seed", "1"]) == 0
+        assert run(["check", session, "--debug-images"]) == 0
+        picture = cv2.imread(str(Path(session, "debug", "000003.png")))
+    cv2.imwrite(str(FOLDER / "debug.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 82])
+
+
+def _frames() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        session = Path(folder, "session")
+        assert run(["simulate", str(session), "--rig", "rlfs", "--captures", "12", "--seed", "1"]) == 0
+        assert run(["calibrate", str(session)]) == 0
+        _save(frames.draw_frames(session / "calibration" / "rlfs.urdf"), "frames.png")
+
+
+def _screens() -> None:
+    from figures.screens import draw_screens
+
+    draw_screens(FOLDER)
+
+
+FIGURES: dict[str, Callable[[], None]] = {
+    "board": _board,
+    "placements": _placements,
+    "refused": _refused,
+    "good_and_bad": _good_and_bad,
+    "debug": _debug,
+    "frames": _frames,
+    "screens": _screens,
+}
+
+if __name__ == "__main__":
+    mpl.use("Agg")
+    plt.rcParams["font.size"] = 13
+    for name in sys.argv[1:] or FIGURES:
+        FIGURES[name]()
+        print(name)

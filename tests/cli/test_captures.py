@@ -1,0 +1,48 @@
+"""`lce-rig captures` as a user types it."""
+
+import json
+
+import pytest
+
+
+def listed(lce_rig, session):
+    return {each["name"]: each for each in json.loads(lce_rig("captures", session, "--json").out)["captures"]}
+
+
+def test_a_rejected_capture_is_used_no_more_until_it_is_restored(lce_rig, calibrated):
+    before = json.loads((calibrated / "calibration" / "result.json").read_text())["pairs"][0]
+    name = before["captures_used"][0]
+    assert listed(lce_rig, calibrated)[name]["used_by"] == [before["camera"]]
+    # Leading zeros may be left away.
+    assert lce_rig("captures", calibrated, "--reject", str(int(name)), "--reason", "a mirror").code == 0
+    assert listed(lce_rig, calibrated)[name]["state"] == "rejected"
+    assert name not in json.loads(lce_rig("check", calibrated, "--json").out)["pairs"][0]["captures"]
+    assert lce_rig("calibrate", calibrated).code == 0
+    pair = json.loads((calibrated / "calibration" / "result.json").read_text())["pairs"][0]
+    assert name not in pair["captures_used"] and pair["n_captures"] == before["n_captures"] - 1
+    assert lce_rig("captures", calibrated, "--restore", name).code == 0
+    assert lce_rig("calibrate", calibrated).code == 0
+    after = json.loads((calibrated / "calibration" / "result.json").read_text())["pairs"][0]
+    assert after["T_cam_lidar"] == before["T_cam_lidar"]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--reject", "99"),
+        ("--restore", "0"),
+        ("--reject", "0", "--restore", "0"),
+        ("--reject", "0", "--reject", "../captures/000001"),
+    ],
+)
+def test_one_wrong_name_moves_nothing(lce_rig, session, options):
+    outcome = lce_rig("captures", session, *options)
+    assert outcome.code == 2
+    assert {each["state"] for each in listed(lce_rig, session).values()} == {"kept"}
+
+
+def test_the_list_names_every_capture_and_a_damaged_one(lce_rig, session):
+    (session / "captures" / "000003" / "meta.json").write_text("{")
+    outcome = lce_rig("captures", session)
+    assert outcome.code == 0 and outcome.out.count("00000") >= 10
+    assert "000003" in listed(lce_rig, session)["000003"]["damage"]

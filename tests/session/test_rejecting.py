@@ -1,0 +1,75 @@
+"""Rejected captures are out of use, not lost, and come back as they were."""
+
+import pytest
+
+from lce_rig.core.errors import SessionError
+from lce_rig.session import Session
+
+
+@pytest.fixture
+def session(tmp_path, rig, samples):
+    """Three captures, open for writing."""
+    with Session.create(tmp_path / "s", rig) as made:
+        for seed in range(3):
+            made.add_capture(*samples(seed), {"source": {"key": f"k:{seed}"}})
+        yield made
+
+
+def names(captures):
+    return [capture.name for capture in captures]
+
+
+def test_a_rejected_capture_is_out_of_use_and_comes_back_to_the_byte(session):
+    before = {file.name: file.read_bytes() for file in session.capture("000001").path.iterdir()}
+    session.reject("000001", "a second board in view")
+    assert (names(session.captures), names(session.rejected)) == (["000000", "000002"], ["000001"])
+    with pytest.raises(SessionError, match="000001"):
+        session.capture("000001")
+    session.restore("000001")
+    assert (names(session.captures), names(session.rejected)) == (["000000", "000001", "000002"], [])
+    after = {file.name: file.read_bytes() for file in session.capture("000001").path.iterdir()}
+    assert after == before
+    told = [(entry["event"], entry["capture"]) for entry in session.read_journal()[-2:]]
+    assert told == [("rejected", "000001"), ("restored", "000001")]
+    assert session.read_journal()[-2]["reason"] == "a second board in view"
+
+
+def test_neither_the_name_nor_the_data_of_a_rejected_capture_is_taken_anew(session, samples):
+    session.reject("000002")
+    assert session.find_duplicate(*samples(2)) == "000002"
+    assert session.add_capture(*samples(7), {}) == "000003"
+    session.close()
+    with Session.open(session.path, writable=True) as again:
+        assert again.find_duplicate(*samples(2)) == "000002"
+        again.restore("000002")
+        assert names(again.captures) == ["000000", "000001", "000002", "000003"]
+
+
+@pytest.mark.parametrize("verb", ["reject", "restore"])
+def test_a_capture_that_is_not_there_is_named(session, verb):
+    with pytest.raises(SessionError, match="000009"):
+        getattr(session, verb)("000009")
+
+
+def test_a_session_open_for_reading_rejects_nothing(session):
+    with pytest.raises(SessionError):
+        Session.open(session.path).reject("000000")
+    assert len(session.captures) == 3
+
+
+def test_a_folder_of_rejected_captures_that_leads_elsewhere_is_refused(session, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (session.path / "rejected").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(SessionError):
+        session.reject("000000")
+    assert len(session.captures) == 3 and not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_nothing_is_replaced_where_a_capture_is_to_go(session):
+    session.reject("000000")
+    (session.path / "captures" / "000000").mkdir()
+    (session.path / "captures" / "000000" / "mine.txt").write_text("a user's")
+    with pytest.raises(SessionError, match="in the way"):
+        session.restore("000000")
+    assert (session.path / "captures" / "000000" / "mine.txt").read_text() == "a user's"
+    assert names(session.rejected) == ["000000"]
