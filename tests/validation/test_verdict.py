@@ -34,8 +34,8 @@ def examined(estimate, lens=CAMERA):
 def verdict_of(estimate):
     """Judge a changed estimate by what the checks found on the sound one."""
 
-    def judged(changed, n_captures=20):
-        return judge(changed, replace(examined(estimate), cov=changed.cov), RIG, "cam", "lidar", n_captures)
+    def judged(changed, n_captures=20, rig=RIG):
+        return judge(changed, replace(examined(estimate), cov=changed.cov), rig, "cam", "lidar", n_captures)
 
     return judged
 
@@ -80,7 +80,10 @@ def test_where_the_lidar_itself_misses_the_target_more_captures_are_not_advised(
 
 def test_a_result_far_from_the_nominal_extrinsic_fails_with_both_figures(estimate, verdict_of):
     moved = perturb(estimate.T_cam_lidar, np.array([0.3, 0, 0, 0, 0, np.radians(20)]))
-    verdict, reasons = verdict_of(replace(estimate, T_cam_lidar=moved))
+    cad = [pose.model_copy(update={"source": "cad"}) for pose in RIG.nominal_extrinsics]
+    drawn = RIG.model_copy(update={"nominal_extrinsics": cad})
+    assert verdict_of(replace(estimate, T_cam_lidar=moved))[0] == "pass"
+    verdict, reasons = verdict_of(replace(estimate, T_cam_lidar=moved), rig=drawn)
     assert verdict == "fail"
     assert reasons[0].code == "verdict.far_from_nominal"
     assert (reasons[0].figures["tolerance_deg"], reasons[0].figures["tolerance_m"]) == (5, 0.05)
