@@ -18,7 +18,7 @@ from lce_rig.core.documents import parse_json, read_json
         (b"[NaN]", "NaN is no number"),
         (b"[-Infinity]", "-Infinity is no number"),
         (b'{"a": 1, "a": 2}', "'a' is given twice"),
-        (b"\xff\xfe[1]", "no UTF-8"),
+        (b"\xff\xfe[1]", "not UTF-8"),
         (b'["\\ud800"]', "half a character"),
         (b'{"\\udc00": 1}', "half a character"),
         (b"", "not JSON"),
