@@ -66,7 +66,7 @@ def _row(code: str, phrase: Phrase) -> str:
         _said(phrase.text),
         "<br>".join(action for action in actions if action),
     )
-    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
+    return f"| {' | '.join(cell.replace('|', '/').replace(chr(10), '<br>') for cell in cells)} |"
 
 
 def _figures(template: Template) -> list[str]:
