@@ -96,8 +96,8 @@ def npy(shape: tuple[int, ...], content: bytes, descr: object = "<i8") -> bytes:
 @pytest.mark.parametrize(
     ("column", "cause"),
     [
-        (b"hello", "column t is no array"),
-        (b"", "column t is no array"),
+        (b"hello", "column t is not an array"),
+        (b"", "column t is not an array"),
         (npy((1 << 40,), bytes(80)), "declares 1099511627776 numbers"),
         (npy((1 << 70, 0), b""), "not a list of numbers"),
         (npy((9,), bytes(80)), "declares 9 numbers"),

@@ -222,7 +222,7 @@ def test_heads_of_aedat4_that_are_deep_or_huge_are_refused(tmp_path: Path) -> No
     os.truncate(tmp_path / "b.aedat4", 1 << 31)
     assert "declares 1074 MB" in refusal(tmp_path / "b.aedat4")
     long = XML.format(streams=STREAM.format(number="9" * 5000, kind="EVTS", name="", width=1, height=1))
-    assert "not a number" in refusal(aedat4(tmp_path / "c.aedat4", [], long.encode()))
+    assert "no number" in refusal(aedat4(tmp_path / "c.aedat4", [], long.encode()))
 
 
 def test_zeros_behind_the_packets_of_aedat4_are_a_torn_end_and_no_packets(tmp_path: Path) -> None:
