@@ -12,7 +12,13 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
+from lce_rig.collect.board_tracker import (
+    BoardDetection,
+    BoardTracker,
+    CaptureMoment,
+    TakenByHand,
+    without_samples,
+)
 from lce_rig.collect.live.capture_triggers import LiveGate, SlowBoards, StillBoards
 from lce_rig.collect.live.capture_writer import CaptureWriter, Task, record_streams
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
@@ -22,8 +28,8 @@ from lce_rig.collect.live.monitor import Monitor
 from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_unseen
 from lce_rig.collect.live.options import Ending, Key, LiveOptions, LiveReport
 from lce_rig.collect.live.state import LiveState
-from lce_rig.collect.live.worker import Worker
 from lce_rig.collect.placement_dedupe import Placements, capture_poses
+from lce_rig.collect.worker import Worker
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.results import Refusal
 from lce_rig.devices.disk_writer import DiskWriter
@@ -89,17 +95,13 @@ class _Search:
         self._longest_s = max(time.monotonic() - began_s, _FORGET * self._longest_s)
         self._tracker.thorough_interval_s = max(THOROUGH_S, _RARE * self._longest_s)
         self._tracker.rescan_interval_s = max(RESCAN_S, _RARE * self._longest_s)
-        return _without_samples(found)
+        return without_samples(found)
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
         found = self._tracker.confirm(moment)
         if isinstance(found, CaptureMoment):
-            return replace(found, sighting=_without_samples(found.sighting))
+            return replace(found, sighting=without_samples(found.sighting))
         return found
-
-
-def _without_samples(sighting: BoardDetection) -> BoardDetection:
-    return replace(sighting, frame=replace(sighting.frame, images=(), scans=()))
 
 
 _WAIT_S = 0.1
@@ -341,7 +343,7 @@ class _Loop:
         if self._seeing_guide(sighting) is None:
             self._monitor.cue("refused", "not captured: not every sensor sees the board")
             return
-        confirmed = self._search.confirm(CaptureMoment(sighting, {"by_hand": 1.0}))
+        confirmed = self._search.confirm(CaptureMoment(sighting, TakenByHand()))
         if isinstance(confirmed, CaptureMoment):
             self._capture(confirmed)
         else:
