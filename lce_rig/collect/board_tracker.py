@@ -1,4 +1,4 @@
-"""The board followed from frame to frame, in every picture and scan."""
+"""The board followed from frame to frame, in every image and scan."""
 
 from dataclasses import dataclass, field, replace
 
@@ -41,13 +41,13 @@ class BoardDetection:
 
 @dataclass(frozen=True, eq=False)
 class CaptureMoment:
-    """A sighting worth a capture.
+    """A detection worth a capture.
 
     Attributes:
         figures: how still or how fast the board was, by name; kept with the capture.
     """
 
-    sighting: BoardDetection
+    detection: BoardDetection
     figures: dict[str, float]
 
 
@@ -57,7 +57,7 @@ class BoardTracker:
 
     Attributes:
         rig: the profile.
-        search_interval_s: how often a whole picture is searched while no board is in sight.
+        search_interval_s: how often a whole image is searched while no board is in sight.
         refusals: frames in which it was not found, and boards that were found and cannot be used.
         thorough_interval_s: how often such a search is thorough, which takes most of a second; 0 for always.
         rescan_interval_s: how often a whole scan is searched while all candidates are followed; 0 for as
@@ -79,7 +79,7 @@ class BoardTracker:
         self.finder = BoardFinder(self.rig)
 
     def sight(self, frame: Frame) -> BoardDetection:
-        """Find the board in every picture and scan of a frame."""
+        """Find the board in every image and scan of a frame."""
         images: dict[ImageKey, ImageBoard] = {}
         unseen: dict[ImageKey, Refusal] = {}
         unfit: dict[ImageKey, Refusal] = {}
@@ -117,20 +117,20 @@ class BoardTracker:
         Returns:
             The moment with what was found; or why it cannot be used.
         """
-        sighting = moment.sighting
-        keys = sighting.images.keys()
+        detection = moment.detection
+        keys = detection.images.keys()
         images = {
             (image.sensor, image.channel): self.finder.image(image)
-            for image in sighting.frame.images
+            for image in detection.frame.images
             if (image.sensor, image.channel) in keys
         }
-        scans = {scan.sensor: self.finder.scan(scan) for scan in sighting.frame.scans}
+        scans = {scan.sensor: self.finder.scan(scan) for scan in detection.frame.scans}
         usable = {key: board for key, board in images.items() if isinstance(board, ImageBoard)}
         lidars = {name: boards for name, boards in scans.items() if isinstance(boards, list)}
         for found, refused in ((usable, images), (lidars, scans)):
             if not found:
                 return next(why for why in refused.values() if isinstance(why, Refusal))
-        return replace(moment, sighting=BoardDetection(sighting.frame, usable, lidars))
+        return replace(moment, detection=BoardDetection(detection.frame, usable, lidars))
 
     def _find_in_image(self, image: Image, key: ImageKey, time_ns: int) -> ImageSearch | None:
         last = self._seen.pop(key, None)
@@ -165,7 +165,7 @@ class BoardTracker:
         return _is_due(self._searched_ns, key, time_ns, self.search_interval_s)
 
     def _is_thorough_due(self, key: ImageKey, time_ns: int, *, was_seen: bool) -> bool:
-        """Tell whether it is time for a thorough search; a board just lost is soon seen again without."""
+        """Check whether it is time for a thorough search; a board just lost is soon seen again without."""
         if was_seen and self.thorough_interval_s > 0:
             self._thorough_ns[key] = time_ns
             return False
@@ -173,7 +173,7 @@ class BoardTracker:
 
 
 def _is_due(last_ns: dict[ImageKey | str, int], key: ImageKey | str, time_ns: int, interval_s: float) -> bool:
-    """Tell whether an interval has gone by since something was done last, and note that it is done now."""
+    """Check whether an interval has gone by since something was done last, and note that it is done now."""
     before_ns = last_ns.get(key)
     if before_ns is not None and 0 <= time_ns - before_ns < interval_s * 1e9:
         return False
