@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import matplotlib as mpl
 import matplotlib.pyplot as plt
-from figures import board, views
+from figures import board, frames, views
 
 from lce_rig.cli.main import run
 from lce_rig.rig import load_rig
@@ -50,6 +50,14 @@ def _debug() -> None:
     cv2.imwrite(str(FOLDER / "debug.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 82])
 
 
+def _frames() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        session = Path(folder, "session")
+        assert run(["simulate", str(session), "--rig", "rlfs", "--captures", "12", "--seed", "1"]) == 0
+        assert run(["calibrate", str(session)]) == 0
+        _save(frames.draw_frames(session / "calibration" / "rlfs.urdf"), "frames.png")
+
+
 def _screens() -> None:
     from figures.screens import draw_screens
 
@@ -62,11 +70,13 @@ FIGURES: dict[str, Callable[[], None]] = {
     "refused": _refused,
     "good_and_bad": _good_and_bad,
     "debug": _debug,
+    "frames": _frames,
     "screens": _screens,
 }
 
 if __name__ == "__main__":
     mpl.use("Agg")
+    plt.rcParams["font.size"] = 13
     for name in sys.argv[1:] or FIGURES:
         FIGURES[name]()
         print(name)

@@ -1,4 +1,4 @@
-"""`lce-rig calibrate`: the extrinsics of a session, judged and written as files."""
+"""`lce-rig calibrate`: estimate the extrinsics of a session, judge them and write them as files."""
 
 import math
 from collections.abc import Collection, Iterator, Sequence
@@ -21,22 +21,23 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.results import Calibration, OtherCamera
 from lce_rig.detect.detection import Pair
-from lce_rig.words import sentence
+from lce_rig.words import not_enough, sentence
+from lce_rig.words.extrinsics import weakest_words
 
-# How the report of a calibration states what is uncertain: by axis, and for points at several distances.
+# The uncertainty in the report: by axis, and for points at several distances.
 
 _AXES = ("x right", "y down", "z forward")
 
 
 def uncertainty_lines(calibration: Calibration) -> list[str]:
-    """State an extrinsic's standard deviations and its least certain motion, in lines of 80 columns."""
+    """State extrinsics's standard deviations and its least certain motion, in lines of 80 columns."""
     c = calibration
     sigmas = np.sqrt(np.diag(c.cov))
     return [
-        f"  known to     {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
+        f"  uncertainty  {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
         f"               about {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
         f"               along {_by_axis(1000 * sigmas[:3], '.1f')} mm",
-        f"  weakest: {c.weak_direction}",
+        *([f"  weakest: {weakest_words(c.weakest)}"] if c.weakest else []),
         *_at_distances(c),
     ]
 
@@ -57,23 +58,23 @@ def _at_distances(c: Calibration) -> list[str]:
     ]
 
 
-# How a calibration is reported of several cameras: how they sit to each other, which one has no result.
+# The report of several cameras: their relative poses, and which of them has no result.
 
 
 def together_lines(calibration: Calibration) -> list[str]:
-    """Say with which cameras an extrinsic was estimated, and how well it is known without them."""
+    """Name the cameras of the joint estimate, and the standard deviation without them."""
     if not calibration.estimated_with:
         return []
     figures = calibration.diagnostics
     alone = ""
-    if "alone_sigma_rotation_deg" in figures:
-        sigma_mm = 1000 * figures["alone_sigma_translation_m"]
-        alone = f"; alone it is known to {figures['alone_sigma_rotation_deg']:.3f} deg, {sigma_mm:.1f} mm"
+    if math.isfinite(figures.alone_sigma_rotation_deg):
+        sigma_mm = 1000 * figures.alone_sigma_translation_m
+        alone = f"; uncertainty alone {figures.alone_sigma_rotation_deg:.3f} deg, {sigma_mm:.1f} mm"
     return [f"  together     with {', '.join(calibration.estimated_with)}{alone}"]
 
 
 def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) -> list[str]:
-    """State where cameras earlier in the result sit to this one; each two cameras are stated once."""
+    """State the poses of cameras earlier in the result relative to this one, each pair of cameras once."""
     c = calibration
     others = {other.camera: other for other in c.other_cameras}
     lines: list[str] = []
@@ -82,8 +83,7 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
             lines += _camera_lines(c.camera, others[earlier.camera])
         elif earlier.lidar == c.lidar:
             lines.append(
-                f"[bold]{earlier.camera} and {c.camera}[/]: no board held still before both: "
-                "neither is held against the other"
+                f"[bold]{earlier.camera} and {c.camera}[/]: not compared, as no still board was seen by both"
             )
     return lines
 
@@ -91,40 +91,40 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
 def lacking_extrinsics(
     wanted: Sequence[str], seen: Collection[str], calibrations: Sequence[Calibration]
 ) -> NotEnoughDataError | None:
-    """Say which cameras have no extrinsic, None where all have: half a rig must not pass for the whole.
+    """Name the cameras without extrinsics; None if all have them.
 
     Args:
-        wanted: cameras that should have one.
+        wanted: cameras that should have extrinsics.
         seen: cameras of which the session holds captures.
-        calibrations: what there is, at least one.
+        calibrations: the results, at least one.
     """
     calibrated = {calibration.camera for calibration in calibrations}
     missing = [camera for camera in wanted if camera not in calibrated]
     if not missing:
         return None
-    causes = [f"No capture holds a picture of {name} and a scan." for name in missing if name not in seen]
+    causes = [f"No capture holds an image of {name} and a scan." for name in missing if name not in seen]
     others = " ".join(f"--camera {name}" for name in wanted if name in calibrated)
     return NotEnoughDataError(
-        f"no extrinsic of camera {', '.join(missing)}",
-        "\n".join([*causes, f"Collect more captures; to do without: {others}"]),
+        f"no extrinsics of camera {', '.join(missing)}",
+        "\n".join([*causes, f"Collect more captures, or omit the camera: {others}"]),
     )
 
 
 def _camera_lines(camera: str, other: OtherCamera) -> list[str]:
     name = other.camera
     lines = [
-        f"[bold]{name} and {camera}[/], by {other.n_captures} captures of both",
+        f"[bold]{name} and {camera}[/], from {other.n_captures} captures of both",
         f"  T_{camera}_{name} (p_{camera} = R p_{name} + t)",
         *("    " + "  ".join(f"{value: .6f}" for value in row) for row in other.T_cam_other[:3]),
     ]
     if other.cov is not None:
         sigma_deg, sigma_m = sigma_sizes(other.cov)
-        lines.append(f"  known to     {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm (1 sigma)")
+        lines.append(f"  uncertainty  {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm (1 sigma)")
     if other.apart_rotation_deg is not None and other.apart_translation_m is not None:
-        by_itself = ", each camera by itself" if other.cov is not None else ""
+        separately = ", each camera estimated separately" if other.cov is not None else ""
         lines.append(
-            f"  pictures     differ by {other.apart_rotation_deg:.3f} deg, "
-            f"{1000 * other.apart_translation_m:.1f} mm{by_itself}"
+            f"  images       differ by {other.apart_rotation_deg:.3f} deg, "
+            f"{1000 * other.apart_translation_m:.1f} mm{separately}"
         )
     lines.append(f"  boards       {1000 * other.board_rms_m:.1f} mm apart")
     return lines
@@ -140,14 +140,14 @@ if TYPE_CHECKING:
     "--reference",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="JSON with a T_cam_lidar to report the error against; never used in the estimate.",
+    help="Report the error from the T_cam_lidar of this JSON file; the estimate does not use it.",
 )
 @cameras_option
 @click.option(
     "--channels",
     callback=split_names,
     metavar="NAME[,NAME]",
-    help="Channels to use, such as frames or events [default: all; together they give one extrinsic].",
+    help="Use only these channels, such as frames or events [default: all, in one joint estimate].",
 )
 @event_image_option
 @click.option(
@@ -155,17 +155,17 @@ if TYPE_CHECKING:
     type=click.Choice(["ml", "paper"]),
     default="paper",
     show_default=True,
-    help="Algorithm 1 of LCE-Calib, or from its solution on the maximum likelihood of everything together.",
+    help="Estimate with Algorithm 1 of LCE-Calib (paper), or refine its result by maximum likelihood (ml).",
 )
 @click.option(
     "--name",
     metavar="NAME",
-    help="Keep the result under a name, in SESSION/results/NAME/; SESSION/calibration/ is unchanged.",
+    help="Write the result to SESSION/results/NAME/ and leave SESSION/calibration/ unchanged.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
-@click.option("--force", is_flag=True, help="Export a failed result too, marked as failed.")
+@click.option("--force", is_flag=True, help="Export failed results too, marked NOT FOR USE.")
 @click.option(
-    "--seed", default=0, show_default=True, type=click.IntRange(0), help="Seed of the draws over subsets."
+    "--seed", default=0, show_default=True, type=click.IntRange(0), help="Set the seed of the random subsets."
 )
 @click.option(
     "--draws",
@@ -173,7 +173,7 @@ if TYPE_CHECKING:
     default=100,
     show_default=True,
     type=click.IntRange(0, 10_000),
-    help="Subsets drawn for each size (the paper's I).",
+    help="Set the number of random subsets per size (I in the paper).",
 )
 def calibrate(
     session: Path,
@@ -188,14 +188,14 @@ def calibrate(
     seed: int,
     n_draws: int,
 ) -> None:
-    """Estimate where the LiDAR sits relative to each camera of SESSION (default: session/).
+    """Estimate the extrinsics between the LiDAR and each camera of SESSION (default: session/).
 
-    Writes SESSION/calibration/ as a whole: result.json, extrinsics.yaml, URDF, camera_info and static
-    transforms. The earlier result moves to SESSION/calibration/previous/; it is untouched where this run ends
-    without a result.
+    Writes SESSION/calibration/ in one step: result.json, extrinsics.yaml, URDF, camera_info and static
+    transforms. The earlier result moves to SESSION/calibration/previous/. A run without a result leaves it
+    unchanged.
 
-    Exits with 7 where a result must not be used: that camera is then left out of the exports, unless --force
-    is given. Exits with 6 where a camera has no result.
+    Exits with 7 if a result has failed; the exports then skip that camera, unless --force is given. Exits
+    with 6 if a camera has no result.
     """
     import lce_rig as lce
     from lce_rig.core.errors import UsageError
@@ -214,8 +214,8 @@ def calibrate(
     truth = None if reference is None else read_reference(reference)
     if truth is not None and truth.default is not None and len(wanted) * len(rig.lidars) > 1:
         raise UsageError(
-            f"{reference}: T_cam_lidar names no sensors, and there are several: {', '.join(wanted)}",
-            'Write {"pairs": [{"camera": ..., "lidar": ..., "T_cam_lidar": ...}, ...]}, or name a --camera.',
+            f"{reference}: T_cam_lidar names no sensors, but the rig has several: {', '.join(wanted)}",
+            'Write {"pairs": [{"camera": ..., "lidar": ..., "T_cam_lidar": ...}, ...]}, or add --camera.',
         )
     with _earlier_result_named(opened.path):
         with show.progress_bar("detecting") as progress:
@@ -231,9 +231,9 @@ def calibrate(
                 progress=progress,
             )
         for shortage in result.shortages:
-            show.warn(str(shortage))
+            show.warn(str(not_enough(shortage)))
         if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
-            show.warn(f"{reference} holds no T_cam_lidar of these sensors")
+            show.warn(f"{reference} has no T_cam_lidar for these sensors")
         written = result.write(name=name, force=force)
     if written.had_overlays:
         with show.progress_bar("drawing") as progress:
@@ -250,12 +250,12 @@ def calibrate(
             show.print_lines(camera_lines(calibration, result.pairs))
         show.note("written: " + ", ".join(f.name for f in written.files) + f" in {written.files[0].parent}")
     _tell_earlier(written)
-    _exit(result.pairs, wanted, {pair.camera for pair in detections.pairs}, are_told=not as_json)
+    _exit(result.pairs, wanted, {pair.camera for pair in detections.pairs}, are_printed=not as_json)
 
 
 @contextmanager
 def _earlier_result_named(session: Path) -> Iterator[None]:
-    """Say, where a run ends without a result, that the files there are of an earlier one."""
+    """Say that the files are those of an earlier run if this one ends without a result."""
     from lce_rig.core.errors import LceRigError
     from lce_rig.pipeline.result_files import RESULT
     from lce_rig.session.session import CALIBRATION
@@ -264,17 +264,17 @@ def _earlier_result_named(session: Path) -> Iterator[None]:
         yield
     except LceRigError:
         if (session / CALIBRATION / RESULT).exists():
-            show.note(f"{session / CALIBRATION} is unchanged: it holds the result of an earlier run")
+            show.note(f"{session / CALIBRATION} is unchanged, with the result of an earlier run")
         raise
 
 
 def _tell_earlier(written: "WrittenResults") -> None:
-    """Say where the earlier run's files are, and which may be used."""
+    """Say where the earlier run's files are, and which are usable."""
     has_exports = len(written.files) > 1
     if written.previous is None:
         return
     if not has_exports and written.has_usable_previous:
-        show.warn(f"no exports of this result; the last usable one is in {written.previous}")
+        show.warn(f"this result is not exported; the last usable result is in {written.previous}")
     elif not written.is_same:
         show.note(f"the earlier result is in {written.previous}")
     if written.only_previous:
@@ -282,19 +282,19 @@ def _tell_earlier(written: "WrittenResults") -> None:
 
 
 def _exit(
-    calibrations: Sequence[Calibration], wanted: Sequence[str], seen: Collection[str], *, are_told: bool
+    calibrations: Sequence[Calibration], wanted: Sequence[str], seen: Collection[str], *, are_printed: bool
 ) -> None:
-    """Leave with exit code 7 where a result must not be used, else 6 where a camera has none."""
+    """Exit with 7 if a result has failed, else with 6 if a camera has no result."""
     lacking = lacking_extrinsics(wanted, seen, calibrations)
     if lacking is not None and any(c.verdict == "fail" for c in calibrations):
         show.warn(str(lacking))
-    exit_by_verdict(calibrations, are_told=are_told)
+    exit_by_verdict(calibrations, are_printed=are_printed)
     if lacking is not None:
         raise lacking
 
 
-def exit_by_verdict(calibrations: Sequence[Calibration], *, are_told: bool = False) -> None:
-    """Leave with exit code 7 where a result must not be used; the reasons stand in what was printed before.
+def exit_by_verdict(calibrations: Sequence[Calibration], *, are_printed: bool = False) -> None:
+    """Exit with 7 if a result has failed.
 
     Raises:
         ResultRefusedError: the worst verdict is "fail".
@@ -304,12 +304,12 @@ def exit_by_verdict(calibrations: Sequence[Calibration], *, are_told: bool = Fal
     failed = [c for c in calibrations if c.verdict == "fail"]
     if failed:
         pairs = ", ".join(str(Pair.of(c)) for c in failed)
-        causes = "\n".join(reason for c in failed for reason in c.reasons)
-        raise ResultRefusedError(f"do not use the result of {pairs}", "" if are_told else causes)
+        causes = "\n".join(sentence(finding) for c in failed for finding in c.findings)
+        raise ResultRefusedError(f"failed: {pairs}; do not use this result", "" if are_printed else causes)
 
 
-def _left_out(held_out_m: float) -> str:
-    return f"left out {1000 * held_out_m:.1f} mm, " if math.isfinite(held_out_m) else ""
+def _held_out(held_out_m: float) -> str:
+    return f"held out {1000 * held_out_m:.1f} mm, " if math.isfinite(held_out_m) else ""
 
 
 def _lines(calibration: Calibration) -> list[str]:
@@ -324,46 +324,47 @@ def _lines(calibration: Calibration) -> list[str]:
         f"  captures     {len(c.captures_used)} used of {c.n_captures}, "
         f"board found by both sensors in {c.n_detected}",
         f"  residuals    planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm, "
-        f"{_left_out(c.held_out_m)}corners {metrics.reprojection_px:.2f} px",
+        f"{_held_out(c.held_out_m)}corners {metrics.reprojection_px:.2f} px",
         f"  certificate  {_certificate(c)}",
     ]
     lines += [*_channel_lines(c), *together_lines(c)]
     if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
         lines.append(
-            f"  reference    off by {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
+            f"  reference    error {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
         )
     for name, why in c.captures_refused.items():
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {sentence(why)}')}[/]")
-    lines += [f"  [{colour}]{show.escape(reason)}[/]" for reason in c.reasons]
+    lines += [f"  [{colour}]{show.escape(sentence(finding))}[/]" for finding in c.findings]
     return lines
 
 
 def _certificate(calibration: Calibration) -> str:
     is_optimal, gap = calibration.certificate.is_optimal, calibration.certificate.gap
     if not math.isfinite(gap):
-        return f"none, method {calibration.method} gives no proof"
+        return f"none (method {calibration.method} has no certificate)"
     return f"{'global minimum' if is_optimal else '[red]not proven[/]'}, gap {gap:.0e}"
 
 
 def _channel_lines(calibration: Calibration) -> list[str]:
-    """Say what each channel contributes where there are several, or where boards moved."""
+    """Say what each channel contributes if there are several, or if boards moved."""
     results = calibration.channel_results
     if len(results) == 1 and results[0].time_offset_s is None:
         return []
     texts = []
     for result in results:
-        text = f"{result.channel}: {result.n_captures} captures, corners to {result.noise_px:.2f} px"
+        text = f"{result.channel}: {result.n_captures} captures, corner noise {result.noise_px:.2f} px"
         if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
             text += (
-                f", clock {1000 * result.time_offset_s:+.0f} +- {1000 * result.time_offset_sigma_s:.0f} ms, "
+                f", time offset {1000 * result.time_offset_s:+.0f} +- "
+                f"{1000 * result.time_offset_sigma_s:.0f} ms, "
                 f"depth scatter {1000 * result.depth_scatter_m:.1f} mm "
-                f"({1000 * result.depth_scatter_still_m:.1f} with motion left in)"
+                f"({1000 * result.depth_scatter_still_m:.1f} without motion compensation)"
             )
         texts.append(text)
     figures = calibration.diagnostics
-    if "channels_rotation_deg" in figures:
+    if math.isfinite(figures.channels_rotation_deg):
         texts.append(
-            f"they differ by {figures['channels_rotation_deg']:.2f} deg, "
-            f"{1000 * figures['channels_translation_m']:.1f} mm"
+            f"channels differ by {figures.channels_rotation_deg:.2f} deg, "
+            f"{1000 * figures.channels_translation_m:.1f} mm"
         )
     return [f"  {'channels' if k == 0 else '':<13}{text}" for k, text in enumerate(texts)]

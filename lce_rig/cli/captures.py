@@ -1,4 +1,4 @@
-"""`lce-rig captures`: the captures of a session; reject some, or restore them."""
+"""`lce-rig captures`: list the captures of a session, reject or restore them."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 @click.command()
 @session_argument
-@click.option("--reject", metavar="NAME", multiple=True, help="Reject this capture; may be repeated.")
-@click.option("--restore", metavar="NAME", multiple=True, help="Restore this capture; may be repeated.")
-@click.option("--reason", metavar="TEXT", default="", help="Note in the session's journal why.")
+@click.option("--reject", metavar="NAME", multiple=True, help="Reject this capture; repeatable.")
+@click.option("--restore", metavar="NAME", multiple=True, help="Restore this capture; repeatable.")
+@click.option("--reason", metavar="TEXT", default="", help="Write this reason into the session's journal.")
 @json_option
 def captures(
     session: Path, reject: tuple[str, ...], restore: tuple[str, ...], reason: str, as_json: bool
@@ -47,11 +47,11 @@ def captures(
     if any(record["state"] == "rejected" and record["used_by"] for record in records) or (
         restoring and any(record["used_by"] for record in records)
     ):
-        show.note("the result was made from other captures: run `lce-rig calibrate` again")
+        show.note("the captures have changed since the result was made: run `lce-rig calibrate` again")
 
 
 def _full(name: str) -> str:
-    """Give a capture's name with its leading zeros, which may be left away."""
+    """Return a capture's name with its leading zeros, which may be omitted."""
     return name.zfill(6) if name.isascii() and name.isdigit() else name
 
 
@@ -77,7 +77,7 @@ def _require_there(session: "Session", rejecting: list[str], restoring: list[str
             raise UsageError(f"{session.path}: capture {name} is {state}")
         if name not in known:
             raise UsageError(
-                f"{session.path} has no capture {name}", f"List them: lce-rig captures {session.path}"
+                f"{session.path} has no capture {name}", f"List them with: lce-rig captures {session.path}"
             )
 
 

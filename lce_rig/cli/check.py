@@ -1,4 +1,4 @@
-"""`lce-rig check`: what was seen in every capture, and where one is refused, why and what to do."""
+"""`lce-rig check`: report the detections in every capture, and the cause and action for refused ones."""
 
 import math
 from collections import Counter
@@ -18,12 +18,12 @@ from lce_rig.words import describe, recommend, refusal_as_json
 @click.command()
 @session_argument
 @json_option
-@click.option("--debug-images", is_flag=True, help="Write one picture a capture into SESSION/debug/.")
+@click.option("--debug-images", is_flag=True, help="Write one image per capture into SESSION/debug/.")
 @event_image_option
 def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) -> None:
-    """Show what was detected in each capture of SESSION (default: session/), and why not.
+    """Report the detections in each capture of SESSION (default: session/), or the cause of refusal.
 
-    Exits with 6 where no capture can be used.
+    Exits with 6 if no capture is usable.
     """
     import lce_rig as lce
     from lce_rig.core.errors import NotEnoughDataError
@@ -31,13 +31,15 @@ def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) ->
 
     opened = lce.Session.open(session)
     if not opened.captures:
-        raise NotEnoughDataError(f"{session} holds no captures", "Collect some first: lce-rig collect --help")
+        raise NotEnoughDataError(
+            f"{session} holds no captures", "Run lce-rig collect first (see its --help)."
+        )
     with show.progress_bar("detecting") as progress:
         detections = lce.detect(opened, event_image=event_image, progress=progress)
     if debug_images:
         with show.progress_bar("drawing") as progress:
             folder = write_debug_images(opened, detections, event_image=event_image, progress=progress)
-        show.note(f"pictures of every capture: {folder}")
+        show.note(f"debug images: {folder}")
     refusals = {pair: refusals_of(opened.rig, detections, pair) for pair in detections.pairs}
     if as_json:
         show.print_json(
@@ -49,8 +51,8 @@ def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) ->
             _summarise(len(detections.captures(pair)), refused)
     if all(len(refused) == len(detections.captures(pair)) for pair, refused in refusals.items()):
         raise NotEnoughDataError(
-            f"{session}: no capture can be used",
-            "See the causes above; --debug-images draws what was seen.",
+            f"{session}: no capture is usable",
+            "Follow the actions above, or draw the detections with --debug-images.",
         )
 
 
@@ -81,7 +83,7 @@ def _record(image: ImageDetection, lidar: LidarDetection, refusal: Refusal | Non
 
 
 def _figures(found: ImageBoard | LidarBoard | Refusal) -> dict[str, float | None] | None:
-    """Give a detection's quality record; a figure that could not be measured is null."""
+    """Return a detection's quality record, with null for figures that were not measured."""
     if isinstance(found, Refusal):
         return None
     return {key: float(value) if math.isfinite(value) else None for key, value in found.figures().items()}
@@ -107,8 +109,8 @@ _LIDAR: tuple[Column, ...] = (
     ("high\nm", "lidar", "height_m", 1.0, 3),
     ("edges\nmm", "lidar", "edge_rms_m", 1000.0, 1),
 )
-# A side of the plate that no ring end shows is not known better than this; the profile's is no measurement.
-_SIDE_KNOWN_M = 0.05
+# A side without ring ends has a larger standard deviation; its length is the profile's, not a measurement.
+_SIDE_SIGMA_MAX_M = 0.05
 
 
 def _table(detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> Any:
@@ -128,7 +130,7 @@ def _table(detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -
 
 
 def _columns(detections: Detections, pair: Pair) -> tuple[Column, ...]:
-    """Choose what a terminal of 80 columns has room for; events have figures of their own."""
+    """Choose columns that fit a terminal of 80 characters; images from events have their own figures."""
     images = [detections.of(pair, name)[0] for name in detections.captures(pair)]
     is_from_events = any(not isinstance(image, Refusal) and image.events is not None for image in images)
     return (*_IMAGE, *(_EVENTS if is_from_events else _POINTS), *_LIDAR)
@@ -137,12 +139,12 @@ def _columns(detections: Detections, pair: Pair) -> tuple[Column, ...]:
 def _cell(figures: Mapping[str, float | None] | None, key: str, scale: float, digits: int) -> str:
     value = None if figures is None else figures.get(key)
     sigma_m = (figures or {}).get(f"{key.removesuffix('_m')}_sigma_m") or 0.0
-    return "-" if value is None or sigma_m > _SIDE_KNOWN_M else f"{scale * value:.{digits}f}"
+    return "-" if value is None or sigma_m > _SIDE_SIGMA_MAX_M else f"{scale * value:.{digits}f}"
 
 
 def _summarise(n_captures: int, refused: Mapping[str, Refusal]) -> None:
-    """Print each cause once, with the captures it holds for."""
-    show.say(f"{n_captures - len(refused)} of {n_captures} captures can be used")
+    """Print each cause once, with its captures."""
+    show.say(f"{n_captures - len(refused)} of {n_captures} captures are usable")
     names: dict[str, list[str]] = {}
     for name, refusal in sorted(refused.items()):
         text = f"{refusal.stage}: {describe(refusal)}\n    -> {recommend(refusal)}"

@@ -1,4 +1,4 @@
-"""`lce-rig collect`: a session from attached sensors, guided, or from recordings, unattended."""
+"""`lce-rig collect`: build a session from attached sensors (guided) or from recordings."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -22,7 +22,9 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 
 
 @click.command()
-@click.option("--rig", "rig_name", required=True, metavar="NAME|FILE", help="Rig profile: a name or a file.")
+@click.option(
+    "--rig", "rig_name", required=True, metavar="NAME|FILE", help="Set the rig profile: a name or a file."
+)
 @click.argument("session", type=click.Path(path_type=Path), default="session")
 @click.option(
     "--from",
@@ -30,77 +32,95 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     multiple=True,
     type=click.Path(path_type=Path),
     metavar="PATH",
-    help="Read a recording: a folder with img/ (several cameras: img/CAMERA/) and pcd/, what --record kept, "
-    "a ROS 1 or ROS 2 bag, an mcap or pcap file, or an event camera's file (AEDAT4, Prophesee RAW, HDF5); "
-    "may be repeated, also for several recorders of one moment.",
+    help="Read a recording: a folder with img/ (several cameras: img/CAMERA/) and pcd/, a folder of "
+    "--record, a ROS 1 or ROS 2 bag, an mcap or pcap file, or an event camera's file (AEDAT4, Prophesee "
+    "RAW, HDF5). "
+    "Repeatable, also for simultaneous recordings of several sensors.",
 )
 @click.option(
     "--pair",
     type=click.Choice(["auto", "stem", "order", "time"]),
     default="auto",
     show_default=True,
-    help="How a folder's pictures and clouds belong together: equal names, sorted order, nearest time.",
+    help="Match a folder's images and point clouds by equal names, sorted order or nearest time.",
 )
-@click.option("--pair-tolerance", type=FiniteRange(0), metavar="S", help="Largest difference of a pair.")
 @click.option(
-    "--topic", "topics", multiple=True, callback=_topics, metavar="SENSOR=/TOPIC", help="Topic of a sensor."
+    "--pair-tolerance",
+    type=FiniteRange(0),
+    metavar="S",
+    help="Set the maximum time difference of an image and its point cloud.",
+)
+@click.option(
+    "--topic",
+    "topics",
+    multiple=True,
+    callback=_topics,
+    metavar="SENSOR=/TOPIC",
+    help="Set the topic of a sensor in a bag; repeatable.",
 )
 @click.option(
     "--camera",
     "cameras",
     multiple=True,
     metavar="NAME",
-    help="Camera that a folder's pictures belong to, where the rig has several and the folder none of its "
-    "name: one for all, or one for each --from in turn.",
+    help="Name the camera of a folder's images if the rig has several and the folder does not name it. "
+    "Give one for all recordings, or one per --from in the same order.",
 )
 @click.option(
     "--channel",
     "channels",
     multiple=True,
     metavar="NAME",
-    help="Channel of it, such as events for pictures reconstructed from events; likewise.",
+    help="Name that camera's channel, such as events for images from events; once or per --from.",
 )
 @click.option(
     "--lidar",
     "lidars",
     multiple=True,
     metavar="NAME",
-    help="LiDAR that a folder's clouds belong to, where the rig has several; likewise.",
+    help="Name the LiDAR of a folder's point clouds if the rig has several; once or per --from.",
 )
-@click.option("--max-captures", type=click.IntRange(1), metavar="N", help="Leave the session at N captures.")
+@click.option(
+    "--max-captures", type=click.IntRange(1), metavar="N", help="Stop at N captures in the session."
+)
 @click.option(
     "--target",
     type=click.IntRange(1),
     metavar="N",
-    help="Stop reading once the session has N captures; say so where it stays short.",
+    help="Stop at N captures in the session, and warn if the recordings give fewer.",
 )
 @click.option(
     "--frames",
     type=click.IntRange(1),
     metavar="N",
-    help="Live: stop when the session holds N captures, not when the target is met.",
+    help="Live: stop at N captures in the session instead of at the predicted target.",
 )
-@click.option("--timeout", type=FiniteRange(0, min_open=True), metavar="S", help="Live: stop after so long.")
-@click.option("--keep-going", is_flag=True, help="Live: go on when the target is met, until told to stop.")
 @click.option(
-    "--hold", type=FiniteRange(0, 30), metavar="S", help="Live: how long a board stands still.  [1.5]"
+    "--timeout", type=FiniteRange(0, min_open=True), metavar="S", help="Live: stop after S seconds."
 )
-@click.option("--plain", is_flag=True, help="Live: lines on stderr in place of a screen.")
+@click.option("--keep-going", is_flag=True, help="Live: continue after the target is met, until stopped.")
+@click.option(
+    "--hold",
+    type=FiniteRange(0, 30),
+    metavar="S",
+    help="Live: capture after the board has stood still for S seconds  [default: 1.5]",
+)
+@click.option("--plain", is_flag=True, help="Live: print lines on stderr instead of the full-screen view.")
 @click.option(
     "--preview",
     is_flag=False,
     flag_value="127.0.0.1:8765",
     metavar="[HOST:PORT]",
-    help="Live: serve a page for a phone; by default on 127.0.0.1:8765. Elsewhere it asks for a token.",
+    help="Live: serve a page for a phone [default address: 127.0.0.1:8765]. Other addresses require a token.",
 )
 @click.option(
     "--record",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Live: keep the raw streams too, in a new folder that --from reads.",
+    help="Live: also record the raw streams into a new folder, which --from reads.",
 )
-@click.option("--simulated", is_flag=True, help="Live: of a simulated rig, with a simulated person.")
-@click.option("--seed", type=click.IntRange(0), help="Of --simulated.  [0]")
+@click.option("--simulated", is_flag=True, help="Live: collect from a simulated rig with a simulated person.")
+@click.option("--seed", type=click.IntRange(0), help="Set the seed of the simulated rig  [default: 0]")
 def collect(
     rig_name: str,
     session: Path,
@@ -117,27 +137,27 @@ def collect(
 ) -> None:
     """Build or continue SESSION (default: session/), live or from recordings.
 
-    Without --from the rig's attached sensors are read. One person holds the board and is told where to go;
-    captures are taken when it stands still there, or moves slowly before an event camera. No key has to be
-    pressed. Collection ends when the calibration is predicted to meet the profile's target, and can be
-    continued any time. Without a terminal it also ends after 30 minutes without a capture, with --simulated
-    after 10. `lce-rig doctor` checks the rig first.
+    Without --from, read the rig's attached sensors and guide the person who holds the board. A capture is
+    taken automatically when the board stands still, or moves slowly before an event camera. Collection ends
+    when the calibration is predicted to meet the profile's target; run the command again to continue.
+    Without a terminal it also ends after 30 minutes without a capture, with --simulated after 10. Run
+    `lce-rig doctor` first to check the rig.
 
-    With --from, every pair of a folder becomes a capture; pictures of several cameras lie in img/CAMERA/, and
-    go with the same cloud. Bags are cut where the board stands still in both
-    sensors and is somewhere new; where they hold raw events, where it moves slowly, and the events are kept.
-    Recordings of one moment, such as --from lidar.bag --from events.aedat4, are read as one: each adds a
-    sensor to those before it. Run it again to continue: what is captured already is not captured twice.
+    With --from, each image-scan pair of a folder becomes a capture. Images of several cameras in img/CAMERA/
+    share the point cloud. A bag gives a capture wherever the board stands still in both sensors at a new
+    placement; a bag with raw events gives one wherever it moves slowly, with the events. Simultaneous
+    recordings, such as --from lidar.bag --from events.aedat4, are joined: each adds a sensor to those before
+    it. Run the command again to continue; existing captures are not repeated.
     """
     if not paths:
-        _refuse_options(_OF_RECORDINGS, "belongs to recordings", "name one with --from")
+        _refuse_options(_OF_RECORDINGS, "applies to recordings only", "Add --from, or omit this option.")
         from lce_rig.cli.collect_live import LiveArguments, run_live
 
         run_live(rig_name, session, LiveArguments(**live))
         return
     from lce_rig.cli.simulate import require_kind
 
-    _refuse_options(tuple(live), "belongs to live collection", "leave --from out, or this option")
+    _refuse_options(tuple(live), "applies to live collection only", "Omit --from or this option.")
     from lce_rig.collect import CollectOptions
     from lce_rig.core.errors import NotEnoughDataError
     from lce_rig.pipeline.collection import fill_session
@@ -161,11 +181,11 @@ def collect(
         report = fill_session(rig, recordings, session, wanted, progress)
     n_captures = len(Session.open(session).captures)
     if topics and any(isinstance(recording, PairedRecording) for recording in recordings):
-        show.warn("--topic means nothing for a folder of pictures and clouds")
+        show.warn("--topic is ignored for a folder of images and point clouds")
     _tell(report, session, n_captures)
     if n_captures == 0:
         raise NotEnoughDataError(
-            f"{session}: no capture could be made of {', '.join(map(str, paths))}",
+            f"{session}: no capture from {', '.join(map(str, paths))}",
             _remedy(report),
         )
 
@@ -185,10 +205,10 @@ _OF_RECORDINGS = (
 def _one_for_each(
     paths: Sequence[Path], option: str, names: Sequence[str], known: Collection[str] | None = None
 ) -> list[str | None]:
-    """Give each recording the name it is read by: the only one, its own, or None.
+    """Return the sensor name for each recording: the only one given, its own, or None.
 
     Raises:
-        UsageError: there are some, but neither one nor as many as recordings; or one is not known.
+        UsageError: the number of names is neither one nor that of the recordings, or a name is unknown.
     """
     from lce_rig.core.errors import UsageError
 
@@ -199,16 +219,16 @@ def _one_for_each(
     if len(names) != len(paths):
         raise UsageError(
             f"{option} is given {len(names)} times for {show.counted(len(paths), 'recording')}",
-            f"Give it once, or for each --from: --from A {option} {names[0]} --from B {option} {names[1]}",
+            f"Give it once, or once per --from: --from A {option} {names[0]} --from B {option} {names[1]}",
         )
     return list(names)
 
 
 def _refuse_options(names: tuple[str, ...], what: str, hint: str) -> None:
-    """Refuse options that mean nothing here, rather than leave them unheard.
+    """Refuse options that do not apply here, instead of ignoring them.
 
     Raises:
-        UsageError: one was given; it is named.
+        UsageError: one was given; the message names it.
     """
     from lce_rig.core.errors import UsageError
 
@@ -220,22 +240,22 @@ def _refuse_options(names: tuple[str, ...], what: str, hint: str) -> None:
 
 
 def _remedy(report: Any) -> str:
-    """Say what to do where nothing could be captured."""
+    """Say what to do if nothing could be captured."""
     if report.has_events:
-        return "The board must move slowly, about 10 cm/s, and be seen by both sensors; the causes are above."
-    return "The board must stand still for a second in both sensors at once; do their clocks agree?"
+        return "Move the board slowly, about 10 cm/s, in view of both sensors; the causes are above."
+    return "Hold the board still for 1 s in view of both sensors, and check that their clocks agree."
 
 
 def _tell(report: Any, session: Path, n_captures: int) -> None:
-    """Say what became of everything that was read.
+    """Report captures, duplicates and refusals.
 
     Raises:
-        SourceError: a recording could not be read to its end; what was captured before is kept.
+        SourceError: a recording could not be read to its end; captures before it are kept.
     """
     for text in report.notes:
         show.note(text)
     for label, capture in report.duplicates.items():
-        show.note(f"{label}: duplicate of {capture}, left out")
+        show.note(f"{label}: duplicate of {capture}, skipped")
     for label, refusal in report.refused.items():
         show.warn(f"{label}: {sentence(refusal)}")
     counts = report.counts.counts()
@@ -243,7 +263,9 @@ def _tell(report: Any, session: Path, n_captures: int) -> None:
         show.note("not captured:\n" + "\n".join(f"  {n} x {sentence(why)}" for why, n in counts))
     if report.n_missing:
         show.warn(f"{report.n_missing} captures short of the target")
-    new = f"{len(report.captured)} new" + (f", {report.n_resumed} known already" if report.n_resumed else "")
+    new = f"{len(report.captured)} new" + (
+        f", {report.n_resumed} captured before" if report.n_resumed else ""
+    )
     new += f", {report.n_rejected} rejected earlier" if report.n_rejected else ""
     show.note(f"{session}: {show.counted(n_captures, 'capture')} ({new})")
     for error in report.errors[:-1]:

@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from lce_rig.rig import Rig
     from lce_rig.session import Session
 
-#: A run that nobody looks after ends after so long without a capture. The simulated person never rests;
-#: before a rig without a terminal somebody may have gone to fetch something.
+#: An unattended run ends after this time without a capture. The simulated person never rests; a person at a
+#: rig without a terminal may be away for a while.
 SIMULATED_IDLE_S, UNATTENDED_IDLE_S = 600.0, 1800.0
 _ENDINGS = {
     "enough": "the target is predicted to be met",
-    "frames": "as many captures as wanted",
-    "timeout": "the time is over",
-    "exhausted": "no new placement was shown",
+    "frames": "the number of captures is reached",
+    "timeout": "the time limit is reached",
+    "exhausted": "no new placement",
     "stopped": "stopped",
     "lost": "a sensor was lost",
 }
@@ -38,7 +38,7 @@ _ENDINGS = {
 
 @dataclass(frozen=True)
 class LiveArguments:
-    """The options of live collection, as they were given.
+    """The options of live collection, as given.
 
     Attributes:
         frames, timeout, keep_going, hold, plain, preview, record, simulated, seed: see --help.
@@ -56,7 +56,7 @@ class LiveArguments:
 
 
 def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
-    """Collect live into a session, and say how it went."""
+    """Collect live into a session and report the outcome."""
     from lce_rig.collect.live.collection import collect_live
     from lce_rig.collect.live.state import HOLD_S, LiveOptions
     from lce_rig.core.errors import UsageError
@@ -64,12 +64,12 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
     from lce_rig.screen.live_view import open_view
 
     if given.seed is not None and not given.simulated:
-        raise UsageError("--seed belongs to --simulated", "leave it out")
+        raise UsageError("--seed applies to --simulated only", "Add --simulated, or omit --seed.")
     rig = load_rig(rig_name)
     require_kind(path, (given.seed or 0) if given.simulated else None)
     hold_s = HOLD_S if given.hold is None else given.hold
     with ExitStack() as stack:
-        # The page first: an address that cannot be served is said before anything is made or started.
+        # The page first: an address that cannot be served fails before anything is created or started.
         listeners, links = _open_preview(stack, given)
         session = stack.enter_context(_session(path, rig))
         n_before = len(session.captures)
@@ -98,14 +98,14 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
 
 
 def _idle_s(given: LiveArguments, asked: Controls) -> float | None:
-    """Choose after how long without a capture nobody is thought to come back; None where somebody may."""
+    """Return the time without a capture that ends an unattended run; None if the run is attended."""
     if given.simulated:
         return SIMULATED_IDLE_S
     return None if asked.is_interactive else UNATTENDED_IDLE_S
 
 
 def _until_gone(show_state: "Callable[[LiveState], None]") -> "Callable[[LiveState], None]":
-    """Show states until the terminal is gone: what comes with its hangup is the end, in good order."""
+    """Show states until the terminal is gone; its hangup then ends the collection in good order."""
     is_gone = threading.Event()
 
     def tell(state: "LiveState") -> None:
@@ -120,7 +120,7 @@ def _until_gone(show_state: "Callable[[LiveState], None]") -> "Callable[[LiveSta
 
 @contextmanager
 def _session(path: Path, rig: "Rig") -> "Iterator[Session]":
-    """Continue or start a session; one that never held anything, as its rig does not answer, goes again."""
+    """Continue or start a session; delete a new one that stays empty because its rig does not answer."""
     from lce_rig.session import Session, discard_if_empty
 
     is_new = not path.exists()
@@ -136,7 +136,7 @@ def _session(path: Path, rig: "Rig") -> "Iterator[Session]":
 def _open_rig(
     stack: ExitStack, rig: "Rig", path: Path, given: LiveArguments
 ) -> "tuple[list[LiveSource], SimulatedRig | None]":
-    """Build the sources: attached ones, or simulated ones, whose truth goes into the session's folder."""
+    """Open the attached or simulated sources; write the truth of simulated ones into the session."""
     if not given.simulated:
         from lce_rig.devices.opening import open_live
 
@@ -154,7 +154,7 @@ def _open_rig(
 def _open_preview(
     stack: ExitStack, given: LiveArguments
 ) -> "tuple[list[Callable[[LiveState], None]], tuple[str, ...]]":
-    """Serve the page where it is wanted, say where, and give its links."""
+    """Serve the preview page if requested; return its listeners and links."""
     if given.preview is None:
         return [], ()
     from lce_rig.page import Preview, parse_address
@@ -180,11 +180,11 @@ def _tell(
     simulated: "SimulatedRig | None",
     given: LiveArguments,
 ) -> None:
-    """Say how it went.
+    """Report the outcome.
 
     Raises:
-        SourceError: a sensor was lost for good; what was captured is safe.
-        NotEnoughDataError: there is not one capture, or too few are all that could be shown.
+        SourceError: a sensor was lost permanently; the captures are kept.
+        NotEnoughDataError: there is no capture, or too few when the new placements are exhausted.
     """
     from lce_rig.core.errors import NotEnoughDataError
 
@@ -194,7 +194,7 @@ def _tell(
         show.note(f"{given.record}: {report.n_recorded} samples recorded")
     lost = {name: n for name, n in report.n_lost.items() if n}
     if lost:
-        show.note("lost on the way: " + ", ".join(f"{name} {n}" for name, n in sorted(lost.items())))
+        show.note("dropped: " + ", ".join(f"{name} {n}" for name, n in sorted(lost.items())))
     if simulated is not None and simulated.pace.problem():
         show.warn(f"the rig was {simulated.pace.problem()}")
     show.note(f"ended: {_ending(report, n_captures, given)}")
@@ -212,23 +212,23 @@ def _tell(
 
 
 def _ending(report: "LiveReport", n_captures: int, given: LiveArguments) -> str:
-    """Say why it ended, and how to go on where the target alone ended it."""
-    said = _ENDINGS[report.ending]
+    """Say why the collection ended, and how to continue if it ended at the target."""
+    ending = _ENDINGS[report.ending]
     if report.ending == "enough":
-        return f"{said} (--keep-going or --frames N collect more)"
+        return f"{ending} (--keep-going or --frames N collect more)"
     if report.ending == "exhausted" and given.frames is not None:
-        return f"{said}; {n_captures} of {given.frames} captures"
-    return said
+        return f"{ending}; {n_captures} of {given.frames} captures"
+    return ending
 
 
 def _remedy(report: "LiveReport", simulated: "SimulatedRig | None") -> str:
-    """Say what to do where too little was captured."""
+    """Say what to do if too little was captured."""
     if report.lost:
         return "\n".join(f"{name} is lost: {error.what}. {error.hint}" for name, error in report.lost.items())
     if simulated is None:
-        return "The board must be seen by every sensor at once; `lce-rig doctor` says what is in the way."
+        return "Hold the board in view of all sensors at once; run `lce-rig doctor` to find the fault."
     if simulated.pace.problem():
-        return "This computer is too busy, or too slow: end other programs, or take `lce-rig simulate`."
+        return "This computer is too busy or too slow. End other programs, or use `lce-rig simulate`."
     if report.ending == "exhausted":
         return "Run the same command again to continue."
-    return "The simulated person needs longer: a longer --timeout."
+    return "Give the simulated person more time with a longer --timeout."

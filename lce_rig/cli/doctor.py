@@ -1,4 +1,4 @@
-"""`lce-rig doctor`: one screen on whether this computer and the rig's sensors are fit to collect."""
+"""`lce-rig doctor`: check on one screen whether the computer and the rig's sensors are fit to collect."""
 
 import sys
 from collections import Counter
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _MARKS = {"note": "[green]ok[/]", "warning": "[yellow]warn[/]", "error": "[bold red]FAIL[/]"}
 _EXIT_ERROR = 5
 _INDENT = 5
-# What the program says before and after, and the next prompt.
+# The lines before and after the table, and the next prompt.
 _N_OTHER_LINES = 3
 _FILE_WIDTH = 160
 
@@ -32,7 +32,7 @@ _FILE_WIDTH = 160
     default=5.0,
     show_default=True,
     metavar="S",
-    help="How long to watch the sensors; longer knows drifts better.",
+    help="Read the sensors for S seconds; longer measures drifts better.",
 )
 @click.option(
     "-o",
@@ -41,15 +41,15 @@ _FILE_WIDTH = 160
     type=click.Path(path_type=Path),
     default=".",
     metavar="FOLDER",
-    help="Where sessions are to be written: its disk is measured. Default: here.",
+    help="Measure the disk of this folder, in which sessions will be written  [default: the current one]",
 )
 def doctor(rig_name: str, as_json: bool, duration: float, folder: Path) -> int:
-    """Look at this computer and every sensor of a rig: a line each, with what to do about it.
+    """Check this computer and every sensor of a rig, with one line per check and an action per fault.
 
-    ok: as it should be. warn: collecting works, but less well. FAIL: it does not work, or its data would be
-    wrong. What is absent is one line; everything else is looked at all the same.
+    ok: no fault. warn: collecting works, with limits. FAIL: collecting does not work, or its data would be
+    wrong. An absent device has one line; the others are checked all the same.
 
-    Exits with 5 where a line says FAIL, else with 0.
+    Exits with 5 if a check reports FAIL, else with 0.
     """
     from lce_rig.core.findings import worst
     from lce_rig.doctor.examine import DoctorOptions, examine
@@ -69,7 +69,7 @@ def doctor(rig_name: str, as_json: bool, duration: float, folder: Path) -> int:
 
 
 def _document(rig: str, severity: str, checks: "list[Check]") -> dict[str, Any]:
-    """Give every line with its findings; a figure that could not be measured is null."""
+    """Return every line with its findings, with null for figures that were not measured."""
     from lce_rig.words import as_json
 
     lines = [
@@ -85,7 +85,7 @@ def _document(rig: str, severity: str, checks: "list[Check]") -> dict[str, Any]:
 
 
 def _print_screen(checks: "list[Check]") -> None:
-    """Print all lines; where the terminal is too small for them, those that are ok share one a group."""
+    """Print all lines; if the terminal is too small, those that are ok share one line per group."""
     from rich.console import Console
 
     console = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
@@ -104,7 +104,7 @@ def _print_screen(checks: "list[Check]") -> None:
 
 @dataclass(frozen=True)
 class _Line:
-    """A check in words: what was found in one line, and a line for each thing to do."""
+    """A check in words: its findings in one line, and a line for each action."""
 
     subject: str
     name: str
@@ -165,7 +165,7 @@ def _screen(lines: list[_Line]) -> Any:
 def _summary(checks: "list[Check]") -> str:
     n = Counter(check.severity for check in checks)
     if n["error"]:
-        return f"{n['error']} FAIL, {n['warning']} warn, {n['note']} ok: see the lines after ->"
+        return f"{n['error']} FAIL, {n['warning']} warn, {n['note']} ok: follow the lines after ->"
     if n["warning"]:
         return f"{n['warning']} warn, {n['note']} ok: fit to collect, with the limits above"
     return f"all {n['note']} ok: fit to collect"

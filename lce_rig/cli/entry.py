@@ -1,4 +1,4 @@
-"""Where the installed command begins: Ctrl-C is provided for before anything else is imported."""
+"""Entry point of the installed command: handle Ctrl-C before anything else is imported."""
 
 import os
 import sys
@@ -8,7 +8,7 @@ from lce_rig.core.interrupts import EXIT_INTERRUPTED, INTERRUPTED, interrupt_no_
 
 
 def main() -> None:
-    """Run the command line, and end with its exit code."""
+    """Run the command line and exit with its code."""
     _open_closed_streams()
     try:
         watch_for_interrupts()
@@ -20,7 +20,7 @@ def main() -> None:
         sys.stderr.write(f"{INTERRUPTED}\n")
         code = EXIT_INTERRUPTED
     if code == EXIT_INTERRUPTED:
-        # Python's own end would wait for threads that still work.
+        # Python's own exit would wait for running threads.
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError, AttributeError):
                 stream.flush()
@@ -29,7 +29,7 @@ def main() -> None:
 
 
 def _open_closed_streams() -> None:
-    """Stand /dev/null in for standard streams that were closed (`lce-rig collect <&-`), as services start."""
+    """Open /dev/null for standard streams that are closed (`lce-rig collect <&-`), as for services."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115, PTH123

@@ -1,4 +1,4 @@
-"""`lce-rig intrinsics`: a camera's lens from the pictures of a session, held against the profile's."""
+"""`lce-rig intrinsics`: estimate the intrinsics from a session's images and compare the profile's."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,18 +22,18 @@ _MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")
     "--channels",
     callback=split_names,
     metavar="NAME[,NAME]",
-    help="Channels to use together, as they share the lens [default: those of frames].",
+    help="Use these channels together, as they share the lens [default: those of kind frames].",
 )
 @click.option(
     "--model",
     type=click.Choice(_MODELS),
-    help="Lens model; auto compares all by their errors on captures left out [default: the profile's].",
+    help="Set the lens model; auto chooses by the error on held-out captures [default: the profile's].",
 )
 @click.option(
     "--save-profile",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Write a new profile: the session's with the measured intrinsics.",
+    help="Write the session's profile with the estimated intrinsics to a new file.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print intrinsics.json on stdout.")
 def intrinsics(
@@ -44,11 +44,11 @@ def intrinsics(
     save_profile: Path | None,
     as_json: bool,
 ) -> None:
-    """Measure the lens of each camera from the boards in SESSION's pictures (default: session/).
+    """Estimate each camera's intrinsics from the boards in the images of SESSION (default: session/).
 
-    Says how sure every parameter is, what the captures leave open, and whether the profile's intrinsics still
-    fit. Writes SESSION/intrinsics/: a block for the profile, camera_info and a page of pictures for each
-    camera. The profile itself is not touched. Exits with 6 where the captures do not do.
+    Reports the standard deviation of every parameter, what the captures do not determine, and whether the
+    profile's intrinsics still fit. Writes SESSION/intrinsics/: a block for the profile, camera_info and a
+    page of plots per camera. The profile is not changed. Exits with 6 if the captures are insufficient.
     """
     from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
     from lce_rig.pipeline.intrinsics_files import document, write_intrinsics
@@ -59,11 +59,11 @@ def intrinsics(
     opened = Session.open(session)
     require_sensors("camera", cameras, opened.rig.cameras)
     if save_profile is not None and save_profile.exists():
-        raise UsageError(f"{save_profile} exists already", "Name another file: nothing is written over.")
+        raise UsageError(f"{save_profile} exists already", "Choose another file; existing files are kept.")
     wanted, measured, troubles = channels or [], [], []
     for camera in cameras or tuple(opened.rig.cameras):
         try:
-            with show.progress_bar(f"looking through {camera}") as progress:
+            with show.progress_bar(f"detecting in {camera}") as progress:
                 measured.append(
                     measure_intrinsics(opened, camera, channels=wanted, model=model, progress=progress)
                 )
@@ -92,9 +92,9 @@ def _head(measured: "MeasuredIntrinsics") -> list[str]:
     n = len({view.capture for view in estimate.views})
     lines = [
         f"[bold]{measured.camera}[/] ({', '.join(measured.channels)}): {estimate.model.name} from "
-        f"{len(estimate.views)} pictures of {n} captures",
-        f"  corners   {estimate.rms_px:.3f} px rms, {estimate.held_out_rms_px:.3f} px on captures left out",
-        f"  seen      {100 * measured.certainty.is_covered.mean():.0f} % of the picture",
+        f"{len(estimate.views)} images of {n} captures",
+        f"  corners   {estimate.rms_px:.3f} px rms, {estimate.held_out_rms_px:.3f} px on held-out captures",
+        f"  covered   {100 * measured.certainty.is_covered.mean():.0f} % of the image",
         f"  board     {_board(measured)}",
     ]
     if measured.choice is not None:
@@ -103,18 +103,18 @@ def _head(measured: "MeasuredIntrinsics") -> list[str]:
 
 
 def _board(measured: "MeasuredIntrinsics") -> str:
-    """Say how the board differs from its drawing, which is taken into account."""
+    """State the board's deviation from its nominal shape, estimated with the intrinsics."""
     estimate = measured.estimate
     (along_width, along_height, aspect), sigma = estimate.shape, estimate.shape_sigma
     return (
-        f"bowed by {1000 * along_width:+.1f} and {1000 * along_height:+.1f} mm (width, height), printed "
+        f"bow {1000 * along_width:+.1f}, {1000 * along_height:+.1f} mm (width, height), pattern "
         f"{100 * aspect:+.2f} +- {100 * sigma[2]:.2f} % too wide, "
-        f"corners off by {1000 * estimate.print_rms_m:.2f} mm"
+        f"corner error {1000 * estimate.print_rms_m:.2f} mm"
     )
 
 
 def _table(measured: "MeasuredIntrinsics") -> Any:
-    """List the parameters, beside the profile's where these are of the same model and resolution."""
+    """List the parameters, with the profile's if model and resolution are the same."""
     from lce_rig.pipeline.intrinsics_files import final
 
     estimate, given = measured.estimate, measured.given
@@ -144,9 +144,7 @@ def _findings(measured: "MeasuredIntrinsics") -> list[str]:
     if measured.check is None:
         given = measured.given
         size = f"{given.width_px}x{given.height_px}"
-        lines.append(
-            f"  [red]the profile's intrinsics belong to {size} px, the pictures have another size[/]"
-        )
+        lines.append(f"  [red]the profile's intrinsics are for {size} px, the images have another size[/]")
     else:
         verdict = measured.check.verdict()
         lines.append(f"  {describe(measured.check)}")

@@ -1,4 +1,4 @@
-"""`lce-rig`: the verbs, loaded when they are called, and the one place that turns errors into exit codes."""
+"""`lce-rig`: load the verbs when they are called, and turn errors into exit codes."""
 
 import importlib
 import os
@@ -19,15 +19,15 @@ __all__ = ["COMMANDS", "main", "run"]
 # runs, so that `lce-rig --help` stays instant.
 COMMANDS: dict[str, tuple[str, str]] = {
     "rigs": ("lce_rig.cli.rigs", "List, show, check and derive rig profiles."),
-    "doctor": ("lce_rig.cli.doctor", "Look at this computer and the sensors: fit to collect?"),
-    "simulate": ("lce_rig.cli.simulate", "Make a session of a simulated rig, with exact truth."),
+    "doctor": ("lce_rig.cli.doctor", "Check whether this computer and the sensors are fit to collect."),
+    "simulate": ("lce_rig.cli.simulate", "Simulate a session or recording of a rig, with exact truth."),
     "collect": ("lce_rig.cli.collect", "Build a session, live and guided, or from recordings."),
-    "reconstruct": ("lce_rig.cli.reconstruct", "Turn the events of a recording into pictures."),
+    "reconstruct": ("lce_rig.cli.reconstruct", "Reconstruct images from the events of a recording."),
     "captures": ("lce_rig.cli.captures", "List the captures of a session; reject or restore some."),
-    "check": ("lce_rig.cli.check", "Show what was detected in each capture, and why not."),
+    "check": ("lce_rig.cli.check", "Report the detections in each capture, or the cause of refusal."),
     "calibrate": ("lce_rig.cli.calibrate", "Estimate the extrinsics of a session."),
-    "intrinsics": ("lce_rig.cli.intrinsics", "Measure the cameras' lenses from a session."),
-    "verify": ("lce_rig.cli.verify", "Draw the LiDAR into the pictures and print residuals."),
+    "intrinsics": ("lce_rig.cli.intrinsics", "Estimate the cameras' intrinsics from a session."),
+    "verify": ("lce_rig.cli.verify", "Project the point clouds into the images and print residuals."),
     "results": ("lce_rig.cli.results", "List the results of a session with figures and verdicts."),
     "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of sessions, or the results of one."),
 }
@@ -41,7 +41,7 @@ Exit codes: 0 done · 1 other error · 2 usage · 3 rig profile · 4 session ·
 
 
 class LateGroup(click.Group):
-    """A group whose commands are imported only when they are asked for."""
+    """A group that imports a command only when it is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """List the verbs in the order of the work."""
@@ -67,7 +67,7 @@ class LateGroup(click.Group):
 
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
-            hint = f" Did you mean '{near[0]}'?" if near else ""
+            hint = f" The nearest is '{near[0]}'." if near else ""
             raise click.UsageError(f"No such command '{args[0]}'.{hint}", ctx)
         return super().resolve_command(ctx, args)
 
@@ -78,16 +78,16 @@ class LateGroup(click.Group):
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, prog_name="lce-rig", message="%(prog)s %(version)s")
-@click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+@click.option("--debug", is_flag=True, help="Print the traceback of an error.")
 def cli(debug: bool) -> None:
-    """Find where a LiDAR sits relative to its cameras, frame or event, with a checkerboard.
+    """Estimate the extrinsics between a LiDAR and frame or event cameras with a checkerboard.
 
     \b
     A first calibration:
-      lce-rig collect --rig rlfs --from recording/   builds session/
-      lce-rig check                                  what was seen in each capture
-      lce-rig calibrate                              extrinsics in session/calibration/
-      lce-rig verify                                 pictures in session/calibration/overlays/
+      lce-rig collect --rig rlfs --from recording/   build session/
+      lce-rig check                                  report the detections in each capture
+      lce-rig calibrate                              write the extrinsics to session/calibration/
+      lce-rig verify                                 write images to session/calibration/overlays/
     """
 
 
@@ -99,7 +99,7 @@ def _report(error: LceRigError) -> int:
 
 
 def _comes_of_interrupt(error: BaseException | None) -> bool:
-    """Tell whether Ctrl-C caused an error, as where it stops the import of a compiled module (open3d)."""
+    """Return whether Ctrl-C caused an error, as when it stops the import of a compiled module (open3d)."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__
     return error is not None
@@ -132,7 +132,7 @@ def run(arguments: list[str]) -> int:
     except (click.Abort, KeyboardInterrupt):
         return _interrupted()
     except BrokenPipeError:
-        # The reader of our output went away (`lce-rig check | head`): nobody is left to report to.
+        # The reader of our output has gone (`lce-rig check | head`).
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
     except ModuleNotFoundError as error:
@@ -150,5 +150,5 @@ def run(arguments: list[str]) -> int:
         if _comes_of_interrupt(error):
             return _interrupted()
         traceback.print_exc()
-        click.secho("this is a bug in lce-rig: please report it with these lines", fg="red", err=True)
+        click.secho("this is a bug in lce-rig: report it with these lines", fg="red", err=True)
         return EXIT_BUG

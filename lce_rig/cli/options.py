@@ -1,4 +1,4 @@
-"""Kinds of option values that several verbs share."""
+"""Option types and options that several verbs share."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -9,45 +9,49 @@ import click
 
 
 class FiniteRange(click.FloatRange):
-    """A number within limits that is neither infinite nor NaN."""
+    """A finite number within limits."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Refuse what float() takes and no quantity is."""
+        """Refuse infinity and NaN, which float() accepts."""
         number = super().convert(value, param, ctx)
         if not math.isfinite(number):
-            self.fail(f"{value!r} is no finite number.", param, ctx)
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
         return number
 
 
 def split_names(_ctx: click.Context, _param: click.Parameter, value: str | None) -> list[str] | None:
-    """Take names separated by commas apart, as an option's callback."""
+    """Split names separated by commas, as an option's callback."""
     return None if value is None else [name.strip() for name in value.split(",")]
 
 
 session_argument = click.argument("session", type=click.Path(path_type=Path), default="session")
 
 rig_option = click.option(
-    "--rig", "rig_name", required=True, metavar="NAME|FILE", help="Rig profile: a shipped name or a file."
+    "--rig",
+    "rig_name",
+    required=True,
+    metavar="NAME|FILE",
+    help="Set the rig profile: a shipped name or a file.",
 )
 
-json_option = click.option("--json", "as_json", is_flag=True, help="Print every figure as JSON.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")
 
 cameras_option = click.option(
-    "--camera", "cameras", multiple=True, metavar="NAME", help="Only this camera; may be repeated."
+    "--camera", "cameras", multiple=True, metavar="NAME", help="Use only this camera; repeatable."
 )
 
 
 def require_sensors(what: str, names: Sequence[str], known: Collection[str]) -> None:
-    """Make sure that sensors asked for, such as cameras, are those of a rig.
+    """Check that the rig has the requested sensors.
 
     Raises:
-        UsageError: one is not.
+        UsageError: it does not have one of them.
     """
     from lce_rig.core.errors import UsageError
 
     unknown = sorted(set(names) - set(known))
     if unknown:
-        raise UsageError(f"there is no {what} {unknown[0]!r}; there is {', '.join(known)}")
+        raise UsageError(f"the rig has no {what} {unknown[0]!r}", f"Choose one of: {', '.join(known)}")
 
 
 EVENT_IMAGES = click.Choice(["network", "map"])
@@ -55,5 +59,6 @@ EVENT_IMAGES = click.Choice(["network", "map"])
 event_image_option = click.option(
     "--event-image",
     type=EVENT_IMAGES,
-    help="How events become pictures: by network, or sums of polarities [default: the profile's, network].",
+    help="Reconstruct images from events with the network, or as sums of polarities (map) "
+    "[default: the profile's, else network].",
 )

@@ -1,4 +1,4 @@
-"""`lce-rig reconstruct`: pictures from an event recording."""
+"""`lce-rig reconstruct`: reconstruct images from an event recording."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from lce_rig.recordings.events.event_recording import EventRecording
 
 STAMPS = "stamps.csv"
-# Fourteen hours at the default period; one wild stamp makes a recording centuries long.
-_MAX_PICTURES = 1_000_000
-# Enough for the network to settle before the first picture wanted.
+# 14 hours at the default period; one wrong timestamp makes a recording centuries long.
+_MAX_IMAGES = 1_000_000
+# Enough for the network to settle before the first requested image.
 _WARM_UP_NS = 1_500_000_000
 
 
@@ -29,7 +29,7 @@ _WARM_UP_NS = 1_500_000_000
     required=True,
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="For the pictures.",
+    help="Write the images into this folder.",
 )
 @click.option(
     "--every",
@@ -37,37 +37,37 @@ _WARM_UP_NS = 1_500_000_000
     show_default=True,
     type=FiniteRange(0.001),
     metavar="S",
-    help="One picture every so many seconds.",
+    help="Set the period of the images.",
 )
 @click.option(
-    "--start", default=0.0, type=FiniteRange(0), metavar="S", help="Begin so long after the first event."
+    "--start", default=0.0, type=FiniteRange(0), metavar="S", help="Begin S seconds after the first event."
 )
-@click.option("--duration", type=FiniteRange(0.001), metavar="S", help="End so long after that.")
-@click.option("--topic", metavar="/TOPIC", help="Events topic of a bag with several.")
+@click.option("--duration", type=FiniteRange(0.001), metavar="S", help="End S seconds after the beginning.")
+@click.option("--topic", metavar="/TOPIC", help="Choose the topic if a bag has several with events.")
 @click.option(
     "--window-s",
     type=FiniteRange(0.001, 10),
     metavar="S",
-    help="Windows of this duration (the paper: 0.05).",
+    help="Use windows of S seconds (paper: 0.05).",
 )
-@click.option("--window-events", type=click.IntRange(1), metavar="N", help="Windows of so many events.")
+@click.option("--window-events", type=click.IntRange(1), metavar="N", help="Use windows of N events.")
 @click.option(
     "--event-image",
     type=EVENT_IMAGES,
     default="network",
     show_default=True,
-    help="Recurrent network, or sums of polarities, the alternative that the paper rejects.",
+    help="Reconstruct with the recurrent network, or as sums of polarities (map, for comparison).",
 )
 @click.option(
     "--model",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="ONNX file in place of the shipped network.",
+    help="Use this ONNX file instead of the shipped network.",
 )
 @click.option("--no-filter", is_flag=True, help="Keep hot pixels and background activity.")
-@click.option("--gif", type=click.Path(path_type=Path), metavar="FILE", help="An animation as well.")
+@click.option("--gif", type=click.Path(path_type=Path), metavar="FILE", help="Also write an animation.")
 @click.option(
-    "--video", type=click.Path(path_type=Path), metavar="FILE", help="A video as well: .mp4, .avi or .mkv."
+    "--video", type=click.Path(path_type=Path), metavar="FILE", help="Also write a video: .mp4, .avi or .mkv."
 )
 def reconstruct(
     recording: Path,
@@ -84,11 +84,10 @@ def reconstruct(
     gif: Path | None,
     video: Path | None,
 ) -> None:
-    """Turn the events of RECORDING into grey pictures in FOLDER, with their stamps in stamps.csv.
+    """Reconstruct grey images from the events of RECORDING into FOLDER, with timestamps in stamps.csv.
 
-    Reads AEDAT4, Prophesee RAW (EVT2, EVT3), ROS 1, ROS 2 and mcap bags, HDF5 as DSEC lays it out, npz and
-    the text of E2VID.
-    The first pictures, from before the network has seen enough, are left out, and their number is told.
+    Reads AEDAT4, Prophesee RAW (EVT2, EVT3), ROS 1, ROS 2 and mcap bags, HDF5 in DSEC's layout, npz and
+    E2VID's text. Skips the first images, until the network has settled, and prints how many.
     """
     from lce_rig.core.errors import SourceError, UsageError
     from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
@@ -110,12 +109,12 @@ def reconstruct(
     for text in events.notes:
         show.note(text)
     if refused:
-        show.note(f"{len(refused)} pictures left out, the first because {refused[0]}")
+        show.note(f"{len(refused)} images skipped, the first because: {refused[0]}")
     if not files:
         raise SourceError(
-            f"{recording}: no picture could be made", "It is too short for the network to warm up."
+            f"{recording}: no image reconstructed", "Record longer: the network needs time to settle."
         )
-    show.note(f"{len(files)} pictures in {output}, stamps in {output / STAMPS}")
+    show.note(f"{len(files)} images in {output}, timestamps in {output / STAMPS}")
     _animate(files, every, gif, video)
 
 
@@ -125,18 +124,18 @@ def _warn_of_flicker(recording: Path, events: "EventRecording") -> None:
     flicker = measure_flicker(events.read(events.start_ns, events.start_ns + 1_000_000_000))
     if flicker.is_storm:
         show.warn(
-            f"{recording.name}: most events come from light that flickers at {flicker.frequency_hz:.0f} Hz: "
-            "record by daylight or under lamps that do not flicker"
+            f"{recording.name}: most events come from light that flickers at {flicker.frequency_hz:.0f} Hz. "
+            "Record in daylight or under lamps that do not flicker."
         )
 
 
 def _stamps(
     recording: Path, events: "EventRecording", start_s: float, duration_s: float | None, every_s: float
 ) -> range:
-    """List when pictures are wanted.
+    """List the timestamps of the requested images.
 
     Raises:
-        UsageError: all of them after the recording's end, or more than a million.
+        UsageError: all are after the recording's end, or there are more than a million.
     """
     from lce_rig.core.errors import UsageError
 
@@ -149,10 +148,10 @@ def _stamps(
         )
     wanted = range(begin_ns + every_ns, max(end_ns, begin_ns + every_ns) + 1, every_ns)
     n_wanted = (wanted.stop - wanted.start - 1) // every_ns + 1
-    if n_wanted > _MAX_PICTURES:
+    if n_wanted > _MAX_IMAGES:
         raise UsageError(
             f"{recording} lasts {1e-9 * (last_ns - first_ns):.3g} s: {n_wanted:.3g} images, "
-            f"maximum {_MAX_PICTURES}. Set --duration or a longer --every."
+            f"maximum {_MAX_IMAGES}. Set --duration or a longer --every."
         )
     return wanted
 
@@ -160,7 +159,7 @@ def _stamps(
 def _write(
     output: Path, reconstructor: Any, events: "EventRecording", stamps_ns: range
 ) -> tuple[list[Path], list[str]]:
-    """Write the pictures and the list of their stamps; return the files, and causes of those left out."""
+    """Write the images and their timestamps; return the files, and the causes of skipped images."""
     from lce_rig.core.results import Refusal
     from lce_rig.verify.overlay_files import write_picture
 
@@ -182,7 +181,7 @@ def _write(
 
 
 def _stretches(events: "EventRecording", stamps_ns: range) -> "Iterator[Events]":
-    """Cut the recording down to what the pictures need."""
+    """Read the part of the recording that the images need."""
     from_ns, until_ns = stamps_ns[0] - stamps_ns.step - _WARM_UP_NS, stamps_ns[-1] + 1
     for stretch in events:
         if stretch.t_ns[0] > until_ns:

@@ -1,4 +1,4 @@
-"""`lce-rig repeat`: do independent sessions of one rig, or results of one, give the same extrinsic?"""
+"""`lce-rig repeat`: compare the extrinsics from independent sessions of one rig, or the results of one."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,21 +21,21 @@ if TYPE_CHECKING:
     "names",
     metavar="NAME",
     multiple=True,
-    help="Compare this named result, see `lce-rig results`; may be repeated for one session.",
+    help="Compare this named result (see `lce-rig results`); repeatable with one session.",
 )
 @json_option
 def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) -> None:
     """Compare the calibrations of two or more independent SESSIONs of one rig, or the results of one SESSION.
 
-    The best test of an extrinsic: collect again, with the board put up anew, and see whether the results
-    differ by no more than their stated uncertainties say. Errors that all sessions share do not show: those
-    of the intrinsics, of the board's size, and constant ones of the LiDAR's ranges.
+    The best test of extrinsics: collect again with new board placements, and compare the differences of the
+    results with their reported uncertainties. It cannot show errors that all sessions share: those of the
+    intrinsics, the board's size, and constant errors of the LiDAR's ranges.
 
-    Of one session, its results are compared, such as that of `calibrate --channels events --name events` with
-    the current one. They share captures, and errors that both contain do not show.
+    With one session, compare its results, such as that of `calibrate --channels events --name events` with
+    the current one. They share captures, so that common errors stay hidden.
 
-    A session that was not calibrated yet is calibrated for this; nothing is written. Exits with 7 where the
-    calibrations disagree, or one of them failed by itself.
+    A session without a result is calibrated for the comparison; nothing is written. Exits with 7 if the
+    calibrations disagree, or if one of them failed.
     """
     from lce_rig.core.errors import ResultRefusedError, UsageError
     from lce_rig.pipeline.comparison import compare_results
@@ -44,12 +44,12 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) ->
     if len(sessions) == 1:
         compared = compare_results(sessions[0], names)
     elif len(names) > 1:
-        raise UsageError("several results and several sessions", "Name one session, or one result.")
+        raise UsageError("several results and several sessions given", "Give one session, or one result.")
     else:
         with show.progress_bar("reading") as progress:
             compared = compare(sessions, name=next(iter(names), None), progress=progress)
     for name in compared.calibrated:
-        show.note(f"{name} held no result: calibrated for this comparison, not written")
+        show.note(f"{name} has no result: calibrated for this comparison, not written")
     for finding in compared.findings:
         if finding.severity != "error":
             show.warn(sentence(finding))
@@ -66,13 +66,15 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) ->
         )
     refused = [comparison for comparison in compared.comparisons if not comparison.agrees]
     if refused:
-        raise ResultRefusedError(f"the calibrations of {', '.join(map(_sensors, refused))} disagree")
+        raise ResultRefusedError(
+            f"the sessions disagree on the extrinsics of {', '.join(map(_sensors, refused))}"
+        )
 
 
 def _deviations(comparison: "Repeatability") -> Any:
     import numpy as np
 
-    table = show.plain_table(f"{_sensors(comparison)}: from the mean")
+    table = show.plain_table(f"{_sensors(comparison)}: difference from the mean")
     table.add_column("session")
     for title in ("x mm", "y mm", "z mm", "about x deg", "about y deg", "about z deg"):
         table.add_column(title, justify="right")
@@ -84,7 +86,7 @@ def _deviations(comparison: "Repeatability") -> Any:
 
 
 def _differences(comparison: "Repeatability") -> Any:
-    table = show.plain_table("each two")
+    table = show.plain_table("pairs of sessions")
     for title in ("first", "second", "deg", "mm", "distance", "chance"):
         table.add_column(title, justify="left" if title in ("first", "second") else "right")
     for pair in comparison.differences:
@@ -100,7 +102,7 @@ def _summary(comparison: "Repeatability") -> list[str]:
         *("  " + "  ".join(f"{value: .6f}" for value in row) for row in c.T_cam_lidar[:3]),
         f"spread   {c.spread_rotation_deg:.3f} deg, {1000 * c.spread_translation_m:.1f} mm "
         "(1 sigma of one session)",
-        f"claimed  {c.claimed_rotation_deg:.3f} deg, {1000 * c.claimed_translation_m:.1f} mm{_scatter(c)}",
+        f"reported {c.claimed_rotation_deg:.3f} deg, {1000 * c.claimed_translation_m:.1f} mm{_scatter(c)}",
         f"chi2     {c.chi2:.1f} with {c.dof} degrees of freedom, chance {c.p:.2g}"
         + ("" if c.are_independent else " (at least: the results share captures)"),
     ]
@@ -109,11 +111,11 @@ def _summary(comparison: "Repeatability") -> list[str]:
 
 
 def _scatter(comparison: "Repeatability") -> str:
-    """Say which part of the claim can differ between sessions at all."""
+    """State the part of the reported uncertainty that is independent between sessions."""
     if comparison.scatter_rotation_deg is None or comparison.scatter_translation_m is None:
         return ""
     return (
-        f", without what all sessions share {comparison.scatter_rotation_deg:.3f} deg, "
+        f", of which independent {comparison.scatter_rotation_deg:.3f} deg, "
         f"{1000 * comparison.scatter_translation_m:.1f} mm"
     )
 

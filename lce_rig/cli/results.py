@@ -1,4 +1,4 @@
-"""`lce-rig results`: every result that a session holds, with its figures and verdict."""
+"""`lce-rig results`: list the results of a session with figures and verdicts."""
 
 import math
 from datetime import datetime

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 @click.group(invoke_without_command=True)
 @click.pass_context
 def rigs(ctx: click.Context) -> None:
-    """List, show, check and derive rig profiles (called bare: list)."""
+    """List, show, check and derive rig profiles (default: list)."""
     if ctx.invoked_subcommand is None:
         ctx.invoke(list_profiles, as_json=False)
 
@@ -38,7 +38,9 @@ def list_profiles(as_json: bool) -> None:
         )
         table.add_row(rig.name, ", ".join(summary["lidars"]), cameras, _board(rig), rig.description)
     screen.print_table(table)
-    screen.note("a profile of your own: lce-rig rigs new NAME --from rlfs, then --rig NAME.yaml everywhere")
+    screen.note(
+        "for your own rig: lce-rig rigs new NAME --from rlfs, then pass --rig NAME.yaml to every verb"
+    )
 
 
 def _summary(rig: "Rig") -> dict[str, Any]:
@@ -60,7 +62,7 @@ def _board(rig: "Rig") -> str:
 @click.option("--json", "as_json", is_flag=True, help="Print every setting as JSON.")
 @click.option("--yaml", "as_yaml", is_flag=True, help="Print every setting, defaults included, as YAML.")
 def show_profile(rig_name: str, as_json: bool, as_yaml: bool) -> None:
-    """Show a profile: RIG is a name or a file."""
+    """Show the profile RIG, a name or a file."""
     from lce_rig.rig import dump_rig, load_rig
 
     rig = load_rig(rig_name)
@@ -69,34 +71,34 @@ def show_profile(rig_name: str, as_json: bool, as_yaml: bool) -> None:
     elif as_yaml:
         click.echo(dump_rig(rig), nl=False)
     else:
-        for table in (_sensor_table(rig), _picture_table(rig), _board_table(rig), _limit_table(rig)):
+        for table in (_sensor_table(rig), _reconstruction_table(rig), _board_table(rig), _limit_table(rig)):
             if table.row_count:
                 screen.print_table(table)
-        _warn_of_doubts(rig)
+        _print_warnings(rig)
 
 
 def _sensor_table(rig: "Rig") -> Any:
 
     table = screen.plain_table(
-        f"{rig.name}: {rig.description}", "sensor", "model", "frame", "lens", "topic", "stamps"
+        f"{rig.name}: {rig.description}", "sensor", "model", "frame", "optics", "topic", "timestamps"
     )
     for name, lidar in rig.lidars.items():
-        lens = f"{lidar.min_range_m:g}-{lidar.max_range_m:g} m"
-        table.add_row(name, lidar.model, lidar.frame, lens, lidar.topic or "-", _stamps(lidar.timestamps))
+        optics = f"{lidar.min_range_m:g}-{lidar.max_range_m:g} m"
+        table.add_row(name, lidar.model, lidar.frame, optics, lidar.topic or "-", _stamps(lidar.timestamps))
     for name, camera in rig.cameras.items():
         given, (width, height) = camera.intrinsics, camera.resolution_px
-        lens = f"{width}x{height}, f {given.fx_px:.1f} {given.fy_px:.1f} px, {given.model}"
+        optics = f"{width}x{height}, f {given.fx_px:.1f} {given.fy_px:.1f} px, {given.model}"
         for channel, settings in camera.channels.items():
             row = (
                 camera.model,
                 camera.optical_frame,
-                lens,
+                optics,
                 settings.topic or "-",
                 _stamps(settings.timestamps),
             )
             table.add_row(f"{name}/{channel}", *row)
     for column in table.columns:
-        # A topic or a frame that is cut short is of no use.
+        # A truncated topic or frame is unusable.
         column.overflow = "fold"
     return table
 
@@ -105,16 +107,16 @@ def _stamps(settings: Any) -> str:
     return f"{settings.reference}, clock {settings.clock}, sync {settings.sync}"
 
 
-def _picture_table(rig: "Rig") -> Any:
-    """List how pictures are made of events."""
+def _reconstruction_table(rig: "Rig") -> Any:
+    """List how images are reconstructed from events."""
     from lce_rig.rig import ReconstructionSettings
 
-    table = screen.plain_table("", "pictures from events", "method", "network", "windows")
+    table = screen.plain_table("", "images from events", "method", "network", "windows")
     for name, camera in rig.cameras.items():
         for channel, stream in camera.channels.items():
             if stream.kind == "events":
                 settings = stream.reconstruction or ReconstructionSettings()
-                windows = "by the rate of events"
+                windows = "by event rate"
                 if settings.window_s is not None:
                     windows = f"{1e3 * settings.window_s:g} ms"
                 elif settings.window_events is not None:
@@ -157,7 +159,8 @@ def _limit_table(rig: "Rig") -> Any:
 @click.argument("file", metavar="FILE")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def check_profile(file: str, as_json: bool) -> None:
-    """Check a profile; every problem is named with its line. Exits with 3 where there is one."""
+    """Check the profile FILE and list every problem with its line. Exits with 3 if there is one."""
+    from lce_rig import words
     from lce_rig.core.errors import ProfileError
     from lce_rig.pipeline.detect_session import check_networks
     from lce_rig.rig import find_profile, load_rig
@@ -168,44 +171,52 @@ def check_profile(file: str, as_json: bool) -> None:
     except ProfileError as error:
         if as_json:
             problems = error.hint.splitlines() if error.hint else [error.what]
-            screen.print_json({"is_valid": False, "problems": problems, "warnings": []})
+            screen.print_json({"is_valid": False, "problems": problems, "warnings": [], "findings": []})
         raise
     if as_json:
-        screen.print_json({"is_valid": True, "problems": [], "warnings": rig.doubts()})
+        found = rig.warnings()
+        screen.print_json(
+            {
+                "is_valid": True,
+                "problems": [],
+                "warnings": [words.sentence(warning) for warning in found],
+                "findings": [words.as_json(warning) for warning in found],
+            }
+        )
         return
     click.echo(f"{find_profile(file)}: a valid profile of rig {rig.name}")
-    _warn_of_doubts(rig)
+    _print_warnings(rig)
 
 
-def _warn_of_doubts(rig: "Rig") -> None:
-    for doubt in rig.doubts():
-        screen.warn(doubt)
+def _print_warnings(rig: "Rig") -> None:
+    from lce_rig import words
+
+    for warning in rig.warnings():
+        screen.warn(words.sentence(warning))
 
 
 @rigs.command("new")
 @click.argument("name")
 @click.option(
-    "--from", "origin", default="rlfs", show_default=True, help="Profile to start from, a name or a file."
+    "--from", "origin", default="rlfs", show_default=True, help="Derive from this profile, a name or a file."
 )
 @click.option(
     "--set",
     "settings",
     multiple=True,
     metavar="KEY=VALUE",
-    help="Set a key, as board.square_m=0.08; repeatable.",
+    help="Set a key, such as board.square_m=0.08; repeatable.",
 )
-@click.option("-o", "--output", help="File to write; NAME.yaml where left out, - for stdout.")
+@click.option("-o", "--output", help="Write to this file, - for stdout  [default: NAME.yaml]")
 def new_profile(name: str, origin: str, settings: tuple[str, ...], output: str | None) -> None:
-    """Derive a profile NAME from another; its comments stay."""
+    """Derive the profile NAME from another, with its comments."""
     from lce_rig.core.errors import UsageError
     from lce_rig.rig import derive_text, find_profile, load_rig, read_profile
 
     pairs = [setting.partition("=") for setting in settings]
     for key, equals, value in pairs:
         if not (key and equals and value):
-            raise UsageError(
-                f"--set {key}{equals}{value}: KEY=VALUE is expected, such as board.square_m=0.08"
-            )
+            raise UsageError(f"--set {key}{equals}{value}: expected KEY=VALUE, such as board.square_m=0.08")
     parent = load_rig(origin)
     path = Path(output or f"{name}.yaml")
     original = read_profile(find_profile(origin))
@@ -217,7 +228,7 @@ def new_profile(name: str, origin: str, settings: tuple[str, ...], output: str |
         return
     _write_new(path, text)
     screen.note(f"wrote {path}; measure your board and edit it, then: lce-rig rigs check {path}")
-    _warn_of_doubts(load_rig(path))
+    _print_warnings(load_rig(path))
 
 
 def _write_new(path: Path, text: str) -> None:
@@ -229,12 +240,12 @@ def _write_new(path: Path, text: str) -> None:
             with file:
                 file.write(text)
         except BaseException:
-            # A part of a profile on a full disk would be in the way of the next try.
+            # A partial profile on a full disk would block the next attempt.
             path.unlink(missing_ok=True)
             raise
     except FileExistsError as error:
         raise ProfileError(
-            f"{path}: exists already", "choose another file with -o, or remove it first"
+            f"{path}: exists already", "Choose another file with -o, or remove it first."
         ) from error
     except OSError as error:
         raise ProfileError(f"{path}: cannot be written: {error.strerror}") from error

@@ -1,4 +1,4 @@
-"""How results look in a terminal: tables, progress bars, notes. Results on stdout, the rest on stderr."""
+"""Print to a terminal: tables, progress bars, notes. Results go to stdout, all else to stderr."""
 
 import json
 import sys
@@ -10,11 +10,11 @@ import click
 
 Progress = Callable[[int, int], None]
 COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
-"""Of verdicts."""
+"""Colour of each verdict."""
 
 
 def note(text: str) -> None:
-    """Say something that is not the result."""
+    """Print a line that is not the result, on stderr."""
     click.echo(text, err=True)
 
 
@@ -24,12 +24,12 @@ def say(text: str) -> None:
 
 
 def counted(n: int, noun: str) -> str:
-    """Say how many: "1 capture", "2 captures"."""
+    """Write a number with its noun: "1 capture", "2 captures"."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def warn(text: str) -> None:
-    """Say something the user should look at."""
+    """Print a warning on stderr."""
     click.secho(f"warning: {text}", fg="yellow", err=True)
 
 
@@ -39,7 +39,7 @@ def print_json(document: Any) -> None:
 
 
 def plain_table(title: str, *headings: str) -> Any:
-    """Start a rich table without lines, which survives copying into a message."""
+    """Start a rich table without rules, so that it can be copied into a message."""
     from rich.table import Table
 
     narrow = (0, 1, 0, 0)
@@ -55,7 +55,7 @@ def plain_table(title: str, *headings: str) -> Any:
 
 
 def print_table(table: Any) -> None:
-    """Print a rich table on stdout, as wide as it needs where nobody watches."""
+    """Print a rich table on stdout, at full width if stdout is not a terminal."""
     from rich.console import Console
 
     Console(width=None if sys.stdout.isatty() else 160).print(table)
@@ -63,7 +63,7 @@ def print_table(table: Any) -> None:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Progress]:
-    """Show a bar on stderr while work is done; plain silence where stderr is no terminal.
+    """Show a progress bar on stderr; nothing if stderr is not a terminal.
 
     Yields:
         A callback (done, total).

@@ -1,4 +1,4 @@
-"""`lce-rig simulate`: a session or a recording of a simulated rig, with exact truth beside it."""
+"""`lce-rig simulate`: simulate a session or a recording of a rig, with exact truth."""
 
 import json
 import re
@@ -22,38 +22,48 @@ _CAPTURES, _DURATION_S = 30, 20.0
 @click.command()
 @rig_option
 @click.argument("session", type=click.Path(path_type=Path), required=False)
-@click.option("--captures", type=click.IntRange(1, 10_000), help=f"Board placements [default: {_CAPTURES}].")
+@click.option(
+    "--captures",
+    type=click.IntRange(1, 10_000),
+    help=f"Set the number of board placements [default: {_CAPTURES}].",
+)
 @click.option(
     "--recording",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Make a recording instead of a session: recording.bag with pictures, scans and events, and "
+    help="Write a recording instead of a session: recording.bag with images, scans and events, and "
     "events.aedat4.",
 )
 @click.option(
     "--duration",
     type=FiniteRange(0.1, 3600),
     metavar="S",
-    help=f"Of the recording [default: {_DURATION_S:g}]; each second takes about ten to simulate.",
+    help=f"Set the recording's duration [default: {_DURATION_S:g}]; simulating 1 s takes about 10 s.",
 )
 @click.option(
-    "--ros", type=click.Choice(["1", "2"]), help="The recording's bag: of ROS 1 [default] or ROS 2 (mcap)."
+    "--ros",
+    type=click.Choice(["1", "2"]),
+    help="Write the recording's bag for ROS 1 [default] or ROS 2 (mcap).",
 )
 @click.option(
-    "--seed", default=0, show_default=True, type=click.IntRange(0), help="The same seed, the same bytes."
+    "--seed",
+    default=0,
+    show_default=True,
+    type=click.IntRange(0),
+    help="Set the seed; the same seed gives the same bytes.",
 )
 @click.option(
     "--motion",
     type=click.Choice(["still", "moving"]),
-    help="Board held still, or moved by hand. Events are stored of a moving board only: a still one makes "
-    "none [default: still; moving for rigs without frames].",
+    help="Hold the board still, or move it by hand. Only a moving board gives events "
+    "[default: still; moving for rigs without frames].",
 )
 @click.option(
     "--speed",
     type=FiniteRange(0, 3),
     nargs=2,
     metavar="MIN MAX",
-    help="Of the moving board, m/s; of a recording MAX is the speed between placements "
+    help="Set the moving board's speed, m/s; in a recording MAX is the speed between placements "
     "[default: 0.05 0.3; recording 0.6].",
 )
 @click.option(
@@ -61,27 +71,40 @@ _CAPTURES, _DURATION_S = 30, 20.0
     default=0.0,
     type=FiniteRange(-10, 10),
     metavar="S",
-    help="How much more the stamps of pictures read than the LiDAR's clock.",
+    help="Add this offset from the LiDAR's clock to the timestamps of images.",
 )
 @click.option(
-    "--event-offset", type=FiniteRange(-10, 10), metavar="S", help="The same for the stamps of events."
+    "--event-offset",
+    type=FiniteRange(-10, 10),
+    metavar="S",
+    help="Add this offset from the LiDAR's clock to the timestamps of events.",
 )
 @click.option(
-    "--flicker", type=FiniteRange(0, 0.9), metavar="DEPTH", help="Lamps whose light swings, 100 Hz."
+    "--flicker",
+    type=FiniteRange(0, 0.9),
+    metavar="DEPTH",
+    help="Let the lamps flicker at 100 Hz with this modulation depth.",
 )
 @click.option(
     "--carrier",
     type=click.Choice(["stand", "person", "none"]),
-    help="What holds the board [default: a person for rigs called rles..., nobody for sss..., else a stand].",
+    help="Choose what holds the board [default: person for rigs rles..., none for sss..., else stand].",
 )
 @click.option(
     "--noise-level",
     type=click.IntRange(1, 10),
-    help="Range noise of the paper's simulated sets: levels 1 (none) to 10 (10 cm).",
+    help="Set the range noise of the paper's simulated sets, from level 1 (none) to 10 (10 cm).",
 )
-@click.option("--range-sigma", type=FiniteRange(0, 1), metavar="M", help="Range noise of the LiDAR.")
-@click.option("--range-offset", type=FiniteRange(-1, 1), metavar="M", help="Constant offset of all ranges.")
-@click.option("--decoy", is_flag=True, help="Stand a blank plate of the board's size in the room.")
+@click.option(
+    "--range-sigma",
+    type=FiniteRange(0, 1),
+    metavar="M",
+    help="Set the standard deviation of the LiDAR's ranges.",
+)
+@click.option(
+    "--range-offset", type=FiniteRange(-1, 1), metavar="M", help="Add a constant offset to all ranges."
+)
+@click.option("--decoy", is_flag=True, help="Place a blank plate of the board's size in the room.")
 def simulate(
     rig_name: str,
     session: Path | None,
@@ -92,12 +115,12 @@ def simulate(
     seed: int,
     **choices: Any,
 ) -> None:
-    """Make SESSION (default: session/) with a simulated rig: pictures, scans and exact truth.
+    """Simulate SESSION (default: session/) of a rig: images, scans and exact truth.
 
-    With `--motion moving` each capture holds the raw events about it, too. With `--recording FOLDER` it makes
+    With `--motion moving`, captures also hold the raw events around them. With `--recording FOLDER`, write
     files for `lce-rig collect`, `lce-rig reconstruct` and other programs instead.
 
-    The truth stands in truth.json beside them: SESSION/truth.json goes to `lce-rig calibrate --reference`.
+    The truth is written to truth.json; pass SESSION/truth.json to `lce-rig calibrate --reference`.
     """
     from lce_rig.core.errors import UsageError
     from lce_rig.rig import load_rig
@@ -107,12 +130,12 @@ def simulate(
     for name in rig.cameras:
         if len(rig.cameras) > 1 and name not in drawn:
             show.warn(
-                f"the profile has no nominal extrinsic of {name}: it is put where the first LiDAR is, looks "
-                "along its x axis, and may see few of the boards"
+                f"the profile has no nominal extrinsics of {name}: simulated at the first LiDAR's origin, "
+                "looking along its x axis; it may see few of the boards"
             )
     if recording is None:
         if duration is not None or ros is not None:
-            raise UsageError("--duration and --ros belong to a recording", "Add --recording FOLDER.")
+            raise UsageError("--duration and --ros apply to recordings only", "Add --recording FOLDER.")
         options = _options(rig, choices["motion"] or _usual_motion(rig), choices)
         _simulate_session(session or Path("session"), rig, captures or _CAPTURES, seed, options)
         return
@@ -120,10 +143,10 @@ def simulate(
         given = f"the session {session}" if session is not None else "--captures"
         raise UsageError(f"--recording and {given} exclude each other", "Run it twice, with the same --seed.")
     if choices["motion"] == "still":
-        raise UsageError("--motion still: the board of a recording is carried from place to place")
+        raise UsageError("--motion still: the board moves in a recording", "Omit --motion, or --recording.")
     options = _options(rig, "moving", choices)
     if options.hand.carry_mps <= 0:
-        raise UsageError("--speed: the board of a recording must move", "Give a MAX above 0.")
+        raise UsageError("--speed: MAX is 0, but the board moves in a recording", "Give a MAX above 0.")
     _simulate_recording(recording, rig, duration or _DURATION_S, seed, options, int(ros or 1))
 
 
@@ -133,10 +156,10 @@ def _usual_motion(rig: "Rig") -> Any:
 
 
 def _options(rig: "Rig", motion: Any, choices: dict[str, Any]) -> "SimulationOptions":
-    """Apply what was chosen to what the rig's recordings show.
+    """Apply the chosen options to the defaults of the rig.
 
     Raises:
-        UsageError: something that only a moving board has was chosen for a still one.
+        UsageError: an option of a moving board was chosen for a still one.
     """
     from dataclasses import replace
 
@@ -146,13 +169,13 @@ def _options(rig: "Rig", motion: Any, choices: dict[str, Any]) -> "SimulationOpt
     of_motion = [name for name in ("speed", "event_offset", "flicker") if choices[name] is not None]
     if motion == "still" and of_motion:
         option = of_motion[0].replace("_", "-")
-        raise UsageError(f"--{option} is of a moving board", "Add --motion moving.")
+        raise UsageError(f"--{option} applies to a moving board only", "Add --motion moving.")
     options = SimulationOptions.for_rig(rig.name, motion)
     hand, lidar = options.hand, options.lidar
     if choices["speed"] is not None:
         slow, fast = choices["speed"]
         if slow > fast:
-            raise UsageError(f"--speed {slow:g} {fast:g}: the slowest comes first")
+            raise UsageError(f"--speed {slow:g} {fast:g}: MIN exceeds MAX", "Give MIN first.")
         hand = replace(hand, speed_mps=(slow, fast), carry_mps=fast)
     if choices["range_sigma"] is not None:
         lidar = replace(lidar, range_sigma_m=choices["range_sigma"])
@@ -179,7 +202,9 @@ def _simulate_session(
     from lce_rig.simulate import capture_truth, rig_truth, simulate_captures
 
     if path.exists():
-        raise SessionError(f"{path} exists already", "Name another folder: a simulation is never continued.")
+        raise SessionError(
+            f"{path} exists already", "Choose another folder; a simulation is never continued."
+        )
     with Session.create(path, rig) as writer, show.progress_bar("simulating") as progress:
         truth = rig_truth(rig, seed, options) | {"captures": {}}
         try:
@@ -217,11 +242,11 @@ def _simulate_recording(
 
 
 def require_kind(session: Path, seed: int | None) -> None:
-    """Refuse to mix simulated captures with real ones, or with those of another simulation.
+    """Refuse to mix simulated captures with real ones or with those of another simulation.
 
     Args:
-        session: where captures are to be added; may not be there yet.
-        seed: of the simulation that they come from; None for real ones.
+        session: the session that gets captures; may not exist yet.
+        seed: the simulation's; None for real captures.
 
     Raises:
         SessionError: the session holds captures of another kind.

@@ -1,4 +1,4 @@
-"""`lce-rig verify`: the LiDAR drawn into the pictures, residuals per capture, exit by verdict."""
+"""`lce-rig verify`: project the point clouds into the images, print residuals, exit by verdict."""
 
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,15 @@ from lce_rig.words import describe
     "--result",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="A result.json of another session of this rig: check it on the captures of this one.",
+    help="Check the result.json of another session of this rig on these captures.",
 )
-@click.option("--name", metavar="NAME", help="Take this result of SESSION, see `lce-rig results`.")
+@click.option("--name", metavar="NAME", help="Check this result of SESSION (see `lce-rig results`).")
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the pictures go."
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Write the images into this folder.",
 )
 @json_option
 @event_image_option
@@ -32,11 +36,11 @@ def verify(
     as_json: bool,
     event_image: Any,
 ) -> None:
-    """Draw the LiDAR of each capture of SESSION (default: session/) into its picture, print residuals.
+    """Project the point clouds of SESSION (default: session/) into the images and print residuals.
 
-    Images and one contact sheet replace those in SESSION/calibration/overlays/, with --result FILE those in
-    SESSION/overlays/, with --name NAME those beside that result. Exits with 7 where the verdict is fail or
-    these captures contradict the extrinsic.
+    Images and a contact sheet replace those in SESSION/calibration/overlays/, with --result FILE those in
+    SESSION/overlays/, with --name NAME those beside that result. Exits with 7 if the verdict is fail or these
+    captures contradict the extrinsics.
     """
     import lce_rig as lce
     from lce_rig.cli.calibrate import exit_by_verdict
@@ -65,7 +69,7 @@ def verify(
     contradicted = [checked for checked in checks if checked.doubts]
     if contradicted:
         raise ResultRefusedError(
-            f"the captures of {session} contradict the extrinsic of "
+            f"the captures of {session} contradict the extrinsics of "
             + " and that of ".join(str(checked.pair) for checked in contradicted),
             "\n".join(
                 f"{checked.pair}: {describe(doubt)}" for checked in contradicted for doubt in checked.doubts
@@ -97,5 +101,5 @@ def _summary(checked: Any) -> list[str]:
     lines.append(f"verdict of the calibration: {checked.calibration.verdict}")
     lines.append(f"these captures: {'; '.join(map(describe, checked.doubts)) or 'agree'}")
     if checked.contact_sheet is not None:
-        lines.append(f"pictures: {show.escape(str(checked.contact_sheet))}")
+        lines.append(f"images: {show.escape(str(checked.contact_sheet))}")
     return lines

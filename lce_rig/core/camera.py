@@ -16,7 +16,7 @@ class Intrinsics:
 
     Attributes:
         fx_px, fy_px, cx_px, cy_px: the camera matrix.
-        width_px, height_px: size of the image the numbers belong to.
+        width_px, height_px: resolution of the images.
         model: "radtan" (k1 k2 p1 p2 [k3 [k4 k5 k6]], as OpenCV's plumb bob and rational models) or
             "equidistant" (k1..k4, as OpenCV's fisheye and Kalibr's equi).
         distortion: the coefficients, in the order above.
@@ -104,7 +104,7 @@ class Intrinsics:
             points_camera: (..., 3) m, frame camera optical (x right, y down, z forward).
 
         Returns:
-            Pixels (..., 2), NaN where invalid, and validity (...,): in front of the camera and within the
+            Pixels (..., 2), NaN if invalid, and validity (...,): in front of the camera and within the
             radius up to which the distortion is monotonic. A valid pixel may lie outside the image.
         """
         points = np.asarray(points_camera, dtype=np.float64)
@@ -159,7 +159,7 @@ class Intrinsics:
             pixels: (..., 2).
 
         Returns:
-            (..., 3) unit vectors, frame camera optical; NaN where no ray within the valid radius fits.
+            (..., 3) unit vectors, frame camera optical; NaN if no ray within the valid radius fits.
         """
         xy = (np.asarray(pixels, dtype=np.float64) - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
         return self._unproject_equidistant(xy) if self.model == "equidistant" else self._unproject_radtan(xy)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,10 @@ class Image:
     Attributes:
         sensor: name of the camera in the rig profile.
         channel: channel of that camera ("frames", "events").
-        stamp_ns: mid exposure, device time; None where the recording carries no time.
-        host_ns: arrival at the host; None where unknown.
+        stamp_ns: mid exposure, device time; None if the recording carries no time.
+        host_ns: arrival at the host; None if unknown.
         pixels: (H, W) grey or (H, W, 3) BGR, uint8.
-        count: the camera's running number of the image; gaps are lost ones; None where it does not count.
+        count: the camera's running number of the image; gaps are lost ones; None if it does not count.
     """
 
     sensor: str
@@ -33,7 +33,7 @@ class Image:
         """The image as (H, W) uint8 grey values (ITU-R BT.601 weights)."""
         if self.pixels.ndim == 2:
             return self.pixels
-        import cv2  # Slow to import, and of no use to commands that look at no image.
+        import cv2  # Slow to import, and unusable to commands that look at no image.
 
         return np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
@@ -44,12 +44,12 @@ class Scan:
 
     Attributes:
         sensor: name of the LiDAR in the rig profile.
-        stamp_ns: first firing, device time; None where the recording carries no time.
+        stamp_ns: first firing, device time; None if the recording carries no time.
         points: (N, 3) float32 m, frame lidar (x forward, y left, z up); finite, no zero ranges.
         intensity: (N,) float32; zeros where the recording has none.
         ring: (N,) int16, 0 = lowest elevation.
-        offset_ns: (N,) int64 firing time after stamp_ns; None where the recording carries none.
-        host_ns: arrival at the host; None where unknown.
+        offset_ns: (N,) int64 firing time after stamp_ns; None if the recording carries none.
+        host_ns: arrival at the host; None if unknown.
     """
 
     sensor: str
@@ -75,6 +75,31 @@ class Scan:
 
 
 @dataclass(frozen=True, eq=False)
+class EventColumns:
+    """Events as read: not checked against a resolution, not sorted.
+
+    Attributes:
+        t_ns: (N,) int64 device time.
+        x, y: (N,) uint16 px.
+        polarity: (N,) bool, True where it became brighter.
+        host_ns: arrival of the first event at the host; None where unknown.
+    """
+
+    t_ns: NDArray[np.int64]
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    polarity: NDArray[np.bool_]
+    host_ns: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def select(self, keep: NDArray[Any] | slice) -> "EventColumns":
+        """Keep the events of a mask, an index or a slice."""
+        return EventColumns(self.t_ns[keep], self.x[keep], self.y[keep], self.polarity[keep], self.host_ns)
+
+
+@dataclass(frozen=True, eq=False)
 class Events:
     """A range of an event camera's stream.
 
@@ -85,7 +110,7 @@ class Events:
         y: (N,) uint16 row.
         polarity: (N,) bool, True where it became brighter.
         width_px, height_px: resolution of the sensor.
-        host_ns: arrival of the first event at the host; None where unknown.
+        host_ns: arrival of the first event at the host; None if unknown.
     """
 
     sensor: str
@@ -119,7 +144,10 @@ class Events:
         )
 
 
-def join_events(parts: Sequence[Events]) -> Events:
+_Stretch = TypeVar("_Stretch", Events, EventColumns)
+
+
+def join_events(parts: Sequence[_Stretch]) -> _Stretch:
     """Put stretches of one camera's stream together, at least one, in order of time."""
     filled = [part for part in parts if len(part)] or parts[:1]
     if len(filled) == 1:
@@ -157,7 +185,7 @@ class Stream:
     Attributes:
         sensor: the camera or LiDAR.
         channel: of a camera; "" for a LiDAR.
-        kind: a channel of events may also bring pictures that others reconstructed.
+        kind: a channel of events may also bring images that others reconstructed.
     """
 
     sensor: str

@@ -57,29 +57,21 @@ def encode_events(events: Events) -> bytes:
     return buffer.getvalue()
 
 
-def decode_events(data: bytes, sensor: str, resolution_px: tuple[int, int] | None = None) -> Events:
-    """Read an archive of this program or another's from memory; see `read_events`."""
-    return read_events(io.BytesIO(data), sensor, resolution_px)
+def decode_events(data: bytes, sensor: str) -> Events:
+    """Read an archive of this program or another's from memory; see `EventArchive`.
 
-
-def read_events(file: BinaryIO, sensor: str, resolution_px: tuple[int, int] | None = None) -> Events:
-    """Read an archive of this program or another's whole; see `EventArchive`.
-
-    Args:
-        file: the archive.
-        sensor: name of the camera.
-        resolution_px: (width, height) where the archive does not say; None takes the events' extent.
+    Its resolution is the events' extent where it does not say.
 
     Raises:
         ValueError: what is wrong with the file, in words.
     """
-    archive = EventArchive(file)
+    archive = EventArchive(io.BytesIO(data))
     # A capture of many events is a large file, too: pixels hardly shrink. What is small stays small.
-    n_bytes = min(_MAX_COLUMN_RATIO * file.seek(0, io.SEEK_END), limits.MAX_FILE_BYTES)
+    n_bytes = min(_MAX_COLUMN_RATIO * len(data), limits.MAX_FILE_BYTES)
     limits.check_size(archive.largest_column_bytes, "a column", max(n_bytes, limits.MAX_CHUNK_BYTES))
     t_ns, x, y, polarity = next(archive.stretches(max(archive.n_events, 1)))
     extent_px = (int(x.max()) + 1, int(y.max()) + 1) if len(x) else (0, 0)
-    width, height = archive.resolution_px or resolution_px or extent_px
+    width, height = archive.resolution_px or extent_px
     if width * height > limits.MAX_EVENT_PIXELS:
         raise ValueError(f"its pixels are beyond any sensor: {width}x{height}")
     return Events(sensor, t_ns, x, y, polarity, width, height, archive.host_ns)
@@ -93,8 +85,8 @@ class EventArchive:
     Attributes:
         n_events: how many there are.
         largest_column_bytes: of the columns with the events, in memory.
-        resolution_px: (width, height); None where the archive does not say.
-        host_ns: host time of the first event; None where the archive does not say.
+        resolution_px: (width, height); None if the archive does not say.
+        host_ns: host time of the first event; None if the archive does not say.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -110,7 +102,7 @@ class EventArchive:
         self._names = [self._time, *(self._find(name) for name in _ALIASES)]
         columns = [self._columns.open(name) for name in self._names]
         if flat := [column.name for column in columns if not column.shape]:
-            raise ValueError(f"its column {flat[0]} is no list of numbers")
+            raise ValueError(f"its column {flat[0]} is not a list of numbers")
         lengths = {column.n_left for column in columns}
         if len(lengths) != 1:
             raise ValueError(f"its columns are of unequal length: {sorted(lengths)}")
@@ -122,7 +114,7 @@ class EventArchive:
     def stretches(
         self, n_events: int
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]]:
-        """Yield times (ns), x, y and polarity of so many events at a time; once where there is none.
+        """Yield times (ns), x, y and polarity of so many events at a time; once if there is none.
 
         Raises:
             ValueError: what is wrong with the file, in words.
@@ -193,7 +185,7 @@ class _Column:
         self._ahead = head[begin:]
         self.n_left = math.prod(self.shape)
         if self._dtype.kind not in "biuf" or len(self.shape) > 1:
-            raise ValueError(f"its column {name} is no list of numbers")
+            raise ValueError(f"its column {name} is not a list of numbers")
         if begin + self.n_left * self._dtype.itemsize != member.file_size:
             raise ValueError(f"its column {name} declares {self.n_left} numbers and holds others")
 
@@ -229,14 +221,14 @@ def _damage_in_words() -> Iterator[None]:
     try:
         yield
     except Exception as error:  # A damaged archive fails in any way: zip, zlib, encryption, sizes, syntax.
-        raise ValueError(f"it is no archive of events, or a damaged one: {error}") from None
+        raise ValueError(f"it is not an archive of events, or it is damaged: {error}") from None
 
 
 def _npy_header(data: bytes, name: str) -> tuple[tuple[int, ...], np.dtype[Any], int]:
     """Read shape and type of an array, and where its numbers begin."""
     file = io.BytesIO(data)
     if not data.startswith(np.lib.format.MAGIC_PREFIX):
-        raise ValueError(f"its column {name} is no array")
+        raise ValueError(f"its column {name} is not an array")
     version = np.lib.format.read_magic(file)
     if version == (1, 0):
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)
@@ -278,7 +270,7 @@ def _resolution(columns: _Columns) -> tuple[int, int] | None:
     column = columns.open("resolution_px")
     size = column.read(2) if column.shape == (2,) else np.empty(0)
     if size.dtype.kind not in "iu":
-        raise ValueError("its resolution_px is no width and height")
+        raise ValueError("its resolution_px is not a width and height")
     width, height = map(int, size)
     if width * height > limits.MAX_EVENT_PIXELS:
         raise ValueError(f"its pixels are beyond any sensor: {width}x{height}")

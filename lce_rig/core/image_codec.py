@@ -42,23 +42,23 @@ def decode_pixels(data: bytes, flags: int) -> NDArray[Any]:
         raise ValueError("it is empty")
     # Older OpenCV fills what is missing from a torn JPEG or PNG with grey and says nothing.
     if data.startswith(b"\x89PNG") and b"IEND" not in data[-64:]:
-        raise ValueError("it is a truncated PNG picture")
+        raise ValueError("it is a truncated PNG image")
     if data.startswith(b"\xff\xd8") and b"\xff\xd9" not in data[-1024:]:
-        raise ValueError("it is a truncated JPEG picture")
+        raise ValueError("it is a truncated JPEG image")
     _check_declared(data)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error:
         pixels = None
     if pixels is None:
-        raise ValueError("it is damaged, or no picture this program reads")
+        raise ValueError("it is damaged, or no image this program reads")
     return np.asarray(pixels)
 
 
 def _check_declared(data: bytes) -> None:
     reader = next((read for magic, read in _READERS.items() if data.startswith(magic)), None)
     if reader is None or (reader is _webp and data[8:12] != b"WEBP"):
-        raise ValueError("it is damaged, or no picture this program reads")
+        raise ValueError("it is damaged, or no image this program reads")
     try:
         declared = reader(data)
     except (struct.error, IndexError, KeyError, OverflowError, ValueError):

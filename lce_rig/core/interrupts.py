@@ -95,7 +95,7 @@ def interrupt_no_more() -> None:
 
 @contextmanager
 def patience(grace_s: float) -> Iterator[None]:
-    """Give the program longer to end in good order, while the block lasts."""
+    """Return the program longer to end in good order, while the block lasts."""
     if _watch is None:
         yield
         return

@@ -136,7 +136,7 @@ def _parse_dtype(entries: dict[str, list[str]]) -> np.dtype[Any]:
     try:
         return np.dtype(columns)
     except ValueError as error:
-        raise ValueError(f"its fields cannot be told apart: {error}") from None
+        raise ValueError(f"its field names are not unique: {error}") from None
 
 
 def _parse_size(entries: dict[str, list[str]]) -> int:

@@ -8,8 +8,9 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.diagnostics import NO_DIAGNOSTICS, Diagnostics
 from lce_rig.core.errors import LceRigError
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, sigma_sizes
 
 Stage = Literal["read", "image", "lidar", "pair", "calibrate"]
@@ -65,7 +66,7 @@ class ImageQuality:
 
 @dataclass(frozen=True)
 class EventQuality:
-    """What events show of the board and of its motion; NaN where it could not be measured.
+    """What events show of the board and of its motion; NaN if it could not be measured.
 
     Attributes:
         events_px_s: events per second and pixel of the board, just before the image.
@@ -134,16 +135,16 @@ class ImageBoard:
         corners_px: (rows * cols, 2) in the order of `Board.corners()`.
         T_cam_board: (4, 4), the pose with the smaller reprojection error.
         cov: (6, 6) of T_cam_board, tangent (translation m, rotation rad).
-        T_cam_board_alternative: (4, 4) second local minimum; None where there is none in front of the camera.
+        T_cam_board_alternative: (4, 4) second local minimum; None if there is none in front of the camera.
         chi2_gap: by how much the alternative's cost is higher, in units of the corner variance.
-        is_ambiguous: whether the picture alone cannot decide between the two (chi2_gap < 9).
+        is_ambiguous: whether the image alone cannot decide between the two (chi2_gap < 9).
         reprojection_px: rms of the corner residuals.
         sigma_px: corner noise per coordinate, from the residuals and their degrees of freedom.
-        quality: what the image shows of the pattern; None where only its corners are known.
-        events: what events show of the board; None where the image is not made of events that are known.
-        stamp_ns: of the picture; None where the recording carries no time.
-        track_ns: (K,) int64 stamps of further pictures of this channel, shortly before and after, in which
-            the board was followed; None where there are none.
+        quality: figures of the pattern in the image; None if only its corners are known.
+        events: figures of the board's events; None if the image was not reconstructed from known events.
+        stamp_ns: of the image; None if the recording carries no time.
+        track_ns: (K,) int64 timestamps of further images of this channel, shortly before and after, in which
+            the board was tracked; None if there are none.
         track_T_cam_board: (K, 4, 4) its poses there, corners in the same order as here.
         track_cov: (K, 6, 6) of those poses, as `cov`.
     """
@@ -195,16 +196,16 @@ class LidarBoard:
         edge_side: (M,) int8, -1 where the board ends towards smaller azimuth, +1 towards larger
             (azimuth = atan2(y, x), counter-clockwise).
         edge_behind_m: (M,) how far behind the board's plane the ring's next return beyond the edge lies;
-            inf where there is none. What stands close behind blends into the beam's return.
+            inf if there is none. What stands close behind blends into the beam's return.
         edge_echo: (M,) share 0..1 of the received power that comes from there where a beam meets it and the
             board alike; 0 where nothing is there. A beam that meets both reports the stronger echo.
         azimuth_step_rad: angle between neighbouring firings of one ring.
         plane: (4,) as (n, d), n.p + d = 0, unit n towards the LiDAR (d > 0).
         sigma_m: rms distance of `points` from the plane.
         T_lidar_board: (4, 4) from the template; known up to the symmetries of a rectangle.
-        offset_ns: (N,) int64 firing time of each point after the scan's stamp; None without.
-        quality: what the scan shows of the plate.
-        stamp_ns: of the scan; None where the recording carries no time.
+        offset_ns: (N,) int64 firing time of each point after the scan's timestamp; None without.
+        quality: figures of the plate in the scan.
+        stamp_ns: of the scan; None if the recording carries no time.
     """
 
     points: Array
@@ -277,13 +278,13 @@ class ChannelResult:
     Attributes:
         channel: its name.
         n_captures: captures in which it shows the board and agrees with the others.
-        noise_px: corner noise per coordinate, from the residuals of all its pictures.
-        T_cam_lidar: (4, 4) extrinsic from this channel's pictures; from others' only how boards moved.
+        noise_px: corner noise per coordinate, from the residuals of all its images.
+        T_cam_lidar: (4, 4) extrinsic from this channel's images; from others' only how boards moved.
         cov: (6, 6) of it, as `Calibration.cov`.
         depth_scatter_m: standard deviation over captures of the LiDAR's distance from the board's plane.
         depth_scatter_still_m: the same if boards are taken to have stood still.
-        time_offset_s: what to add to its stamps beyond the profile's expected offset to come to the LiDAR's
-            time; pictures without stamps count from the scan's first firing. None where nothing moved.
+        time_offset_s: what to add to its timestamps beyond the profile's expected offset to come to the
+            LiDAR's time; images without timestamps count from the scan's first firing. None if nothing moved.
         time_offset_sigma_s: standard deviation of that.
     """
 
@@ -304,7 +305,7 @@ class PointUncertainty:
 
     Attributes:
         distance_m: of the point from the camera.
-        centre_px, centre_m: in the middle of the picture; in it, and in space.
+        centre_px, centre_m: in the middle of the image; in it, and in space.
         corner_px, corner_m: in the least certain corner.
     """
 
@@ -323,9 +324,9 @@ class OtherCamera:
         camera: name of the other one.
         n_captures: that both used.
         T_cam_other: (4, 4) to which the extrinsics of both with the LiDAR compose, p_cam = R p_other + t.
-        cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the camera; None where the
+        cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the camera; None if the
             extrinsics were not estimated together.
-        T_cam_other_pictures: (4, 4) from the pictures of both alone; None where too few boards tell.
+        T_cam_other_pictures: (4, 4) from the images of both alone; None if too few boards tell.
         apart_rotation_deg, apart_translation_m: how far that lies from what the extrinsics compose to, each
             estimated by itself.
         board_rms_m: how far apart those put the middle of the same board, rms.
@@ -343,7 +344,7 @@ class OtherCamera:
 
 @dataclass(frozen=True)
 class CaptureResidual:
-    """How well one capture fits an extrinsic.
+    """How well one capture fits extrinsics.
 
     Attributes:
         capture: its name.
@@ -362,36 +363,71 @@ class CaptureResidual:
     reprojection_px: float
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """The extrinsic of one camera and one LiDAR, with everything needed to judge it.
+Motion = Literal["translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z"]
+MOTIONS: tuple[Motion, ...] = (
+    "translation_x",
+    "translation_y",
+    "translation_z",
+    "rotation_x",
+    "rotation_y",
+    "rotation_z",
+)
+"""Motions along and about the camera's axes, in the order of a tangent (6,)."""
 
-    result.json keeps all of it but the last four attributes, which are empty where it is read back.
+
+@dataclass(frozen=True)
+class WeakestMotion:
+    """The motion of an extrinsic that its captures determine least.
 
     Attributes:
-        channel: of the camera, or several joined by "+".
+        motion: its main component, axes of the camera.
+        sigma: standard deviation of that, m or rad.
+    """
+
+    motion: Motion
+    sigma: float
+
+    @property
+    def is_rotation(self) -> bool:
+        """Whether the motion is a rotation."""
+        return MOTIONS.index(self.motion) >= 3
+
+    def figures(self) -> dict[str, Figure]:
+        """Give motion and standard deviation as figures of a finding."""
+        if self.is_rotation:
+            return {"weakest": self.motion, "weakest_sigma_deg": math.degrees(self.sigma)}
+        return {"weakest": self.motion, "weakest_sigma_m": self.sigma}
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The extrinsics of one camera and one LiDAR, with everything needed to judge it.
+
+    result.json keeps all of it but the last four attributes, which are empty if it is read back.
+
+    Attributes:
+        channels: of the camera, names.
         channel_results: what each of these says alone.
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
         egt_rotation_deg, egt_translation_m: error against a reference given by the user; None without.
         verdict: "pass", "marginal" or "fail".
-        reasons: for it, worst first, in words.
-        findings: the same as codes and figures; empty in results of earlier versions.
+        findings: the reasons for it, worst first, and notes.
         captures_used: names of the captures behind the estimate.
         captures_refused: why each other capture is not.
-        diagnostics: further figures by name.
-        method: that found the extrinsic, as `CalibrateOptions.method`.
-        uncertainty: what `cov` means for points at several distances; empty where no lens was at hand.
+        diagnostics: further figures.
+        method: that found the extrinsics, as `CalibrateOptions.method`.
+        uncertainty: what `cov` means for points at several distances; empty if no lens was at hand.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         other_cameras: those that saw the same boards held still.
-        weak_direction: the least certain motion, with its standard deviation.
-        held_out_m: rms residual of captures where they were not fitted; NaN where no method knows it.
+        weakest: the least determined motion; None if it is read back.
+        held_out_m: rms residual of captures where they were not fitted; NaN if no method knows it.
         residuals: of each capture used.
         observations: capture -> the boards that were paired, as measured, for each capture used.
     """
 
     camera: str
-    channel: str
+    channels: tuple[str, ...]
     lidar: str
     T_cam_lidar: Array
     cov: Array
@@ -402,25 +438,24 @@ class Calibration:
     captures_used: tuple[str, ...]
     captures_refused: Mapping[str, Refusal]
     verdict: Literal["pass", "marginal", "fail"]
-    reasons: tuple[str, ...]
     findings: tuple[Finding, ...] = ()
     egt_rotation_deg: float | None = None
     egt_translation_m: float | None = None
-    diagnostics: Mapping[str, float] = field(default_factory=dict)
+    diagnostics: Diagnostics = NO_DIAGNOSTICS
     channel_results: tuple[ChannelResult, ...] = ()
     method: str = "paper"
     uncertainty: tuple[PointUncertainty, ...] = ()
     estimated_with: tuple[str, ...] = ()
     other_cameras: tuple[OtherCamera, ...] = ()
-    weak_direction: str = ""
+    weakest: WeakestMotion | None = None
     held_out_m: float = float("nan")
     residuals: tuple[CaptureResidual, ...] = ()
     observations: Mapping[str, Observation] = field(default_factory=dict)
 
     @property
-    def channels(self) -> tuple[str, ...]:
-        """Names of the channels behind the result."""
-        return tuple(self.channel.split("+"))
+    def channel(self) -> str:
+        """Names of the channels for people: several are joined by "+"."""
+        return "+".join(self.channels)
 
     @property
     def sigma_rotation_deg(self) -> float:

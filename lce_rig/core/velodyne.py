@@ -59,5 +59,5 @@ POSITION_PACKET = np.dtype(
 
 
 def packet_ns(is_dual: bool) -> int:
-    """Give the time from the first firing of a packet to the first firing of the next."""
+    """Return the time from the first firing of a packet to the first firing of the next."""
     return N_BLOCKS * BLOCK_NS // (2 if is_dual else 1)

@@ -1,1 +1,1 @@
-"""Find the calibration board: in pictures and in LiDAR scans."""
+"""Find the calibration board: in images and in LiDAR scans."""

@@ -37,7 +37,7 @@ class ObservedSensor:
         failure: why it could not be opened, or ended early.
         watched_s: for how long it was open.
         ended_ns: when that ended, by the computer's time of day.
-        stamps: (timestamp, arrival) ns of each scan, image or batch, by "scans", "frames", "events".
+        timestamps: (timestamp, arrival) ns of each scan, image or batch, by "scans", "frames", "events".
         frames: every image, without its pixels.
         pulses: every pulse, of a board or seen by a camera.
         scan, images, events: the last scan, the last image of each channel, the last 1.5 s of events.

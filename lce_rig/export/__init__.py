@@ -1,4 +1,4 @@
-"""Results as files that other programs read; each is read back before it is handed out."""
+"""Write results as files for other programs; each is read back and checked."""
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -8,6 +8,7 @@ from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError, re
 from lce_rig.core.results import Calibration
 from lce_rig.export.frames import require_known
 from lce_rig.rig import Rig
+from lce_rig.words import sentence
 
 Exporter = Callable[[Sequence[Calibration], Rig, Path], list[Path]]
 
@@ -29,7 +30,7 @@ def load_exporter(name: str) -> Exporter:
         UsageError: no such format.
     """
     if name not in EXPORTS:
-        raise UsageError(f"no export format is called {name}", f"there is {', '.join(EXPORTS)}")
+        raise UsageError(f"no export format is called {name}", f"Choose one of: {', '.join(EXPORTS)}")
     exporter: Exporter = resolve_name(EXPORTS[name])
     return exporter
 
@@ -44,13 +45,13 @@ def export(
 ) -> list[Path]:
     """Write all formats (or those named) into a folder, each read back and checked by probe points.
 
-    Exports of an earlier run are removed first, also when this one is refused: a file that stays behind would
-    pass for this result.
+    Exports of an earlier run are removed first, even if this one is refused, so that they are not mistaken
+    for this result.
 
     Args:
         calibrations: what to write, one for each camera channel and LiDAR.
         rig: the profile the calibrations belong to.
-        folder: as a rule the session's `calibration/`.
+        folder: usually the session's `calibration/`.
         formats: keys of EXPORTS; all by default.
         is_forced: write failed calibrations too; every file then says so.
 
@@ -58,9 +59,9 @@ def export(
         The files written, in the order of the formats.
 
     Raises:
-        LceRigError: a calibration is about sensors that the rig does not have.
+        LceRigError: a calibration names sensors that the rig does not have.
         ResultRefusedError: a verdict is "fail"; nothing is written.
-        LceRigError: a file does not say what was calibrated; it and all others are removed again.
+        LceRigError: a file reads back differently; it and all others are removed again.
     """
     folder = Path(folder)
     for calibration in calibrations:
@@ -70,7 +71,7 @@ def export(
     failed = [c for c in calibrations if c.verdict == "fail"]
     if failed and not is_forced:
         pairs = ", ".join(f"{c.camera}/{c.channel} and {c.lidar}" for c in failed)
-        reasons = "; ".join(reason for c in failed for reason in c.reasons)
+        reasons = "; ".join(sentence(finding) for c in failed for finding in c.findings)
         raise ResultRefusedError(f"not exported: the calibration of {pairs} failed", reasons)
     paths: list[Path] = []
     try:
@@ -83,7 +84,7 @@ def export(
 
 
 def remove_exports(folder: Path) -> None:
-    """Remove the exports that lce-rig wrote into a folder earlier, known by their first lines.
+    """Remove exports of earlier runs from a folder, recognised by their first lines.
 
     Raises:
         SessionError: one cannot be removed.

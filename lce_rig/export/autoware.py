@@ -22,7 +22,7 @@ def export_autoware(calibrations: Sequence[Calibration], rig: Rig, folder: Path)
     """Write sensor_kit_calibration.yaml, each sensor's pose in its tree's root, and read it back.
 
     Raises:
-        LceRigError: the file does not say what was calibrated.
+        LceRigError: the file reads back differently.
     """
     chosen = choose_channels(calibrations, rig)
     trees = build_trees(calibrations, rig)

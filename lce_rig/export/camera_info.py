@@ -20,7 +20,7 @@ def export_camera_info(calibrations: Sequence[Calibration], rig: Rig, folder: Pa
     """Write a file for each calibrated camera and check it by reading it back.
 
     Raises:
-        LceRigError: a file does not project as the rig's camera does.
+        LceRigError: a file projects differently from the rig's camera.
     """
     chosen = {calibration.camera: calibration for calibration in choose_channels(calibrations, rig)}
     paths = []
@@ -36,7 +36,7 @@ def export_camera_info(calibrations: Sequence[Calibration], rig: Rig, folder: Pa
 
 
 def ros_distortion(intrinsics: Intrinsics) -> tuple[str, tuple[float, ...]]:
-    """Name the ROS distortion model and list the coefficients it wants (4, 5 or 8)."""
+    """Return the name of the ROS distortion model and its coefficients (4, 5 or 8)."""
     given = intrinsics.distortion
     if intrinsics.model == "equidistant":
         return "equidistant", given
@@ -73,7 +73,7 @@ def read_camera_info(path: Path) -> Intrinsics:
     """Read a camera model from a camera_info file.
 
     Raises:
-        LceRigError: a model or shape that ROS does not know.
+        LceRigError: a model or shape that ROS does not support.
     """
     import yaml
 
@@ -86,9 +86,9 @@ def read_camera_info(path: Path) -> Intrinsics:
     name, coefficients = data["distortion_model"], tuple(data["distortion_coefficients"]["data"])
     K, P = np.array(data["camera_matrix"]["data"]), np.array(data["projection_matrix"]["data"])
     if name not in models or len(coefficients) != models[name][1]:
-        raise LceRigError(f"{path}: {name} with {len(coefficients)} coefficients is unknown to ROS")
+        raise LceRigError(f"{path}: {name} with {len(coefficients)} coefficients is not a model of ROS")
     if not np.array_equal(P.reshape(3, 4), np.hstack([K.reshape(3, 3), np.zeros((3, 1))])):
-        raise LceRigError(f"{path}: projection_matrix does not belong to camera_matrix")
+        raise LceRigError(f"{path}: projection_matrix contradicts camera_matrix")
     fx, _, cx, _, fy, cy, *_ = (float(value) for value in K)
     size = data["image_width"], data["image_height"]
     return Intrinsics(fx, fy, cx, cy, *size, model=models[name][0], distortion=coefficients)

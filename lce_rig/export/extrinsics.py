@@ -1,4 +1,4 @@
-"""extrinsics.yaml: the pose and its inverse, each with a sentence, a worked point and its uncertainty."""
+"""extrinsics.yaml: the pose and its inverse, each with its meaning, an example point and its uncertainty."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,6 +23,7 @@ from lce_rig.export.probes import TOLERANCE, check_pose
 from lce_rig.export.rotations import quaternion_wxyz, rotation_from_quaternion
 from lce_rig.rig import Rig
 from lce_rig.session.durable import write_atomically
+from lce_rig.words import sentence
 
 FILE_NAME = "extrinsics.yaml"
 
@@ -31,7 +32,7 @@ def export_extrinsics(calibrations: Sequence[Calibration], rig: Rig, folder: Pat
     """Write extrinsics.yaml and check it by reading it back.
 
     Raises:
-        LceRigError: the file does not say what was calibrated.
+        LceRigError: the file reads back differently.
     """
     lines = [f"# {line}" for line in header("extrinsics", rig, calibrations)]
     lines += ["format_version: 1", f"rig: {quoted(rig.name)}", f"made_by: {quoted(MADE_BY)}", "pairs:"]
@@ -48,7 +49,7 @@ def _pair(calibration: Calibration, rig: Rig) -> list[str]:
     in_lidar = f"the LiDAR's frame {lidar.frame} (x forward, y left, z up)"
     in_camera = f"the camera's optical frame {camera.optical_frame} (x right, y down, z forward)"
     T_lidar_cam = invert(calibration.T_cam_lidar)
-    # Round coordinates in the LiDAR's frame of a point in front of the camera: easy to check by hand.
+    # A point in front of the camera with round coordinates in the LiDAR's frame, easy to check by hand.
     point_lidar = np.round(transform(T_lidar_cam, np.array([[0.3, 0.2, 3.0]])), 2)
     point_camera = transform(calibration.T_cam_lidar, point_lidar)
     pixel, _ = camera.to_intrinsics().project(point_camera)
@@ -63,7 +64,7 @@ def _pair(calibration: Calibration, rig: Rig) -> list[str]:
         f"    camera_frame: {quoted(camera.optical_frame)}",
         f"    lidar_frame: {quoted(lidar.frame)}",
         f"    verdict: {calibration.verdict}",
-        f"    reasons: {texts(calibration.reasons)}",
+        f"    reasons: {texts(map(sentence, calibration.findings))}",
     ]
     lines += _pose_block("T_cam_lidar", forward, calibration.T_cam_lidar)
     lines += [
@@ -129,11 +130,11 @@ def _check(path: Path, calibrations: Sequence[Calibration], rig: Rig) -> None:
         worked = pair["T_cam_lidar"]["worked_point"]
         point_camera = transform(calibration.T_cam_lidar, np.array([worked["p_lidar_m"]]))
         if not np.abs(point_camera - worked["p_cam_m"]).max() <= TOLERANCE:
-            raise LceRigError(f"{path}: the worked point of T_cam_lidar is wrong")
+            raise LceRigError(f"{path}: the example point of T_cam_lidar is wrong")
 
 
 def _poses(block: Mapping[str, Any]) -> list[tuple[str, Array]]:
-    """List the pose in each of the ways the block gives it."""
+    """List the pose in each representation of the block."""
     t = np.array(block["translation_m"], dtype=np.float64)
     wxyz = np.array(block["quaternion_wxyz"], dtype=np.float64)
     x, y, z, w = block["quaternion_xyzw"]

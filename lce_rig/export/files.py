@@ -1,4 +1,4 @@
-"""Text on disk: numbers that read back exactly, files that are complete or absent."""
+"""Write text: numbers that read back exactly, files that are complete or absent."""
 
 import json
 from collections.abc import Callable, Iterable, Sequence
@@ -14,10 +14,11 @@ from lce_rig.core.errors import LceRigError, ResultRefusedError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Calibration
 from lce_rig.rig import Rig
+from lce_rig.words import sentence
 
 _Arguments = ParamSpec("_Arguments")
 _Read = TypeVar("_Read")
-# What damage to a text of numbers does to whoever reads it: syntax, missing keys, other types, other shapes.
+# Errors from reading a damaged text of numbers: syntax, missing keys, other types, other shapes.
 _DAMAGE = (
     *(OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError),
     yaml.YAMLError,
@@ -56,20 +57,20 @@ def texts(values: Iterable[str]) -> str:
 
 
 def rows(matrix: Array, indent: str) -> list[str]:
-    """Write a matrix as YAML lines, a row a line."""
+    """Write a matrix as YAML, one row per line."""
     return [f"{indent}- {numbers(row)}" for row in matrix]
 
 
 def header(
     what: str, rig: Rig, calibrations: Sequence[Calibration], *, of_one_camera: bool = False
 ) -> list[str]:
-    """List the lines every file begins with, as comments: what it is, by whom, whether to use it.
+    """List the comment lines at the head of every file: content, program, whether to use it.
 
     Args:
-        what: what the file is.
+        what: the file's content.
         rig: the profile.
-        calibrations: what the file holds.
-        of_one_camera: whether that is all it should hold; else cameras that it lacks are named.
+        calibrations: the calibrations in the file.
+        of_one_camera: whether the file is for one camera; else the head names cameras that it lacks.
     """
     lines = [f"{what} of rig {rig.name}, written by {MADE_BY}"]
     for calibration in calibrations:
@@ -77,22 +78,22 @@ def header(
         deg, mm = calibration.sigma_rotation_deg, 1e3 * calibration.sigma_translation_m
         lines.append(f"{pair}: {calibration.verdict}, standard deviation {deg:.3f} deg, {mm:.2f} mm")
         if calibration.verdict == "fail":
-            reasons = "; ".join(calibration.reasons) or "no reason given"
+            reasons = "; ".join(map(sentence, calibration.findings)) or "no reason given"
             lines.append(f"NOT FOR USE: the calibration of {pair} failed: {' '.join(reasons.split())}")
     held = {calibration.camera for calibration in calibrations}
     lacking = [camera for camera in rig.cameras if camera not in held]
     if lacking and not of_one_camera:
-        lines.append(f"not in this file, for want of a result to use: {', '.join(lacking)}")
+        lines.append(f"not in this file, without a usable result: {', '.join(lacking)}")
     return lines
 
 
 def reads_back(
     read: Callable[Concatenate[Path, _Arguments], _Read],
 ) -> Callable[Concatenate[Path, _Arguments], _Read]:
-    """Let a function that reads an export back report any damage to the file as one error.
+    """Make a function that reads an export back report any damage to the file as one error.
 
     Args:
-        read: takes the file's path first. Poses that are not finite are its to refuse.
+        read: takes the file's path first, and refuses poses that are not finite.
     """
 
     @wraps(read)

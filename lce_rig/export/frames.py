@@ -24,7 +24,7 @@ class Joint:
 
     Attributes:
         T_parent_child: (4, 4), the child's pose in the parent's frame.
-        is_optical: whether it is the turn from a camera's body to its optical frame.
+        is_optical: whether it is the rotation from a camera's body to its optical frame.
     """
 
     parent: str
@@ -47,9 +47,9 @@ class FrameTree:
 
 
 def build_trees(calibrations: Sequence[Calibration], rig: Rig) -> list[FrameTree]:
-    """Hang all calibrated sensors under the rig's base frame; what is not connected to it makes other trees.
+    """Connect all calibrated sensors to the rig's base frame; unconnected ones form other trees.
 
-    Each camera has one place, so of several channels the one is taken that `choose_channels` names.
+    Each camera has one pose; of several channels the one from `choose_channels` is used.
 
     Raises:
         LceRigError: a calibration names a sensor that the rig does not have.
@@ -110,7 +110,7 @@ def choose_channels(calibrations: Sequence[Calibration], rig: Rig) -> list[Calib
 
 
 def require_known(calibration: Calibration, rig: Rig) -> None:
-    """Check that a calibration is about sensors of the rig.
+    """Check that a calibration names sensors of the rig.
 
     Raises:
         LceRigError: a sensor or channel that the rig does not have.
@@ -119,12 +119,12 @@ def require_known(calibration: Calibration, rig: Rig) -> None:
     is_known = camera is not None and set(calibration.channels) <= set(camera.channels)
     if not is_known or calibration.lidar not in rig.lidars:
         pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
-        what = f"the result is about {pair}, which rig {rig.name} does not have"
-        raise LceRigError(what, "use the profile the session was made with")
+        what = f"the result is for {pair}, which rig {rig.name} does not have"
+        raise LceRigError(what, "Use the profile that the session was made with.")
 
 
 def check_tree(links: Sequence[str], joints: Iterable[tuple[str, str]]) -> None:
-    """Check that links and (parent, child) joints make one tree; no URDF parser at hand does so.
+    """Check that links and (parent, child) joints make one tree, which no available URDF parser does.
 
     Raises:
         LceRigError: no link, a name twice, an unknown link, two parents, several roots, or a loop.

@@ -18,10 +18,10 @@ from lce_rig.session.durable import write_atomically
 def export_kalibr(calibrations: Sequence[Calibration], rig: Rig, folder: Path) -> list[Path]:
     """Write camchain_LIDAR.yaml for each LiDAR whose cameras Kalibr's models describe, and read it back.
 
-    Kalibr knows four radtan coefficients: cameras with k3 or more are skipped.
+    Kalibr supports four radtan coefficients; cameras with k3 or more are skipped.
 
     Raises:
-        LceRigError: a file does not say what was calibrated.
+        LceRigError: a file reads back differently.
     """
     chosen = choose_channels(calibrations, rig)
     paths = []

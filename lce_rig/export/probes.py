@@ -14,12 +14,12 @@ TOLERANCE = 1e-6
 
 
 def probe_points(calibration: Calibration, rig: Rig) -> Array:
-    """List points (N, 3) m, frame LiDAR, that the camera sees all over its image 1 to 10 m away."""
+    """List points (N, 3) m, frame LiDAR, that cover the camera's image at 1 to 10 m."""
     intrinsics = rig.cameras[calibration.camera].to_intrinsics()
     u = np.linspace(0.05, 0.95, 5) * (intrinsics.width_px - 1)
     v = np.linspace(0.05, 0.95, 5) * (intrinsics.height_px - 1)
     rays = intrinsics.unproject(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
-    # A lens model may end short of the image's corners.
+    # A lens model may end before the image's corners.
     rays = rays[np.isfinite(rays).all(axis=1)]
     points_camera = (rays[:, None, :] * np.array([1.0, 3.0, 10.0])[:, None]).reshape(-1, 3)
     return transform(invert(calibration.T_cam_lidar), points_camera)
@@ -60,7 +60,6 @@ def check_projection(
     off_px = float(np.abs(pixels_read - pixels_wanted).max())
     if not (off_m <= TOLERANCE and off_px <= TOLERANCE):
         raise LceRigError(
-            f"{path}: {what} does not say what was calibrated: read back, it moves a point by {off_m:.3g} m, "
-            f"{off_px:.3g} px",
-            "this is a fault of lce-rig or of the disk: do not use the file, and report it",
+            f"{path}: {what} reads back differently: a point moves by {off_m:.3g} m, {off_px:.3g} px",
+            "Do not use the file. Check the disk, or report this as a bug of lce-rig.",
         )

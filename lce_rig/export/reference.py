@@ -15,13 +15,13 @@ _ROUNDING = 5e-3
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """T_cam_lidar (4, 4) by (camera, lidar), and one for pairs that are not named."""
+    """T_cam_lidar (4, 4) by (camera, lidar), and a default for other pairs."""
 
     by_pair: Mapping[tuple[str, str], Array]
     default: Array | None
 
     def of(self, camera: str, lidar: str) -> Array | None:
-        """Give the reference of a pair of sensors; None where the file has none for it."""
+        """Return the reference of a pair of sensors; None if the file has none."""
         return self.by_pair.get((camera, lidar), self.default)
 
 
@@ -51,5 +51,6 @@ def _pose(path: Path, key: str, holder: Mapping[str, Any]) -> Array:
         return parse_pose(holder.get("T_cam_lidar"), _ROUNDING)
     except ValueError as error:
         raise SessionError(
-            f"{path}: {key} {error}", "It takes points from the LiDAR to the camera."
+            f"{path}: {key} {error}",
+            "Give T_cam_lidar as a 4x4 rigid transform from the LiDAR to the camera.",
         ) from error

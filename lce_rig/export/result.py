@@ -9,17 +9,18 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.documents import read_json
 from lce_rig.core.errors import ResultRefusedError, SessionError, reading
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Figure, Finding, Severity
 from lce_rig.core.geometry import FARTHEST_M
 from lce_rig.core.limits import describe
 from lce_rig.core.results import Calibration, ChannelResult, OtherCamera, PointUncertainty, Refusal
 from lce_rig.export.files import MADE_BY
 from lce_rig.session.durable import write_atomically
-from lce_rig.words import as_json, is_renderable, refusal_as_json
+from lce_rig.words import as_json, is_renderable, refusal_as_json, sentence
 
-# The schema of result.json, strict where it is read.
+# The schema of result.json; reading is strict.
 
 
 def _check_pose(rows: list[list[float]]) -> list[list[float]]:
@@ -43,7 +44,7 @@ def _check_cov(rows: list[list[float]]) -> list[list[float]]:
     return rows
 
 
-# Products of such figures stay far from overflow; a direction that is open has a variance beyond a million.
+# Products of such figures stay far from overflow; an undetermined direction has a variance above 1e6.
 _Figure = Annotated[float, Field(ge=-1e100, le=1e100)]
 _Row4 = Annotated[list[_Figure], Field(min_length=4, max_length=4)]
 _Row6 = Annotated[list[_Figure], Field(min_length=6, max_length=6)]
@@ -63,7 +64,7 @@ def _check_figures(figures: dict[str, Any]) -> dict[str, Figure]:
 
 def _read_figure(value: Any) -> Figure:
     if isinstance(value, dict):
-        raise ValueError("a figure is no mapping")
+        raise ValueError("a figure is not a mapping")
     return tuple(_read_figure(each) for each in value) if isinstance(value, list) else value
 
 
@@ -82,7 +83,7 @@ class RefusalRecord(_SavedRecord):
 
     @property
     def refusal(self) -> Refusal:
-        """The refusal; as plain text where this version has no words for its code."""
+        """The refusal; as plain text if this version does not know its code."""
         if self.code.startswith(f"{self.stage}."):
             known = Refusal(self.code, figures=self.figures, action=self.action_code)
             if is_renderable(known):
@@ -103,15 +104,15 @@ class FindingRecord(_SavedRecord):
 
     @property
     def finding(self) -> Finding:
-        """The finding; as plain text where this version has no words for its code."""
+        """The finding; as plain text if this version does not know its code."""
         known = Finding(self.code, self.severity, self.subject, self.figures, self.action_code)
         if is_renderable(known):
             return known
-        return Finding("verdict.text", self.severity, figures={"text": self.text})
+        return Finding("verdict.text", self.severity, figures={"text": self.text, "advice": self.action})
 
 
 class CertificateRecord(_SavedRecord):
-    """Proof of optimality; gap is null where there is no bound."""
+    """Proof of optimality; gap is null if there is no bound."""
 
     is_optimal: bool
     gap: float | None
@@ -194,7 +195,7 @@ class PairRecord(_SavedRecord):
             ("sigma_rotation_deg", self.sigma_rotation_deg, sigma_r),
         ):
             if not np.isclose(value, wanted, rtol=1e-6):
-                raise ValueError(f"{name}: {value:g} does not belong to cov, which gives {wanted:g}")
+                raise ValueError(f"{name}: {value:g} contradicts cov, which gives {wanted:g}")
         if self.n_detected > self.n_captures:
             raise ValueError(f"n_detected: {self.n_detected} of {self.n_captures} captures")
         return self
@@ -229,7 +230,7 @@ class SavedResult:
         rig: its name.
         made_by: the program and its version.
         pairs: one for each camera and LiDAR.
-        inputs_sha256: SHA-256 of the session's files that the result was made from, by their path in it.
+        inputs_sha256: SHA-256 of the result's input files, by their path in the session.
     """
 
     rig: str
@@ -248,7 +249,7 @@ def to_json_dict(
     Args:
         rig_name: of the profile.
         calibrations: one for each camera and LiDAR.
-        inputs_sha256: SHA-256 of the session's files behind the result, by their path in it.
+        inputs_sha256: SHA-256 of the result's input files, by their path in the session.
 
     Raises:
         ResultRefusedError: a pose or covariance is not finite.
@@ -269,7 +270,6 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
     calculated = {
         **vars(calibration.metrics),
         "mge_m": calibration.metrics.mge_m,
-        "diagnostics": dict(sorted(calibration.diagnostics.items())),
         "channels": calibration.channel_results,
     }
     written = {
@@ -277,6 +277,8 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
             name: refusal_as_json(refusal) for name, refusal in sorted(calibration.captures_refused.items())
         },
         "findings": [as_json(finding) for finding in calibration.findings],
+        "reasons": [sentence(finding) for finding in calibration.findings],
+        "diagnostics": calibration.diagnostics.figures(),
     }
     return {
         name: written[name]
@@ -287,7 +289,7 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
 
 
 def _plain(value: Any, name: str, pair: str) -> Any:
-    """Turn a value into plain types: records and mappings into dicts, arrays into rows, NaN into null."""
+    """Convert a value to plain types: records and mappings to dicts, arrays to rows, NaN to null."""
     if is_dataclass(value):
         value = vars(value)
     if isinstance(value, Mapping):
@@ -297,7 +299,7 @@ def _plain(value: Any, name: str, pair: str) -> Any:
     if isinstance(value, np.ndarray):
         if not np.isfinite(value).all():
             what = f"{name} of {pair} is not finite"
-            raise ResultRefusedError(what, "the captures leave a direction undetermined: add captures")
+            raise ResultRefusedError(what, "Add captures: they leave a direction undetermined.")
         return (value.astype(np.float64) + 0.0).tolist()
     value = value.item() if isinstance(value, np.generic) else value
     return None if isinstance(value, float) and not np.isfinite(value) else value
@@ -306,17 +308,17 @@ def _plain(value: Any, name: str, pair: str) -> Any:
 def result_text(
     rig_name: str, calibrations: Sequence[Calibration], inputs_sha256: Mapping[str, str] | None = None
 ) -> str:
-    """Write the content of result.json: deterministic, floats to the last digit, a matrix row a line."""
+    """Write the content of result.json: deterministic, floats with all digits, one matrix row per line."""
     return layout(to_json_dict(rig_name, calibrations, inputs_sha256))
 
 
 def layout(document: Mapping[str, Any]) -> str:
-    """Lay the content of result.json out as its text."""
+    """Format the content of result.json as text."""
     return _layout(document, "") + "\n"
 
 
 def _layout(value: Any, indent: str) -> str:
-    """Lay JSON out as json.dumps(indent=2) does, but lists of plain values on one line."""
+    """Format JSON like json.dumps(indent=2), but lists of plain values on one line."""
     deeper = indent + "  "
     if isinstance(value, dict) and value:
         items = (
@@ -335,7 +337,7 @@ def write_result(
     calibrations: Sequence[Calibration],
     inputs_sha256: Mapping[str, str] | None = None,
 ) -> None:
-    """Write result.json, whole or not at all.
+    """Write result.json in one step.
 
     Raises:
         ResultRefusedError: a pose or covariance is not finite.
@@ -348,7 +350,7 @@ def read_result(path: Path | str) -> SavedResult:
     """Read result.json back, exactly as it was written; keys that later versions may add are ignored.
 
     Raises:
-        SessionError: no such file, or not a result that can be trusted; with the key at fault.
+        SessionError: no such file, or not a valid result; with the key at fault.
     """
     path = Path(path)
     if not path.exists():
@@ -358,8 +360,8 @@ def read_result(path: Path | str) -> SavedResult:
     version = data.get("format_version") if isinstance(data, dict) else None
     if version != FORMAT_VERSION or isinstance(version, bool):
         raise SessionError(
-            f"{path}: format_version is {describe(version)}, this lce-rig reads {FORMAT_VERSION}",
-            "run `lce-rig calibrate SESSION` again",
+            f"{path}: format_version is {describe(version)}, but this lce-rig reads {FORMAT_VERSION}",
+            "Run `lce-rig calibrate SESSION` again.",
         )
     try:
         record = ResultRecord.model_validate(data)
@@ -369,7 +371,7 @@ def read_result(path: Path | str) -> SavedResult:
         what = (
             f"{path}: {describe(key)[1:-1] + ': ' if key else ''}{first['msg'].removeprefix('Value error, ')}"
         )
-        raise SessionError(what, "run `lce-rig calibrate SESSION` again") from error
+        raise SessionError(what, "Run `lce-rig calibrate SESSION` again.") from error
     calibrations = tuple(_calibration(pair) for pair in record.pairs)
     return SavedResult(record.rig, record.made_by, calibrations, record.inputs_sha256)
 
@@ -382,7 +384,7 @@ def _calibration(pair: PairRecord) -> Calibration:
 
     return Calibration(
         camera=pair.camera,
-        channel=pair.channel,
+        channels=tuple(record.channel for record in pair.channels) or tuple(pair.channel.split("+")),
         lidar=pair.lidar,
         T_cam_lidar=np.array(pair.T_cam_lidar, dtype=np.float64),
         cov=np.array(pair.cov, dtype=np.float64),
@@ -395,16 +397,25 @@ def _calibration(pair: PairRecord) -> Calibration:
         captures_used=tuple(pair.captures_used),
         captures_refused={name: record.refusal for name, record in pair.captures_refused.items()},
         verdict=pair.verdict,
-        reasons=tuple(pair.reasons),
-        findings=tuple(record.finding for record in pair.findings),
+        findings=_findings(pair),
         egt_rotation_deg=pair.egt_rotation_deg,
         egt_translation_m=pair.egt_translation_m,
-        diagnostics={name: figure(value) for name, value in pair.diagnostics.items()},
+        diagnostics=Diagnostics.of(pair.diagnostics),
         channel_results=tuple(_channel_result(record) for record in pair.channels),
         method=pair.method,
         uncertainty=tuple(PointUncertainty(**each.model_dump()) for each in pair.uncertainty),
         estimated_with=tuple(pair.estimated_with),
         other_cameras=tuple(_other(record) for record in pair.other_cameras),
+    )
+
+
+def _findings(pair: PairRecord) -> tuple[Finding, ...]:
+    """Read the findings; files of earlier versions hold their sentences only."""
+    if pair.findings:
+        return tuple(record.finding for record in pair.findings)
+    severity: Severity = "error" if pair.verdict == "fail" else "warning"
+    return tuple(
+        Finding("verdict.text", severity, figures={"text": reason, "advice": ""}) for reason in pair.reasons
     )
 
 

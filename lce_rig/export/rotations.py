@@ -1,4 +1,4 @@
-"""Rotations as the formats write them: quaternions and fixed-axis angles.
+"""Rotations in the formats' representations: quaternions and fixed-axis angles.
 
 References:
     K. Shoemake, "Euler angle conversion", Graphics Gems IV, 1994.
@@ -32,8 +32,8 @@ def rotation_from_quaternion(wxyz: Array) -> Array:
 def rpy(R: Array) -> Array:
     """Compute (roll, pitch, yaw) in rad with R = Rz(yaw) Ry(pitch) Rx(roll), to rounding at every pitch.
 
-    Near pitch = +-90 deg yaw is ill-determined; pitch and roll are therefore read from Rz(yaw)^T R for the
-    yaw that was chosen, so that whatever yaw is wrong by, roll makes up for.
+    Near pitch = +-90 deg yaw is ill-determined. Pitch and roll are therefore read from Rz(yaw)^T R for the
+    chosen yaw, so that roll compensates for an error in yaw.
     """
     R = project_to_so3(R)
     yaw = np.arctan2(R[1, 0], R[0, 0])

@@ -24,7 +24,7 @@ def export_static_tf(calibrations: Sequence[Calibration], rig: Rig, folder: Path
     """Write static_transforms.txt and check it by reading it back.
 
     Raises:
-        LceRigError: the file does not say what was calibrated.
+        LceRigError: the file reads back differently.
     """
     chosen = choose_channels(calibrations, rig)
     joints = [joint for tree in build_trees(calibrations, rig) for joint in tree.joints]
@@ -85,7 +85,7 @@ def _check(path: Path, joints: Sequence[Joint], chosen: Sequence[Calibration], r
     wanted = {(joint.parent, joint.child) for joint in joints}
     for version, poses in read_static_tf(path).items():
         if set(poses) != wanted:
-            raise LceRigError(f"{path}: {version}: other frames read back than written")
+            raise LceRigError(f"{path}: {version}: reads back with different frames")
         for calibration in chosen:
             camera, lidar = rig.cameras[calibration.camera], rig.lidars[calibration.lidar]
             T_body_optical = poses[camera.frame, camera.optical_frame]

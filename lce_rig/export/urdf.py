@@ -22,7 +22,7 @@ def export_urdf(calibrations: Sequence[Calibration], rig: Rig, folder: Path) -> 
     """Write RIG.urdf, and RIG-ROOT.urdf for sensors not connected with the base, and read them back.
 
     Raises:
-        LceRigError: a file is not a tree or does not say what was calibrated.
+        LceRigError: a file is not a tree or reads back differently.
     """
     chosen = choose_channels(calibrations, rig)
     paths = []

@@ -7,12 +7,13 @@ References:
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import Array, pose, project_to_so3
 from lce_rig.core.results import Certificate, Observation, Refusal
 from lce_rig.extrinsics.background import estimate_shifts, move_ends
@@ -20,7 +21,7 @@ from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.metrics import error_to_reference
 from lce_rig.extrinsics.observability import require_observable
 from lce_rig.extrinsics.options import Algorithm1Parts, EstimateSettings
-from lce_rig.extrinsics.report import name_sigmas, report_estimate
+from lce_rig.extrinsics.report import report_estimate, with_parts
 from lce_rig.extrinsics.systematic import ring_sensitivities
 from lce_rig.residuals.features import CaptureFeatures, extract_features
 from lce_rig.residuals.moments import Problem, Solutions, Weights
@@ -30,7 +31,7 @@ from lce_rig.solvers.certificate import solve_globally
 from lce_rig.solvers.covariance import systematic_covariances
 from lce_rig.solvers.registration import eliminate_linear, linear_unknowns, rotation_from_directions
 
-# First phase of Algorithm 1: the extrinsic from the boards' planes alone.
+# First phase of Algorithm 1: extrinsics from the boards' planes alone.
 
 KEPT_SHARE = 0.9
 
@@ -38,7 +39,7 @@ KEPT_SHARE = 0.9
 def solve_planes(features: Sequence[CaptureFeatures], problem: Problem) -> Array:
     """Solve point-to-plane over all captures: T_cam_lidar (4, 4).
 
-    The start turns the LiDAR's normals onto the camera's; where its minimum is not certified the global one
+    The start rotates the LiDAR's normals onto the camera's. If its minimum is not certified, the global one
     is searched from everywhere.
     """
     R_start = rotation_from_directions(
@@ -57,7 +58,7 @@ def drop_uncertain(features: Sequence[CaptureFeatures], T_cam_lidar: Array) -> l
     """Mask the tenth of all plane terms with the largest propagated variance.
 
     The distance n . (R p + t) + d of a point inherits sigma^2 = (R p + t)^T cov_n (R p + t) from the camera's
-    normal. No capture loses more than half of its points: the filter thins captures and does not select them.
+    normal. No capture loses more than half of its points, so that the filter does not reject whole captures.
 
     Args:
         features: of all captures.
@@ -74,7 +75,7 @@ def drop_uncertain(features: Sequence[CaptureFeatures], T_cam_lidar: Array) -> l
     return [v <= max(limit, np.median(v)) for v in variances]
 
 
-# Captures that disagree with what the others predict, and the size of the errors of those that agree.
+# Captures that disagree with the others' prediction, and the size of the errors of those that agree.
 
 _DEVIATIONS = 6.0
 _TIMES_MEDIAN = 3.0
@@ -87,13 +88,13 @@ _SIGMA_FLOOR_M = 0.001
 def reject_outliers(
     features: Sequence[CaptureFeatures], problem: Problem, T_start: Array, parts: Algorithm1Parts
 ) -> tuple[dict[str, Refusal], tuple[float, float]]:
-    """Refuse captures whose plane or edges lie far from where the other captures predict them, worst first.
+    """Refuse captures whose plane or edges are far from the other captures' prediction, worst first.
 
     Args:
         features: of the captures in `problem`.
         problem: their moments, weighted alike.
         T_start: (4, 4) planar initialisation.
-        parts: of Algorithm 1; `reject_outliers` switches the refusal off.
+        parts: of Algorithm 1; `reject_outliers` switches the refusal on or off.
 
     Returns:
         The refusals by capture; and the typical predicted plane and edge error of the captures kept, m.
@@ -117,7 +118,7 @@ def reject_outliers(
 
 
 def _excess(errors: Array) -> Array:
-    """Divide errors (F,) by the largest that still passes for noise."""
+    """Divide errors (F,) by the largest that still counts as noise."""
     median = float(np.median(errors))
     deviation = 1.4826 * float(np.median(np.abs(errors - median)))
     limit = max(median + _DEVIATIONS * deviation, _TIMES_MEDIAN * median, _FLOOR_M)
@@ -140,7 +141,7 @@ def _refusal(plane: Array, edge: Array, k: int) -> Refusal:
     )
 
 
-# Second phase of Algorithm 1: many refinements on random subsets, judged on the captures they left out.
+# Second phase of Algorithm 1: many refinements on random subsets, judged on held-out captures.
 
 MIN_SUBSET = 3
 _CHUNK = 1000
@@ -148,7 +149,7 @@ _CHUNK = 1000
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """What the subsets of each size M say.
+    """Results of the subsets of each size M.
 
     Attributes:
         sizes: (S,) M.
@@ -182,8 +183,8 @@ def draw_subsets(
 ) -> Draws | None:
     """Solve `n_draws` random subsets of each size 3..F-1.
 
-    A candidate that is judged on the captures it was fitted to gains from fitting their noise; here each is
-    judged on the others. Every capture counts alike, whatever subsets it happened to be left out of.
+    Each candidate is judged on the captures it was not fitted to, as fitted noise would bias the judgement.
+    Every capture counts equally, however often it was held out.
 
     Args:
         problem: F captures.
@@ -194,7 +195,7 @@ def draw_subsets(
         progress: called with (subsets done, subsets in all).
 
     Returns:
-        The draws; None without any, or where fewer than four captures leave none out.
+        The draws; None without any, or if fewer than four captures leave none held out.
     """
     n = problem.n_captures
     sizes = np.arange(MIN_SUBSET, n)
@@ -202,7 +203,7 @@ def draw_subsets(
         return None
     rng = np.random.default_rng(seed)
     order = np.argsort(rng.random((len(sizes) * n_draws, n)), axis=1)
-    # A capture takes part where its rank in the shuffled order is below the subset's size.
+    # A capture takes part if its rank in the shuffled order is below the subset's size.
     selection = (order < np.repeat(sizes, n_draws)[:, None]).astype(np.float64)
     T, errors, certified = [], [], []
     for start in range(0, len(selection), _CHUNK):
@@ -235,7 +236,7 @@ def _judge(
     """Average held-out errors per size and capture, and candidates per size."""
     count = is_held_out.sum(axis=1)
     total = np.sum(errors * is_held_out, axis=1)
-    # With few draws a capture may never have been left out at a size: its mean over the sizes stands in.
+    # With few draws a capture may never be held out at a size; its mean over the sizes replaces the figure.
     overall = total.sum(axis=0) / np.maximum(count.sum(axis=0), 1)
     per_capture = np.where(count > 0, total / np.maximum(count, 1), overall)
     held_out_m = per_capture.mean(axis=1)
@@ -258,10 +259,8 @@ def _judge(
     )
 
 
-# Residuals that captures are first weighed by; weights are reported in units of it.
+# Residuals for the first weights of captures; weights are reported in units of it.
 NOMINAL_SIGMA_M = 0.01
-# Names of what `estimate_shifts` finds.
-_SHIFTS = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m")
 
 
 def calibrate_by_algorithm_1(
@@ -270,10 +269,10 @@ def calibrate_by_algorithm_1(
     options: EstimateSettings,
     progress: Callable[[int, int], None] | None = None,
 ) -> CalibrationEstimate:
-    """Estimate T_cam_lidar from boards whose pairing is settled.
+    """Estimate T_cam_lidar from matched boards.
 
     Args:
-        observations: one a capture.
+        observations: one per capture.
         board: its specification.
         options: switches of the algorithm.
         progress: called with (subsets done, subsets in all).
@@ -284,14 +283,13 @@ def calibrate_by_algorithm_1(
     parts = options.parts
     features = [extract_features(observation, board, parts.features) for observation in observations]
     problem, T_planes = _start(features, board, _weights(parts, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
-    fitted, shifts = list(observations), dict.fromkeys(_SHIFTS, 0.0)
+    fitted, shifts_m = list(observations), np.zeros(3)
     if problem.n_shift:
         shifts_m = estimate_shifts(observations, features, T_planes, board)
         if shifts_m.any():
             fitted = move_ends(observations, features, T_planes, board, shifts_m)
             features = [extract_features(observation, board, parts.features) for observation in fitted]
             problem = Problem(features, board, problem.weights)
-        shifts = dict(zip(_SHIFTS, shifts_m.tolist(), strict=True))
 
     outliers, sigmas = reject_outliers(features, problem, T_planes, parts)
     observations, fitted = (
@@ -303,7 +301,7 @@ def calibrate_by_algorithm_1(
     problem, T_planes = _start(features, board, _weights(parts, features, *sigmas), keep)
 
     draws = draw_subsets(problem, T_planes, options.n_draws, parts.n_rounds, options.seed, progress)
-    # Draws judge the solution and do not choose it: all begin at the same place.
+    # Draws judge the solution and do not choose it, so all begin at the same place.
     solution = problem.solve(np.ones((1, problem.n_captures)), T_planes, parts.n_rounds)
     covariances = _covariances(fitted, board, options, problem, solution)
     held_out = np.full(len(features), np.nan) if draws is None else draws.capture_held_out_m
@@ -318,7 +316,7 @@ def calibrate_by_algorithm_1(
         certificate=Certificate(bool(certificates.is_optimal[0]), float(certificates.relative_gap[0])),
         held_out_m=held_out,
         refused=outliers,
-        diagnostics={**_diagnostics(problem, solution, covariances, draws), **shifts},
+        diagnostics=_diagnostics(problem, solution, covariances, shifts_m, draws),
     )
 
 
@@ -328,7 +326,7 @@ def _start(
     weights: Weights,
     keep: Sequence[NDArray[np.bool_]] | None = None,
 ) -> tuple[Problem, Array]:
-    """Solve for T_cam_lidar (4, 4) from the planes alone; also the problem that goes on from there.
+    """Solve for T_cam_lidar (4, 4) from the planes alone; also return the problem for the refinement.
 
     Raises:
         NotEnoughDataError: the planes leave a direction undetermined, which is named.
@@ -342,10 +340,10 @@ def _start(
 def _weights(
     parts: Algorithm1Parts, features: Sequence[CaptureFeatures], plane_sigma_m: float, edge_sigma_m: float
 ) -> Weights:
-    """Weigh by likelihood.
+    """Weight by likelihood.
 
-    The camera's and the LiDAR's plane differ in three ways, by an offset and two tilts, however many points
-    the LiDAR's has; its ring ends err independently, by where their rays happen to fall. A capture's mean
+    The camera's and the LiDAR's plane differ by three parameters, an offset and two tilts, for any number of
+    points. Ring ends err independently, by the random position of their rays. A capture's mean
     squares therefore count 3 / sigma_plane^2 and M / sigma_edge^2, with M ring ends.
     """
     n_ends = float(np.mean([len(f.edge_points) for f in features]))
@@ -366,7 +364,7 @@ def _covariances(
     """Estimate the covariances (6 + k, 6 + k) of the solution, edge shift last.
 
     Returns:
-        What the scatter between captures shows, and what the LiDAR's errors common to them add.
+        The part from the scatter between captures, and the part from the LiDAR's errors common to them.
     """
     x, edge_ids = solution.x[0], solution.edge_ids[0]
     cost = problem.quadratics(x, edge_ids, group_placements(observations))
@@ -385,29 +383,35 @@ def _diagnostics(
     problem: Problem,
     solution: Solutions,
     covariances: tuple[Array, Array],
+    shifts_m: Array,
     draws: Draws | None,
-) -> dict[str, float]:
+) -> Diagnostics:
     plane, edge = problem.errors(solution.x)
-    figures = {
-        "plane_weight": problem.weights.plane * NOMINAL_SIGMA_M**2,
-        "edge_weight": problem.weights.edge * NOMINAL_SIGMA_M**2,
-        "fit_plane_rms_m": float(np.sqrt(np.mean(plane**2))),
-        "fit_edge_rms_m": float(np.sqrt(np.mean(edge**2))),
-    }
-    for name, cov in zip(("scatter", "systematic"), covariances, strict=True):
-        figures |= name_sigmas(name, cov)
+    figures = Diagnostics(
+        plane_weight=problem.weights.plane * NOMINAL_SIGMA_M**2,
+        edge_weight=problem.weights.edge * NOMINAL_SIGMA_M**2,
+        fit_plane_rms_m=float(np.sqrt(np.mean(plane**2))),
+        fit_edge_rms_m=float(np.sqrt(np.mean(edge**2))),
+        edge_shift_echo_m=float(shifts_m[0]),
+        edge_shift_blended_m=float(shifts_m[1]),
+        edge_shift_blended_echo_m=float(shifts_m[2]),
+    )
     if problem.n_shift:
-        figures["edge_shift_m"] = float(solution.linear[0, 3])
-        figures["edge_shift_sigma_m"] = float(np.sqrt(covariances[0][6, 6] + covariances[1][6, 6]))
+        figures = replace(
+            figures,
+            edge_shift_m=float(solution.linear[0, 3]),
+            edge_shift_sigma_m=float(np.sqrt(covariances[0][6, 6] + covariances[1][6, 6])),
+        )
     if draws is not None:
-        offset = error_to_reference(draws.T_mean[draws.best], solution.T[0])
-        figures |= {
-            "best_subset_size": float(draws.sizes[draws.best]),
-            "n_solved": float(draws.n_solved),
-            "certified_share": draws.certified_share,
-            "draw_mean_offset_deg": offset[0],
-            "draw_mean_offset_m": offset[1],
-            "draw_spread_rotation_deg": float(np.degrees(draws.spread_rotation_rad[draws.best])),
-            "draw_spread_translation_m": float(draws.spread_translation_m[draws.best]),
-        }
-    return figures
+        offset_deg, offset_m = error_to_reference(draws.T_mean[draws.best], solution.T[0])
+        figures = replace(
+            figures,
+            best_subset_size=float(draws.sizes[draws.best]),
+            n_solved=float(draws.n_solved),
+            certified_share=draws.certified_share,
+            draw_mean_offset_deg=offset_deg,
+            draw_mean_offset_m=offset_m,
+            draw_spread_rotation_deg=float(np.degrees(draws.spread_rotation_rad[draws.best])),
+            draw_spread_translation_m=float(draws.spread_translation_m[draws.best]),
+        )
+    return with_parts(figures, *covariances)

@@ -1,8 +1,8 @@
-"""Ring ends and what is behind them: by how much the board seems to end sooner there.
+"""Shift of ring ends by the background: the board seems to end earlier there.
 
-A beam that meets both board and background reports the stronger echo: the brighter and nearer the background,
-the sooner the board is lost. Where the background is so near that both echoes blend into one, its range lies
-off the board's plane. Recordings show 17 mm times the background's share of the power (docs/method.md).
+A beam that hits both board and background reports the stronger echo. The brighter and nearer the background,
+the earlier the board is lost. If the background is so near that both echoes merge, the range is off the
+board's plane. Recordings show 17 mm times the background's share of the power (docs/method.md).
 """
 
 from collections.abc import Sequence
@@ -23,18 +23,18 @@ from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.solvers.covariance import symmetric_inverse
 
 BACKGROUND_SIGMAS_M = (0.015, 0.01, 0.015)
-"""What is believed of the shifts by the background, in the order of `describe_background`."""
-# What is believed of the extrinsic near which the shifts are sought.
+"""Prior standard deviations of the shifts, in the order of `describe_background`."""
+# Prior standard deviations of the extrinsics around which the shifts are estimated.
 _SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD = 0.02, 0.01
 _N_SHIFTS = len(BACKGROUND_SIGMAS_M)
-# Noise of a ring end, and beyond how many sigmas one counts less.
+# Noise of a ring end, and the number of sigmas beyond which its weight decreases.
 _END_SIGMA_M, _HUBER = 0.003, 1.5
 _ROUNDS = 5
-# Columns that count if together they are sure: all, what is far behind, what is close behind.
+# Groups of columns tested for significance: all, far background, near background.
 _TOGETHER = ((0, 1, 2), (0,), (1, 2))
-# Each column must differ from 0 in so many captures.
+# Each column must differ from 0 in this number of captures.
 _MIN_CAPTURES = 5
-# They count if they would come about by chance in one session of so many.
+# They count if chance produces them in at most one session of this number.
 _ONE_IN = 1000
 
 
@@ -43,7 +43,7 @@ def estimate_shifts(
 ) -> Array:
     """Estimate how far each column of `describe_background` shifts ring ends, outwards: (3,) m.
 
-    Zeros where that is not certain. Robust least squares over all ring ends, with the extrinsic, the beam's
+    Zero if not significant. Robust least squares over all ring ends, with the extrinsics, the beam's
     width and the shifts unknown.
 
     Args:
@@ -56,9 +56,9 @@ def estimate_shifts(
     first = np.flatnonzero(np.concatenate([np.arange(len(r)) == 0 for r, _ in parts]))
     inside = np.concatenate([r for r, _ in parts])
     background = np.concatenate([describe_background(observation.lidar) for observation in observations])
-    # Inside distance = - (change of the extrinsic) - beam's width - shifts.
+    # Inside distance = - (change of the extrinsics) - beam's width - shifts.
     A = -np.column_stack([np.concatenate([J[:, : SHIFT + 1] for _, J in parts]), background])
-    # What few captures have is not told from their scatter; it stays zero, and so does what is uncertain.
+    # Columns of few captures have no reliable scatter and stay zero, like insignificant ones.
     n_having = np.count_nonzero(np.add.reduceat(background, first, axis=0) > 0, axis=0)
     free = n_having >= _MIN_CAPTURES
     while free.any():
@@ -97,7 +97,7 @@ def _fit_shifts(
 
 
 def _is_sure(shifts: Array, scatter: Array, n_captures: int) -> bool:
-    """Tell whether shifts (K,) are too large for chance, by Hotelling's test with their scatter (K, K)."""
+    """Return whether shifts (K,) are significant, by Hotelling's test with their scatter (K, K)."""
     from scipy.special import fdtri
 
     freedoms, n_left = len(shifts), n_captures - len(shifts)
@@ -113,7 +113,7 @@ def move_ends(
     board: Board,
     shifts_m: Array,
 ) -> list[Observation]:
-    """Take the shifts (3,) of `estimate_shifts` off ring ends."""
+    """Subtract the shifts (3,) of `estimate_shifts` from ring ends."""
     moved = []
     for observation, f in zip(observations, features, strict=True):
         _, edge = end_residuals(f, T_cam_lidar, board)

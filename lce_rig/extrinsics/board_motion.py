@@ -1,12 +1,12 @@
-"""The motion of a hand-held board in front of one camera, capture by capture, from all pictures of it.
+"""The motion of a hand-held board in front of one camera, per capture, from all its images.
 
-Pictures of one capture, of one channel or several, see the board at different times. About each scan its pose
-is taken to change steadily,
+Images of one capture, of one channel or several, see the board at different times. Around each scan, its
+velocity is assumed to be constant,
 
     c(t) = c_0 + v t,    R(t) = exp((w t)^) R_0,    v ~ N(0, s_v^2 I),    w ~ N(0, s_w^2 I)               (1)
 
-The four vectors of each capture follow from its pictures by linear least squares in the tangent space of one
-of their poses; the hand's habits s_v and s_w follow from all captures together.
+The four vectors of each capture follow from its images by linear least squares in the tangent space of one
+of their poses; the hand's typical rates s_v and s_w follow from all captures together.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,24 +19,24 @@ from lce_rig.core.geometry import Array, difference, fit_plane, perturb, rotatio
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.solvers.covariance import symmetric_inverse
 
-# Habits of a hand before any capture is seen: (speed m/s, turn rad/s) for each axis; worth so many captures.
+# Prior of a hand's typical rates: (speed m/s, turn rad/s) per axis, and its weight in captures.
 USUAL_HABITS = np.array([0.15, np.radians(10.0)])
 _USUAL_WEIGHT = 3.0
 _N_LEARNING = 15
-# What pictures err beyond their corners' noise: lens, board and reconstruction.
+# Errors of images beyond their corners' noise: lens, board and reconstruction.
 POSE_FLOOR = np.r_[np.full(3, 1e-3), np.full(3, np.radians(0.1))]
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class PoseSamples:
-    """Poses of the board in the pictures of F captures, J of each at most.
+    """Poses of the board in the images of F captures, J of each at most.
 
     Attributes:
         channels: names of the channels.
         T_cam_board: (F, J, 4, 4).
-        information: (F, J, 6, 6) inverse covariance, zero where there is no picture.
-        time_s: (F, J) after the scan's stamp, by the clocks as the profile has them.
+        information: (F, J, 6, 6) inverse covariance, zero if there is no image.
+        time_s: (F, J) after the scan's timestamp, by the profile's clocks.
         channel: (F, J) index into `channels`.
     """
 
@@ -48,14 +48,14 @@ class PoseSamples:
 
     @property
     def is_followed(self) -> NDArray[np.bool_]:
-        """Whether a sample (F, J) is of a channel that has pictures of several times in its capture."""
+        """Whether a sample (F, J) is of a channel that has images of several times in its capture."""
         known = self.information[..., 0, 0] > 0
         mates = known[:, :, None] & known[:, None] & (self.channel[:, :, None] == self.channel[:, None])
         return np.asarray(np.any(mates & (self.time_s[:, :, None] != self.time_s[:, None]), axis=2))
 
     @property
     def tells_motion(self) -> NDArray[np.bool_]:
-        """Whether a capture (F,) has pictures of two times, or of two channels whose offset may differ."""
+        """Whether a capture (F,) has images of two times, or of two channels whose offset may differ."""
         known = self.information[..., 0, 0] > 0
         differs = (self.time_s != self.time_s[:, :1]) | (self.channel != self.channel[:, :1])
         return np.asarray(np.any(known & differs, axis=1))
@@ -73,11 +73,11 @@ class BoardMotions:
     """Equation (1) for F captures.
 
     Attributes:
-        T_cam_board: (F, 4, 4) at the scan's stamp.
+        T_cam_board: (F, 4, 4) at the scan's timestamp.
         rates: (F, 6) tangent per second (m/s, rad/s).
         cov: (F, 12, 12) of pose and rates.
-        misfit, log_volume: (F,) each, their sum is -2 ln p(poses) up to a constant: how ill (1) at a hand's
-            speed explains them, and in how wide a range of motions.
+        misfit, log_volume: (F,) each, their sum is -2 ln p(poses) up to a constant: the residual of (1) at a
+            hand's typical rates, and the log volume of possible motions.
     """
 
     T_cam_board: Array
@@ -94,7 +94,7 @@ class BoardMotions:
         return float(np.mean(squares)) / 6
 
     def at(self, time_s: Array) -> Array:
-        """Compute T_cam_board (F, 4, 4) at a time (F,) of each capture after its scan's stamp."""
+        """Compute T_cam_board (F, 4, 4) at a time (F,) of each capture after its scan's timestamp."""
         return perturb(self.T_cam_board, self.rates * time_s[:, None])
 
     def cov_at(self, time_s: Array) -> Array:
@@ -108,15 +108,15 @@ class BoardMotions:
 def sample_poses(
     captures: Sequence[Sequence[tuple[str, ImageBoard, float]]], noise_px: Mapping[str, float]
 ) -> PoseSamples:
-    """Gather the poses of captures.
+    """Collect the poses of captures.
 
-    The pictures of one channel in one capture, reconstructed from one stream, share much of their error:
-    together they weigh as one.
+    The images of one channel in one capture, reconstructed from one stream, share much of their error:
+    together they count as one.
 
     Args:
-        captures: (channel, board, time in s of its picture after the scan's stamp) of each; the first board's
-            corners say which way up the others are taken to be.
-        noise_px: corner noise by channel, in place of what each picture shows by itself.
+        captures: (channel, board, time in s of its image after the scan's timestamp) of each; the first
+            board's corners give the orientation of the others.
+        noise_px: corner noise by channel, replacing each image's own.
     """
     channels = tuple(sorted({channel for capture in captures for channel, *_ in capture}))
     rows = [
@@ -152,21 +152,21 @@ def _samples_of(
 
 
 def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) -> BoardMotions:
-    """Fit equation (1) to each capture, with the habits that make all of them likeliest.
+    """Fit equation (1) to each capture, with the typical rates of maximum likelihood.
 
     Args:
         samples: of F captures.
-        offset_s: (C,) what to add to the pictures' times, by channel.
-        only: a channel that alone places the board; the others then only tell how it moves.
+        offset_s: (C,) what to add to the images' times, by channel.
+        only: a channel that alone gives the board's position; the others then only give its motion.
 
     References:
-        The habits are found by expectation maximisation: Dempster, Laird, Rubin, "Maximum likelihood from
-        incomplete data via the EM algorithm", J. Royal Statistical Society B, 1977.
+        The typical rates follow from expectation maximisation: Dempster, Laird, Rubin, "Maximum likelihood
+        from incomplete data via the EM algorithm", J. Royal Statistical Society B, 1977.
     """
     time_s = samples.time_s + offset_s[samples.channel]
     base = samples.T_cam_board[:, 0]
     y = difference(samples.T_cam_board, base[:, None])
-    # Where a channel was followed, it alone tells the motion: how channels differ must not pass for motion.
+    # If a channel was tracked, it alone gives the motion; differences of channels must not count as motion.
     is_followed = samples.is_followed
     is_heard = is_followed | ~np.any(is_followed, axis=1, keepdims=True)
     heard = samples.information * is_heard[..., None, None]
@@ -194,9 +194,9 @@ def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) 
 def _disagreement(
     samples: PoseSamples, moved: Array, cov: Array, time_s: Array, is_silent: NDArray[np.bool_]
 ) -> Array:
-    """Measure how ill pictures fit motions that were found without them, (F,), as squared deviations.
+    """Measure squared residuals (F,) of images under motions that were estimated without them.
 
-    Another place of the camera, the same in all captures, is no misfit: a tangent (tau, phi) of it moves the
+    Another camera pose, the same in all captures, is no residual: its tangent (tau, phi) moves the
     board at c by tau + phi x c.
     """
     f, j = np.nonzero(is_silent & (samples.information[..., 0, 0] > 0))
@@ -218,7 +218,7 @@ def _disagreement(
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """Normal equations of y_j = p + t_j r, before what is known of r: (F, 12, 12) and (F, 12)."""
+    """Normal equations of y_j = p + t_j r, without the prior of r: (F, 12, 12) and (F, 12)."""
 
     H: Array
     g: Array
@@ -237,7 +237,7 @@ class _Lines:
         return self.H[:, 6:, 6:] - lever @ self.H[:, :6, 6:], g
 
     def fit(self, habits: Array) -> tuple[Array, Array, Array]:
-        """Solve for (p, r) (F, 12), its covariance (F, 12, 12), and give the prior's precision (12, 12)."""
+        """Solve for (p, r) (F, 12), its covariance (F, 12, 12), and return the prior's precision (12, 12)."""
         prior = np.zeros((12, 12))
         prior[6:, 6:] = _habit_precision(habits)
         cov = np.asarray(np.linalg.inv(self.H + prior), dtype=np.float64)
@@ -245,14 +245,14 @@ class _Lines:
 
 
 def _habit_precision(habits: Array) -> Array:
-    """Give the inverse covariance (6, 6) of rates at a hand's habits."""
+    """Return the inverse covariance (6, 6) of rates from a hand's typical ones."""
     return np.diag(np.repeat(habits, 3) ** -2.0)
 
 
 def _place(
     y: Array, information: Array, time_s: Array, rates: Array, cov_rates: Array
 ) -> tuple[Array, Array]:
-    """Solve y_j = p + t_j r for p with the rates r known to cov_rates."""
+    """Solve y_j = p + t_j r for p with the rates r of covariance cov_rates."""
     total = information.sum(axis=1)
     cov = symmetric_inverse(total)
     moved = y - time_s[..., None] * rates[:, None]
@@ -267,12 +267,12 @@ def _place(
 
 
 def board_time_s(lidar: LidarBoard, sweep_s: float) -> float:
-    """Average the firing times of a board's points, s after the scan's stamp; mid sweep where unknown."""
+    """Average the firing times of a board's points, s after the scan's timestamp; mid scan where unknown."""
     return sweep_s / 2 if lidar.offset_ns is None else float(np.mean(lidar.offset_ns)) * 1e-9
 
 
 def deskew(lidar: LidarBoard, rates_lidar: Array) -> LidarBoard:
-    """Move a board's points to where they would have been met at the points' mean firing time.
+    """Move a board's points to their positions at the points' mean firing time.
 
     Args:
         lidar: with firing times; without them nothing is moved.
@@ -283,7 +283,7 @@ def deskew(lidar: LidarBoard, rates_lidar: Array) -> LidarBoard:
     since_s = lidar.offset_ns * 1e-9 - float(np.mean(lidar.offset_ns)) * 1e-9
     arms = lidar.points - lidar.T_lidar_board[:3, 3]
     moved = -since_s[:, None] * (rates_lidar[:3] + np.cross(rates_lidar[3:], arms))
-    # A ring end is one of the points, or lies within a step of one.
+    # A ring end is one of the points, or within one step of a point.
     nearest = np.argmin(_squared_distances(lidar.edge_points, lidar.points), axis=1)
     points = lidar.points + moved
     plane, rms_m = fit_plane(points)

@@ -1,9 +1,9 @@
-"""One extrinsic from all channels of a camera: frames and events share pixels and lens, not their times.
+"""Joint extrinsics from all channels of a camera: frames and events share pixels and lens, not their times.
 
-    consensus by channel -> shared scans -> motion and time offsets -> one board pose a scan -> Algorithm 1
+    consensus by channel -> shared scans -> motion and time offsets -> one board pose per scan -> Algorithm 1
 
-Where pictures tell how the board moved, its pose at the time the LiDAR saw it takes the place of its pose in
-each picture. Every channel is also calibrated alone: a camera cannot sit in two places.
+If images show how the board moved, its pose at the LiDAR's time replaces its pose in each image. Every
+channel is also calibrated alone for comparison, as a camera has one pose.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,9 +33,9 @@ from lce_rig.extrinsics.time_offsets import TimeOffsets, at_sweep_time, deskew_p
 from lce_rig.residuals.moments import Weights
 from lce_rig.residuals.plane_and_ends import along_normals
 
-# Fewer captures with known motion say nothing about clocks.
+# Fewer captures with known motion do not determine time offsets.
 _MIN_MOVING = 6
-# Rates are this much larger than noise makes them, as mean squares, where boards moved.
+# Ratio of mean squared rates to noise above which boards moved.
 _MOVED = 1.0
 _N_SHARES = 7
 
@@ -47,18 +47,18 @@ def calibrate_channels(
     clocks: Clocks,
     progress: Callable[[int, int], None] | None = None,
 ) -> CalibrationEstimate:
-    """Estimate T_cam_lidar from what the channels of one camera and a LiDAR saw of the board.
+    """Estimate T_cam_lidar from detections of the channels of one camera and a LiDAR.
 
     Args:
-        candidates: by channel, of each capture in which both sensors saw something; channels whose captures
-            agree with no extrinsic are left out.
+        candidates: by channel, of each capture with detections of both sensors; channels whose captures agree
+            on no extrinsics are skipped.
         board: its specification.
         options: switches of the algorithm.
         clocks: of the sensors.
         progress: called with (subsets done, subsets in all).
 
     Raises:
-        NotEnoughDataError: no channel has captures enough, or they leave a direction undetermined.
+        NotEnoughDataError: no channel has enough captures, or they leave a direction undetermined.
     """
     agreed = _agree(candidates, board)
     scans, conflicts = join_scans(agreed, candidates)
@@ -79,7 +79,8 @@ def calibrate_channels(
     estimate = _widened(calibrate_observations(mover.observations(), board, options, progress), offsets)
     for consensus in agreed.values():
         estimate = with_consensus(estimate, consensus)
-    estimate = replace(estimate, refused={**conflicts, **estimate.refused})
+    same_scan = {scan.capture: scan.captures for scan in scans if len(scan.captures) > 1}
+    estimate = replace(estimate, refused={**conflicts, **estimate.refused}, same_scan=same_scan)
     alone = {name: _alone_moved(mover, name, board, options, offsets) for name in agreed}
     results = tuple(
         _channel_result(
@@ -93,7 +94,7 @@ def calibrate_channels(
 
 @dataclass(frozen=True, eq=False)
 class _Mover:
-    """Gives scans their board poses at the LiDAR's time, from all channels or with one alone placing them."""
+    """Computes board poses at the LiDAR's time, from all channels or positioned by one alone."""
 
     samples: PoseSamples
     scans: Sequence[SharedScan]
@@ -112,7 +113,7 @@ class _Mover:
 
     @property
     def is_motion_own(self) -> bool:
-        """Whether some channel tells of motion by itself, so that channels can be held against each other."""
+        """Whether a channel alone shows motion, so that channels can be compared."""
         return bool(np.mean(self.samples.is_followed.any(axis=1)) > 0.5)
 
 
@@ -159,11 +160,11 @@ def _offsets(
     clocks: Clocks,
     start: CalibrationEstimate,
 ) -> TimeOffsets | None:
-    """Estimate the channels' time offsets; None where the boards did not move, which says nothing of time."""
+    """Estimate the channels' time offsets; None if the boards did not move."""
     unit = 1 / NOMINAL_SIGMA_M**2
     weights = Weights(
-        plane=start.diagnostics["plane_weight"] * unit,
-        edge=start.diagnostics["edge_weight"] * unit,
+        plane=start.diagnostics.plane_weight * unit,
+        edge=start.diagnostics.edge_weight * unit,
         shift_prior=options.parts.edge_shift_precision,
     )
     moving = np.flatnonzero(samples.tells_motion).tolist()
@@ -182,7 +183,7 @@ def _offsets(
 
 
 def _widened(estimate: CalibrationEstimate, offsets: TimeOffsets | None) -> CalibrationEstimate:
-    """Add to the covariance what the uncertainty of the time offsets does to the extrinsic."""
+    """Add the effect of the time offsets' uncertainty on the extrinsics to the covariance."""
     if offsets is None:
         return estimate
     added = offsets.sensitivity @ offsets.cov @ offsets.sensitivity.T
@@ -230,8 +231,8 @@ def _difference(
 ) -> tuple[Array | None, Array | None]:
     """Hold two channels' extrinsics against each other: the tangent (6,) between them and its covariance.
 
-    Where only the two channels together tell how boards moved, each pose depends on both; then one channel's
-    extrinsic from half of the scans is held against the other's from the other half, and of several ways to
+    If only the two channels together show how boards moved, each pose depends on both; then one channel's
+    extrinsic from half of the scans is compared with the other's from the other half, and of several ways to
     share them out the median counts.
     """
     if len(results) != 2:
@@ -252,7 +253,7 @@ def _difference(
                 for own, is_first in zip(seen, (True, False), strict=True)
             ]
         except NotEnoughDataError:
-            continue  # These shares of few scans leave a direction open; others may not.
+            continue  # This split of few scans leaves a direction undetermined; others may not.
         apart = difference(halves[0].T_cam_lidar, halves[1].T_cam_lidar)
         cov = halves[0].cov + halves[1].cov
         ways.append((float(apart @ np.linalg.solve(cov, apart)), apart, cov))

@@ -1,10 +1,11 @@
-"""Which LiDAR candidate and which camera pose of each capture belong together.
+"""Matching of LiDAR candidates and camera poses of each capture.
 
-A scan may hold decoys of the board's size and a picture of a plane two poses; wrong pairs agree with no rigid
-extrinsic, right ones all with the same. Distances and angles between two boards are the same in both sensors
-(1), whatever the extrinsic, which already tells most wrong pairs: the pairs that agree with each other form a
-graph. The edges in the most triangles each propose an extrinsic (Wahba on both normals and the line between
-the centres), the proposals are scored by all captures, and the best is refined on what agrees with it.
+A scan may contain decoys of the board's size, and an image of a plane two poses. Wrong pairs agree with no
+rigid extrinsic, right ones all with the same. Distances and angles between two boards are the same in both
+sensors (1), for any extrinsics, which already excludes most wrong pairs. The pairs that agree with each other
+form a graph. The edges in the most triangles each propose extrinsics (Wahba on both normals and the line
+between the centres), the proposals are scored by all captures, and the best is refined on what agrees with
+it.
 
 No assumption on how the sensors are mounted is made, only that both see the same side of the board.
 """
@@ -26,18 +27,18 @@ CENTRE_TOLERANCE_M = 0.15
 _N_PROPOSALS = 400
 _N_REFINEMENTS = 10
 _MOVED_M = 0.1
-# Beyond this the picture alone rules the second pose out, whatever the errors of the camera model.
+# Beyond this the image alone excludes the second pose, for any error of the camera model.
 _MAX_CHI2_GAP = 100.0
 
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """The pairs that agree with one rigid extrinsic.
+    """The pairs that agree with one rigid transform.
 
     Attributes:
-        T_cam_lidar: (4, 4) rough extrinsic from normals and centres.
+        T_cam_lidar: (4, 4) rough extrinsics from normals and centres.
         observations: one per agreeing capture, sorted by name.
-        refused: why each other capture is left out.
+        refused: why each other capture is rejected.
         n_alternative_poses: captures that use the second of the camera's poses.
     """
 
@@ -52,7 +53,7 @@ class _Pairs:
     """Every combination of a camera pose and a LiDAR candidate of the same capture.
 
     Attributes:
-        capture, pose, candidate: (P,) indices; pose 0 is the picture's first choice.
+        capture, pose, candidate: (P,) indices; pose 0 is the image's first choice.
         normal_cam, normal_lidar: (P, 3).
         centre_cam, centre_lidar: (P, 3) m.
     """
@@ -67,14 +68,14 @@ class _Pairs:
 
 
 def find_consensus(candidates: Sequence[CaptureCandidates], board: Board) -> Consensus | None:
-    """Choose the pairs that agree with one rigid extrinsic.
+    """Choose the pairs that agree with one rigid transform.
 
     Args:
         candidates: of each capture.
         board: its size sets the scale at which an angle weighs as much as a distance.
 
     Returns:
-        The consensus; None where no three captures agree with any extrinsic.
+        The consensus; None if no three captures agree with any extrinsics.
     """
     candidates = sorted(candidates, key=lambda item: item.capture)
     pairs = _list_pairs(candidates)
@@ -133,7 +134,7 @@ def _centre(board: LidarBoard) -> Array:
 
 
 def _agreement(pairs: _Pairs) -> NDArray[np.float32]:
-    """Tell which pairs (P, P) keep angles and distances between their boards, (1)."""
+    """Return which pairs (P, P) preserve angles and distances between their boards, (1)."""
     angles, along, lengths = [], [], []
     for normals, centres in ((pairs.normal_cam, pairs.centre_cam), (pairs.normal_lidar, pairs.centre_lidar)):
         baseline = centres[None] - centres[:, None]
@@ -142,7 +143,8 @@ def _agreement(pairs: _Pairs) -> NDArray[np.float32]:
         along.append(np.einsum("ijk,ik->ij", baseline, normals))
     agrees = np.abs(angles[0] - angles[1]) < NORMAL_TOLERANCE_RAD
     agrees &= np.abs(lengths[0] - lengths[1]) < CENTRE_TOLERANCE_M
-    # The height of one board over the other's plane also suffers from the angle between the two planes.
+    # The height of one board over the other's plane also depends on the error of the angle between both
+    # planes.
     height_tolerance = CENTRE_TOLERANCE_M + np.maximum(*lengths) * np.sin(NORMAL_TOLERANCE_RAD)
     is_level = np.abs(along[0] - along[1]) < height_tolerance
     agrees &= is_level & is_level.T
@@ -188,7 +190,7 @@ def _score(pairs: _Pairs, R: Array, t: Array) -> tuple[Array, Array]:
 
 
 def _refine(pairs: _Pairs, R: Array, t: Array, n_captures: int) -> tuple[Array, Array, NDArray[np.intp]]:
-    """Fit R and t to the agreeing pairs until they stay the same; also the pair of each capture, or -1."""
+    """Fit R and t to the agreeing pairs until stable; return also the pair of each capture, or -1."""
     chosen = np.full(n_captures, -1, dtype=np.intp)
     for _ in range(_N_REFINEMENTS):
         _, r2 = _score(pairs, R[None], t[None])
@@ -218,7 +220,7 @@ def _observation(item: CaptureCandidates, pairs: _Pairs, index: int) -> Observat
 
 
 def _explain(item: CaptureCandidates, pairs: _Pairs, rows: NDArray[np.intp], R: Array, t: Array) -> Refusal:
-    """Say by how much the best pair of a capture misses the consensus."""
+    """State the deviation of a capture's best pair from the consensus."""
     if len(rows) == 0:
         return Refusal("pair.no_candidate")
     angle, distance = (values[0, rows] for values in _misfit(pairs, R[None], t[None]))

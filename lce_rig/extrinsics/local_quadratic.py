@@ -1,7 +1,7 @@
-"""The cost of a result by another weighting: a second opinion for every check that leaves captures out.
+"""The cost of a result with independent weights, for all checks that leave captures out.
 
-It is built from points, planes and ring ends, whatever method found the extrinsic. Unknown beside the
-extrinsic are the edge shift and the range offset of each laser, with priors: otherwise these would look like
+It is built from points, planes and ring ends, for any method. The unknowns are the extrinsics, the edge shift
+and the range offset of each laser, with priors; without the latter two, their effects would look like
 disagreement between captures.
 """
 
@@ -20,10 +20,10 @@ from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS, end_rows, feature_s
 from lce_rig.residuals.quadratics import Quadratics
 
 SHIFT, FIRST_RING, SCALE = 6, 7, -1
-"""Places in the x of `expand`, after the tangent (translation m, rotation rad): edge shift m, range offset m
+"""Indices in the x of `expand`, after the tangent (translation m, rotation rad): edge shift m, range offset m
 of each ring, and last the camera's scale."""
 
-# Where a profile states no error of the lasers, their ranges are still no better than this.
+# Minimum range error of lasers, if a profile states none.
 _RANGE_FLOOR_M = 0.0005
 
 
@@ -35,10 +35,10 @@ def expand(
     laser_bias_sigma_m: float,
     range_offset_sigma_m: float,
 ) -> Quadratics:
-    """Expand the cost of captures about an extrinsic.
+    """Expand the cost of captures about given extrinsics.
 
     A capture counts 3 / sigma_plane^2 times the mean square over its points, and the square of each ring end
-    over sigma_end^2, with both sigmas from the captures themselves.
+    over sigma_end^2, with both sigmas estimated from the captures.
 
     Args:
         observations: one a capture.

@@ -1,4 +1,4 @@
-"""The pose about which others scatter."""
+"""The robust mean of poses."""
 
 from collections.abc import Callable
 
@@ -20,9 +20,9 @@ def mean_pose(
     Args:
         T: (K, 4, 4).
         information: (K, 6, 6) W_k.
-        T_start: (4, 4) to start from; the first pose where None.
-        weigh: weights w (K,) for squared distances x_k^T W_k x_k (K,), anew at each step, so that single
-            poses do not spoil the mean; 1 where None.
+        T_start: (4, 4) to start from; the first pose if None.
+        weigh: weights w (K,) for squared distances x_k^T W_k x_k (K,), recomputed at each step, so that
+            outliers do not shift the mean; 1 if None.
 
     Returns:
         (4, 4), and the weights (K,).

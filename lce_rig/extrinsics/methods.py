@@ -1,16 +1,17 @@
-"""One camera and one LiDAR: pairs that agree on one extrinsic, then the method that the options name."""
+"""One camera and one LiDAR: reject pairs that disagree, then apply the method of the options."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from lce_rig.core.board import Board
-from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.findings import Finding
 from lce_rig.core.results import Observation
 from lce_rig.extrinsics.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.extrinsics.consensus import Consensus, find_consensus
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.likelihood import calibrate_by_likelihood
 from lce_rig.extrinsics.options import CaptureCandidates, EstimateSettings, Estimator, Method
+from lce_rig.words import not_enough
 
 Progress = Callable[[int, int], None]
 
@@ -20,7 +21,7 @@ METHODS: Mapping[Method, Estimator] = {
     "ml": calibrate_by_likelihood,
     "paper": calibrate_by_algorithm_1,
 }
-"""Name -> what estimates T_cam_lidar from boards whose pairing is settled."""
+"""Name -> function that estimates T_cam_lidar from matched boards."""
 
 
 def fit_extrinsic(
@@ -29,16 +30,16 @@ def fit_extrinsic(
     options: EstimateSettings | None = None,
     progress: Progress | None = None,
 ) -> CalibrationEstimate:
-    """Estimate T_cam_lidar from what both sensors saw of the board.
+    """Estimate T_cam_lidar from both sensors' detections.
 
     Args:
-        candidates: of each capture in which both sensors saw something; their order does not matter.
+        candidates: of each capture with detections of both sensors, in any order.
         board: its specification.
         options: switches of the algorithm.
         progress: called with (subsets done, subsets in all).
 
     Raises:
-        NotEnoughDataError: too few captures, captures that agree with no extrinsic, or captures that leave a
+        NotEnoughDataError: too few captures, captures that agree with no extrinsics, or captures that leave a
             direction undetermined, which is named.
     """
     options = options or EstimateSettings()
@@ -53,10 +54,10 @@ def calibrate_observations(
     options: EstimateSettings,
     progress: Progress | None = None,
 ) -> CalibrationEstimate:
-    """Estimate T_cam_lidar by the settings' method from boards whose pairing is settled.
+    """Estimate T_cam_lidar by the settings' method from matched boards.
 
     Args:
-        observations: one a capture.
+        observations: one per capture.
         board: its specification.
         options: switches of the algorithm.
         progress: called with (subsets done, subsets in all).
@@ -70,11 +71,11 @@ def calibrate_observations(
 
 
 def with_consensus(estimate: CalibrationEstimate, consensus: Consensus) -> CalibrationEstimate:
-    """Add to an estimate what the consensus had refused before."""
+    """Add the consensus's refusals to an estimate."""
     return replace(
         estimate,
         refused=dict(sorted({**consensus.refused, **estimate.refused}.items())),
-        diagnostics={**estimate.diagnostics, "n_alternative_poses": float(consensus.n_alternative_poses)},
+        diagnostics=replace(estimate.diagnostics, n_alternative_poses=float(consensus.n_alternative_poses)),
     )
 
 
@@ -82,19 +83,15 @@ def agree(candidates: Sequence[CaptureCandidates], board: Board) -> Consensus:
     """Find the consensus, or explain why there is none.
 
     Raises:
-        NotEnoughDataError: too few captures, or captures that agree with no extrinsic.
+        NotEnoughDataError: too few captures, or captures that agree with no extrinsics.
     """
     needed = _MIN_CAPTURES
     if len(candidates) < needed:
-        raise NotEnoughDataError(
-            f"{len(candidates)} captures show the board in both sensors, {needed} are needed",
-            "add captures: ten or more, with the board at different places and tilts",
-        )
+        figures = {"n_captures": len(candidates), "n_needed": needed}
+        raise not_enough(Finding("shortage.few_captures", "warning", figures=figures))
     consensus = find_consensus(candidates, board)
     n_agreeing = 0 if consensus is None else len(consensus.observations)
     if consensus is None or n_agreeing < needed:
-        raise NotEnoughDataError(
-            f"only {n_agreeing} of {len(candidates)} captures agree with one extrinsic, {needed} are needed",
-            "check the board's size, the intrinsics and the pairing of pictures with scans; add captures",
-        )
+        figures = {"n_agreeing": n_agreeing, "n_captures": len(candidates), "n_needed": needed}
+        raise not_enough(Finding("shortage.few_agree", "warning", figures=figures))
     return consensus

@@ -1,4 +1,4 @@
-"""Errors of an extrinsic, as the paper defines them and as they are useful."""
+"""Error measures of extrinsics: the paper's and others."""
 
 from collections.abc import Sequence
 
@@ -14,10 +14,10 @@ from lce_rig.residuals.plane_and_ends import ends_on_board, plane_residuals
 def capture_residual(
     T_cam_lidar: Array, observation: Observation, board: Board, held_out_m: float = float("nan")
 ) -> CaptureResidual:
-    """Measure how well one capture fits an extrinsic.
+    """Measure the residuals of one capture under given extrinsics.
 
     Points are taken as the LiDAR measured them; ring ends are moved along their rays onto the board's plane
-    and compared with the printed size, without half step or shift.
+    and compared with the profile's size, without half step or shift.
 
     Args:
         T_cam_lidar: (4, 4).
@@ -51,7 +51,7 @@ def summarise(residuals: Sequence[CaptureResidual]) -> Metrics:
 
 
 def error_to_reference(T_cam_lidar: Array, T_reference: Array) -> tuple[float, float]:
-    """Compute the paper's EGT: angle in deg and distance in m between an extrinsic and a reference (4, 4)."""
+    """Compute the paper's EGT: angle in deg and distance in m between extrinsics and a reference (4, 4)."""
     angle = rotation_angle(T_cam_lidar[:3, :3], T_reference[:3, :3])
     return float(np.degrees(angle)), float(np.linalg.norm(T_cam_lidar[:3, 3] - T_reference[:3, 3]))
 

@@ -1,4 +1,4 @@
-"""What goes into a calibration: candidates per capture, the user's options, and what they are joined by."""
+"""Input of a calibration: candidates per capture, the user's options, and the profile's settings."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,16 +14,16 @@ Method = Literal["ml", "paper"]
 
 
 EDGE_SHIFT_SIGMA_M = 0.015
-"""How far ring ends may lie beyond an edge, a priori: beams are about as wide."""
+"""Prior standard deviation of the distance of ring ends beyond an edge: about a beam's width."""
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureCandidates:
-    """What both sensors saw of the board in one capture.
+    """Both sensors' detections of the board in one capture.
 
     Attributes:
         capture: its name.
-        image: the board in the picture, with its second pose where there is one.
+        image: the board in the image, with its second pose if there is one.
         lidar: places in the scan where the board may be, best first.
     """
 
@@ -34,12 +34,11 @@ class CaptureCandidates:
 
 @dataclass(frozen=True)
 class CalibrateOptions:
-    """What a user decides about a calibration.
+    """A user's choices for a calibration.
 
     Attributes:
-        method: how the extrinsic is found: "paper" (Algorithm 1 of LCE-Calib) or "ml" (from Algorithm 1's
-            solution on, the extrinsic, all board poses and the sensors' constant errors that are most
-            probable together).
+        method: "paper" (Algorithm 1 of LCE-Calib) or "ml" (Algorithm 1, then maximum likelihood of
+            extrinsics, all board poses and the sensors' constant errors).
         n_draws: I, subsets drawn for each subset size; they judge the result and do not change it.
         seed: of the draws.
     """
@@ -51,16 +50,15 @@ class CalibrateOptions:
 
 @dataclass(frozen=True)
 class Algorithm1Parts:
-    """Parts of Algorithm 1; benchmarks leave single ones out to see what each is good for.
+    """Parts of Algorithm 1; benchmarks switch single ones off to measure their effect.
 
     Attributes:
-        features: how points and ring ends come onto the board's plane.
+        features: how points and ring ends are projected onto the board's plane.
         n_rounds: of association and solution.
-        use_uncertainty: leave out the tenth of the plane terms with the largest propagated variance.
+        use_uncertainty: remove the tenth of the plane terms with the largest propagated variance.
         use_planes, use_ends: use plane terms, ring-end terms in the refinement.
-        is_shift_free: ring ends may lie beyond the printed size by a common distance, as the beam's width
-            makes them.
-        reject_outliers: leave out captures that disagree with what the others predict.
+        is_shift_free: estimate a common distance of ring ends beyond the plate, due to the beam's width.
+        reject_outliers: reject captures that disagree with the others' prediction.
     """
 
     features: FeatureSettings = AS_FITTED
@@ -73,19 +71,19 @@ class Algorithm1Parts:
 
     @property
     def edge_shift_precision(self) -> float | None:
-        """Inverse variance of the edge shift a priori, 1/m^2; None where it is held at zero."""
+        """Inverse variance of the edge shift a priori, 1/m^2; None if it is held at zero."""
         return 1 / EDGE_SHIFT_SIGMA_M**2 if self.is_shift_free and self.use_ends else None
 
 
 @dataclass(frozen=True)
 class EstimateSettings(CalibrateOptions):
-    """The user's options with what the profile says of the LiDAR, and what benchmarks exchange.
+    """The user's options, the profile's settings of the LiDAR, and parts that benchmarks replace.
 
     Attributes:
         laser_bias_sigma_m: standard deviation a priori of the lasers' range offsets about their mean.
         range_offset_sigma_m: standard deviation a priori of that mean, the offset common to all ranges.
         parts: of Algorithm 1.
-        estimator: takes the place of the method.
+        estimator: replaces the method.
     """
 
     laser_bias_sigma_m: float = 0.0
@@ -95,7 +93,7 @@ class EstimateSettings(CalibrateOptions):
 
     @classmethod
     def of(cls, options: CalibrateOptions, lidar: LidarSettings) -> "EstimateSettings":
-        """Add what the profile says of a LiDAR to a user's options."""
+        """Add the profile's settings of a LiDAR to a user's options."""
         settings = options if isinstance(options, cls) else cls(**vars(options))
         return replace(
             settings,
@@ -107,4 +105,4 @@ class EstimateSettings(CalibrateOptions):
 Estimator = Callable[
     [Sequence[Observation], Board, EstimateSettings, Callable[[int, int], None] | None], CalibrationEstimate
 ]
-"""Estimates T_cam_lidar from boards whose pairing is settled."""
+"""Estimates T_cam_lidar from matched boards."""

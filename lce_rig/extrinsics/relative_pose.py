@@ -1,4 +1,4 @@
-"""Where two cameras sit to each other, from two poses that they have in common."""
+"""The relative pose of two cameras from two poses that they have in common."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from lce_rig.core.geometry import Array, invert, skew
 
 
 def relative_pose(T_second: Array, T_first: Array) -> tuple[Array, Array]:
-    """Compute T_second_first = T_second_x T_first_x^-1 and how errors of both poses reach it.
+    """Compute T_second_first = T_second_x T_first_x^-1 and its derivatives by both poses.
 
     With tangents (tau, phi) of the two poses, R and t_1 the rotations and translations before:
 

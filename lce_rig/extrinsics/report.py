@@ -1,26 +1,34 @@
-"""From a solution to an estimate with residuals and figures, the same whatever method found it."""
+"""Turn a solution of any method into an estimate with residuals and figures."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from lce_rig.core.board import Board
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.results import Certificate, Observation, Refusal
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.metrics import capture_residual, summarise
-from lce_rig.extrinsics.observability import describe_weakest
+from lce_rig.extrinsics.observability import find_weakest
 from lce_rig.residuals.features import CaptureFeatures
 from lce_rig.residuals.placements import group_placements
 
-# Of methods that prove nothing about their minimum.
+# For methods without a certificate.
 NO_CERTIFICATE = Certificate(is_optimal=False, gap=float("inf"))
 
 
-def name_sigmas(part: str, cov: Array) -> dict[str, float]:
-    """Name the sizes of a part of a claim, "scatter" or "systematic", as diagnostics: cov (6 + k, 6 + k)."""
-    sigma_deg, sigma_m = sigma_sizes(cov)
-    return {f"sigma_{part}_rotation_deg": sigma_deg, f"sigma_{part}_translation_m": sigma_m}
+def with_parts(figures: Diagnostics, scatter: Array, systematic: Array) -> Diagnostics:
+    """Add the sizes of both parts of a covariance, each (6 + k, 6 + k)."""
+    (scatter_deg, scatter_m), (systematic_deg, systematic_m) = map(sigma_sizes, (scatter, systematic))
+    return replace(
+        figures,
+        sigma_scatter_rotation_deg=scatter_deg,
+        sigma_scatter_translation_m=scatter_m,
+        sigma_systematic_rotation_deg=systematic_deg,
+        sigma_systematic_translation_m=systematic_m,
+    )
 
 
 def report_estimate(
@@ -34,20 +42,20 @@ def report_estimate(
     certificate: Certificate = NO_CERTIFICATE,
     held_out_m: Array | None = None,
     refused: Mapping[str, Refusal],
-    diagnostics: Mapping[str, float],
+    diagnostics: Diagnostics,
 ) -> CalibrationEstimate:
-    """Measure the residuals of an extrinsic and put everything known about it together.
+    """Measure the residuals of extrinsics and assemble the estimate.
 
     Args:
         T_cam_lidar: (4, 4).
         cov: (6, 6) of it, tangent (translation m, rotation rad).
-        observations: the F captures used, as measured: residuals are of these.
+        observations: the F captures used, as measured; residuals are computed from these.
         features: of each.
         board: the board.
-        fitted: the same as the method's cost takes them, where it moves ring ends; as measured where None.
-        certificate: of the minimum, where the method gives one.
-        held_out_m: (F,) rms residual of each capture where it was not fitted, where the method knows it.
-        refused: captures that the method left out.
+        fitted: the same as used in the method's cost, if it moves ring ends; as measured if None.
+        certificate: of the minimum, if the method gives one.
+        held_out_m: (F,) rms residual of each held-out capture, if the method computes it.
+        refused: captures that the method rejected.
         diagnostics: the method's own figures.
     """
     held_out = np.full(len(observations), np.nan) if held_out_m is None else held_out_m
@@ -56,12 +64,13 @@ def report_estimate(
         for observation, error in zip(observations, held_out, strict=True)
     )
     metrics = summarise(residuals)
-    figures = {
+    figures = replace(
+        diagnostics,
         # The paper's code counts every ring end twice, which halves its mean.
-        "paper_mee_m": metrics.mee_m / 2,
-        "held_out_m": float(np.mean(held_out)),
-        "n_placements": float(group_placements(observations).max() + 1),
-    }
+        paper_mee_m=metrics.mee_m / 2,
+        held_out_m=float(np.mean(held_out)),
+        n_placements=float(group_placements(observations).max() + 1),
+    )
     return CalibrationEstimate(
         T_cam_lidar=T_cam_lidar,
         cov=cov,
@@ -73,6 +82,6 @@ def report_estimate(
         fitted={observation.capture: observation for observation in fitted or observations},
         residuals=residuals,
         held_out_m=float(np.mean(held_out)),
-        weak_direction=describe_weakest(cov, features),
-        diagnostics={**diagnostics, **figures},
+        weakest=find_weakest(cov, features),
+        diagnostics=figures,
     )

@@ -1,6 +1,6 @@
-"""What the channels of one camera saw while the LiDAR made one scan."""
+"""Images of all channels of one camera that share one scan."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,19 +10,19 @@ from lce_rig.extrinsics.board_motion import PoseSamples, sample_poses
 from lce_rig.extrinsics.consensus import Consensus
 from lce_rig.extrinsics.options import CaptureCandidates
 
-# Pictures without stamps may lie anywhere about the scan they were saved with.
+# Images without timestamps may be at any time around the scan they were saved with.
 NO_STAMPS_SIGMA_S = 0.15
 
 
 @dataclass(frozen=True)
 class Clocks:
-    """What the profile says of time.
+    """The profile's settings of time.
 
     Attributes:
         sweep_s: duration of a revolution.
-        lidar_offset_s: what to add to the LiDAR's stamps to come to the rig's time.
-        channel_offset_s: the same of each channel's.
-        tolerance_s: how far each channel's stamps may be off after that.
+        lidar_offset_s: offset from the LiDAR's timestamps to the rig's time.
+        channel_offset_s: the same for each channel.
+        tolerance_s: remaining tolerance of each channel's timestamps.
     """
 
     sweep_s: float = 0.1
@@ -31,7 +31,7 @@ class Clocks:
     tolerance_s: Mapping[str, float] = field(default_factory=dict)
 
     def after_scan_s(self, channel: str, image: ImageBoard, lidar: LidarBoard) -> float:
-        """Compute how long after a scan's first firing a picture was taken; 0 where stamps are missing."""
+        """Compute how long after a scan's first firing an image was taken; 0 if timestamps are missing."""
         if image.stamp_ns is None or lidar.stamp_ns is None:
             return 0.0
         apart_s = (image.stamp_ns - lidar.stamp_ns) * 1e-9
@@ -40,36 +40,41 @@ class Clocks:
 
 @dataclass(frozen=True, eq=False)
 class SharedScan:
-    """One scan of the board and the pictures that go with it.
+    """One scan of the board and its images.
 
     Attributes:
-        capture: its name; captures that hold the same scan are joined by "+".
+        captures: names of those that hold it, sorted; its images may lie in several, with copies of it.
         images: the board by channel, at least one.
         lidar: the board in the scan.
     """
 
-    capture: str
+    captures: tuple[str, ...]
     images: Mapping[str, ImageBoard]
     lidar: LidarBoard
 
+    @property
+    def capture(self) -> str:
+        """The capture that stands for all of them."""
+        return self.captures[0]
+
     def observation(self) -> Observation:
-        """Pair the scan with its first channel's picture."""
+        """Pair the scan with its first channel's image."""
         return Observation(self.capture, next(iter(self.images.values())), self.lidar)
 
 
 def join_scans(
     agreed: Mapping[str, Consensus], candidates: Mapping[str, Sequence[CaptureCandidates]]
 ) -> tuple[list[SharedScan], dict[str, Refusal]]:
-    """Bring the channels' observations of the same scan together, in whatever captures they lie.
+    """Group the channels' observations by scan, in any captures.
 
-    Recordings often hold the pictures of each channel in a folder of its own, with copies of the same scans.
+    Recordings often hold the images of each channel in a folder of its own, with copies of the same scans.
 
     Args:
         agreed: consensus of each channel, the most trusted first.
         candidates: of each channel, all places that each scan offers.
 
     Returns:
-        The scans by name; and refusals of pictures that go with another place in the scan than those of the
+        The scans by name, and refusals of images that match another surface of the scan than those of the
         channel before.
     """
     scan_of = {
@@ -91,7 +96,7 @@ def join_scans(
                 group[channel] = observation
     scans = [
         SharedScan(
-            "+".join(sorted({o.capture for o in group.values()})),
+            tuple(sorted({o.capture for o in group.values()})),
             {channel: o.image for channel, o in group.items()},
             next(iter(group.values())).lidar,
         )
@@ -100,13 +105,8 @@ def join_scans(
     return sorted(scans, key=lambda scan: scan.capture), refused
 
 
-def take_apart(names: Iterable[str]) -> set[str]:
-    """Take names of captures that share a scan ("000003+000060") apart."""
-    return {single for name in names for single in name.split("+")}
-
-
 def sample_scans(scans: Sequence[SharedScan], clocks: Clocks, noise_px: Mapping[str, float]) -> PoseSamples:
-    """Gather the poses and times of the pictures that go with each scan."""
+    """Collect the poses and times of each scan's images."""
     return sample_poses(
         [
             [
@@ -120,7 +120,7 @@ def sample_scans(scans: Sequence[SharedScan], clocks: Clocks, noise_px: Mapping[
 
 
 def time_sigmas_s(scans: Sequence[SharedScan], clocks: Clocks, channels: Sequence[str]) -> list[float]:
-    """Say how far times may be off by channel: the profile's tolerance, or more where stamps are missing."""
+    """Return the time tolerance of each channel: the profile's, or more if timestamps are missing."""
     sigmas = []
     for channel in channels:
         stamped = [

@@ -1,7 +1,7 @@
-"""How errors that the LiDAR repeats in every capture move the solution.
+"""The effect of the LiDAR's constant errors on the solution.
 
-Captures differ from one another by noise, and their scatter shows it. A laser whose ranges are all 8 mm too
-long is wrong in the same way in each of them: nothing scatters, and the extrinsic is off all the same.
+The scatter between captures shows their noise. A laser whose ranges are all 8 mm too long has the same error
+in each capture: it causes no scatter, but moves the extrinsics.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from lce_rig.residuals.features import CaptureFeatures, FeatureSettings, extract
 from lce_rig.residuals.moments import Problem
 from lce_rig.solvers.covariance import symmetric_inverse
 
-# Of the order of the errors themselves, so that the difference quotient sees what they would do.
+# Of the order of the errors themselves, so that the difference quotient represents their effect.
 STEP_M = 0.005
 
 
@@ -32,19 +32,19 @@ def ring_sensitivities(
 ) -> Array:
     """Differentiate the solution by the range offset of each ring, by one Newton step.
 
-    With half gradient g and half Hessian H of the cost, both at the solution, ranges that are off by b in
+    With half gradient g and half Hessian H of the cost, both at the solution, a range error b in
     ring r move the minimum by
 
         s_r b = -H^-1 sum_k (g_k(ranges of ring r + b) - g_k)                                            (1)
 
-    A ring that some capture does not see leaves its g_k alone: only (capture, ring) pairs that occur are
+    A ring that a capture does not see does not change its g_k: only (capture, ring) pairs that occur are
     built, as captures of one large problem. To first order an offset common to all rings moves the minimum
     by the sum of all s_r.
 
     Args:
         observations: the F captures in `problem`.
         board: the board.
-        settings: how features are extracted.
+        settings: of the feature extraction.
         problem: their moments.
         x: (m,) solution [vec R; t; d; 1].
         edge_ids: (n,) its association, which is held.
@@ -72,17 +72,17 @@ def ring_sensitivities(
 
 
 def shift_rings(lidar: LidarBoard, rings: NDArray[np.int16], offset_m: float) -> list[LidarBoard]:
-    """Lengthen the ranges of one ring at a time, and let the plane follow.
+    """Lengthen the ranges of one ring at a time, and refit the plane.
 
     The plane m . p = 1, with m = -n / d, predicts ranges r_i = 1 / (m . u_i) along the rays u_i. Fitted to
-    them by least squares it follows ranges that are off by b_i to first order by
+    them by least squares, range errors b_i change it to first order by
 
         dm = (sum J_i^T J_i)^-1 sum J_i^T b_i,    J_i = -r_i^2 u_i^T                                     (2)
 
     Args:
         lidar: a board as measured.
         rings: (L,) ring numbers.
-        offset_m: what is added to every range of the ring.
+        offset_m: added to every range of the ring.
 
     Returns:
         The board with the points and ring ends of each ring moved along their rays, and the plane refitted.

@@ -1,12 +1,13 @@
-"""By how much the stamps of each channel's pictures are off, from boards that moved while they were seen.
+"""Time offsets of each channel's images, from boards that moved.
 
 The cost of Algorithm 1 is a function of the channels' time offsets o: each o gives every capture another pose
-of the board at the time the LiDAR saw it (`calibrate.motion`), and the extrinsic is solved anew,
+of the board at the time the LiDAR saw it (`board_motion`), and the extrinsics are solved again,
 
     C(o) = min_T sum_k rho(c_k(T, o) / u) + rho(m_k(o)) + l_k(o) + sum_c (o_c / sigma_c)^2                (1)
 
-with c_k the cost of capture k, u its typical size, m_k + l_k = -2 ln p of its pictures' poses (offsets of two
-channels that nearly agree would need boards faster than hands), and rho bounding what one capture can say.
+with c_k the cost of capture k, u its typical size, m_k + l_k = -2 ln p of its images' poses (offsets of two
+channels that nearly agree would need boards faster than hands), and rho bounding the influence of one
+capture.
 """
 
 from collections.abc import Sequence
@@ -29,20 +30,20 @@ _REACH_S, _GRID_S = 0.2, 0.04
 _STEP_S = 0.004
 _N_ITERATIONS = 6
 _CONVERGED_S = 5e-4
-# A capture's term whose square is this counts half; it has three to six freedoms.
+# A capture's squared term of this size has half weight; it has three to six degrees of freedom.
 _ROBUST = 12.0
 _FREEDOMS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class TimeOffsets:
-    """What to add to the stamps of each channel's pictures to come to the LiDAR's time.
+    """Offsets from the timestamps of each channel's images to the LiDAR's time.
 
     Attributes:
         channels: names.
         offset_s: (C,).
         cov: (C, C) s^2, from the scatter between captures.
-        sensitivity: (6, C) by how much the extrinsic moves (m, rad) for a second of each offset.
+        sensitivity: (6, C) change of the extrinsics (m, rad) per second of each offset.
     """
 
     channels: tuple[str, ...]
@@ -54,7 +55,7 @@ class TimeOffsets:
 def at_sweep_time(
     observations: Sequence[Observation], motions: BoardMotions, sweep_s: float
 ) -> list[Observation]:
-    """Give every capture the board's pose at the time the LiDAR saw it.
+    """Replace the board's pose of every capture by that at the LiDAR's time.
 
     Args:
         observations: of F captures.
@@ -71,12 +72,12 @@ def at_sweep_time(
 def deskew_points(
     observations: Sequence[Observation], motions: BoardMotions, T_cam_lidar: Array
 ) -> list[Observation]:
-    """Move the points of boards to where they would have been met had the LiDAR seen all of them at once.
+    """Motion-compensate the points of boards to one time.
 
     Args:
         observations: of F captures.
         motions: of the board in them.
-        T_cam_lidar: (4, 4), good to a few degrees: it turns the rates of motion only.
+        T_cam_lidar: (4, 4), accurate to a few degrees; it only rotates the rates of motion.
     """
     R_cam_lidar = T_cam_lidar[:3, :3]
     rates = np.concatenate([motions.rates[:, :3] @ R_cam_lidar, motions.rates[:, 3:] @ R_cam_lidar], axis=1)
@@ -98,12 +99,12 @@ def estimate_time_offsets(
 
     Args:
         samples: the poses of F captures by channel.
-        observations: the same captures as the LiDAR saw them, any channel's picture.
+        observations: the same captures with the LiDAR's boards and any channel's image.
         board: its size.
         options: switches of the features.
         weights: of the cost's terms.
         T_start: (4, 4) T_cam_lidar without compensation.
-        prior_sigma_s: (C,) standard deviation of each offset beforehand.
+        prior_sigma_s: (C,) prior standard deviation of each offset.
         sweep_s: of the LiDAR.
     """
     offset_s = _search_grid(samples, observations, T_start, prior_sigma_s, sweep_s)
@@ -120,14 +121,14 @@ def estimate_time_offsets(
     inverse = symmetric_inverse(slopes.hessian + cost.precision)
     few = len(observations) / max(len(observations) - len(offset_s) - 6, 1)
     cov = inverse @ (few * slopes.gradients.T @ slopes.gradients + cost.precision) @ inverse
-    # Captures that say little scatter little: never claim more than the curvature of (1) does.
+    # Uninformative captures scatter little: the variance must not be below that from the curvature of (1).
     widen = np.sqrt(np.maximum(np.diag(inverse) / np.diag(cov), 1.0))
     return TimeOffsets(samples.channels, offset_s, np.asarray(widen[:, None] * cov * widen), slopes.T_rates)
 
 
 @dataclass(frozen=True, eq=False)
 class _Cost:
-    """Equation (1) for F captures, whose boards the LiDAR saw at times (F,) after their scans' stamps."""
+    """Equation (1) for F captures, whose boards the LiDAR saw at times (F,) after their scans' timestamps."""
 
     samples: PoseSamples
     features: Sequence[CaptureFeatures]
@@ -137,7 +138,7 @@ class _Cost:
     precision: Array
 
     def at(self, offset_s: Array, T_start: Array) -> "_Evaluation":
-        """Solve for the extrinsic at offsets (C,), from T_cam_lidar (4, 4) nearby."""
+        """Solve for the extrinsics at offsets (C,), from T_cam_lidar (4, 4) nearby."""
         motions = fit_motions(self.samples, offset_s)
         poses = zip(self.features, motions.at(self.times_s), motions.cov_at(self.times_s), strict=True)
         placed = [place_features(f, T_cam_board, cov, self.board) for f, T_cam_board, cov in poses]
@@ -176,7 +177,7 @@ class _Slopes:
     Attributes:
         gradients: (F, C) of each capture.
         hessian: (C, C) of all.
-        T_rates: (6, C) of the extrinsic's tangent.
+        T_rates: (6, C) of the extrinsics' tangent.
     """
 
     gradients: Array
@@ -185,7 +186,7 @@ class _Slopes:
 
 
 def _descend(cost: _Cost, offset_s: Array, T_start: Array) -> tuple[Array, _Slopes]:
-    """Minimise (1) by Newton steps, shortened where they lead upwards: the offsets (C,), slopes near them."""
+    """Minimise (1) by Newton steps, shortened if the cost rises: the offsets (C,), slopes near them."""
     here = cost.at(offset_s, T_start)
     for _ in range(_N_ITERATIONS):
         unit = float(np.median(here.cost)) / _FREEDOMS
@@ -220,7 +221,7 @@ def _differentiate(cost: _Cost, offset_s: Array, here: _Evaluation, unit: float)
             corner = cost.at(offset_s + steps[i] + steps[j], here.T).by_capture(unit)
             H[i, j] = H[j, i] = float(np.sum(corner - up[i] - up[j] + middle)) / _STEP_S**2
     rates = [difference(a.T, b.T) / (2 * _STEP_S) for a, b in zip(ahead, behind, strict=True)]
-    # Far from the minimum the cost may bend the other way.
+    # Far from the minimum the curvature may be negative.
     values, vectors = np.linalg.eigh(H)
     return _Slopes(g, np.asarray((vectors * np.abs(values)) @ vectors.T), np.stack(rates, axis=1))
 
@@ -228,7 +229,7 @@ def _differentiate(cost: _Cost, offset_s: Array, here: _Evaluation, unit: float)
 def _search_grid(
     samples: PoseSamples, observations: Sequence[Observation], T: Array, prior_sigma_s: Array, sweep_s: float
 ) -> Array:
-    """Find the offsets (C,) that best put the boards' middles onto the camera's planes, on a coarse grid."""
+    """Find the offsets (C,) with the boards' middles closest to the camera's planes, on a coarse grid."""
     lidars = [observation.lidar for observation in observations]
     times_s = np.array([board_time_s(lidar, sweep_s) for lidar in lidars])
     middles = np.array([lidar.points.mean(axis=0) for lidar in lidars])
@@ -239,7 +240,7 @@ def _search_grid(
         motions = fit_motions(samples, offset_s)
         T_cam_board = motions.at(times_s)
         depth = along_normals(T_cam_board[:, :3, 2], T_cam_board[:, :3, 3], middles, T)
-        # The extrinsic follows: what six small motions of it explain is no misfit.
+        # The extrinsics adapt: what their six small motions explain is no residual.
         J = differentiate(T_cam_board[:, :3, 2], middles @ T[:3, :3].T)
         misfit = np.abs(depth - J @ np.linalg.lstsq(J, depth, rcond=None)[0])
         cost = 2 * len(misfit) * np.log(np.median(misfit) + 1e-3)

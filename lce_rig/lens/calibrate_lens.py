@@ -1,4 +1,4 @@
-"""Intrinsics of a camera from pictures of the board, with covariance and errors on pictures left out."""
+"""Intrinsics of a camera from images of the board, with covariance and held-out errors."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,15 +18,15 @@ from lce_rig.solvers.pnp import solve_planar_pose
 
 MIN_CAPTURES = 4
 N_FOLDS = 10
-# Rounds of fitting and weighing anew, until no weight changes by more than a tenth.
+# Rounds of fitting and reweighting, until no weight changes by more than a tenth.
 _ROUNDS, _STEADY = 6, 0.1
-# A board's noise is its own, known no better than from this many residuals of its channel beside its own.
+# A board's noise is estimated from its own residuals and this many of its channel as a prior.
 _PRIOR_DOF = 30.0
-# Corners of one picture that lie off by this many times what is usual in its channel are no corners.
+# Corners with residuals this many times the typical value of their channel are outliers.
 _BAD = 4.0
-# A capture that alone decides a direction has no others to be held against.
+# A capture that alone decides a direction has no others to be compared with.
 _LEAST_REST = 1e-3
-# A focal length known no better than this is not known.
+# A focal length with a larger relative standard deviation is undetermined.
 _MAX_FOCAL_SIGMA = 0.1
 
 
@@ -38,20 +38,20 @@ def estimate_intrinsics(
     *,
     n_folds: int = N_FOLDS,
 ) -> IntrinsicsEstimate:
-    """Fit lens and shape of the board to the corners of all views, each with a pose and a noise of its own.
+    """Fit intrinsics and board shape to the corners of all views, each with its own pose and noise level.
 
-    Boards are weighted by their own residuals, so that blurred pictures and noisier channels count less, and
+    Boards are weighted by their own residuals, so that blurred images and noisier channels count less, and
     views that do not fit the others are refused by name.
 
     Args:
         views: of at least `MIN_CAPTURES` captures.
         board: the board.
-        start: the best guess, at the pictures' size; it may be off by a third.
+        start: an initial guess at the images' resolution; it may be wrong by a third.
         model: of the lens to fit.
-        n_folds: parts that are left out in turn.
+        n_folds: number of cross-validation folds.
 
     Raises:
-        NotEnoughDataError: too few captures, or captures that leave the focal length open.
+        NotEnoughDataError: too few captures, or captures that do not determine the focal length.
     """
     _require_captures(views)
     setup = Setup.of(np.array([view.board.corners_px for view in views]), board, model)
@@ -61,7 +61,7 @@ def estimate_intrinsics(
     kept = np.ones(len(views), dtype=bool)
     for rounds_left in reversed(range(_ROUNDS)):
         fitted, weights = _fit_weighted(setup.select(kept), state.select(kept), channels[kept])
-        # Views that a bad start made look bad come back where they fit after all.
+        # Views rejected because of a bad start return if they fit after all.
         starts[kept] = fitted.T_cam_board
         starts[~kept] = _posed_anew(setup.select(~kept), starts[~kept], fitted, start)
         state = refine_poses(setup, fitted.with_poses(starts))
@@ -76,7 +76,7 @@ def estimate_intrinsics(
 
 
 def distances_under(intrinsics: Intrinsics, views: Sequence[BoardView], board: Board) -> Array:
-    """Measure how well given intrinsics fit: only poses and the board's shape are fitted.
+    """Measure how well given intrinsics fit, with only poses and the board's shape free.
 
     Returns:
         Rms distance (K,) of each view's corners from their prediction, px.
@@ -93,19 +93,19 @@ def _require_captures(views: Sequence[BoardView]) -> None:
     n = len({view.capture for view in views})
     if n < MIN_CAPTURES:
         raise NotEnoughDataError(
-            f"intrinsics need the board in at least {MIN_CAPTURES} captures, it is in {n}",
-            "collect 15 or more, tilted in different directions, all over the picture",
+            f"the board is in {n} captures (minimum {MIN_CAPTURES} for intrinsics)",
+            "Collect 15 or more, tilted in different directions, all over the image",
         )
 
 
 def _fit_weighted(setup: Setup, state: LensState, channels: NDArray[np.str_]) -> tuple[LensState, Array]:
-    """Fit and weigh in turn; weights (K,) are 1 / px^2."""
+    """Alternate fitting and weighting; weights (K,) are 1 / px^2."""
     state = refine_poses(setup, state)
     weights = _weights(setup, state, channels)
     for done in range(_ROUNDS):
         state = fit(setup, state, weights)
         if done < 2:
-            # A better lens may show that a board's tilt was mirrored.
+            # Better intrinsics may show that a board's tilt was mirrored.
             state = refine_poses(setup, state)
         before, weights = weights, _weights(setup, state, channels)
         if np.all(np.abs(weights - before) < _STEADY * before):
@@ -114,7 +114,7 @@ def _fit_weighted(setup: Setup, state: LensState, channels: NDArray[np.str_]) ->
 
 
 def _posed_anew(setup: Setup, poses: Array, fitted: LensState, size: Intrinsics) -> Array:
-    """Solve for poses (K, 4, 4) without a start; those given stay where corners fit no pose."""
+    """Solve for poses (K, 4, 4) without a start; keep the given ones if corners fit no pose."""
     lens = setup.model.intrinsics(fitted.lens, size.width_px, size.height_px)
     solved = [solve_planar_pose(corners, setup.corners_board, lens) for corners in setup.corners_px]
     return np.array(
@@ -124,13 +124,13 @@ def _posed_anew(setup: Setup, poses: Array, fitted: LensState, size: Intrinsics)
 
 def _variances(setup: Setup, state: LensState) -> Array:
     residuals = residuals_px(setup, state).reshape(len(setup.corners_px), -1)
-    # A start that draws nothing at some board: it gets no weight in this round.
+    # If the start cannot project a board, the board gets no weight in this round.
     variances = np.sum(residuals**2, axis=1) / (residuals.shape[1] - 6)
     return np.where(np.isfinite(variances), variances, 1e12)
 
 
 def _usual(variances: Array, channels: NDArray[np.str_]) -> Array:
-    """Give each board the median of its channel (K,)."""
+    """Return each board the median of its channel (K,)."""
     return np.array([np.median(variances[channels == name]) for name in channels])
 
 
@@ -142,13 +142,13 @@ def _weights(setup: Setup, state: LensState, channels: NDArray[np.str_]) -> Arra
 
 
 def _fitting(setup: Setup, state: LensState, channels: NDArray[np.str_]) -> NDArray[np.bool_]:
-    """Tell which boards fit about as well as their channel's usually do (K,)."""
+    """Return which boards fit about as well as is typical of their channel (K,)."""
     variances = _variances(setup, state)
     return np.asarray(variances <= _BAD**2 * _usual(variances, channels))
 
 
 def _refusals(distances_px: Array, kept: NDArray[np.bool_], views: Sequence[BoardView]) -> dict[str, Refusal]:
-    """Say of each view that was left out how far its corners are from where the others' lens puts them."""
+    """State for each rejected view the error of its corners under the intrinsics from the others."""
     usual = float(np.median(distances_px[kept]))
     return {
         view.name: Refusal("calibrate.other_lens", figures={"rms_px": float(px), "median_px": usual})
@@ -176,11 +176,11 @@ def _estimate(
     try:
         cov, inflation = _covariance(setup, state, weights, captures)
     except np.linalg.LinAlgError as error:
-        raise NotEnoughDataError("the captures leave the lens open", advice) from error
+        raise NotEnoughDataError("the captures do not determine the intrinsics", advice) from error
     P = setup.model.size
     focal_sigma = float(np.sqrt(cov[0, 0]) / state.lens[0])
     if not 0 <= focal_sigma < _MAX_FOCAL_SIGMA:
-        raise NotEnoughDataError(f"the focal length is known to {100 * focal_sigma:.0f} % only", advice)
+        raise NotEnoughDataError(f"focal length standard deviation {100 * focal_sigma:.0f} %", advice)
     return IntrinsicsEstimate(
         model=setup.model,
         intrinsics=setup.model.intrinsics(state.lens, start.width_px, start.height_px),
@@ -201,12 +201,12 @@ def _estimate(
 def _covariance(
     setup: Setup, state: LensState, weights: Array, captures: NDArray[np.intp]
 ) -> tuple[Array, float]:
-    """Compute the covariance (Q, Q) of lens and shape, inflated to what the captures' scatter shows.
+    """Compute the covariance (Q, Q) of intrinsics and shape, inflated to the captures' scatter.
 
-    H^-1 holds where corner errors are independent. They are not: what the model lacks moves all corners of a
-    picture together. With g_k and H_k what capture k says, H = L L^T and S_k = L^-1 H_k L^-T, each
-    e_k = (I - S_k)^-1/2 L^-1 g_k has the covariance S_k where they are independent, whatever weight single
-    captures have. The scatter sum_k L^-T e_k e_k^T L^-1 of the lens over what H^-1 says of it inflates H^-1.
+    H^-1 is valid for independent corner errors. In fact, model errors move all corners of an image together.
+    With gradient g_k and Hessian H_k of capture k, H = L L^T and S_k = L^-1 H_k L^-T, each
+    e_k = (I - S_k)^-1/2 L^-1 g_k has the covariance S_k if errors are independent, for any weights of single
+    captures. The ratio of the scatter sum_k L^-T e_k e_k^T L^-1 of the intrinsics to H^-1 inflates H^-1.
 
     References:
         R. Bell, D. McCaffrey: Bias reduction in standard errors for linear regression with multi-stage
@@ -218,7 +218,7 @@ def _covariance(
     L = np.linalg.cholesky(information.sum(axis=0) + np.diag(setup.information * scale**2))
     back = np.linalg.inv(L)
     cov = back.T @ back
-    # Residuals are too small by what the shared unknowns took from them.
+    # The shared unknowns absorb part of the residuals.
     n_residuals = len(weights) * (2 * setup.corners_px.shape[1] - 6)
     lost = float(np.einsum("ij,kji->", cov, information))
     cov *= n_residuals / max(n_residuals - lost, 1.0)
@@ -237,7 +237,7 @@ def _covariance(
 def _held_out(
     setup: Setup, state: LensState, weights: Array, captures: NDArray[np.intp], n_folds: int
 ) -> Array:
-    """Rms distance (K,) of each board's corners under a lens and shape fitted to the other folds."""
+    """Rms distance (K,) of each board's corners under intrinsics and shape fitted to the other folds."""
     distances = np.empty(len(captures))
     n = min(n_folds, int(captures.max()) + 1)
     for fold in range(n):
@@ -248,23 +248,24 @@ def _held_out(
     return distances
 
 
-# Which lens model? That with the fewest parameters which foretells left-out captures as well as the best.
+# Choice of the lens model: the fewest parameters among those that predict held-out captures as well as the
+# best.
 
-# Models whose mean squared distances differ by less than this fraction are alike for any use.
+# Models whose mean squared distances differ by less than this fraction are equivalent in practice.
 _ALIKE = 0.02
 
 
 @dataclass(frozen=True)
 class ModelScore:
-    """How well a model does.
+    """The errors of a model.
 
     Attributes:
         name: of the model.
-        n_parameters: it has.
+        n_parameters: number of its parameters.
         rms_px: rms distance of corners it was fitted to.
-        held_out_px: the same of captures left out.
-        excess_px2: by how much its mean squared distance on these is worse than the best model's.
-        excess_sigma_px2: standard deviation of that, from how captures differ.
+        held_out_px: the same for held-out captures.
+        excess_px2: its mean squared distance on these minus the best model's.
+        excess_sigma_px2: standard deviation of that, from the scatter of captures.
     """
 
     name: str
@@ -276,13 +277,13 @@ class ModelScore:
 
     @property
     def is_as_good_as_the_best(self) -> bool:
-        """Whether the captures left out do not tell it from the best, or it hardly matters."""
+        """Whether its held-out error is not significantly or not relevantly worse than the best."""
         return self.excess_px2 <= max(self.excess_sigma_px2, _ALIKE * self.held_out_px**2)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The model chosen, why, and how all of them did."""
+    """The chosen model, the reason, and the scores of all models."""
 
     name: str
     reason: str
@@ -292,16 +293,16 @@ class Choice:
 def choose_model(
     views: Sequence[BoardView], board: Board, start: Intrinsics, *, n_folds: int = N_FOLDS
 ) -> tuple[IntrinsicsEstimate, Choice]:
-    """Fit every model and choose one by its error on captures that were left out.
+    """Fit every model and choose one by its error on held-out captures.
 
-    Of the models that are no worse than the best by more than one standard deviation of the difference, the
-    one with the fewest parameters is chosen; of those one of the same family as `start`, and then the best.
+    Among models within one standard deviation of the best, choose the one with the fewest parameters; among
+    equals prefer the family of `start`, then the best.
 
     Args:
         views: of at least `MIN_CAPTURES` captures.
         board: the board.
-        start: the best guess, of any model.
-        n_folds: parts that are left out in turn.
+        start: an initial guess, of any model.
+        n_folds: number of cross-validation folds.
 
     Raises:
         NotEnoughDataError: no model can be fitted.
@@ -338,7 +339,7 @@ def _scores(fitted: Mapping[str, IntrinsicsEstimate]) -> tuple[ModelScore, ...]:
 
 
 def _squares_by_capture(estimate: IntrinsicsEstimate) -> dict[str, float]:
-    """Mean squared distance of each capture's corners when it was left out, px^2."""
+    """Mean squared distance of each held-out capture's corners, px^2."""
     captures = np.array([view.capture for view in estimate.views])
     return {str(name): float(np.mean(estimate.held_out_px[captures == name] ** 2)) for name in set(captures)}
 
@@ -347,8 +348,8 @@ def _reason(chosen: ModelScore, scores: Sequence[ModelScore]) -> str:
     def listed(some: Sequence[ModelScore]) -> str:
         return ", ".join(f"{score.name} {score.held_out_px:.3f} px" for score in some)
 
-    text = f"{chosen.name}: {chosen.held_out_px:.3f} px on captures left out"
+    text = f"{chosen.name}: {chosen.held_out_px:.3f} px on held-out captures"
     alike = [score for score in scores if score.is_as_good_as_the_best and score.name != chosen.name]
     worse = [score for score in scores if not score.is_as_good_as_the_best]
-    text += f"; no surely better: {listed(alike)}" if alike else ", the least"
+    text += f"; not significantly better: {listed(alike)}" if alike else ", the lowest"
     return text + (f"; worse: {listed(worse)}" if worse else "")

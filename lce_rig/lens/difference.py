@@ -1,8 +1,8 @@
-"""How far two lens models draw the same rays apart, once the camera may turn to make up for it.
+"""Pixel difference of two lens models after the rotation of the camera that minimises it.
 
-A shift of the principal point is nearly a small turn of the camera: compared number by number, two intrinsics
-may look different and still be the same lens. What counts is how far pixels move after the best turn, and the
-turn.
+A shift of the principal point is nearly a small rotation of the camera. Two intrinsics may therefore differ
+in their numbers and still project alike. What counts is the pixel displacement after the best rotation, and
+that rotation.
 """
 
 from dataclasses import dataclass
@@ -16,17 +16,17 @@ from lce_rig.lens.models import LensModel
 
 _GRID = 40
 _STEPS = 10
-# Fewer pixels that both lenses draw are no picture to turn.
+# Fewer pixels covered by both models do not determine a rotation.
 _LEAST_ALIGNED = 10
 
 
 @dataclass(frozen=True, eq=False)
 class LensDifference:
-    """Where a second lens draws what a first one draws at each pixel.
+    """Where a second lens model projects the ray of each pixel of a first one.
 
     Attributes:
-        pixels: (G, 2) grid over the picture.
-        displacement_px: (G, 2) the second lens's pixel minus the first's; NaN where either draws nothing.
+        pixels: (G, 2) grid over the image.
+        displacement_px: (G, 2) the second model's pixel minus the first's; NaN if either is undefined.
         is_covered: (G,) whether boards were seen there.
         turn_rad: (3,) rotation vector from the first camera's rays to the second's.
         sigma_px: root of the mean variance of the displacement over the covered pixels.
@@ -42,7 +42,7 @@ class LensDifference:
 
     @property
     def rms_px(self) -> float:
-        """Rms distance over the covered pixels; infinite where the first lens draws none of them."""
+        """Rms distance over the covered pixels; infinite if the first model projects none of them."""
         return float(np.sqrt(np.mean(self._lengths**2)))
 
     @property
@@ -59,11 +59,11 @@ class LensDifference:
 
 @dataclass(frozen=True, eq=False)
 class LensCertainty:
-    """How well a lens is known, pixel by pixel, after the turn of the camera that least matters.
+    """Standard deviation per pixel of a lens model, after the rotation that minimises it.
 
     Attributes:
-        pixels: (H, W, 2) grid over the picture.
-        sigma_px: (H, W) root of the summed variances of both coordinates; NaN where the lens draws nothing.
+        pixels: (H, W, 2) grid over the image.
+        sigma_px: (H, W) root of the summed variances of both coordinates; NaN for pixels without a ray.
         is_covered: (H, W) whether boards were seen there.
     """
 
@@ -75,12 +75,12 @@ class LensCertainty:
 def compare_lenses(
     first: Intrinsics, second: Intrinsics, corners_px: Array, cov: Array, model: LensModel
 ) -> LensDifference:
-    """Measure how far two intrinsics move pixels after the best rotation between their rays.
+    """Measure the pixel displacement between two intrinsics after the best rotation between their rays.
 
     The rotation minimises sum |project_2(R ray_1(u)) - u|^2 over the pixels u in the corners' convex hull.
 
     Args:
-        first, second: of pictures of the same size.
+        first, second: for images of the same size.
         corners_px: (n, 2) where boards were seen.
         cov: (P, P) of the second's parameters.
         model: of the second, whose parameters these are.
@@ -109,11 +109,11 @@ def compare_lenses(
 
 
 def certainty_of(intrinsics: Intrinsics, corners_px: Array, cov: Array, model: LensModel) -> LensCertainty:
-    """Propagate the covariance of a lens to the pixels of its picture.
+    """Propagate the covariance of intrinsics to the image's pixels.
 
     Args:
         intrinsics: the lens.
-        corners_px: (n, 2) where boards were seen; the camera is turned to fit best there.
+        corners_px: (n, 2) where boards were seen; the rotation minimises the deviation there.
         cov: (P, P) of its parameters.
         model: whose parameters these are.
     """
@@ -138,14 +138,14 @@ def _by_turn(model: LensModel, vector: Array, rays: Array) -> tuple[Array, Array
 
 
 def _best_turn(model: LensModel, vector: Array, rays: Array) -> tuple[Array, Array]:
-    """Find the rotation (3, P) that best undoes a change of each parameter, and what is left (2 n, P)."""
+    """Find the rotation (3, P) that best compensates each parameter's change, and the remainder (2 n, P)."""
     _, J, A = _by_turn(model, vector, rays)
     turn = np.asarray(-np.linalg.lstsq(J, A, rcond=None)[0])
     return turn, np.asarray(A + J @ turn)
 
 
 def _grid(intrinsics: Intrinsics) -> Array:
-    """Lay points (H, W, 2) over the picture, `_GRID` along its longer side."""
+    """Return a grid of points (H, W, 2) over the image, `_GRID` along its longer side."""
     width, height = intrinsics.width_px, intrinsics.height_px
     step = max(width, height) / _GRID
     u, v = (np.arange(step / 2, length, step) - 0.5 for length in (width, height))

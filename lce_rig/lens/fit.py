@@ -1,11 +1,11 @@
 """Intrinsics from the corners of many boards: least squares over the lens, the board's shape and every pose.
 
-Lens and board are shared by all pictures, the pose is each one's own: the normal equations have an arrow's
-shape, and eliminating the poses (Schur) leaves one small system however many pictures there are.
+Lens and board are shared by all images, the pose is each one's own: the normal equations have an arrow's
+shape, and eliminating the poses (Schur) leaves one small system however many images there are.
 
-The board is not what the drawing says. A bow of half a millimetre, a print a thousandth too long one way,
-corners a tenth of a millimetre off their places: each moves the focal length or the principal point by more
-than the noise of the corners does.
+The board deviates from its nominal shape. A bow of half a millimetre, a pattern a thousandth too long in one
+direction, corners displaced by a tenth of a millimetre: each moves the focal length or the principal point by
+more than the noise of the corners does.
 """
 
 from dataclasses import dataclass, replace
@@ -18,12 +18,12 @@ from lce_rig.core.geometry import Array, perturb, skew
 from lce_rig.lens.models import LensModel
 from lce_rig.solvers.pnp import mirror_tilt
 
-# How far boards depart from their drawing a priori: bowed by millimetres, printed longer one way by a
-# fraction, single corners off by a tenth of a millimetre.
+# Prior deviations of boards from the nominal shape: bowed by millimetres, printed longer in one direction by
+# a fraction, single corners displaced by a tenth of a millimetre.
 BOW_SIGMA_M = 0.003
 ASPECT_SIGMA = 0.002
 PRINT_SIGMA_M = 1e-4
-# Bow along width and height, aspect; after these come the corners' own offsets.
+# Bow along width and height, aspect; then the corners' own offsets.
 N_MODES = 3
 _MAX_STEPS = 40
 _POSE_STEPS = 15
@@ -31,15 +31,15 @@ _POSE_STEPS = 15
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What is seen and what it is fitted with.
+    """Measurements and model of a fit.
 
     Attributes:
         corners_px: (K, N, 2) of K boards, in the order of `Board.corners()`.
-        corners_board: (N, 3) as drawn, m.
-        shapes: (S, N, 3) how the corners move by one unit of each way the board departs from the drawing.
+        corners_board: (N, 3) nominal, m.
+        shapes: (S, N, 3) displacement of the corners per unit of each shape parameter.
         shape_sigma: (S,) standard deviations of these a priori.
         model: of the lens.
-        is_lens_free: whether the lens is fitted; else only the board's shape and the poses are.
+        is_lens_free: whether the intrinsics are fitted; else only the board's shape and the poses are.
     """
 
     corners_px: Array
@@ -54,8 +54,8 @@ class Setup:
         """Prepare boards (K, N, 2) for a fit.
 
         Shapes are two bows, the aspect, and x and y of each corner. A bow is a parabola along either side of
-        the pattern, zero at its ends, positive towards the viewer; the aspect is by what fraction the print
-        is longer along its width than along its height.
+        the pattern, zero at its ends, positive towards the viewer; the aspect is the fraction by which the
+        pattern is longer along its width than along its height.
 
         References:
             D. Kogan, mrcal: the deformed calibration object.
@@ -79,7 +79,7 @@ class Setup:
 
     @property
     def information(self) -> Array:
-        """What the priors know (P + S,) of lens and shape, all about zero."""
+        """Information (P + S,) of the priors on intrinsics and shape, all about zero."""
         lens = np.concatenate([np.full(4, np.inf), self.model.prior_sigma])
         return np.asarray(1.0 / np.concatenate([lens, self.shape_sigma]) ** 2)
 
@@ -99,7 +99,7 @@ class LensState:
     T_cam_board: Array
 
     def with_poses(self, T_cam_board: Array) -> "LensState":
-        """Exchange the poses."""
+        """Replace the poses."""
         return replace(self, T_cam_board=T_cam_board)
 
     def select(self, keep: NDArray[np.bool_]) -> "LensState":
@@ -113,7 +113,7 @@ class LensState:
 
 
 def corners_of(setup: Setup, shape: Array) -> Array:
-    """Place the board's corners (N, 3) as its shape (S,) says, frame board, m."""
+    """Place the board's corners (N, 3) according to its shape (S,), frame board, m."""
     return np.asarray(setup.corners_board + np.tensordot(shape, setup.shapes, axes=1))
 
 
@@ -123,7 +123,7 @@ def residuals_px(setup: Setup, state: LensState) -> Array:
 
 
 def _project(setup: Setup, state: LensState) -> tuple[Array, Array, Array, Array]:
-    """Compute residuals (K, N, 2), derivatives by point and lens, and the corners turned into the camera."""
+    """Compute residuals (K, N, 2), derivatives by point and lens, and the corners rotated into the camera."""
     T = state.T_cam_board
     turned = corners_of(setup, state.shape) @ np.swapaxes(T[:, :3, :3], 1, 2)
     pixels, by_point, by_lens = setup.model.project(state.lens, turned + T[:, None, :3, 3])
@@ -156,12 +156,12 @@ def linearise(setup: Setup, state: LensState) -> tuple[Array, Array, Array]:
 def refine_poses(setup: Setup, state: LensState, *, tries_mirror: bool = True) -> LensState:
     """Fit every board's pose to a given lens and shape.
 
-    This is `solvers.pnp.solve_planar_pose` for all boards at once, where a start is known.
+    This is `solvers.pnp.solve_planar_pose` for all boards at once, with a known start.
 
     Args:
         setup: K boards.
         state: with the poses to start from.
-        tries_mirror: also start from the mirrored tilt, and keep the better of both.
+        tries_mirror: also start from the mirrored tilt, and keep the better result.
     """
     if not tries_mirror:
         return state.with_poses(_descend(setup, state)[0])
@@ -174,7 +174,7 @@ def refine_poses(setup: Setup, state: LensState, *, tries_mirror: bool = True) -
 
 
 def _descend(setup: Setup, state: LensState) -> tuple[Array, Array]:
-    """Levenberg-Marquardt on each pose by itself; poses (K, 4, 4) and costs (K,) px^2."""
+    """Levenberg-Marquardt on each pose separately; poses (K, 4, 4) and costs (K,) px^2."""
     damping = np.full(len(state.T_cam_board), 1e-4)
     T = state.T_cam_board
     residuals, J = _by_pose(setup, state)
@@ -202,7 +202,7 @@ def fit(setup: Setup, start: LensState, weights: Array) -> LensState:
 
     Args:
         setup: K boards.
-        start: near enough; a lens wrong by a third will do.
+        start: an initial guess; intrinsics wrong by a third are sufficient.
         weights: (K,) 1 / px^2.
     """
     state, damping = start, 1e-4
@@ -229,7 +229,7 @@ def fit(setup: Setup, start: LensState, weights: Array) -> LensState:
 
 
 def reduced(setup: Setup, state: LensState, weights: Array) -> tuple[Array, Array]:
-    """Compute what each board says about lens and shape once its pose is eliminated.
+    """Compute each board's gradient and information of intrinsics and shape, with its pose eliminated.
 
     Returns:
         Gradients (K, Q) and information (K, Q, Q) with Q = P + S, without the priors.

@@ -1,4 +1,4 @@
-"""What the pictures leave open about a lens, and which further pictures would mend it."""
+"""What the images do not determine about the intrinsics, and which further images would improve it."""
 
 import numpy as np
 
@@ -7,20 +7,21 @@ from lce_rig.lens.difference import LensCertainty
 from lce_rig.lens.lens_estimate import IntrinsicsEstimate
 
 ENOUGH_CAPTURES = 10
-# The border is unknown where a ray's pixel is worse than this, and this many times worse than in the middle.
+# The border is undetermined if a pixel's standard deviation exceeds this, and this many times that in the
+# middle.
 _BORDER_PX, _BORDER_RATIO = 1.0, 4.0
 _BORDER_PERCENTILE = 98.0
-# A focal length off by this moves boards at 3 m by 9 mm.
+# A focal length error of this size moves boards at 3 m by 9 mm.
 _FOCAL_SIGMA = 0.003
 _TILTED_DEG, _TILTED_SHARE = 15.0, 0.5
-# Tilts about one axis only leave the other direction of the focal length to the first.
+# Tilts about one axis determine the focal length in one direction only.
 _AXIS_SPREAD_DEG = 8.0
 _OVERFITTED = 1.5
 _BOW_M, _ASPECT = 0.002, 0.002
 
 
 def find_weaknesses(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> tuple[str, ...]:
-    """List what the captures leave open, each with its figure and what to do; the gravest first.
+    """List what the captures do not determine, with figures and actions, the most severe first.
 
     Args:
         estimate: of the lens.
@@ -41,9 +42,9 @@ def find_weaknesses(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> t
 
 
 def tilts_deg(estimate: IntrinsicsEstimate) -> Array:
-    """Measure each board's tilt (K, 2) deg out of the line of sight, split by the axes of the picture.
+    """Measure each board's tilt (K, 2) deg from the line of sight, by the axes of the image.
 
-    A board that faces the camera has none; one whose right edge is farther away than its left has (+, 0).
+    A board that faces the camera has no tilt; one whose right edge is farther away than its left has (+, 0).
     """
     normals, centres = estimate.T_cam_board[:, :3, 2], estimate.T_cam_board[:, :3, 3]
     sight = centres / np.linalg.norm(centres, axis=1, keepdims=True)
@@ -55,7 +56,7 @@ def tilts_deg(estimate: IntrinsicsEstimate) -> Array:
 
 
 def reach(estimate: IntrinsicsEstimate) -> float:
-    """Measure how far boards reach from the principal point to the picture's farthest corner, 0..1."""
+    """Measure how far boards reach from the principal point to the image's farthest corner, 0..1."""
     i = estimate.intrinsics
     centre = np.array([i.cx_px, i.cy_px])
     ends = np.array([[u, v] for u in (0, i.width_px - 1) for v in (0, i.height_px - 1)])
@@ -67,7 +68,7 @@ def _few_captures(estimate: IntrinsicsEstimate) -> str:
     n = len({view.capture for view in estimate.views})
     if n >= ENOUGH_CAPTURES:
         return ""
-    return f"only {n} captures: deviations are rough; collect 15 or more"
+    return f"only {n} captures: standard deviations are rough; collect 15 or more"
 
 
 def _folds(certainty: LensCertainty) -> str:
@@ -75,8 +76,8 @@ def _folds(certainty: LensCertainty) -> str:
     if not blank.any():
         return ""
     return (
-        f"the distortion folds back: {100 * blank.mean():.0f} % of the picture, at its border, has no ray; "
-        "hold the board there too, or choose a model with fewer parameters"
+        f"the distortion folds back: {100 * blank.mean():.0f} % of the image, at its border, has no ray; "
+        "place the board there too, or choose a model with fewer parameters"
     )
 
 
@@ -86,9 +87,9 @@ def _border(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> str:
     if outside < max(_BORDER_PX, _BORDER_RATIO * inside):
         return ""
     return (
-        f"boards reach {100 * reach(estimate):.0f} % of the way to the picture's corners: beyond, the "
-        f"distortion is unknown (a pixel is known to {outside:.1f} px there, {inside:.1f} px where boards "
-        "were seen); hold the board into all four corners"
+        f"boards reach {100 * reach(estimate):.0f} % of the way to the image's corners, the distortion is "
+        f"not determined beyond (pixel standard deviation {outside:.1f} px there, {inside:.1f} px where "
+        "boards were seen); place boards in all four corners"
     )
 
 
@@ -97,7 +98,7 @@ def _tilts(estimate: IntrinsicsEstimate) -> list[str]:
     if focal_sigma < _FOCAL_SIGMA:
         return []
     tilts = tilts_deg(estimate)
-    known = f"focal length and distance trade off (known to {100 * focal_sigma:.1f} %)"
+    known = f"focal length and distance trade off (standard deviation {100 * focal_sigma:.1f} %)"
     share = float(np.mean(np.linalg.norm(tilts, axis=1) > _TILTED_DEG))
     if share < _TILTED_SHARE:
         n = round(share * len(tilts))
@@ -106,9 +107,7 @@ def _tilts(estimate: IntrinsicsEstimate) -> list[str]:
     _, spread, axes = np.linalg.svd(tilts / np.sqrt(len(tilts)))
     if spread[1] < _AXIS_SPREAD_DEG:
         way = "left and right" if abs(axes[1, 0]) > abs(axes[1, 1]) else "up and down"
-        return [
-            f"boards are hardly tilted {way} (by {spread[1]:.0f} deg rms): {known}; tilt them that way too"
-        ]
+        return [f"boards are hardly tilted {way} ({spread[1]:.0f} deg rms): {known}; tilt them that way too"]
     return [f"{known}: add captures, nearer and tilted by 30 to 45 deg"]
 
 
@@ -116,7 +115,7 @@ def _overfitted(estimate: IntrinsicsEstimate) -> str:
     if estimate.held_out_rms_px < _OVERFITTED * estimate.rms_px:
         return ""
     return (
-        f"captures left out fit worse ({estimate.held_out_rms_px:.2f} px) than captures used "
+        f"held-out captures fit worse ({estimate.held_out_rms_px:.2f} px) than captures used "
         f"({estimate.rms_px:.2f} px): add captures, or choose a model with fewer parameters"
     )
 
@@ -126,11 +125,13 @@ def _board(estimate: IntrinsicsEstimate) -> list[str]:
     bow_m = max(estimate.shape[:2], key=abs)
     if abs(bow_m) > _BOW_M:
         way = "towards" if bow_m > 0 else "away from"
-        text = f"the board is bent: its middle stands out {1000 * abs(bow_m):.1f} mm {way} the viewer"
+        text = f"the board is bent: its middle is {1000 * abs(bow_m):.1f} mm {way} the viewer"
         texts.append(f"{text}; use a stiffer plate")
     aspect, sigma = float(estimate.shape[2]), float(estimate.shape_sigma[2])
     if abs(aspect) > _ASPECT + 2 * sigma:
         way = "width" if aspect > 0 else "height"
-        text = f"the print is {100 * abs(aspect):.2f} +- {100 * sigma:.2f} % too long along the plate's {way}"
+        text = (
+            f"the pattern is {100 * abs(aspect):.2f} +- {100 * sigma:.2f} % too long along the plate's {way}"
+        )
         texts.append(f"{text}, compared with the other side: measure the squares both ways")
     return texts

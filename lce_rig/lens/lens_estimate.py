@@ -1,4 +1,4 @@
-"""What intrinsics are measured from, and what comes out."""
+"""Views of the board, and the intrinsics estimated from them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ from lce_rig.lens.models import LensModel
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """The board in one picture.
+    """The board in one image.
 
     Attributes:
-        capture: what the picture belongs to; views of one capture are never held out without each other.
-        channel: of the camera; each has a noise of its own.
+        capture: the image's capture; views of one capture are held out together.
+        channel: of the camera; each has its own noise level.
         board: its corners, and a pose to start from.
     """
 
@@ -27,29 +27,30 @@ class BoardView:
 
     @property
     def name(self) -> str:
-        """What to call it: 000012.frames."""
+        """The view's name, such as 000012.frames."""
         return f"{self.capture}.{self.channel}"
 
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicsEstimate:
-    """Intrinsics fitted to views, with everything needed to judge them.
+    """Intrinsics fitted to views, with the figures to judge them.
 
     Attributes:
         model: of the lens.
         intrinsics: the estimate.
         cov: (P, P) of `model.parameters`, from the captures' scatter.
-        inflation: how many times larger its deviations are than the corners' noise alone explains.
-        corners_board: (N, 3) where the board's corners are, which is not where the drawing puts them, m.
-        shape: (3,) how far the middle of the pattern stands out towards the viewer along its width and along
-            its height, m; by what fraction the print is longer along its width than along its height.
+        inflation: ratio of its standard deviations to those from the corners' noise alone.
+        corners_board: (N, 3) estimated positions of the board's corners, which differ from the nominal ones,
+            m.
+        shape: (3,) bow of the pattern's middle towards the viewer along its width and along its height, m;
+            fraction by which the pattern is longer along its width than along its height.
         shape_sigma: (3,) standard deviations of these.
-        print_rms_m: by how much single corners lie off their places beyond that, rms.
-        views: behind the estimate.
+        print_rms_m: remaining displacement of single corners, rms.
+        views: used in the estimate.
         T_cam_board: (K, 4, 4) of the views.
         residuals_px: (K, N, 2) measured minus predicted.
-        held_out_px: (K,) rms distance of each view's corners under a lens fitted without its capture.
-        refused: name of a view -> why it is not behind the estimate.
+        held_out_px: (K,) rms distance of each view's corners under intrinsics fitted without its capture.
+        refused: name of a view -> why the estimate does not use it.
     """
 
     model: LensModel
@@ -78,7 +79,7 @@ class IntrinsicsEstimate:
 
     @property
     def held_out_rms_px(self) -> float:
-        """Rms distance of a corner from its prediction by the others' lens."""
+        """Rms distance of a corner from its prediction by intrinsics fitted to the others."""
         return float(np.sqrt(np.mean(self.held_out_px**2)))
 
     @property

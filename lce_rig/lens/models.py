@@ -1,4 +1,4 @@
-"""Lens models as vectors of parameters, with the derivatives that fitting them wants."""
+"""Lens models as vectors of parameters, with the derivatives for fitting."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,7 +8,7 @@ import numpy as np
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
 
-# Tells a lens from another: rays of a grid of this many points across the picture.
+# Models are compared on the rays of a grid of this many points across the image.
 _GRID = 24
 _STEPS = 20
 
@@ -18,10 +18,10 @@ class LensModel:
     """A lens model: [fx, fy, cx, cy, distortion ...] in pixels and the order of `Intrinsics.distortion`.
 
     Attributes:
-        name: what the command line calls it.
+        name: its name on the command line.
         family: the model of `Intrinsics`.
         coefficients: names of the distortion coefficients.
-        prior_sigma: standard deviation a priori of each coefficient about zero; inf where there is none. The
+        prior_sigma: standard deviation a priori of each coefficient about zero; inf if there is none. The
             rational model's upper and lower polynomials can stand in for each other, which this decides.
     """
 
@@ -48,7 +48,7 @@ class LensModel:
         """
         given = intrinsics.distortion
         if intrinsics.model != self.family or len(given) > len(self.coefficients):
-            raise ValueError(f"{intrinsics.model} with {len(given)} coefficients is no {self.name}")
+            raise ValueError(f"{intrinsics.model} with {len(given)} coefficients is not {self.name}")
         padded = (*given, *(0.0,) * (len(self.coefficients) - len(given)))
         return np.array([intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px, *padded])
 
@@ -95,7 +95,7 @@ MODELS = {
 
 
 def model_of(intrinsics: Intrinsics) -> LensModel:
-    """Choose the smallest model that holds these intrinsics; a lens without distortion gets radtan4."""
+    """Choose the smallest model that represents these intrinsics; without distortion, radtan4."""
     if intrinsics.model == "equidistant":
         return MODELS["equidistant"]
     n = len(intrinsics.distortion)
@@ -103,7 +103,7 @@ def model_of(intrinsics: Intrinsics) -> LensModel:
 
 
 def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
-    """Find the parameters (P,) of another model that draw about the same picture.
+    """Find the parameters (P,) of another model with about the same projection.
 
     Exact where the new model contains the old one; else least squares over a grid of pixels, within the field
     of view where the old model is valid.
@@ -115,7 +115,7 @@ def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
     )
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)
     rays = intrinsics.unproject(pixels)
-    # A pinhole polynomial cannot draw what lies beside or behind the camera.
+    # A pinhole polynomial cannot project points beside or behind the camera.
     is_seen = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.2)
     vector = np.concatenate(
         [
@@ -175,7 +175,7 @@ def _distort_equidistant(coefficients: Array, points: Array) -> tuple[Array, Arr
     slope = 1 + squares @ (coefficients * [3, 5, 7, 9])
     direction = lateral / rho[..., None]
     by_rho, by_z = slope * z / (rho**2 + z**2), -slope * rho / (rho**2 + z**2)
-    # The radius grows along the direction by `by_rho`; across it the picture turns about the centre.
+    # The radius grows along the direction by `by_rho`; across it the image rotates about the centre.
     outer = direction[..., :, None] * direction[..., None, :]
     turn = (radius / rho)[..., None, None]
     by_lateral = by_rho[..., None, None] * outer + turn * (np.eye(2) - outer)

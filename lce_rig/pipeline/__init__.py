@@ -1,11 +1,11 @@
-"""The story in order: captures -> detections -> extrinsics -> files and pictures. Start reading here.
+"""The whole chain: captures -> detections -> extrinsics -> files and images. Start reading here.
 
     detections = detect(session)                 the board in all images, scans and events
-    result = calibrate(session, detections)      an extrinsic and a verdict for each camera and LiDAR
+    result = calibrate(session, detections)      extrinsics and a verdict for each camera and LiDAR
     result.write()                               result.json, YAML, URDF, camera_info, transforms
     verify(session, result).write()              the point clouds projected into the images
 
-Every step takes what the step before it made. Results are frozen dataclasses; only the
+Every step takes the output of the one before. Results are frozen dataclasses; only the
 session and the export layer touch files.
 """
 

@@ -1,4 +1,4 @@
-"""Estimate and judge the extrinsic of every camera with every LiDAR of a session.
+"""Estimate and judge the extrinsics of every camera with every LiDAR of a session.
 
 detections -> estimate of each camera with each LiDAR -> cameras of one LiDAR, together -> checks, verdict
 """
@@ -10,9 +10,10 @@ from itertools import combinations
 
 import numpy as np
 
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
-from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.geometry import invert, sigma_sizes, tangent_sizes
 from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
@@ -28,27 +29,26 @@ from lce_rig.extrinsics.consensus import find_consensus
 from lce_rig.extrinsics.likelihood.calibrate_together import TogetherEstimate, calibrate_together
 from lce_rig.extrinsics.metrics import error_to_reference
 from lce_rig.extrinsics.relative_pose import relative_pose
-from lce_rig.extrinsics.shared_scans import take_apart
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.result_files import Result
 from lce_rig.rig import Rig
 from lce_rig.session import Session
-from lce_rig.validation.camera_pairs import CameraPair, doubt_cameras, relate
+from lce_rig.validation.camera_pairs import CameraPair, camera_findings, relate
 from lce_rig.validation.reach import point_uncertainties
 from lce_rig.validation.validate import Validation, validate
 from lce_rig.validation.verdict import judge
-from lce_rig.words import sentence
+from lce_rig.words import not_enough, sentence
 
 
 @dataclass(frozen=True, eq=False)
 class _Sensors:
-    """One camera with one LiDAR, and what both saw.
+    """One camera with one LiDAR, and their detections.
 
     Attributes:
         pairs: channels of the camera with the LiDAR.
-        settings: the user's options, with what the profile says of the LiDAR.
-        candidates: by channel, of captures in which both sensors saw something.
+        settings: the user's options, with the LiDAR's properties from the profile.
+        candidates: by channel, of captures with detections of both sensors.
         refused: why the other captures are unusable.
     """
 
@@ -67,13 +67,35 @@ class _Sensors:
 
 
 @dataclass(frozen=True, eq=False)
+class _Solved:
+    """The result of the captures of one camera and one LiDAR.
+
+    Attributes:
+        sensors: the two.
+        estimate: of the extrinsics.
+        validation: of the estimate on the camera's own captures and images.
+        together: the estimate of several cameras that it is part of; None where it stands alone.
+    """
+
+    sensors: _Sensors
+    estimate: CalibrationEstimate
+    validation: Validation
+    together: TogetherEstimate | None = None
+
+    @property
+    def is_still(self) -> bool:
+        """Whether boards stood still, so that images need no motion compensation."""
+        return all(channel.time_offset_s is None for channel in self.estimate.channels)
+
+
+@dataclass(frozen=True, eq=False)
 class _Link:
-    """Two cameras that saw the same boards, by their place among all that have an estimate."""
+    """Two cameras that saw the same boards, by their indices among those with an estimate."""
 
     first: int
     second: int
     pair: CameraPair
-    doubts: tuple[Finding, ...]
+    findings: tuple[Finding, ...]
 
 
 def calibrate(
@@ -86,19 +108,20 @@ def calibrate(
     reference: Reference | None = None,
     progress: Progress = silent,
 ) -> Result:
-    """Estimate and judge the extrinsic of every camera with every LiDAR of a session; nothing is written.
+    """Estimate and judge the extrinsics of every camera with every LiDAR of a session; nothing is written.
 
     Args:
         session: open for reading is enough.
         detections: of the session; None detects the board first, as `detect` does by default.
-        options: of the estimate; None takes the usual ones.
-        cameras: to calibrate, as if the session held no others; None takes all.
-        channels: of the cameras, to use; None takes all that the session holds.
+        options: of the estimate; None for the defaults.
+        cameras: the cameras to calibrate, as if the session held no others; None for all.
+        channels: the cameras' channels to use; None for all that the session holds.
         reference: extrinsics to report errors against; they never enter the estimate or the verdict.
         progress: called with (done, total) for each camera and LiDAR in turn.
 
     Raises:
-        NotEnoughDataError: every pair has too few captures or leaves a direction open; the causes are named.
+        NotEnoughDataError: every pair has too few captures or an undetermined direction; the causes are
+            named.
         UsageError: no capture holds one of the channels.
     """
     pairs, shortages = calibrate_detections(
@@ -122,11 +145,11 @@ def calibrate_detections(
     channels: Sequence[str] | None = None,
     reference: Reference | None = None,
     progress: Progress = silent,
-) -> tuple[list[Calibration], list[NotEnoughDataError]]:
-    """Estimate and judge the extrinsic of every camera with every LiDAR from what they saw of the board.
+) -> tuple[list[Calibration], list[Finding]]:
+    """Estimate and judge the extrinsics of every camera with every LiDAR from their detections.
 
-    Channels of one camera share pixels and lens: together they give one extrinsic. Cameras that saw the same
-    boards are held against each other, and with method "ml" estimated together.
+    Channels of one camera share pixels and lens: together they give one set of extrinsics. Cameras that saw
+    the same boards are compared with each other, and with method "ml" estimated together.
 
     Args:
         rig: thresholds, targets and nominal extrinsics.
@@ -134,60 +157,54 @@ def calibrate_detections(
         options, cameras, channels, reference, progress: as of `calibrate`.
 
     Returns:
-        The sensors that could be calibrated; and for each other pair why not.
+        The calibrated sensors, and for each other pair the cause.
 
     Raises:
-        NotEnoughDataError: every pair has too few captures or leaves a direction open; the causes are named.
+        NotEnoughDataError: every pair has too few captures or an undetermined direction; the causes are
+            named.
         UsageError: no capture holds one of the channels.
     """
-    board = rig.board.to_board()
-    sensors, alone, shortages = [], [], []
+    alone: list[_Solved] = []
+    shortages: list[Finding] = []
     for pairs in _pairs_by_sensors(detections, cameras, channels):
         try:
-            own = _sensors(rig, detections, pairs, options or CalibrateOptions())
-            clocks = clocks_of(rig, own.camera, own.lidar)
-            alone.append(calibrate_channels(own.candidates, board, own.settings, clocks, progress))
-            sensors.append(own)
+            alone.append(_solve(rig, detections, pairs, options or CalibrateOptions(), progress))
         except NotEnoughDataError as error:
-            shortages.append(error)
-    if not sensors:
+            shortages.append(_shortage(pairs, error))
+    if not alone:
         raise _nothing_solved(shortages, cameras)
-    links = list(_links(rig, sensors, alone))
-    joint = _estimate_together(rig, sensors, alone, links)
-    final = [_from_all_cameras(rig, detections, k, sensors[k], alone[k], joint) for k in range(len(sensors))]
-    checked = [_examine(rig, detections, *each) for each in zip(sensors, final, strict=True)]
-    calibrations = []
-    for k, own in enumerate(sensors):
-        mine = [link for link in links if k in (link.first, link.second)]
-        doubts = [doubt for link in mine for doubt in link.doubts]
-        others = tuple(_other_camera(sensors, final, checked, k, link, joint) for link in mine)
-        calibration = _judged(rig, detections, own, final[k], checked[k], doubts, others)
-        truth = reference.of(own.camera, own.lidar) if reference else None
-        calibrations.append(calibration if truth is None else _compared(calibration, truth))
-    return calibrations, shortages
+    links = list(_links(rig, alone))
+    solved = _solve_together(rig, detections, alone, links)
+    calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
+    return [_compared(calibration, reference) for calibration in calibrations], shortages
 
 
-def _nothing_solved(
-    troubles: Sequence[NotEnoughDataError], cameras: Sequence[str] | None
-) -> NotEnoughDataError:
-    """Say of every pair why it could not be calibrated."""
-    if not troubles:
+def _nothing_solved(shortages: Sequence[Finding], cameras: Sequence[str] | None) -> NotEnoughDataError:
+    """State for every pair why it could not be calibrated."""
+    if not shortages:
         of_cameras = f" of {' or '.join(cameras)}" if cameras else ""
         return NotEnoughDataError(
-            f"the session holds no capture with a picture{of_cameras} and a scan", "Collect captures first."
+            f"the session has no capture with an image{of_cameras} and a scan", "Collect captures first."
         )
-    return join_shortages(troubles)
+    return join_shortages([not_enough(shortage) for shortage in shortages])
+
+
+def _shortage(pairs: Sequence[Pair], error: NotEnoughDataError) -> Finding:
+    """Name the sensors that lack captures, if the error does not."""
+    figures = {"text": error.what, "advice": error.hint}
+    found = error.finding or Finding("shortage.text", "warning", figures=figures)
+    return found if found.subject else replace(found, subject=f"{pairs[0].camera} and {pairs[0].lidar}")
 
 
 def _pairs_by_sensors(
     detections: Detections, cameras: Sequence[str] | None, channels: Sequence[str] | None
 ) -> list[list[Pair]]:
-    """Bring together the pairs of one camera and LiDAR, whose channels are calibrated as one."""
+    """Group the pairs by camera and LiDAR, whose channels are calibrated jointly."""
     held = sorted({pair.channel for pair in detections.pairs})
     unknown = sorted(set(channels or ()) - set(held))
     if unknown:
         raise UsageError(
-            f"no capture of the session holds channel {unknown[0]!r}", f"there is {', '.join(held)}"
+            f"no capture of the session has channel {unknown[0]!r}", f"Choose one of: {', '.join(held)}"
         )
     wanted = [
         pair
@@ -200,29 +217,40 @@ def _pairs_by_sensors(
     return list(groups.values())
 
 
-def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: CalibrateOptions) -> _Sensors:
-    """Gather the candidates of each channel that has captures enough, and why other captures are unusable.
+def _solve(
+    rig: Rig, detections: Detections, pairs: Sequence[Pair], options: CalibrateOptions, progress: Progress
+) -> _Solved:
+    """Estimate the extrinsics of one camera and LiDAR from their own captures alone.
 
     Raises:
-        NotEnoughDataError: no channel has.
+        NotEnoughDataError: there are too few, or a direction is undetermined.
+    """
+    sensors = _sensors(rig, detections, pairs, options)
+    clocks = clocks_of(rig, sensors.camera, sensors.lidar)
+    estimate = calibrate_channels(
+        sensors.candidates, rig.board.to_board(), sensors.settings, clocks, progress
+    )
+    return _Solved(sensors, estimate, _examine(rig, detections, sensors, estimate))
+
+
+def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: CalibrateOptions) -> _Sensors:
+    """Collect the candidates of each channel with enough captures, and why other captures are unusable.
+
+    Raises:
+        NotEnoughDataError: no channel has enough.
     """
     candidates: dict[str, list[CaptureCandidates]] = {}
     refused: dict[str, Refusal] = {}
-    needed = rig.quality.min_captures
-    trouble: NotEnoughDataError | None = None
+    shortages: list[Finding] = []
     for pair in pairs:
         own, own_refused = _candidates(detections, pair)
         refused |= {name: why for name, why in own_refused.items() if name not in refused}
-        if len(own) >= needed:
+        if len(own) >= rig.quality.min_captures:
             candidates[pair.channel] = own
-        elif trouble is None:
-            trouble = NotEnoughDataError(
-                f"{pair}: the board was found by both sensors in {len(own)} of "
-                f"{len(own) + len(own_refused)} captures, at least {needed} are needed",
-                _commonest(own_refused) or "collect more captures",
-            )
-    if not candidates and trouble is not None:
-        raise trouble
+        else:
+            shortages.append(_few_detected(pair, len(own), own_refused, rig.quality.min_captures))
+    if not candidates:
+        raise not_enough(shortages[0])
     found = {item.capture for items in candidates.values() for item in items}
     refused = {name: why for name, why in refused.items() if name not in found}
     settings = EstimateSettings.of(options, rig.lidars[pairs[0].lidar])
@@ -242,100 +270,92 @@ def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandida
     return candidates, refused
 
 
-def _commonest(refused: dict[str, Refusal]) -> str:
-    """List the commonest causes of refusal, one a line."""
-    counts = Counter(f"{why.stage}: {sentence(why)}" for why in refused.values())
-    return "\n".join(f"{n} x {text}" for text, n in counts.most_common(3))
+def _few_detected(pair: Pair, n_detected: int, refused: Mapping[str, Refusal], n_needed: int) -> Finding:
+    """State in how many captures both sensors found the board, and the most frequent causes of refusal."""
+    counts = Counter((why.code, f"{why.stage}: {sentence(why)}") for why in refused.values())
+    figures: dict[str, Figure] = {
+        "n_detected": n_detected,
+        "n_captures": n_detected + len(refused),
+        "n_needed": n_needed,
+        "causes": tuple((n, code, text) for (code, text), n in counts.most_common(3)),
+    }
+    return Finding("shortage.few_detected", "warning", str(pair), figures)
 
 
-def _links(rig: Rig, sensors: Sequence[_Sensors], alone: Sequence[CalibrationEstimate]) -> Iterator[_Link]:
-    """Compare cameras of one LiDAR that saw the same boards held still."""
-    for i, j in combinations(range(len(sensors)), 2):
-        if sensors[i].lidar == sensors[j].lidar and _is_still(alone[i]) and _is_still(alone[j]):
-            # Captures that contradict each other widen what a method claims: that must not excuse them.
-            pair = relate(alone[i], alone[j])
+def _links(rig: Rig, solved: Sequence[_Solved]) -> Iterator[_Link]:
+    """Compare cameras of one LiDAR that saw the same still boards."""
+    for (i, one), (j, other) in combinations(enumerate(solved), 2):
+        if one.sensors.lidar == other.sensors.lidar and one.is_still and other.is_still:
+            # Contradicting captures widen a method's covariance; that must not hide the contradiction.
+            pair = relate(one.estimate, other.estimate)
             if pair is not None:
-                names = sensors[i].camera, sensors[j].camera
-                yield _Link(i, j, pair, tuple(doubt_cameras(pair, names, rig.calibration, rig.verdict)))
+                names = one.sensors.camera, other.sensors.camera
+                yield _Link(i, j, pair, tuple(camera_findings(pair, names, rig.calibration, rig.verdict)))
 
 
-def _is_still(estimate: CalibrationEstimate) -> bool:
-    """Tell whether boards stood still, so that images count as they are, whenever they were taken."""
-    return all(channel.time_offset_s is None for channel in estimate.channels)
+def _solve_together(
+    rig: Rig, detections: Detections, alone: Sequence[_Solved], links: Sequence[_Link]
+) -> list[_Solved]:
+    """Estimate cameras that agree jointly with method "ml"; leave the others unchanged.
 
-
-def _estimate_together(
-    rig: Rig, sensors: Sequence[_Sensors], alone: Sequence[CalibrationEstimate], links: Sequence[_Link]
-) -> dict[int, TogetherEstimate]:
-    """Estimate cameras that agree together, with method "ml", by their place.
-
-    One that contradicts another is not among them, or it would spoil the other's extrinsic.
+    A camera that contradicts another is excluded, as it would corrupt the other's extrinsics.
     """
-    joint: dict[int, TogetherEstimate] = {}
-    for group in _groups(len(sensors), links):
-        settings = sensors[group[0]].settings
+    solved = list(alone)
+    for group in _groups(len(alone), links):
+        settings = alone[group[0]].sensors.settings
         if settings.method == "ml":
-            own = {sensors[k].camera: alone[k] for k in group}
-            joint |= dict.fromkeys(group, calibrate_together(own, rig.board.to_board(), settings))
-    return joint
+            own = {alone[k].sensors.camera: alone[k].estimate for k in group}
+            together = calibrate_together(own, rig.board.to_board(), settings)
+            for k in group:
+                solved[k] = _part_of(together, rig, detections, alone[k])
+    return solved
 
 
 def _groups(n: int, links: Sequence[_Link]) -> list[list[int]]:
-    """List groups of two or more that sound links connect, without those in which a link is doubted."""
+    """List groups of two or more connected cameras, without those that have a contradicted link."""
     group = list(range(n))
     for link in links:
-        if not link.doubts:
+        if not link.findings:
             mine, other = group[link.first], group[link.second]
             group = [mine if number == other else number for number in group]
-    doubted = {group[link.first] for link in links if link.doubts and group[link.first] == group[link.second]}
-    found = [[k for k in range(n) if group[k] == number] for number in sorted(set(group) - doubted)]
+    contradicted = {
+        group[link.first] for link in links if link.findings and group[link.first] == group[link.second]
+    }
+    found = [[k for k in range(n) if group[k] == number] for number in sorted(set(group) - contradicted)]
     return [members for members in found if len(members) > 1]
 
 
-def _from_all_cameras(
-    rig: Rig,
-    detections: Detections,
-    k: int,
-    sensors: _Sensors,
-    alone: CalibrationEstimate,
-    joint: Mapping[int, TogetherEstimate],
-) -> CalibrationEstimate:
-    """Give the estimate together with other cameras where there is one, else the camera's own."""
-    if k not in joint:
-        return alone
-    estimate = joint[k].estimates[sensors.camera]
-    sigma_deg, sigma_m = sigma_sizes(_examine(rig, detections, sensors, alone).cov)
-    figures = {"alone_sigma_rotation_deg": sigma_deg, "alone_sigma_translation_m": sigma_m}
-    return replace(
+def _part_of(together: TogetherEstimate, rig: Rig, detections: Detections, alone: _Solved) -> _Solved:
+    """Replace a camera's own estimate by its part of a joint one."""
+    estimate = together.estimates[alone.sensors.camera]
+    sigma_deg, sigma_m = sigma_sizes(alone.validation.cov)
+    estimate = replace(
         estimate,
-        diagnostics={**estimate.diagnostics, **figures},
-        channels=alone.channels,
-        channel_difference=alone.channel_difference,
-        channel_difference_cov=alone.channel_difference_cov,
+        diagnostics=replace(
+            estimate.diagnostics, alone_sigma_rotation_deg=sigma_deg, alone_sigma_translation_m=sigma_m
+        ),
+        channels=alone.estimate.channels,
+        channel_difference=alone.estimate.channel_difference,
+        channel_difference_cov=alone.estimate.channel_difference_cov,
     )
+    return _Solved(alone.sensors, estimate, _examine(rig, detections, alone.sensors, estimate), together)
 
 
-def _other_camera(
-    sensors: Sequence[_Sensors],
-    estimates: Sequence[CalibrationEstimate],
-    checked: Sequence[Validation],
-    k: int,
-    link: _Link,
-    joint: Mapping[int, TogetherEstimate],
-) -> OtherCamera:
-    """Say where the other camera of a link sits to camera k."""
+def _other_camera(solved: Sequence[_Solved], link: _Link, k: int) -> OtherCamera:
+    """State the pose of the other camera of a link relative to the camera of index k."""
     pair, is_second = link.pair, k == link.second
-    other = link.first if is_second else link.second
-    T, J = relative_pose(estimates[k].T_cam_lidar, estimates[other].T_cam_lidar)
+    own, other = solved[k], solved[link.first if is_second else link.second]
+    T, J = relative_pose(own.estimate.T_cam_lidar, other.estimate.T_cam_lidar)
     cov = None
-    if k in joint and joint[k] is joint.get(other):
-        # Widened as both extrinsics were.
-        J = J * np.repeat([checked[k].widened_by, checked[other].widened_by], 6)
-        cov = np.asarray(J @ joint[k].covariance_of(sensors[k].camera, sensors[other].camera) @ J.T)
+    if own.together is not None and own.together is other.together:
+        # Widened like both extrinsics.
+        J = J * np.repeat([own.validation.widened_by, other.validation.widened_by], 6)
+        both = own.together.covariance_of(own.sensors.camera, other.sensors.camera)
+        cov = np.asarray(J @ both @ J.T)
     seen = None if pair.pictures is None else pair.pictures.T_second_first
     apart_deg, apart_m = (None, None) if pair.apart is None else tangent_sizes(pair.apart)
     return OtherCamera(
-        camera=sensors[other].camera,
+        camera=other.sensors.camera,
         n_captures=len(pair.captures),
         T_cam_other=T,
         cov=cov,
@@ -350,7 +370,7 @@ def _examine(
     rig: Rig, detections: Detections, sensors: _Sensors, estimate: CalibrationEstimate
 ) -> Validation:
     """Check an estimate on its own captures and images."""
-    used = sorted(take_apart(estimate.used))
+    used = sorted(estimate.captures_of(estimate.used))
     channels = {channel.channel for channel in estimate.channels}
     views = []
     for name in used:
@@ -363,76 +383,81 @@ def _examine(
 
 
 def _judged(
-    rig: Rig,
-    detections: Detections,
-    sensors: _Sensors,
-    estimate: CalibrationEstimate,
-    examination: Validation,
-    between_cameras: Sequence[Finding],
-    others: tuple[OtherCamera, ...],
+    rig: Rig, detections: Detections, solved: Sequence[_Solved], links: Sequence[_Link], k: int
 ) -> Calibration:
+    """Judge the extrinsics of index k and assemble their result."""
+    sensors, estimate, validation = solved[k].sensors, solved[k].estimate, solved[k].validation
     camera, lidar = sensors.camera, sensors.lidar
+    mine = [link for link in links if k in (link.first, link.second)]
+    contradictions = [finding for link in mine for finding in link.findings]
     n_captures = len({name for pair in sensors.pairs for name in detections.captures(pair)})
-    verdict, findings = judge(estimate, examination, rig, camera, lidar, n_captures, between_cameras)
-    diagnostics = dict(estimate.diagnostics)
-    if examination.widened_by != 1:
-        diagnostics["sigma_widened"] = examination.widened_by
-    if estimate.channel_difference is not None:
-        rotation_deg, translation_m = tangent_sizes(estimate.channel_difference)
-        diagnostics |= {"channels_rotation_deg": rotation_deg, "channels_translation_m": translation_m}
+    verdict, findings = judge(estimate, validation, rig, camera, lidar, n_captures, contradictions)
     lens = rig.cameras[camera].to_intrinsics()
     return Calibration(
         camera=camera,
-        channel="+".join(channel.channel for channel in estimate.channels),
+        channels=tuple(channel.channel for channel in estimate.channels),
         lidar=lidar,
         T_cam_lidar=estimate.T_cam_lidar,
-        cov=examination.cov,
+        cov=validation.cov,
         certificate=estimate.certificate,
         metrics=estimate.metrics,
         n_captures=n_captures,
         n_detected=n_captures - len(sensors.refused),
-        captures_used=tuple(sorted(take_apart(estimate.used))),
+        captures_used=tuple(sorted(estimate.captures_of(estimate.used))),
         captures_refused=_still_refused(estimate, sensors.refused),
         verdict=verdict,
-        reasons=tuple(sentence(finding) for finding in findings),
         findings=findings,
-        diagnostics=diagnostics,
+        diagnostics=_diagnostics(estimate, validation),
         channel_results=estimate.channels,
         method=estimate.method,
-        uncertainty=point_uncertainties(estimate.T_cam_lidar, examination.cov, lens),
+        uncertainty=point_uncertainties(estimate.T_cam_lidar, validation.cov, lens),
         estimated_with=estimate.estimated_with,
-        other_cameras=others,
-        weak_direction=estimate.weak_direction,
+        other_cameras=tuple(_other_camera(solved, link, k) for link in mine),
+        weakest=estimate.weakest,
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,
         observations=estimate.observations,
     )
 
 
+def _diagnostics(estimate: CalibrationEstimate, validation: Validation) -> Diagnostics:
+    """Add what the validation and the comparison of channels found."""
+    figures = estimate.diagnostics
+    if validation.widened_by != 1:
+        figures = replace(figures, sigma_widened=validation.widened_by)
+    if estimate.channel_difference is None:
+        return figures
+    rotation_deg, translation_m = tangent_sizes(estimate.channel_difference)
+    return replace(figures, channels_rotation_deg=rotation_deg, channels_translation_m=translation_m)
+
+
 def _still_refused(estimate: CalibrationEstimate, refused: Mapping[str, Refusal]) -> dict[str, Refusal]:
-    """List refusals by capture, less what another channel of the same scan made up for."""
-    used = take_apart(estimate.used)
+    """List refusals by capture, except those for which another channel of the same scan is usable."""
+    used = estimate.captures_of(estimate.used)
     every = dict(refused)
     for name, why in estimate.refused.items():
-        every |= dict.fromkeys(take_apart([name]), why)
+        every |= dict.fromkeys(estimate.captures_of([name]), why)
     return {name: every[name] for name in sorted(every) if name not in used}
 
 
-def _compared(calibration: Calibration, reference: Array) -> Calibration:
-    """Report the error against a T_cam_lidar (4, 4) that somebody else vouches for."""
-    rotation_deg, translation_m = error_to_reference(calibration.T_cam_lidar, reference)
+def _compared(calibration: Calibration, reference: Reference | None) -> Calibration:
+    """Report the error from a reference T_cam_lidar, if there is one."""
+    truth = reference.of(calibration.camera, calibration.lidar) if reference else None
+    if truth is None:
+        return calibration
+    rotation_deg, translation_m = error_to_reference(calibration.T_cam_lidar, truth)
     return replace(calibration, egt_rotation_deg=rotation_deg, egt_translation_m=translation_m)
 
 
 def refusals_of(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refusal]:
-    """Say why captures of a pair cannot be used: a sensor saw no board, or both sensors disagree."""
+    """State why captures of a pair are unusable: a sensor found no board, or both sensors disagree."""
     candidates, refused = _candidates(detections, pair)
     consensus = find_consensus(candidates, rig.board.to_board()) if len(candidates) >= 3 else None
     return dict(sorted({**refused, **(consensus.refused if consensus else {})}.items()))
 
 
 def clocks_of(rig: Rig, camera: str, lidar: str) -> Clocks:
-    """Read what the profile says of the time of a camera and a LiDAR."""
+    """Read the time settings of a camera and a LiDAR from the profile."""
     stamps = {name: channel.timestamps for name, channel in rig.cameras[camera].channels.items()}
     return Clocks(
         sweep_s=1 / rig.lidars[lidar].rate_hz,

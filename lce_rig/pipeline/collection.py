@@ -1,4 +1,4 @@
-"""Recordings into a session, unattended: by their paths, or by readers of one's own."""
+"""Collect recordings into a session, from paths or your own readers."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,19 +31,19 @@ def collect_from(
     Args:
         rig: the profile.
         recordings: paths of folders, bags and files, or readers with the attributes of `Recording`; several
-            are of one moment and read as one.
+            simultaneous ones are read as one.
         session: its folder.
         options: what becomes a capture.
-        sources: how the paths are read, where the profile does not say.
+        sources: how to read the paths, if the profile does not say.
         progress: called with (done, total) samples.
 
     Returns:
         The session, open for reading.
 
     Raises:
-        SourceError: a recording cannot be read, or not to its end; what was captured before is kept.
-        SessionError: the folder holds something else, or cannot be written.
-        NotEnoughDataError: no capture could be made; the commonest causes are named.
+        SourceError: a recording cannot be read to its end; captures before it are kept.
+        SessionError: the folder is not a session, or cannot be written.
+        NotEnoughDataError: no capture could be made; the most frequent causes are named.
     """
     given: list[Source] = [*recordings] if isinstance(recordings, list | tuple) else [recordings]
     part = replace(sources or SourceOptions(), is_part=len(given) > 1)
@@ -71,7 +71,7 @@ def fill_session(
     options: CollectOptions | None = None,
     progress: Progress = silent,
 ) -> CollectReport:
-    """Add what recordings hold to the session in a folder, or start one there.
+    """Add recordings to the session in a folder, or start one there.
 
     Args:
         rig: the profile.
@@ -81,8 +81,8 @@ def fill_session(
         progress: called with (done, total) samples.
 
     Raises:
-        SourceError: nothing could be read at all.
-        SessionError: the folder holds something else, or cannot be written.
+        SourceError: nothing could be read.
+        SessionError: the folder is not a session, or cannot be written.
     """
     with Session.resume(session, rig) as writer:
         return collect(writer, recordings, options, lambda done, total, _message: progress(done, total))

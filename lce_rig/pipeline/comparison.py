@@ -1,4 +1,4 @@
-"""The same rig calibrated in several sessions: what each says, and whether they agree."""
+"""Compare the calibrations of one rig in several sessions."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -18,8 +18,9 @@ from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_part
 from lce_rig.session import Session
 from lce_rig.session.identity import DifferingKey, differing_keys
 from lce_rig.validation.repeatability import Repeatability, compare_calibrations
+from lce_rig.words import describe, recommend
 
-# What an extrinsic depends on beside the captures: another lens is another camera.
+# Inputs of the extrinsics besides the captures; another lens is another camera.
 _SAME_SENSORS = frozenset({"intrinsics", "resolution_px", "model"})
 
 
@@ -31,7 +32,7 @@ class Repeat:
         rig: its name.
         comparisons: one for each camera and LiDAR that at least two sessions calibrate.
         calibrated: names of the sessions that held no result and were calibrated for this.
-        findings: errors name sessions whose own calibration must not be used, warnings what else to know.
+        findings: errors name sessions whose own calibration has failed; warnings state limits.
     """
 
     rig: str
@@ -41,7 +42,7 @@ class Repeat:
 
     @property
     def failed(self) -> tuple[Finding, ...]:
-        """Calibrations that must not be used, by session and sensors."""
+        """Failed calibrations, by session and sensors."""
         return tuple(finding for finding in self.findings if finding.severity == "error")
 
 
@@ -81,7 +82,7 @@ def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
 def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: Progress = silent) -> Repeat:
     """Compare the results of independent sessions of one rig.
 
-    A session without a result is calibrated with the usual options; nothing is written.
+    A session without a result is calibrated with the default options; nothing is written.
 
     Args:
         folders: of the sessions.
@@ -96,7 +97,7 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
     """
     paths = [Path(folder) for folder in folders]
     if len(paths) < 2:
-        raise UsageError("one session alone has nothing to agree with", "Name two sessions or more.")
+        raise UsageError("a comparison requires two sessions or more, 1 given", "Give two sessions or more.")
     _require_different(paths)
     sessions = dict(zip(_names(paths), (Session.open(path) for path in paths), strict=True))
     _require_one_rig(sessions)
@@ -143,11 +144,11 @@ def _require_different(paths: Sequence[Path]) -> None:
     resolved = [path.resolve() for path in paths]
     for path, where in zip(paths, resolved, strict=True):
         if resolved.count(where) > 1:
-            raise UsageError(f"{path} is given twice", "A session agrees with itself; name independent ones.")
+            raise UsageError(f"{path} is given twice", "Give independent sessions.")
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Call sessions by their folder's name, or by their path where two have the same."""
+    """Name sessions by their folder, or by their path if two folders have the same name."""
     short = [path.resolve().name for path in paths]
     return short if len(set(short)) == len(short) else [str(path) for path in paths]
 
@@ -157,8 +158,8 @@ def _require_one_rig(sessions: dict[str, Session]) -> None:
     for name, session in others:
         if session.rig.name != first.rig.name:
             raise SessionError(
-                f"{first_name} is of rig {first.rig.name!r}, {name} of rig {session.rig.name!r}",
-                "Only sessions of one rig can be compared.",
+                f"{first_name} belongs to rig {first.rig.name!r}, {name} to rig {session.rig.name!r}",
+                "Compare sessions of one rig.",
             )
         keys = [key for key in differing_keys(first.rig, session.rig) if _is_of_sensors(key)]
         if keys:
@@ -169,18 +170,18 @@ def _require_one_rig(sessions: dict[str, Session]) -> None:
 
 
 def _is_of_sensors(difference: DifferingKey) -> bool:
-    """Tell whether a difference between profiles moves extrinsics."""
+    """Return whether a difference between profiles moves extrinsics."""
     block, *keys = difference.path
     return block in ("cameras", "lidars") and not _SAME_SENSORS.isdisjoint(keys)
 
 
 def _require_independent(sessions: dict[str, Session]) -> None:
-    """Refuse sessions that share pictures or scans: a copy agrees with its original whatever is wrong."""
+    """Refuse sessions that share images or scans: a copy agrees with its original despite any error."""
     hashes: dict[str, list[frozenset[str]]] = {}
     for name, session in sessions.items():
         hashes[name] = []
         for capture in session.captures:
-            # A damaged capture is named where it is read.
+            # A damaged capture is reported when it is read.
             with suppress(SessionError):
                 hashes[name].append(capture.file_hashes)
     for one, other in combinations(sessions, 2):
@@ -189,7 +190,7 @@ def _require_independent(sessions: dict[str, Session]) -> None:
         if n_shared:
             raise SessionError(
                 f"{one} and {other} share {n_shared} captures: they are not independent",
-                "Collect each session anew, best with the board put up again.",
+                "Collect each session separately, with the board mounted again.",
             )
 
 
@@ -203,17 +204,27 @@ def _other_boards(sessions: dict[str, Session]) -> list[Finding]:
 
 
 def _calibrate(name: str, session: Session) -> tuple[list[Calibration], list[Finding]]:
-    """Calibrate a session; and say which of its sensors could not be, and why.
+    """Calibrate a session, and report sensors that could not be calibrated.
 
     Raises:
-        NotEnoughDataError: none of them could; the session is named.
+        NotEnoughDataError: no sensors could be calibrated; the session is named.
     """
     try:
         result = calibrate(session)
     except NotEnoughDataError as error:
         raise NotEnoughDataError(f"{name}: {error.what}", error.hint) from None
     return list(result.pairs), [
-        Finding("repeat.not_calibrated", "warning", name, {"what": shortage.what, "hint": shortage.hint})
+        Finding(
+            "repeat.not_calibrated",
+            "warning",
+            name,
+            {
+                "sensors": shortage.subject,
+                "cause": shortage.code,
+                "what": describe(shortage),
+                "hint": recommend(shortage),
+            },
+        )
         for shortage in result.shortages
     ]
 
@@ -228,7 +239,7 @@ def _read_calibrations(session: Session, folder: Path) -> list[Calibration]:
     saved = read_result(path)
     if saved.rig != session.rig.name:
         raise SessionError(
-            f"{path} is of rig {saved.rig!r}, its session of rig {session.rig.name!r}",
+            f"{path} belongs to rig {saved.rig!r}, its session to rig {session.rig.name!r}",
             "Run `lce-rig calibrate` again.",
         )
     for calibration in saved.pairs:
@@ -243,7 +254,7 @@ def _read_calibrations(session: Session, folder: Path) -> list[Calibration]:
 def _comparisons(
     results: dict[str, list[Calibration]], *, are_independent: bool = True
 ) -> tuple[tuple[Repeatability, ...], list[Finding]]:
-    """Compare camera by camera and LiDAR by LiDAR; and say what only one session calibrates."""
+    """Compare each camera and LiDAR, and report those that only one session calibrates."""
     groups: dict[tuple[str, str], dict[str, Calibration]] = {}
     for name, calibrations in results.items():
         for calibration in calibrations:

@@ -1,4 +1,4 @@
-"""Find the board in every picture, every scan and all raw events of a session, once."""
+"""Find the board in every image, every scan and all raw events of a session, once."""
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -35,15 +35,15 @@ def detect(
     progress: Progress = silent,
     n_threads: int = 2,
 ) -> Detections:
-    """Find the board in all samples of a session; what was found before is not sought again.
+    """Find the board in all samples of a session, or read earlier detections from the cache.
 
-    A capture's raw events are seen through pictures made for the time at which the LiDAR saw the board.
+    Images are reconstructed from a capture's raw events for the time at which the LiDAR saw the board.
 
     Args:
         session: open for reading is enough.
-        event_image: how pictures are made of raw events; None as the profile says.
+        event_image: how to reconstruct images from raw events; None for the profile's method.
         progress: called with (done, total).
-        n_threads: detectors at work side by side.
+        n_threads: detectors that run in parallel.
 
     Raises:
         ProfileError: a network that the profile names cannot be used.
@@ -60,7 +60,7 @@ def detect(
         scanned = pool.map(lambda job: finder.scan(*job), scan_jobs)
         for (capture, lidar), scan in _counted(scan_jobs, scanned, progress, 0, total):
             lidars.setdefault(lidar, {})[capture.name] = scan
-        # What the LiDAR saw says when pictures of events are wanted.
+        # The LiDAR's detection gives the time for the images from events.
         pictured = pool.map(lambda job: finder.image(*job), image_jobs)
         developed = pool.map(lambda job: finder.events(*job, scans=_in_capture(lidars, job[0])), event_jobs)
         for jobs, seen, n_before in (
@@ -75,12 +75,12 @@ def detect(
 def event_picture(
     session: Session, capture: Capture, camera: str, channel: str, event_image: EventImage | None = None
 ) -> Image | Refusal:
-    """Give the picture through which a capture's raw events were seen, or why there is none.
+    """Return the image reconstructed from a capture's raw events, or the cause if there is none.
 
     Args:
         session: open for reading is enough.
         capture: holds events of the camera.
-        camera, channel: whose picture it is.
+        camera, channel: the image's camera and channel.
         event_image: as in `detect`.
     """
     finder = _Finder(session, event_image)
@@ -104,7 +104,7 @@ def _counted(
 
 @dataclass(frozen=True)
 class _Held:
-    """What a capture holds: pictures and raw events by (camera, channel), and scans by LiDAR."""
+    """What a capture holds: images and raw events by (camera, channel), and scans by LiDAR."""
 
     capture: Capture
     images: list[Key]
@@ -113,7 +113,7 @@ class _Held:
 
 
 class _Finder:
-    """Finds boards, and remembers them in the session's cache."""
+    """Detects boards and stores the detections in the session's cache."""
 
     def __init__(self, session: Session, event_image: EventImage | None) -> None:
         self._session = session
@@ -125,8 +125,8 @@ class _Finder:
     def held(self, captures: list[Capture]) -> list[_Held]:
         """List what each capture holds.
 
-        A capture whose manifest is damaged, or names sensors that the rig lacks, is asked for what the others
-        hold, so that every pair says so.
+        A capture with a damaged manifest, or with sensors that the rig lacks, counts as holding the same as
+        the others, so that every pair reports it.
         """
         known: dict[str, _Held] = {}
         for capture in captures:
@@ -135,7 +135,7 @@ class _Finder:
                 stored = [key for key in capture.image_keys if key not in made_here]
                 known[capture.name] = _Held(capture, stored, made_here, capture.lidars)
         if captures and not known:
-            check_capture(self._session.rig, captures[0])  # raises what is wrong with it
+            check_capture(self._session.rig, captures[0])  # raises the manifest's error
         every = list(known.values())
         images = sorted({key for each in every for key in each.images})
         events = sorted({key for each in every for key in each.events} - set(images))
@@ -143,7 +143,7 @@ class _Finder:
         return [known.get(capture.name, _Held(capture, images, events, lidars)) for capture in captures]
 
     def image(self, capture: Capture, camera: str, channel: str) -> ImageDetection:
-        """Find the board in a picture that the capture holds."""
+        """Find the board in an image that the capture holds."""
 
         def find() -> ImageDetection:
             try:
@@ -168,7 +168,7 @@ class _Finder:
     def events(
         self, capture: Capture, camera: str, channel: str, *, scans: Mapping[str, LidarDetection]
     ) -> ImageDetection:
-        """Find the board in raw events, and keep the picture it was found in."""
+        """Find the board in raw events, and keep the reconstructed image."""
         digest = self._event_digest(camera, channel)
 
         def find() -> ImageDetection:
@@ -182,7 +182,7 @@ class _Finder:
     def picture(
         self, capture: Capture, camera: str, channel: str, *, scans: Mapping[str, LidarDetection]
     ) -> Image | Refusal:
-        """Give the picture that raw events were seen through."""
+        """Return the image reconstructed from raw events."""
 
         def find() -> Image | Refusal:
             seen = see_events(self._session, capture, camera, channel, scans, self._event_image)
@@ -207,7 +207,7 @@ class _Finder:
         kind: type,
         find: Callable[[], ImageDetection | LidarDetection | Image],
     ) -> Any:
-        """Look a detection up in the session's cache, or make and keep it; a damaged sample is a refusal."""
+        """Read a detection from the session's cache, or make and store it; a damaged sample is a refusal."""
         try:
             check_capture(self._session.rig, capture)
             capture.check()
@@ -223,7 +223,7 @@ class _Finder:
         return detection
 
     def _require(self, detection: Any, kind: type) -> Any:
-        """Refuse what is kept of another kind of sample, or of another board, by a ValueError."""
+        """Raise a ValueError for a cached detection of another kind of sample or of another board."""
         if not isinstance(detection, (kind, Refusal)):
             raise ValueError(f"not a detection of kind {kind.__name__}")
         board = self._session.rig.board.to_board()
@@ -236,12 +236,12 @@ class _Finder:
 
 
 def _cache_key(digest: str, capture: Capture, sensor: str) -> str:
-    # Samples and stamps are part of the key: a capture may be removed and another take its name.
+    # Samples and timestamps are part of the key: a capture may be removed and another take its name.
     return f"{digest}/{capture.name}-{capture.manifest_sha256[:12]}.{sensor}"
 
 
 def detection_digest(rig: Rig) -> str:
-    """Name by 12 digits what a detection depends on beside the capture: the profile and the code."""
+    """Hash the inputs of a detection besides the capture, profile and code, to 12 digits."""
     digest = hashlib.sha256(rig.model_dump_json(include={"board", "cameras", "lidars", "quality"}).encode())
     package = Path(__file__).parents[1]
     sources = [
@@ -253,10 +253,9 @@ def detection_digest(rig: Rig) -> str:
 
 
 def event_channels(rig: Rig, capture: Capture, event_image: EventImage | None) -> list[tuple[str, str]]:
-    """List the (camera, channel) that are seen through pictures made here, of raw events.
+    """List the (camera, channel) whose images are reconstructed here from raw events.
 
-    A picture that a capture holds already, made by others, is taken in place of one made here, unless a way
-    of making it is asked for.
+    An image that the capture already holds takes precedence, unless a method of reconstruction is requested.
 
     Raises:
         SessionError: the capture is damaged, or names sensors that the rig lacks.
@@ -278,14 +277,14 @@ def see_events(
     lidars: Mapping[str, LidarDetection],
     event_image: EventImage | None,
 ) -> EventSighting:
-    """Make a picture of a capture's events for the time at which the LiDAR saw the board, and find it there.
+    """Reconstruct an image of a capture's events for the LiDAR's time of the board, and find the board in it.
 
     Args:
-        session: whose profile says how.
+        session: its profile gives the method.
         capture: holds the camera's events.
-        camera, channel: whose picture it is.
-        lidars: what was seen in the capture's scans, by LiDAR.
-        event_image: in place of the profile's method.
+        camera, channel: the image's camera and channel.
+        lidars: detections in the capture's scans, by LiDAR.
+        event_image: replaces the profile's method.
 
     Raises:
         ProfileError: the network cannot be used; with file and key.
@@ -313,10 +312,10 @@ def see_events(
 def picture_stamp_ns(
     rig: Rig, capture: Capture, camera: str, channel: str, lidars: Mapping[str, LidarDetection]
 ) -> int | None:
-    """Say when a LiDAR saw the board, on a channel's own clock; None where no scan carries a stamp.
+    """Return when a LiDAR saw the board, on the channel's clock; None if no scan has a timestamp.
 
-    Of several LiDARs the first in the profile counts that found the board; where none did, or points carry no
-    times, the middle of the sweep.
+    Of several LiDARs, the first in the profile that found the board counts. If none did, or points have no
+    times, the time is the middle of the scan.
     """
     names = [name for name in rig.lidars if name in lidars]
     for name in sorted(names, key=lambda name: not isinstance(lidars[name], list)):
@@ -336,13 +335,13 @@ def picture_stamp_ns(
 def event_digest(
     session: Session, camera: str, channel: str, event_image: EventImage | None, base: str
 ) -> str:
-    """Name the cache after everything that pictures of events depend on beside the capture.
+    """Name the cache by the inputs of images from events besides the capture.
 
     Args:
-        session: whose profile says how pictures are made.
-        camera, channel: whose pictures they are.
-        event_image: in place of the profile's method.
-        base: what all detections depend on.
+        session: its profile gives the method.
+        camera, channel: the images' camera and channel.
+        event_image: replaces the profile's method.
+        base: inputs of all detections.
 
     Raises:
         ProfileError: the network's file cannot be read; with file and key.
@@ -361,14 +360,14 @@ def event_digest(
 
 
 def check_networks(rig: Rig, source: str) -> None:
-    """Make sure that every network that a profile names can be used.
+    """Check that every network that a profile names is usable.
 
     Args:
         rig: the profile.
         source: its file, for errors.
 
     Raises:
-        ProfileError: one cannot; with file and key.
+        ProfileError: one is not; with file and key.
     """
     for camera, settings in rig.cameras.items():
         for channel, stream in settings.channels.items():
@@ -380,7 +379,7 @@ def check_networks(rig: Rig, source: str) -> None:
 
 
 def _sweep_s(rig: Rig, lidars: Mapping[str, LidarDetection]) -> float | None:
-    """Measure how long the LiDAR saw the board; None where it did not."""
+    """Measure how long the LiDAR saw the board; None if it did not."""
     from lce_rig.detect.events.figures import sweep_time_s
 
     for name, found in lidars.items():
@@ -390,7 +389,7 @@ def _sweep_s(rig: Rig, lidars: Mapping[str, LidarDetection]) -> float | None:
 
 
 def _in_profile(source: str, camera: str, channel: str, error: ProfileError) -> ProfileError:
-    """Name the file and the key that an error about a network comes from."""
+    """Add the file and the key to an error about a network."""
     key = f"cameras.{camera}.channels.{channel}.reconstruction.model"
     return ProfileError(f"{source}: {key}: {error.what}", error.hint)
 

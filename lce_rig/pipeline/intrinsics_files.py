@@ -1,4 +1,4 @@
-"""Measured intrinsics as files: a block for the profile, a new profile, camera_info, a page of pictures."""
+"""Write measured intrinsics as files: a block for the profile, a new profile, camera_info, plots."""
 
 import json
 from collections.abc import Collection, Mapping, Sequence
@@ -38,16 +38,16 @@ _PIXEL_DIGITS, _COEFFICIENT_DIGITS = 4, 8
 
 
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
-    """Write the session's intrinsics/ as a whole; an earlier run's files move to intrinsics/previous/.
+    """Write the session's intrinsics/ in one step; an earlier run's files move to intrinsics/previous/.
 
-    For each camera a block to paste into the profile, a camera_info file and a page of images; and
-    intrinsics.json for machines. Cameras that an earlier run measured and this one did not stay.
+    For each camera a block to paste into the profile, a camera_info file and a page of plots; and
+    intrinsics.json for machines. Cameras that only an earlier run measured are kept.
 
     Returns:
         The files of this run.
 
     Raises:
-        LceRigError: a file cannot be written, or does not read back as it was; earlier ones are untouched.
+        LceRigError: a file cannot be written or reads back differently; earlier ones are unchanged.
     """
     names = [DOCUMENT]
 
@@ -68,7 +68,7 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
 
 
 def _write_camera(folder: Path, rig: Rig, one: MeasuredIntrinsics) -> tuple[str, ...]:
-    """Write the files of one camera and give their names."""
+    """Write the files of one camera and return their names."""
     from lce_rig.verify.intrinsics_plot import draw_intrinsics
     from lce_rig.verify.overlay_files import write_picture
 
@@ -93,7 +93,7 @@ def _file_names(camera: str) -> tuple[str, str, str]:
 
 
 def _other_cameras(path: Path, measured: Collection[str]) -> dict[str, dict[str, Any]]:
-    """Read what an earlier run says of cameras that were not measured again; nothing where it is damaged."""
+    """Read an earlier run's entries of cameras that were not measured again; none if damaged."""
     try:
         cameras = read_json(path)["cameras"]
         return {str(each["camera"]): each for each in cameras if each["camera"] not in measured}
@@ -102,7 +102,7 @@ def _other_cameras(path: Path, measured: Collection[str]) -> dict[str, dict[str,
 
 
 def final(measured: MeasuredIntrinsics) -> Intrinsics:
-    """Give the intrinsics with as many digits as every file holds."""
+    """Return the intrinsics rounded as in every file."""
     lens = measured.estimate.intrinsics
     fx, fy, cx, cy = (
         round(value, _PIXEL_DIGITS) for value in (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
@@ -112,11 +112,11 @@ def final(measured: MeasuredIntrinsics) -> Intrinsics:
 
 
 def profile_block(rig: Rig, measured: MeasuredIntrinsics) -> str:
-    """Write the block `intrinsics:` of the camera as a profile holds it, indented to be pasted."""
+    """Write the camera's block `intrinsics:`, indented for pasting into a profile."""
     lens, sigma = final(measured), measured.estimate.sigma
     lines = [f"# {line}" for line in _head(rig, measured)]
     lines += [
-        f"# In the profile this block belongs to cameras.{measured.camera}, whose pictures have",
+        f"# In the profile this block belongs to cameras.{measured.camera}, whose images have",
         f"#   resolution_px: [{lens.width_px}, {lens.height_px}]",
         "    intrinsics:",
         f"      model: {lens.model}",
@@ -130,14 +130,16 @@ def profile_block(rig: Rig, measured: MeasuredIntrinsics) -> str:
 
 
 def save_profile(session: Session, measured: Sequence[MeasuredIntrinsics], path: Path) -> None:
-    """Write the session's profile with the measured intrinsics in place of its own, comments kept.
+    """Write the session's profile with the measured intrinsics, keeping its comments.
 
     Raises:
         UsageError: the file exists already.
         ProfileError: the intrinsics make no valid profile.
     """
     if path.exists():
-        raise UsageError(f"{path} exists already", "Name another file: a profile is never written over.")
+        raise UsageError(
+            f"{path} exists already", "Choose another file; an existing profile is never overwritten."
+        )
     text = _profile_text(session.rig)
     for one in measured:
         lens, block = final(one), f"cameras.{one.camera}"
@@ -153,7 +155,7 @@ def save_profile(session: Session, measured: Sequence[MeasuredIntrinsics], path:
 
 
 def _profile_text(rig: Rig) -> str:
-    """Find the text of a profile with its comments: a session keeps none, a shipped profile does."""
+    """Find the text of a profile with comments: a shipped profile has them, a session's does not."""
     if rig.name in shipped_profiles() and load_rig(rig.name) == rig:
         return read_profile(find_profile(rig.name))
     return dump_rig(rig)
@@ -164,17 +166,17 @@ def _head(rig: Rig, measured: MeasuredIntrinsics) -> list[str]:
     n = len({view.capture for view in estimate.views})
     return [
         f"intrinsics of camera {measured.camera} of rig {rig.name}, measured by {MADE_BY} from {n} captures",
-        f"corners off by {estimate.rms_px:.3f} px rms, {estimate.held_out_rms_px:.3f} px on captures left "
-        "out",
+        f"reprojection error {estimate.rms_px:.3f} px rms, {estimate.held_out_rms_px:.3f} px on held-out "
+        "captures",
         *(f"weak: {text}" for text in measured.weaknesses),
     ]
 
 
 def _check(path: Path, wanted: Intrinsics) -> None:
-    """Read a camera_info file back: it must be the same camera."""
+    """Read a camera_info file back and compare it."""
     given, read = ros_distortion(wanted)[1], read_camera_info(path)
     if read != replace(wanted, distortion=given):
-        raise LceRigError(f"{path}: reads back as another camera")
+        raise LceRigError(f"{path}: reads back with different intrinsics")
 
 
 def document(
@@ -232,7 +234,7 @@ def _settings(lens: Intrinsics) -> dict[str, Any]:
 
 
 def _figure(value: float | None) -> float | None:
-    """Give null for what could not be computed, as where the profile's lens draws nothing."""
+    """Return null for a figure that is not finite, as when the profile's intrinsics project nothing."""
     return value if value is not None and np.isfinite(value) else None
 
 
@@ -241,7 +243,7 @@ def _refusals(refused: Mapping[str, Refusal]) -> dict[str, Any]:
 
 
 def _comparison(measured: MeasuredIntrinsics) -> dict[str, Any] | None:
-    """How the profile's intrinsics compare; null where they belong to another resolution."""
+    """Compare the profile's intrinsics; null if they are for another resolution."""
     check, difference = measured.check, measured.difference
     if check is None or difference is None:
         return None

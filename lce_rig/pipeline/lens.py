@@ -1,4 +1,4 @@
-"""Intrinsics of a session's cameras from its own pictures of the board."""
+"""Estimate the intrinsics of a session's cameras from its images of the board."""
 
 from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
@@ -25,27 +25,27 @@ from lce_rig.words import describe
 
 AUTO = "auto"
 Key = tuple[str, str]
-"""Capture and channel of a picture."""
-# A usual lens, for where the profile's draws nothing sensible: 64 deg wide.
+"""Capture and channel of an image."""
+# A typical field of view, 64 deg, if the profile's intrinsics are unusable.
 _GUESSED_FOCAL = 0.8
 _ANY_REPROJECTION_PX = 1e9
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredIntrinsics:
-    """A camera's intrinsics from the boards of a session, held against the profile's.
+    """A camera's intrinsics from the boards of a session, compared with the profile's.
 
     Attributes:
         camera: its name.
-        channels: whose pictures were used.
-        given: what the profile says; at another resolution, where the pictures have another.
-        estimate: what the boards say.
-        choice: why this model, where models were compared.
-        check: the profile's against the estimate; None where they belong to another resolution.
-        difference: pixel by pixel; None likewise.
-        certainty: of the estimate, pixel by pixel.
-        weaknesses: what the captures leave open, and what to do.
-        refused: name of a picture -> why it is not behind the estimate.
+        channels: the channels whose images were used.
+        given: the profile's intrinsics, scaled to the images if their resolution differs.
+        estimate: the intrinsics from the boards.
+        choice: the chosen model and why, if models were compared.
+        check: the profile's intrinsics compared with the estimate; None if they are for another resolution.
+        difference: per pixel; None likewise.
+        certainty: of the estimate, per pixel.
+        weaknesses: what the captures do not determine, and what to do.
+        refused: name of an image -> why the estimate does not use it.
     """
 
     camera: str
@@ -68,22 +68,22 @@ def measure_intrinsics(
     model: str | None = None,
     progress: Progress = silent,
 ) -> MeasuredIntrinsics:
-    """Fit a camera's intrinsics to the boards in its pictures.
+    """Fit a camera's intrinsics to the boards in its images.
 
-    Corners are found with the profile's intrinsics, which decide nothing but which corners look misplaced.
-    Where these turn out far off, corners are looked for again with the fitted ones.
+    The profile's intrinsics only decide which corners look misplaced. If they turn out to be wrong, corners
+    are detected again with the fitted ones.
 
     Args:
         session: open for reading is enough.
         camera: its name.
-        channels: whose pictures to use, as they share lens and pixels; those of frames where left out, or of
-            events where there are no frames.
-        model: name of a lens model, or "auto" to compare them; the profile's where None.
+        channels: the channels whose images to use, as they share the lens; by default those of kind frames,
+            or of events if there are no frames.
+        model: name of a lens model, or "auto" to compare all; the profile's if None.
         progress: called with (done, total).
 
     Raises:
         UsageError: no such channel or model.
-        NotEnoughDataError: too few pictures show the board, or they leave the focal length open.
+        NotEnoughDataError: too few images show the board, or the focal length is undetermined.
     """
     rig = session.rig
     if model not in (None, AUTO, *MODELS):
@@ -118,7 +118,7 @@ def _channels(rig: Rig, camera: str, wanted: Sequence[str]) -> tuple[str, ...]:
 
 
 class _Samples:
-    """The pictures of one camera's channels in a session."""
+    """The images of one camera's channels in a session."""
 
     def __init__(self, session: Session, camera: str, channels: Sequence[str]) -> None:
         self._session = session
@@ -128,7 +128,7 @@ class _Samples:
         self._jobs = list(_pictures(session.captures, camera, channels))
 
     def lens_at_their_size(self, given: Intrinsics) -> Intrinsics:
-        """Scale intrinsics to the size of the first picture that can be read, where it is another."""
+        """Scale intrinsics to the size of the first readable image, if it differs."""
         for capture, channel in self._jobs:
             try:
                 image = capture.image(self._camera, channel)
@@ -148,9 +148,9 @@ class _Samples:
         only: Container[Key] | None = None,
         progress: Progress = silent,
     ) -> dict[Key, ImageDetection]:
-        """Find the board in every picture, or in some of them only.
+        """Find the board in every image, or in some of them only.
 
-        Of a channel without pictures, what the session's own detection sees in its events is taken.
+        For a channel without images, the session's detections in its events are used.
         """
         jobs = [
             (capture, channel)
@@ -191,7 +191,7 @@ class _Samples:
 def _pictures(
     captures: Iterable[Capture], camera: str, channels: Sequence[str]
 ) -> Iterable[tuple[Capture, str]]:
-    """List the pictures of the channels; a capture whose manifest is damaged is named by each of them."""
+    """List the images of the channels; every channel reports a capture with a damaged manifest."""
     for capture in captures:
         try:
             held = capture.image_keys
@@ -201,7 +201,7 @@ def _pictures(
 
 
 def _is_doubtful(board: ImageDetection, limit_px: float) -> bool:
-    """Tell whether a wrong lens may have spoilt a detection: the board, its pose, or single corners."""
+    """Return whether wrong intrinsics may have caused a detection to fail: board, pose or single corners."""
     if isinstance(board, Refusal):
         return True
     return board.reprojection_px > limit_px or (
@@ -242,7 +242,7 @@ def _require_boards(camera: str, found: Mapping[Key, ImageDetection]) -> None:
     raise NotEnoughDataError(
         f"camera {camera}: the board is in {n} of {total} captures, intrinsics need {MIN_CAPTURES} at least "
         "and 15 for a good result",
-        hint or "collect captures with pictures of the board first",
+        hint or "collect captures with images of the board first",
     )
 
 

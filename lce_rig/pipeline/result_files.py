@@ -1,4 +1,4 @@
-"""The files of a result in its session: written whole, fingerprinted, the last usable ones before kept."""
+"""Write the files of a result into its session in one step; keep the last usable earlier ones."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, UsageError
+from lce_rig.core.findings import Finding
 from lce_rig.core.limits import read_file
 from lce_rig.core.results import Calibration
 from lce_rig.session import Session
@@ -30,20 +31,20 @@ class Result:
     """The extrinsics of a session's sensors.
 
     Attributes:
-        session: whose captures they come from.
-        pairs: one for each camera and LiDAR that could be calibrated.
-        shortages: for each other camera and LiDAR with captures, why it has none.
+        session: the source of the captures.
+        pairs: one for each calibrated camera and LiDAR.
+        shortages: for each other camera and LiDAR with captures, why it has no result.
     """
 
     session: Session
     pairs: tuple[Calibration, ...]
-    shortages: tuple[NotEnoughDataError, ...] = ()
+    shortages: tuple[Finding, ...] = ()
 
     def of(self, camera: str, lidar: str | None = None) -> Calibration:
-        """Give the extrinsic of a camera with a LiDAR, by default the first that has one.
+        """Return the extrinsics of a camera with a LiDAR, by default the first with a result.
 
         Raises:
-            NotEnoughDataError: they have none.
+            NotEnoughDataError: they have no result.
         """
         for pair in self.pairs:
             if pair.camera == camera and lidar in (None, pair.lidar):
@@ -54,7 +55,7 @@ class Result:
         """Build the content of result.json from plain types.
 
         Raises:
-            SessionError: a capture that was used is no longer there.
+            SessionError: a capture that was used is missing.
             ResultRefusedError: a pose or covariance is not finite.
         """
         from lce_rig.export.result import to_json_dict
@@ -62,7 +63,7 @@ class Result:
         return to_json_dict(self.session.rig.name, self.pairs, inputs_sha256(self.session, self.pairs))
 
     def text(self) -> str:
-        """Write the content of result.json; raises as `document`."""
+        """Write the content of result.json; raises like `document`."""
         from lce_rig.export.result import layout
 
         return layout(self.document())
@@ -70,7 +71,7 @@ class Result:
     def write(
         self, folder: Path | str | None = None, *, name: str | None = None, force: bool = False
     ) -> "WrittenResults":
-        """Write result.json and, unless a verdict forbids it, every export.
+        """Write result.json and, unless a verdict is fail, all exports.
 
         Args:
             folder: None, or the session's calibration/: the files there are replaced in one step, and the
@@ -79,7 +80,7 @@ class Result:
             force: export failed results too; each file then says so.
 
         Raises:
-            SessionError: a capture that was used is gone, or the disk is full.
+            SessionError: a capture that was used is missing, or the disk is full.
             ResultRefusedError: a pose or covariance is not finite.
         """
         own = self.session.path / CALIBRATION
@@ -91,14 +92,14 @@ class Result:
 
 @dataclass(frozen=True)
 class WrittenResults:
-    """What a run left in the session's calibration/.
+    """The files in the session's calibration/ after a run.
 
     Attributes:
         files: the result.json and exports of this run.
-        previous: the folder with the earlier run's files; None where there was none.
-        has_usable_previous: whether that run had a result that may be used.
-        only_previous: cameras and LiDARs with a usable result there and none, usable or not, in this run.
-        is_same: whether this result is the same to the byte as the one that was there.
+        previous: the folder with the earlier run's files; None if there was none.
+        has_usable_previous: whether that run had a usable result.
+        only_previous: cameras and LiDARs with a usable result there and no result in this run.
+        is_same: whether this result is identical byte for byte to the earlier one.
         had_overlays: whether overlays of the earlier result moved to `previous`, and this one has none.
     """
 
@@ -111,10 +112,10 @@ class WrittenResults:
 
 
 def result_parts(name: str | None) -> tuple[str, ...]:
-    """Give the path in a session of the result of a name; None is its main one, in calibration/.
+    """Return the path in a session of a named result; None for the main one, in calibration/.
 
     Raises:
-        UsageError: a name that is no folder's, or one that results have anyway.
+        UsageError: a name that cannot be a folder's, or is reserved.
     """
     if name is None or name == CURRENT:
         return (CALIBRATION,)
@@ -131,12 +132,12 @@ def result_parts(name: str | None) -> tuple[str, ...]:
 def write_results(
     session: Session, calibrations: Sequence[Calibration], *, force: bool, name: str | None = None
 ) -> WrittenResults:
-    """Write result.json and, unless a verdict forbids it, every export, in place of an earlier run's.
+    """Write result.json and, unless a verdict is fail, all exports, replacing an earlier run's.
 
-    All files of a run appear together. Those of the earlier run move to calibration/previous/; a failed run
-    never takes the place of a usable one there, nor one without a camera whose only usable result is there.
-    Where the result is the same to the byte, overlays and calibration/previous/ stay. Files that lce-rig did
-    not write stay, too.
+    All files of a run appear together. Those of the earlier run move to calibration/previous/, except that
+    neither a failed run nor one without a camera's only usable result replaces a usable run there. If the
+    result is identical byte for byte, overlays and calibration/previous/ stay. Files that lce-rig did not
+    write stay, too.
 
     Args:
         session: whose result it is.
@@ -145,8 +146,9 @@ def write_results(
         name: writes results/NAME/ instead of calibration/.
 
     Raises:
-        UsageError: the name cannot be one.
-        SessionError: a capture that was used is gone, or the disk is full; the earlier files are untouched.
+        UsageError: the name is not valid.
+        SessionError: a capture that was used is missing, or the disk is full; the earlier files are
+            unchanged.
         ResultRefusedError: a pose or covariance is not finite; the same.
     """
     parts = result_parts(name)
@@ -176,7 +178,7 @@ def write_results(
 def _write_files(
     folder: Path, session: Session, calibrations: Sequence[Calibration], *, force: bool
 ) -> list[str]:
-    """Write result.json and the exports of what may be used; give the files' names."""
+    """Write result.json and the exports of usable results; return the files' names."""
     from lce_rig.export import export, remove_exports
     from lce_rig.export.result import write_result
 
@@ -189,15 +191,15 @@ def _write_files(
 
 
 def inputs_sha256(session: Session, calibrations: Sequence[Calibration]) -> dict[str, str]:
-    """Fingerprint what results were made from: the profile, and the manifest of every capture used.
+    """Fingerprint the inputs of results: the profile, and the manifest of every capture used.
 
-    A manifest vouches for the capture's files, whose SHA-256 it holds.
+    A manifest holds the SHA-256 of the capture's files.
 
     Returns:
         SHA-256 by path in the session.
 
     Raises:
-        SessionError: a capture that was used is no longer there.
+        SessionError: a capture that was used is missing.
     """
     used = sorted({name for calibration in calibrations for name in calibration.captures_used})
     profile = hashlib.sha256(read_file(session.path / PROFILE)).hexdigest()
@@ -206,12 +208,12 @@ def inputs_sha256(session: Session, calibrations: Sequence[Calibration]) -> dict
 
 
 def is_usable(folder: Path) -> bool:
-    """Tell whether a folder holds the result of a calibration that did not fail."""
+    """Return whether a folder holds the result of a calibration that did not fail."""
     return bool(_usable(folder))
 
 
 def _usable(folder: Path) -> set[str]:
-    """Name the cameras and LiDARs of which a folder holds a result that did not fail."""
+    """Name the cameras and LiDARs with a result in a folder that did not fail."""
     from lce_rig.export.result import read_result
 
     with suppress(LceRigError):
@@ -224,17 +226,17 @@ def _usable(folder: Path) -> set[str]:
 def keep_earlier(
     earlier: Path, draft: Path, document: str, is_ours: Callable[[Path], bool], *, deserves: bool = True
 ) -> bool:
-    """Take over into a draft what the folder that it replaces holds.
+    """Copy files to keep from a folder into the draft that replaces it.
 
     Args:
         earlier: need not exist.
         draft: with the new files.
-        document: the name of the file that tells whether the new result is another one.
-        is_ours: tells the files of a result from those of the user, which stay.
-        deserves: whether the earlier files, not those that were earlier than they, become `previous/`.
+        document: name of the file to compare both results by.
+        is_ours: returns whether a file belongs to a result; the user's files stay.
+        deserves: whether the earlier files become `previous/`; else the present `previous/` stays.
 
     Returns:
-        Whether both results are the same to the byte: then what was previous stays so.
+        Whether both results are identical byte for byte; then `previous/` stays.
 
     Raises:
         OSError: a full disk, no permission; or `previous` is a file, or a link.
@@ -258,7 +260,7 @@ def keep_earlier(
 
 
 def keep_foreign(earlier: Path, draft: Path, is_ours: Callable[[Path], bool]) -> None:
-    """Take what the user put into a folder over into the draft that replaces it.
+    """Copy the user's files from a folder into the draft that replaces it.
 
     Raises:
         OSError: a full disk, no permission.
@@ -271,15 +273,15 @@ def keep_foreign(earlier: Path, draft: Path, is_ours: Callable[[Path], bool]) ->
 
 @dataclass(frozen=True, eq=False)
 class StoredResult:
-    """A result of a session as it lies on the disk.
+    """A result of a session on the disk.
 
     Attributes:
-        name: "current" and "previous" for those in calibration/, else as `calibrate --name` was told.
+        name: "current" and "previous" for those in calibration/, else the name of `calibrate --name`.
         folder: with its result.json.
-        saved: its content; None where it cannot be read.
-        problem: why it cannot; "" where it can.
+        saved: its content; None if it cannot be read.
+        problem: why it cannot be read; "" if it can.
         written_s: when it was written, seconds since 1970.
-        is_outdated: whether the profile, or a capture that it used, is another one now or gone.
+        is_outdated: whether the profile or a capture that it used has changed or is missing.
     """
 
     name: str
@@ -315,7 +317,7 @@ def _stored(session: Session, name: str) -> StoredResult:
 
 
 def _is_outdated(session: Session, saved: "SavedResult") -> bool:
-    """Tell whether a session no longer holds what a result was made from."""
+    """Return whether a result's inputs in its session have changed."""
     try:
         return dict(saved.inputs_sha256) != inputs_sha256(session, saved.pairs)
     except LceRigError:
@@ -323,7 +325,7 @@ def _is_outdated(session: Session, saved: "SavedResult") -> bool:
 
 
 def result_content(session: Session, name: str | None = None) -> bytes | None:
-    """Read a result.json of the session as it lies on the disk; None where there is none.
+    """Read a result.json of the session; None if there is none.
 
     Raises:
         SessionError: it cannot be read.
@@ -336,7 +338,7 @@ def result_content(session: Session, name: str | None = None) -> bytes | None:
 
 
 def _keep_earlier_results(earlier: Path, draft: Path) -> bool:
-    """Keep the last usable result, and overlays with their result; tell whether both results are the same."""
+    """Keep the last usable result, and overlays with their result; return whether both results are equal."""
     usable, kept = _usable(earlier), _usable(earlier / PREVIOUS)
     deserves = (bool(usable) or not kept) and kept <= usable | _usable(draft)
     is_same = keep_earlier(earlier, draft, RESULT, _is_of_a_result, deserves=deserves)
@@ -352,7 +354,7 @@ def _is_of_a_result(path: Path) -> bool:
 
 
 def _content(path: Path) -> bytes | None:
-    """Read a file; None where there is none, or nothing that lce-rig wrote: a folder, a pipe, too large."""
+    """Read a file; None if there is none, or if lce-rig did not write it: a folder, a pipe, too large."""
     with suppress(FileNotFoundError, IsADirectoryError, ValueError):
         return read_file(path)
     return None

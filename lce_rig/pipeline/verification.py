@@ -1,4 +1,4 @@
-"""Extrinsics compared with captures: residuals, overlays, and what each sensor saw."""
+"""Compare extrinsics with captures: residuals, overlays, and the sensors' detections."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,13 +26,13 @@ class Verification:
     """Extrinsics compared with the captures of a session.
 
     Attributes:
-        session: whose captures were looked at.
-        checks: one for each channel of a camera and LiDAR that the session holds captures of.
-        calibrations: the extrinsics, also of sensors that it holds no captures of.
+        session: the source of the captures.
+        checks: one for each channel of a camera and LiDAR with captures in the session.
+        calibrations: the extrinsics, including those of sensors without captures.
         detections: of the session.
-        event_image: how pictures are made of raw events, as the detections were made.
-        own_result: content of the session's result.json where the calibrations are those in it, else None.
-        name: of the session's result that they are those of; None for the one in calibration/.
+        event_image: how images were reconstructed from raw events for the detections.
+        own_result: content of the session's result.json if the calibrations come from it, else None.
+        name: of that result; None for the one in calibration/.
     """
 
     session: Session
@@ -45,26 +45,26 @@ class Verification:
 
     @property
     def unchecked(self) -> tuple[Calibration, ...]:
-        """Extrinsics of sensors that the session holds no captures of."""
+        """Extrinsics of sensors without captures in the session."""
         checked = {(check.pair.camera, check.pair.lidar) for check in self.checks}
         return tuple(c for c in self.calibrations if (c.camera, c.lidar) not in checked)
 
     def write(
         self, folder: Path | str | None = None, *, progress: Progress = silent
     ) -> tuple[SessionCheck, ...]:
-        """Draw the LiDAR into every picture of the session.
+        """Project the point clouds into all images of the session.
 
         Args:
-            folder: for the images; by default overlays/ beside the session's result.json where the result is
-                its own, else the session's overlays/, replaced as a whole. Several pairs get a folder each.
+            folder: for the images; by default overlays/ beside the session's result.json if the result is its
+                own, else the session's overlays/, replaced in one step. Several pairs get a folder each.
             progress: called with (done, total) for each pair in turn.
 
         Returns:
-            The checks, with their pictures.
+            The checks, with their images.
 
         Raises:
-            SessionError: a picture cannot be written; or the session's result was replaced meanwhile, and the
-                overlays there are untouched.
+            SessionError: an image cannot be written; or the session's result was replaced meanwhile, in which
+                case the overlays there are unchanged.
         """
         session = self.session
         if folder is not None:
@@ -111,15 +111,15 @@ def verify(
     """Compare extrinsics with every capture of a session.
 
     Args:
-        session: may be another one than the extrinsics come from.
-        result: of `calibrate` or `read_result`; None takes the session's own result.json.
-        name: of the session's result to take; None for the one in calibration/.
-        detections: of this session; None detects the board first.
-        event_image: how pictures are made of raw events, as the detections were made.
+        session: may differ from the session that the extrinsics come from.
+        result: of `calibrate` or `read_result`; None for the session's result.json.
+        name: of the session's result to check; None for the one in calibration/.
+        detections: of this session; None to detect the board first.
+        event_image: how images were reconstructed from raw events for the detections.
         progress: called with (done, total) while the board is detected.
 
     Raises:
-        SessionError: there is no result, or it is of another rig; or the session has no captures of its
+        SessionError: there is no result, it belongs to another rig, or the session has no captures of its
             sensors.
     """
     calibrations, own_result = _extrinsics(session, result, name)
@@ -132,16 +132,14 @@ def verify(
     )
     if not checks:
         wanted = ", ".join(str(Pair.of(c)) for c in calibrations)
-        raise SessionError(
-            f"{session.path} holds no captures of {wanted}", "The result belongs to another session."
-        )
+        raise SessionError(f"{session.path} holds no captures of {wanted}", "Check the result's session.")
     return Verification(session, checks, tuple(calibrations), detections, event_image, own_result, name)
 
 
 def _extrinsics(
     session: Session, result: Result | SavedResult | None, name: str | None
 ) -> tuple[Sequence[Calibration], bytes | None]:
-    """Give the extrinsics to check; and the content of the session's result.json where it holds them."""
+    """Return the extrinsics to check, and the content of the session's result.json if it holds them."""
     content = result_content(session, name)
     if isinstance(result, Result):
         rig, calibrations = result.session.rig.name, result.pairs
@@ -152,16 +150,16 @@ def _extrinsics(
         rig, calibrations, is_own = saved.rig, saved.pairs, result is None
         content = content if is_own else None
     if rig != session.rig.name or not calibrations:
-        what = f"the result is of rig {rig!r}" if calibrations else "the result holds no pair of sensors"
-        raise SessionError(f"{what}; the session {session.path} is of rig {session.rig.name!r}")
+        what = f"the result belongs to rig {rig!r}" if calibrations else "the result holds no pair of sensors"
+        raise SessionError(f"{what}; the session {session.path} belongs to rig {session.rig.name!r}")
     if not is_own:
-        # Names of captures say nothing across sessions: none of these was fitted.
+        # Names of captures differ between sessions: none of these was fitted.
         calibrations = tuple(replace(c, captures_used=(), captures_refused={}) for c in calibrations)
     return calibrations, content
 
 
 def _keep_users_files(rig: Rig, earlier: Path, draft: Path) -> None:
-    """Take over what `verify` did not draw, beside its images and in its folders."""
+    """Keep files that `verify` did not draw, beside its images and in its folders."""
     folders = {
         Pair(camera, channel, lidar).folder_name
         for camera, sensor in rig.cameras.items()
@@ -182,17 +180,17 @@ def write_debug_images(
     folder: Path | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Draw for every capture what each sensor saw of the board, and why it was refused.
+    """Draw for every capture each sensor's detection of the board, or why it was refused.
 
     Args:
-        session: whose captures are drawn.
+        session: the source of the captures.
         detections: of the session.
-        event_image: as the detections were made.
-        folder: for the pictures; the session's debug/ where None.
+        event_image: how images were reconstructed from raw events for the detections.
+        folder: for the images; the session's debug/ if None.
         progress: called with (done, total).
 
     Returns:
-        The folder of the pictures.
+        The folder of the images.
     """
     from lce_rig.verify.debug_image import draw_debug
     from lce_rig.verify.overlay_files import write_picture
@@ -205,7 +203,7 @@ def write_debug_images(
         try:
             scan = capture.scan(pair.lidar)
         except SessionError:
-            # It is damaged, as its detection says.
+            # It is damaged; its detection says so.
             scan = None
         picture = draw_debug(
             None if view is None else view.image,
@@ -228,7 +226,7 @@ def write_debug_images(
 def _view(
     session: Session, camera: str, channel: str, event_image: EventImage | None, capture: Capture
 ) -> CameraView | None:
-    """Give what a camera saw; None where it is damaged, or events gave no picture, as its detection says."""
+    """Return a camera's image; None if it is damaged or events gave none; its detection says why."""
     try:
         if (camera, channel) not in event_channels(session.rig, capture, event_image):
             return CameraView(capture.image(camera, channel))

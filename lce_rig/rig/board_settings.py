@@ -43,7 +43,7 @@ class BoardSettings(Settings):
         cols, rows = self.inner_corners
         width, height = (cols + 1) * self.square_m, (rows + 1) * self.square_m
         offset_x, offset_y = (2 * abs(offset) for offset in self.pattern_offset_m)
-        # Where the pattern fills the plate both are measured to a millimetre.
+        # If the pattern fills the plate, both are measured to a millimetre.
         if width + offset_x <= self.width_m + 1e-3 and height + offset_y <= self.height_m + 1e-3:
             return self
         what = (
@@ -52,15 +52,15 @@ class BoardSettings(Settings):
         )
         if offset_x or offset_y:
             x, y = self.pattern_offset_m
-            what += f" with its centre {x:g}, {y:g} m off the plate's"
+            what += f" with its centre {x:g}, {y:g} m from the plate's"
         if width + offset_y <= self.height_m + 1e-3 and height + offset_x <= self.width_m + 1e-3:
-            what += "; width and height look swapped, of either the plate or inner_corners [cols, rows]"
+            what += "; swap width_m and height_m, or inner_corners [cols, rows]"
         elif (cols - 1) * self.square_m <= self.width_m and (rows - 1) * self.square_m <= self.height_m:
-            what += "; were squares counted where inner corners are wanted (one fewer each way)?"
+            what += "; count inner corners, one fewer than squares in each direction"
         raise problem(what)
 
     def to_board(self) -> Board:
-        """Build the board as the algorithms know it."""
+        """Build the board for the algorithms."""
         cols, rows = self.inner_corners
         return Board(cols, rows, self.square_m, self.width_m, self.height_m, self.pattern_offset_m)
 
@@ -69,9 +69,9 @@ def _require_metres(value: float, limit: float) -> float:
     if limit / 1000 <= value <= limit:
         return value
     if value < limit:
-        raise problem(f"{value:g} m is smaller than any board (at least {limit / 1000:g} m)")
+        raise problem(f"{value:g} m is smaller than any board (minimum {limit / 1000:g} m)")
     for unit, factor in (("centimetres", 1e-2), ("millimetres", 1e-3)):
-        # A square is never below 5 mm and a plate never below 5 cm, which tells 70 mm from 7 cm.
+        # A square is never below 5 mm and a plate never below 5 cm, which distinguishes mm from cm.
         if limit / 200 <= value * factor <= limit and (unit == "millimetres" or value < 10):
-            raise problem(f"did you mean {value * factor:.3f} m? {value:g} looks like {unit}")
-    raise problem(f"{value:g} m is larger than any board (at most {limit:g} m)")
+            raise problem(f"{value:g} looks like {unit}: write {value * factor:.3f} (m)")
+    raise problem(f"{value:g} m is larger than any board (limit {limit:g} m)")

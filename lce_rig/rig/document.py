@@ -11,12 +11,12 @@ from lce_rig.core.errors import ProfileError
 from lce_rig.core.limits import describe
 
 BAD_SCALARS = (ValueError, ArithmeticError, LookupError, AttributeError, TypeError)
-"""What PyYAML raises of a scalar that is not what its tag says: `!!bool x`, `!!int ""`, `!!timestamp x`."""
+"""Errors of PyYAML for a scalar that contradicts its tag: `!!bool x`, `!!int ""`, `!!timestamp x`."""
 _MAX_INTEGER = 1 << 53
 KeyPath = tuple[str | int, ...]
 
-# A profile is a page or two; more is an attack by nested aliases or the wrong file.
-# It takes a second to parse 100 kB of YAML.
+# A profile has a page or two; more is the wrong file, or an attack with nested aliases.
+# Parsing 100 kB of YAML takes a second.
 _MAX_BYTES = 1 << 18
 _MAX_NODES = 20_000
 _MAX_DEPTH = 20
@@ -58,7 +58,7 @@ def read_document(text: str, source: str) -> Document:
         node = loader.get_single_node()
         if node is None:
             raise ProfileError(
-                f"{source}: is empty", "`lce-rig rigs new NAME --from rlfs` writes one to start from"
+                f"{source}: is empty", "Start from a shipped one: `lce-rig rigs new NAME --from rlfs`"
             )
         reader = _Reader(loader, source)
         data = reader.read(node, ())
@@ -71,9 +71,7 @@ def read_document(text: str, source: str) -> Document:
     except RecursionError as error:
         raise ProfileError(f"{source}: is too deeply nested to be a rig profile") from error
     if not isinstance(data, dict):
-        raise ProfileError(
-            f"{source}: is not a rig profile: a mapping of keys is expected, {_kind(data)} found"
-        )
+        raise ProfileError(f"{source}: is not a rig profile: expected a mapping of keys, found {_kind(data)}")
     return Document(source, data, reader.lines)
 
 
@@ -90,7 +88,7 @@ class _Reader:
             raise ProfileError(f"{self._source}: is too large or too deeply nested to be a rig profile")
         if isinstance(node, yaml.CollectionNode) and node.tag not in _PLAIN_TAGS:
             raise ProfileError(
-                f"{self._source}:{node.start_mark.line + 1}: the tag {node.tag} has no place here"
+                f"{self._source}:{node.start_mark.line + 1}: the tag {node.tag} is not allowed in a profile"
             )
         if isinstance(node, yaml.MappingNode):
             return self._read_mapping(node, path)
@@ -106,7 +104,7 @@ class _Reader:
         for key_node, value_node in node.value:
             line = key_node.start_mark.line + 1
             key = self._construct(key_node) if isinstance(key_node, yaml.ScalarNode) else None
-            # YAML 1.1 reads the keys `on`, `no` and `y` as booleans: take the text that was written.
+            # YAML 1.1 reads the keys `on`, `no` and `y` as booleans; use the text as written.
             key = (
                 str(key_node.value)
                 if isinstance(key_node, yaml.ScalarNode) and key != key_node.value

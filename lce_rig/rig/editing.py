@@ -17,7 +17,7 @@ def derive_text(text: str, name: str, settings: Sequence[tuple[str, str]], sourc
         text: the other profile.
         name: name of the new rig.
         settings: (key path, YAML value) to set, such as ("board.square_m", "0.08").
-        source: what to call the new text in errors, as a rule the file it is for.
+        source: name of the new text in errors, usually its file.
         origin: name of the other profile.
 
     Returns:
@@ -27,8 +27,8 @@ def derive_text(text: str, name: str, settings: Sequence[tuple[str, str]], sourc
         ProfileError: the new profile would not be valid.
         UsageError: a value that is not YAML, or a path into something that has no keys.
     """
-    head = f"# {name}: made from {origin} by `lce-rig rigs new`; the comments below are {origin}'s.\n"
-    # A name such as 346 is a text only in quotes.
+    head = f"# {name}: made from {origin} by `lce-rig rigs new`; the comments below are from {origin}.\n"
+    # A name such as 346 is text only in quotes.
     text = head + set_value(text, "name", name if _is_plain(name) else json.dumps(name))
     for path, value in settings:
         text = set_value(text, path, value)
@@ -41,7 +41,7 @@ def set_value(text: str, path: str, value: str) -> str:
 
     Args:
         text: valid YAML.
-        path: keys and places in lists joined by dots: "nominal_extrinsics.0.tolerance_m".
+        path: keys and list indices joined by dots: "nominal_extrinsics.0.tolerance_m".
         value: the value as YAML on one line: "0.1", "[1, 2]".
 
     Raises:
@@ -50,7 +50,7 @@ def set_value(text: str, path: str, value: str) -> str:
     wanted = _parsed(path, value)
     root = yaml.compose(text, Loader=yaml.SafeLoader)
     if root is None:
-        raise UsageError(f"--set {path}: there is nothing to set it in")
+        raise UsageError(f"--set {path}: no block for this key")
     keys = path.split(".")
     node, depth = _descend(root, keys)
     if depth == len(keys):
@@ -60,12 +60,12 @@ def set_value(text: str, path: str, value: str) -> str:
     else:
         raise UsageError(f"--set {path}: {'.'.join(keys[:depth])} has no key {keys[depth]}")
     if not _holds(new, keys, wanted):
-        raise UsageError(f"--set {path}: {value!r} cannot be put there", "quote a text that holds : or #")
+        raise UsageError(f"--set {path}: {value!r} is not allowed there", "quote a text that holds : or #")
     return new
 
 
 def _is_plain(name: str) -> bool:
-    """Return whether a text is read as that text without quotes."""
+    """Return whether YAML reads a text back unchanged without quotes."""
     try:
         return bool(yaml.safe_load(name) == name)
     except (yaml.YAMLError, RecursionError, *BAD_SCALARS):
@@ -76,9 +76,9 @@ def _parsed(path: str, value: str) -> object:
     try:
         parsed: object = yaml.safe_load(value)
     except (yaml.YAMLError, RecursionError, *BAD_SCALARS) as error:
-        raise UsageError(f"--set {path}: {value!r} is no YAML value") from error
+        raise UsageError(f"--set {path}: {value!r} is not a YAML value") from error
     if "\n" in value or not value.strip() or not all(path.split(".")):
-        raise UsageError(f"--set {path}={value}: KEY=VALUE is expected, such as board.square_m=0.08")
+        raise UsageError(f"--set {path}={value}: expected KEY=VALUE, such as board.square_m=0.08")
     return parsed
 
 
@@ -102,7 +102,7 @@ def _child(node: yaml.Node, key: str) -> yaml.Node | None:
 
 
 def _end(node: yaml.Node) -> int:
-    """Find where a node's text ends; a block's own mark lies behind the comments that follow it."""
+    """Find where a node's text ends; a block's own mark is after the comments that follow it."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)

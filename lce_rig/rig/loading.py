@@ -1,4 +1,4 @@
-"""Profiles from and to YAML, found by name or by path."""
+"""Read and write profiles as YAML, by name or by path."""
 
 import difflib
 from collections.abc import Iterable, Iterator
@@ -17,9 +17,9 @@ from lce_rig.rig.document import Document, KeyPath, read_document
 from lce_rig.rig.profile import Rig
 from lce_rig.rig.settings import PATTERNS
 
-# Validation errors as sentences that name file, line, key and the nearest valid key.
+# Validation errors with file, line, key and the nearest valid key.
 
-# To look for the key that was meant takes a millisecond each; nobody reads as many.
+# The search for the nearest key takes 1 ms per problem.
 _MOST_SHOWN = 100
 
 
@@ -27,12 +27,12 @@ _MOST_SHOWN = 100
 class _InvalidKey:
     path: KeyPath
     what: str
-    # The key that was probably meant by an unknown one: it need not be reported missing as well.
+    # The valid key nearest to an unknown one; it need not be reported as missing as well.
     meant: KeyPath | None = None
 
 
 def explain(error: ValidationError, document: Document) -> ProfileError:
-    """Build the error for the user: each problem once, in the order of the file's lines."""
+    """Build the error for the user, with each problem once, in the order of the file's lines."""
     details = error.errors()
     problems = {
         problem.path: problem for problem in reversed([_problem(detail) for detail in details[:_MOST_SHOWN]])
@@ -65,7 +65,7 @@ def _problem(detail: ErrorDetails) -> _InvalidKey:
     if kind == "string_pattern_mismatch":
         return _InvalidKey(path, f"{_shown(given)}: {PATTERNS[context['pattern']]}")
     if "controls" in path[:-2]:
-        # The last part names a member of the union that the value was tried as.
+        # The last part names the member of the union that validation tried.
         return _InvalidKey(path[:-1], "must be a text, a number, true or false")
     what = detail["msg"].replace("Input should", "must").replace("Tuple should", "must")
     what = (
@@ -89,15 +89,15 @@ def _shown(value: Any) -> str:
 def _unknown_key(path: KeyPath) -> _InvalidKey:
     key = str(path[-1])
     valid = valid_keys(path[:-1])
-    # A forgotten unit is the likeliest slip: for difflib, fx is as close to fy_px as to fx_px.
+    # A missing unit is the most likely error: for difflib, fx is as close to fy_px as to fx_px.
     nearest = [name for name in valid if name.startswith(f"{key}_")]
     nearest = nearest or difflib.get_close_matches(key, valid, n=1)
     if nearest:
-        return _InvalidKey(path, f"unknown key; did you mean {nearest[0]}?", (*path[:-1], nearest[0]))
+        return _InvalidKey(path, f"unknown key; the nearest is {nearest[0]}", (*path[:-1], nearest[0]))
     elsewhere = [block for block, name in all_keys() if name == key]
     if elsewhere:
-        return _InvalidKey(path, f"unknown key here; it belongs into {elsewhere[0] or 'the top level'}")
-    return _InvalidKey(path, f"unknown key; known are {', '.join(valid)}")
+        return _InvalidKey(path, f"unknown key here; move it to {elsewhere[0] or 'the top level'}")
+    return _InvalidKey(path, f"unknown key; choose one of: {', '.join(valid)}")
 
 
 def valid_keys(path: KeyPath) -> list[str]:
@@ -112,7 +112,7 @@ def valid_keys(path: KeyPath) -> list[str]:
         key = str(parts.pop(0))
         annotation = model.model_fields[key].annotation if key in model.model_fields else None
         model = _model_within(annotation)
-        # The names of sensors and the places in lists lie between a block and its settings.
+        # Names of sensors and list indices lie between a block and its settings.
         if parts and not _is_block(annotation):
             parts.pop(0)
     return list(model.model_fields) if model is not None else []
@@ -123,7 +123,7 @@ def _is_model(annotation: Any) -> bool:
 
 
 def _is_block(annotation: Any) -> bool:
-    """Return a block of settings, optional or not, from many by name or in a list."""
+    """Return whether an annotation is one settings block, optional or not, not a dict or list of them."""
     return _is_model(annotation) or any(_is_model(argument) for argument in _members(annotation))
 
 
@@ -141,7 +141,7 @@ def _model_within(annotation: Any) -> type[BaseModel] | None:
 
 
 def all_keys(model: type[BaseModel] = Rig, block: str = "") -> Iterator[tuple[str, str]]:
-    """List every key of the schema as (block, key), names of sensors and places in lists shown as *."""
+    """List every key of the schema as (block, key), names of sensors and list indices shown as *."""
     for key, field in model.model_fields.items():
         yield block, key
         inner = _model_within(field.annotation)
@@ -169,7 +169,7 @@ def find_profile(name_or_path: str | Path) -> Path:
     """Find a profile's file from the name of a shipped one or from a path.
 
     Raises:
-        ProfileError: neither fits; known names and the nearest are listed.
+        ProfileError: neither exists; the hint lists the shipped names.
     """
     text = str(name_or_path)
     path = Path(name_or_path)
@@ -182,8 +182,8 @@ def find_profile(name_or_path: str | Path) -> Path:
         state = "is a folder, not a file" if path.is_dir() else "there is no such file"
         raise ProfileError(f"{text}: {state}", f"shipped profiles: {', '.join(shipped)}")
     nearest = difflib.get_close_matches(text, shipped, n=1)
-    question = f"did you mean {nearest[0]}? " if nearest else ""
-    hint = f"{question}shipped profiles: {', '.join(shipped)}; a file is given by its path"
+    nearest_name = f"The nearest is {nearest[0]}. " if nearest else ""
+    hint = f"{nearest_name}Choose one of: {', '.join(shipped)}, or give the path of a file."
     raise ProfileError(f"no rig profile is called {text}", hint)
 
 
@@ -194,7 +194,7 @@ def load_rig(name_or_path: str | Path) -> Rig:
         name_or_path: name of a shipped profile ("rlfs") or path of a YAML file.
 
     Raises:
-        ProfileError: no such profile, or one that cannot be used; every problem with file, line and key.
+        ProfileError: no such profile, or an invalid one; every problem with file, line and key.
     """
     path = find_profile(name_or_path)
     return parse_rig(read_profile(path), str(path)).located(path.parent)
@@ -204,7 +204,7 @@ def read_profile(path: Path) -> str:
     """Read the text of a profile's file.
 
     Raises:
-        ProfileError: it cannot be read, or is not a text of a profile's size.
+        ProfileError: it cannot be read, is not text, or is too large.
     """
     with reading(path, ProfileError):
         try:
@@ -218,10 +218,10 @@ def parse_rig(text: str, source: str = "profile") -> Rig:
 
     Args:
         text: the YAML.
-        source: what to call the text in errors, as a rule its file.
+        source: name of the text in errors, usually its file.
 
     Raises:
-        ProfileError: the text is not a profile.
+        ProfileError: the text is not a valid profile.
     """
     return rig_from_document(read_document(text, source))
 
@@ -235,13 +235,13 @@ def rig_from_document(document: Document) -> Rig:
 
 
 def dump_rig(rig: Rig) -> str:
-    """Write a rig as YAML, without comments; `parse_rig` gives back an equal rig."""
+    """Write a rig as YAML, without comments; `parse_rig` returns an equal rig."""
     data = rig.model_dump(mode="json", exclude_none=True)
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
 
 
 class _Dumper(yaml.SafeDumper):
-    """Block style, but short lists of numbers on one line; floats that read back as floats."""
+    """Write block style, but short lists of numbers on one line, and floats that read back as floats."""
 
     def represent_sequence(
         self, tag: str, sequence: Iterable[Any], flow_style: bool | None = None

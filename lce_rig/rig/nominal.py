@@ -9,12 +9,12 @@ from lce_rig.core.geometry import Array, pose, project_to_so3
 from lce_rig.rig.settings import Figure, Name, Positive, Settings, problem
 
 Row = tuple[Figure, Figure, Figure]
-# Drawings and papers round to three digits: a unit quaternion's norm is then off by up to about 1e-3.
+# CAD models and papers round to three digits, which changes a unit quaternion's norm by up to about 1e-3.
 _ROUNDING = 5e-3
 
 
 class NominalExtrinsic(Settings):
-    """Where a camera should be; compared with the result, never an initial guess.
+    """The expected pose of a camera; compared with the result, never used as an initial guess.
 
     It takes points from the LiDAR's frame to the camera's optical frame: p_cam = R p_lidar + t. The rotation
     is given in exactly one way.
@@ -45,7 +45,7 @@ class NominalExtrinsic(Settings):
         given = [key for key in ("quaternion_wxyz", "rpy_deg", "matrix") if getattr(self, key) is not None]
         if len(given) != 1:
             found = " and ".join(given) if given else "none"
-            raise problem(f"give the rotation as one of quaternion_wxyz, rpy_deg, matrix; {found} given")
+            raise problem(f"{found} given; give the rotation as one of quaternion_wxyz, rpy_deg, matrix")
         if self.quaternion_wxyz is not None:
             norm = float(np.linalg.norm(self.quaternion_wxyz))
             if abs(norm - 1) > _ROUNDING:
@@ -59,7 +59,7 @@ class NominalExtrinsic(Settings):
                 raise problem("not a rotation but a mirroring: its determinant is -1", "matrix")
         far = max(abs(value) for value in self.translation_m)
         if far > 20:
-            what = f"{far:g} m between two sensors of one rig; are these millimetres?"
+            what = f"{far:g} m between two sensors of one rig (limit 20 m); write metres"
             raise problem(what, "translation_m")
         return self
 

@@ -1,4 +1,4 @@
-"""The block of a channel for image reconstruction from its events."""
+"""A channel's block for image reconstruction from its events."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,9 +14,9 @@ class ReconstructionSettings(Settings):
 
     Attributes:
         method: a recurrent network, or the event map: sums of polarities, for comparison.
-        model: ONNX file of another network than the shipped one; absolute in a profile that was loaded.
-        window_s: windows of this duration; where neither is given, the rate of events decides.
-        window_events: windows of so many events.
+        model: ONNX file of another network than the shipped one; absolute in a loaded profile.
+        window_s: windows of this duration; if neither is given, the rate of events decides.
+        window_events: windows of this number of events.
     """
 
     method: Literal["network", "map"] = "network"

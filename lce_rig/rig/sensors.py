@@ -31,11 +31,11 @@ class TimestampSettings(Settings):
     """The meaning of a sensor's timestamps.
 
     Attributes:
-        clock: whose clock is read: the sensor's own, the computer's, or UTC by GPS or PTP.
+        clock: the clock that is read: the sensor's own, the computer's, or UTC by GPS or PTP.
         reference: the moment a timestamp marks: start or middle of the exposure, first or last firing.
-        sync: how clocks are tied: by a shared pulse, by PTP, or not at all.
-        expected_offset_s: what to add to these timestamps to get the rig's time.
-        tolerance_s: how far pairs of captures may lie apart after that.
+        sync: how clocks are synchronised: by a shared pulse, by PTP, or not at all.
+        expected_offset_s: offset to add to these timestamps to get the rig's time.
+        tolerance_s: maximum time difference of an image and a scan after that.
     """
 
     clock: Literal["device", "host", "utc"] = "host"
@@ -49,9 +49,9 @@ class FrameTimingSettings(Settings):
     """The meaning of the kernel's timestamp of an image, if the camera's driver does not report it correctly.
 
     Attributes:
-        clock: the clock that timestamps images; "auto" tries which one fits.
-        mark: the moment that is timestamped; "auto" believes the driver's flags.
-        exposure_us: how long a row is exposed; None asks the camera.
+        clock: the clock that timestamps images; "auto" finds the one that fits.
+        mark: the moment that is timestamped; "auto" uses the driver's flags.
+        exposure_us: exposure time of a row; None reads it from the camera.
         line_time_us: time between rows of a rolling shutter; 0 for a global one.
         trigger_delay_us: from the trigger's edge to the start of the first row's exposure.
     """
@@ -67,15 +67,15 @@ class DriverSettings(Settings):
     """The connection to a live sensor.
 
     Attributes:
-        type: which of the program's drivers; None takes the one that goes with the model.
+        type: the driver; None for the default driver of the model.
         port: UDP port of a networked sensor.
         address: IP address of a networked sensor.
         device: device file or serial number of an attached sensor.
         command: program and arguments whose standard output is the camera's images.
-        pixel_format: four characters of the wanted pixel format ("UYVY"); None takes the camera's first.
-        frame_rate_hz: wanted images per second; None leaves the camera's own.
-        frame_timing: what an image's timestamp means.
-        controls: settings handed to the driver as they are.
+        pixel_format: four characters of the pixel format ("UYVY"); None for the camera's first.
+        frame_rate_hz: images per second; None for the camera's own rate.
+        frame_timing: the meaning of an image's timestamp.
+        controls: settings passed to the driver unchanged.
     """
 
     type: Name | None = None
@@ -159,7 +159,7 @@ class ChannelSettings(Settings):
     Attributes:
         kind: "frames", or "events" and the images reconstructed from them.
         topic: topic of its images or events in bags.
-        reconstruction: how images are made from events; None for the shipped network.
+        reconstruction: how to reconstruct images from events; None for the shipped network.
     """
 
     kind: Literal["frames", "events"] = "frames"
@@ -211,23 +211,21 @@ class CameraSettings(Settings):
     def _intrinsics_belong_to_resolution(self) -> "CameraSettings":
         given, size = self.intrinsics, self.resolution_px
         if size[0] * size[1] > MAX_PIXELS:
-            raise problem(
-                f"{size[0]}x{size[1]} px are more than a camera has ({MAX_PIXELS})", "resolution_px"
-            )
+            raise problem(f"{size[0]}x{size[1]} px exceed the limit of {MAX_PIXELS} pixels", "resolution_px")
         sides = (
             ("x", "width", given.cx_px, given.fx_px, size[0]),
             ("y", "height", given.cy_px, given.fy_px, size[1]),
         )
         for axis, side, centre, focal, length in sides:
             if not 0 < centre < length - 1:
-                what = f"{centre:g} lies outside the picture, whose {side} is {length} px"
+                what = f"{centre:g} lies outside the image, whose {side} is {length} px"
                 raise problem(what + self._other_resolution(), f"intrinsics.c{axis}_px")
             if not 0.1 <= focal / length <= 30:
                 what = (
-                    f"a focal length of {focal:g} px is implausible for pictures with a {side} of {length} px"
+                    f"a focal length of {focal:g} px is implausible for images with a {side} of {length} px"
                 )
                 raise problem(what + self._other_resolution(), f"intrinsics.f{axis}_px")
-        # A lens sits near the middle; numbers of another resolution are off by the same factor in x and y.
+        # A lens is near the middle; numbers of another resolution differ by the same factor in x and y.
         x, y = given.cx_px / size[0], given.cy_px / size[1]
         if max(x, y) < 0.4 or min(x, y) > 0.6 or not (0.2 < x < 0.8 and 0.2 < y < 0.8):
             point = f"{given.cx_px:g}, {given.cy_px:g}"
@@ -239,7 +237,7 @@ class CameraSettings(Settings):
 
     def _other_resolution(self) -> str:
         width, height = round(2 * self.intrinsics.cx_px), round(2 * self.intrinsics.cy_px)
-        return f"; were the intrinsics measured at another resolution (about {width}x{height})?"
+        return f"; check whether they belong to another resolution (about {width}x{height} px)"
 
     def located(self, folder: Path) -> "CameraSettings":
         """Make paths absolute; relative ones start at the profile's folder."""
@@ -247,11 +245,11 @@ class CameraSettings(Settings):
         return self.model_copy(update={"channels": channels})
 
     def first_channel(self, kind: Literal["frames", "events"]) -> str | None:
-        """Name the first channel of a kind; None where there is none."""
+        """Name the first channel of a kind; None if there is none."""
         return next((name for name, channel in self.channels.items() if channel.kind == kind), None)
 
     def to_intrinsics(self) -> Intrinsics:
-        """Build the camera model as the algorithms know it."""
+        """Build the camera model for the algorithms."""
         given = self.intrinsics
         return Intrinsics(
             given.fx_px,

@@ -1,4 +1,4 @@
-"""Base of the profile's settings and the small vocabulary they share."""
+"""Base class and shared types of the profile's settings."""
 
 from typing import Annotated, Any
 
@@ -10,7 +10,7 @@ _RIG_NAME = r"^[a-z0-9][a-z0-9_-]*$"
 _FRAME = r"^[A-Za-z][A-Za-z0-9_/-]*$"
 _TOPIC = r"^/?[A-Za-z][A-Za-z0-9_/]*$"
 
-# What each pattern means, for errors.
+# The meaning of each pattern, for errors.
 PATTERNS = {
     _NAME: "a name has lower-case letters, digits and _ and begins with a letter",
     _RIG_NAME: "a rig's name has lower-case letters, digits, - and _",
@@ -22,14 +22,14 @@ Name = Annotated[str, Field(pattern=_NAME, max_length=64)]
 RigName = Annotated[str, Field(pattern=_RIG_NAME, max_length=64)]
 FrameName = Annotated[str, Field(pattern=_FRAME, max_length=128)]
 TopicName = Annotated[str, Field(pattern=_TOPIC, max_length=256)]
-# Whatever is measured on a rig lies within; squares and quotients of such figures stay far from overflow.
+# All figures of a rig lie within; their squares and quotients stay far from overflow.
 _SMALLEST, _LARGEST = 1e-6, 1e6
 Text = Annotated[str, Field(max_length=1000)]
 
 
 def _not_tiny(value: float) -> float:
     if value < _SMALLEST:
-        raise problem(f"{value:g} is too small (at least {_SMALLEST:g})")
+        raise problem(f"{value:g} is too small (minimum {_SMALLEST:g})")
     return value
 
 
@@ -47,15 +47,15 @@ class Settings(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _has_no_truth_values(cls, data: Any) -> Any:
-        """Refuse `yes` and `no`, which would pass for 1 and 0; no setting is a truth value."""
+        """Refuse `yes` and `no`, which would become 1 and 0; no setting is a truth value."""
         for key, value in data.items() if isinstance(data, dict) else ():
             if any(isinstance(item, bool) for item in (value if isinstance(value, list) else [value])):
-                raise problem("a truth value (true, yes, on, false, no, off) is given", str(key))
+                raise problem("a truth value (true, yes, on, false, no, off) is not allowed", str(key))
         return data
 
 
 def problem(what: str, key: str = "") -> PydanticCustomError:
-    """Build the error that a check across several keys raises.
+    """Build the error of a check across several keys.
 
     Args:
         what: what is wrong, with its figures.

@@ -9,7 +9,7 @@ from lce_rig.rig.settings import Name, Settings, problem
 _BAUD = {"lce1": 115_200, "nmea": 9_600, "simplesensorsync": 921_600, "tline": 921_600}
 
 BOARD, PPS_LINE = "sync", "pps"
-"""Names of the sync board among the sensors, and of its pulses per second among the lines of cameras."""
+"""Reserved names: the sync board among the sensors, and its pulse per second among the camera lines."""
 
 
 class TriggerSettings(Settings):
@@ -20,7 +20,7 @@ class TriggerSettings(Settings):
         rate_hz: pulses per second; not sent to boards that set their own rate.
         phase_us: first pulse of a second after that second's beginning.
         pulse_us: length of a pulse.
-        max_delay_s: latest timestamp of a frame after its pulse; as short as the camera allows.
+        max_delay_s: maximum delay of an image's timestamp after its pulse; as short as the camera allows.
     """
 
     channel: Annotated[int, Field(ge=0, le=15)]
@@ -33,7 +33,7 @@ class TriggerSettings(Settings):
     def _pulses_fit_into_their_period(self) -> "TriggerSettings":
         period_us = 1e6 / self.rate_hz
         if self.pulse_us >= period_us:
-            what = f"pulses of {self.pulse_us} us do not fit into a period of {period_us:.0f} us"
+            what = f"pulses of {self.pulse_us} us exceed the period of {period_us:.0f} us"
             raise problem(what, "pulse_us")
         if self.phase_us >= period_us:
             what = f"{self.phase_us} us is beyond the period of {period_us:.0f} us"
@@ -45,10 +45,10 @@ class SyncSettings(Settings):
     """A board that generates the pulse per second and triggers cameras.
 
     Attributes:
-        type: how it talks: lce-rig's own protocol, plain NMEA, SimpleSensorSync's JSON, or lines `T,n,us`.
+        type: its protocol: lce-rig's own, plain NMEA, SimpleSensorSync's JSON, or lines `T,n,us`.
         device: its serial port.
-        baud: speed of the port; None takes what is usual for the type.
-        triggers: the lines it triggers cameras by, by the camera's name.
+        baud: speed of the port; None for the type's default.
+        triggers: the trigger lines, by the camera's name.
     """
 
     type: Literal["lce1", "nmea", "simplesensorsync", "tline"] = "lce1"
@@ -65,10 +65,10 @@ class SyncSettings(Settings):
                 raise problem(what, f"triggers.{camera}.channel")
             seen[trigger.channel] = camera
         if self.triggers and self.type == "nmea":
-            raise problem("a board of type nmea tells the time, and nothing of triggers", "triggers")
+            raise problem("a board of type nmea sends the time only and cannot trigger cameras", "triggers")
         return self
 
     @property
     def port_baud(self) -> int:
-        """The speed to open the port with."""
+        """The speed of the port."""
         return self.baud or _BAUD[self.type]

@@ -1,4 +1,4 @@
-"""Thresholds of a profile; each is optional and has a default."""
+"""Thresholds of a profile; each has a default."""
 
 from typing import Annotated, Any
 
@@ -24,15 +24,15 @@ class QualitySettings(Settings):
         max_edge_rms_m: largest rms distance of ring ends from the board's edges.
         min_distance_m: nearest board.
         max_distance_m: farthest board.
-        max_motion_m: how far the board may move while it counts as still.
-        min_events_px: fewest events on the board in a second, per pixel of it.
+        max_motion_m: largest motion of a board that counts as still.
+        min_events_px: fewest events on the board in 1 s, per pixel.
         min_event_contrast: least difference of black and white in an image made from events, grey values.
-        min_event_sharpness: fewest widths of an edge in a square of such an image.
+        min_event_sharpness: fewest edge widths per square of such an image.
         max_board_speed_mps: fastest board that events may show.
         max_turn_deg_s: fastest turn of such a board.
-        max_smear_m: how far such a board may move while the LiDAR scans it.
-        min_captures: fewer captures make no calibration.
-        min_detected_fraction: a smaller share of captures with the board found is marginal.
+        max_smear_m: largest motion of such a board during its scan.
+        min_captures: minimum number of captures for a calibration.
+        min_detected_fraction: a smaller fraction of captures with the board found is marginal.
         max_mpe_m: largest mean distance of LiDAR points from the camera's board plane.
         max_mee_m: largest mean distance of ring ends from the board's edges.
     """
@@ -78,7 +78,7 @@ class CalibrationSettings(Settings):
     @model_validator(mode="before")
     @classmethod
     def _without_weights(cls, data: Any) -> Any:
-        """Drop weights, which profiles of earlier sessions hold: they follow from the captures."""
+        """Drop the weights of earlier sessions' profiles; they now follow from the captures."""
         return {k: v for k, v in data.items() if k not in _WEIGHTS} if isinstance(data, dict) else data
 
     def in_targets(self, rotation_deg: float, translation_m: float) -> float:
@@ -87,26 +87,26 @@ class CalibrationSettings(Settings):
 
 
 class VerdictSettings(Settings):
-    """Limits of the verdict: beyond a limit a result is marginal, beyond a second limit it fails.
+    """Limits of the verdict: beyond a first limit a result is marginal, beyond a second limit it fails.
 
     Attributes:
-        fail_factor: a deviation, or a difference between two answers, this many times the target fails.
-        max_scale_error: how far camera and LiDAR distances may differ, as a fraction; 2.5 times that fails.
-        max_edge_shift_m: how far ring ends may lie beyond the plate's edge; beams are not wider.
-        max_plane_misfit_m: rms between the planes of both sensors that boards held still stay below.
-        max_held_out_ratio: how many times worse held-out captures may fit.
-        max_prior_sigmas: how many of the profile's `laser_bias_sigma_m` a laser's range offset may reach.
+        fail_factor: a standard deviation, or a difference of two results, of this many targets fails.
+        max_scale_error: largest relative difference of camera and LiDAR distances; 2.5 times that fails.
+        max_edge_shift_m: largest distance of ring ends beyond the plate's edge; beams are not wider.
+        max_plane_misfit_m: largest rms distance between both sensors' planes; still boards stay below.
+        max_held_out_ratio: largest ratio of the residuals of held-out and used captures.
+        max_prior_sigmas: largest range offset of a laser, in units of the profile's `laser_bias_sigma_m`.
         max_change: largest difference of earlier and later captures, in targets; twice it fails.
         max_contrast: the same between near and far, left and right, upper and lower boards, whose differences
-            all but cancel in the whole.
-        max_camera_difference: how far two cameras' extrinsics and their own images may differ on where one
-            sits to the other, and how far that may change on the way, in targets; `fail_factor` times that,
-            or twice for a change, fails.
-        least_chance: a difference of shares of the captures counts where chance makes it this rarely.
-        control_sigmas: how many standard deviations the result is moved for the control, and no less than
-            the target; held-out captures must then fit worse.
-        max_spread_ratio: where resampled captures spread the result by more than this many claimed standard
-            deviations, the claim is widened.
+            nearly cancel in the whole.
+        max_camera_difference: largest difference of two cameras' relative pose between extrinsics and images,
+            and its largest change during the session, in targets; `fail_factor` times that, or twice for a
+            change, fails.
+        least_chance: a difference of subsets of the captures is significant below this probability.
+        control_sigmas: number of standard deviations, at least the target, by which the negative control
+            moves the result; held-out captures must then fit worse.
+        max_spread_ratio: if resampling spreads the result by more than this many reported standard
+            deviations, the covariance is widened.
     """
 
     fail_factor: Annotated[float, Field(gt=1, le=1e6)] = 3.0

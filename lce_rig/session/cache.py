@@ -18,14 +18,14 @@ from lce_rig.session.durable import replace_file
 
 _VALUES = "values_json"
 _MAX_MEMBERS = 4096
-# Behind the archive, where NumPy and other programs pass over it: a bit that flips in a zip may go unnoticed.
+# Behind the archive, where NumPy and other programs ignore it: a flipped bit in a zip may go unnoticed.
 _SEAL = b"sha256:"
 _SEAL_BYTES = len(_SEAL) + 64
 
 
 @dataclass(frozen=True, eq=False)
 class Cached:
-    """The entry of one key: arrays by name, and values of JSON types."""
+    """One entry: arrays by name, and values of JSON types."""
 
     arrays: dict[str, NDArray[Any]]
     values: dict[str, Any]
@@ -35,10 +35,10 @@ def store(path: Path, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, A
     """Write one entry without pickle; the same content gives the same bytes.
 
     Returns:
-        Whether it could be written (a full or read-only disk is no reason to stop).
+        Whether it could be written (a full or read-only disk is not an error).
     """
     if _VALUES in arrays:
-        raise ValueError(f"{_VALUES} is no name for an array")
+        raise ValueError(f"{_VALUES} is not allowed as the name of an array")
     text = json.dumps(dict(values), sort_keys=True).encode()
     buffer = io.BytesIO()
     np.savez_compressed(
@@ -54,7 +54,7 @@ def store(path: Path, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, A
 
 
 def load(path: Path) -> Cached | None:
-    """Read one entry; None where there is none or it is damaged."""
+    """Read one entry; None if there is none or it is damaged."""
     try:
         data = read_file(path, MAX_CHUNK_BYTES)
     except (OSError, ValueError):
@@ -65,13 +65,13 @@ def load(path: Path) -> Cached | None:
     try:
         arrays = _unpack(archive)
         values = parse_json(arrays.pop(_VALUES).tobytes())
-    except Exception:  # What somebody else made fails in any way: zip, zlib, encryption, sizes, syntax.
+    except Exception:  # A foreign file can fail in any way: zip, zlib, encryption, sizes, syntax.
         return None
     return Cached(arrays, values) if isinstance(values, dict) else None
 
 
 def _seal(path: Path, archive: bytes) -> bytes:
-    """Fingerprint an entry together with its place: of another capture it is not there."""
+    """Fingerprint an entry with its key, so that a copy under another key counts as missing."""
     place = "/".join(path.parts[-2:]).encode()
     return _SEAL + hashlib.sha256(place + b"\0" + archive).hexdigest().encode()
 

@@ -24,7 +24,7 @@ from lce_rig.core.pcd import decode_pcd
 from lce_rig.rig.settings import Name
 from lce_rig.session.capture_files import EVENTS_VERSION, MANIFEST, check_events, stamps_of
 
-# The schema of a capture's manifest; reading is strict, as a session may come from elsewhere.
+# The schema of a capture's manifest. Reading is strict, as a session may come from another source.
 
 _Stamp = Annotated[int, Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)] | None
 _Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
@@ -73,7 +73,7 @@ Entry = ImageEntry | ScanEntry | EventsEntry
 
 
 class Manifest(_Record):
-    """The whole file; `meta` holds any JSON of the collector."""
+    """The manifest; `meta` holds any JSON of the collector."""
 
     format_version: Annotated[int, Field(ge=1)]
     content_sha256: str
@@ -127,7 +127,7 @@ def parse_manifest(document: Any) -> Manifest:
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
 _SOME_ENTRY = TypeVar("_SOME_ENTRY", bound=Entry)
-# A firing lies so far from a scan's first at most.
+# Maximum time of a firing after the scan's first.
 _MAX_OFFSET_NS = 3600 * 10**9
 
 
@@ -148,7 +148,7 @@ class Capture:
 
     @property
     def meta(self) -> dict[str, Any]:
-        """What the collector wrote about this capture (source, duplicates, board poses)."""
+        """The collector's notes on this capture (source, duplicates, board poses)."""
         return dict(self._manifest.meta)
 
     @property
@@ -163,7 +163,7 @@ class Capture:
 
     @property
     def manifest_sha256(self) -> str:
-        """A fingerprint of the manifest: of what the sensors saw, and when.
+        """The manifest's fingerprint: of samples and timestamps.
 
         Raises:
             SessionError: there is none.
@@ -239,7 +239,7 @@ class Capture:
             events = decode_events(self._read(entry), camera)
             check_events(events)
         if stamps_of(events) != {"first_ns": entry.first_ns, "last_ns": entry.last_ns}:
-            raise self._damaged(f"{entry.file} holds other stamps than {MANIFEST} says")
+            raise self._damaged(f"{entry.file} holds other timestamps than {MANIFEST} says")
         return events
 
     def check(self) -> None:
@@ -264,19 +264,20 @@ class Capture:
         return manifest
 
     def _require_here(self, name: str) -> None:
-        # The manifest is input like any other: it must not make us read, or show, files elsewhere.
-        # Unlike Path.resolve, realpath has an answer where links run in a circle; a NUL it does not take.
+        # The manifest is untrusted input: it must not make us read or show files elsewhere.
+        # Unlike Path.resolve, realpath accepts circular links; it raises on a NUL.
         is_here = SAFE_NAME.fullmatch(name) is not None and (
             Path(os.path.realpath(self.path / name)).parent == Path(os.path.realpath(self.path))
         )
         if not is_here:
             raise SessionError(
                 f"capture {self.name}: {MANIFEST} names the file {name!r} outside the capture's folder",
-                f"Nothing outside {self.path} is read. Remove this capture if you did not make it yourself.",
+                f"Files outside {self.path} are not read. Remove this capture if you did not make it "
+                "yourself.",
             )
 
     def _only(self, entries: Sequence[_SOME_ENTRY], lacking: str) -> _SOME_ENTRY:
-        """Take the entry of a sensor, of which there is one at most."""
+        """Return the entry of a sensor, at most one."""
         if entries:
             return entries[0]
         have = [".".join(key) for key in self.image_keys] + self.lidars
@@ -289,7 +290,7 @@ class Capture:
         if len(data) != entry.bytes:
             raise self._damaged(f"{entry.file} has {len(data)} of {entry.bytes} bytes")
         if hashlib.sha256(data).hexdigest() != entry.sha256:
-            raise self._damaged(f"{entry.file} is not what was captured (checksum)")
+            raise self._damaged(f"{entry.file} has changed since it was captured (checksum)")
         return data
 
     @contextmanager
@@ -308,7 +309,7 @@ class Capture:
 
 
 def _lengths(cloud: NDArray[Any], name: str) -> NDArray[np.float32]:
-    """Take a field of finite values from a scan's point cloud; raise a ValueError where one is not."""
+    """Take a field of finite values from a scan's point cloud; raise a ValueError if one is not."""
     values = _field(cloud, name, "f")
     if not np.isfinite(values).all() or np.abs(values).max(initial=0) > np.finfo(np.float32).max:
         raise ValueError(f"its field {name} is not finite everywhere")
@@ -316,7 +317,7 @@ def _lengths(cloud: NDArray[Any], name: str) -> NDArray[np.float32]:
 
 
 def _whole(cloud: NDArray[Any], name: str, lowest: int, highest: int) -> NDArray[np.int64]:
-    """Take a field of whole numbers from a scan's point cloud; raise a ValueError where one is not."""
+    """Take a field of whole numbers from a scan's point cloud; raise a ValueError if one is not."""
     values = _field(cloud, name, "iu")
     if len(values) and (int(values.min()) < lowest or int(values.max()) > highest):
         raise ValueError(f"its field {name} runs from {values.min()} to {values.max()} (limit {highest})")

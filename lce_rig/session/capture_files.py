@@ -1,4 +1,4 @@
-"""Writing a capture: samples as plain files, and a manifest with their checksums."""
+"""Write a capture: samples as plain files, and a manifest with their checksums."""
 
 import hashlib
 import json
@@ -16,13 +16,13 @@ from lce_rig.session.durable import flush_folder, write_new_file
 
 MANIFEST = "meta.json"
 PLAIN_VERSION, EVENTS_VERSION = 1, 2
-"""Of manifests without and with events: what holds none is read by versions that know none."""
+"""Versions of manifests without and with events; older programs read those without."""
 
 
 def content_hash(images: Iterable[Image], scans: Iterable[Scan], events: Iterable[Events] = ()) -> str:
-    """Fingerprint what the sensors saw, timestamps left aside, whatever files it came from.
+    """Fingerprint samples without their timestamps, independently of the files they came from.
 
-    Of events, the times between them count.
+    Of events, the time differences count.
 
     Returns:
         SHA-256 as hex digits.
@@ -61,7 +61,8 @@ def write_capture(
             `meta` that is not JSON.
     """
     images, scans, events = list(images), list(scans), list(events)
-    # Encoding, hashing and flushing release the interpreter: a capture takes as long as its slowest file.
+    # Encoding, hashing and flushing release the interpreter lock, so a capture takes as long as its slowest
+    # file.
     with ThreadPoolExecutor(thread_name_prefix="write capture") as pool:
         content = pool.submit(content_hash, images, scans, [stretch for _, stretch in events])
         stored_events = [pool.submit(_store_events, folder, *each) for each in events]  # the longest first
@@ -79,23 +80,23 @@ def write_capture(
 
 
 def stamps_of(events: Events) -> dict[str, int | None]:
-    """Read the first and last timestamp of events, null where there are none, as a manifest has them."""
+    """Read the first and last timestamp of events as in a manifest, null if there are none."""
     if not len(events):
         return {"first_ns": None, "last_ns": None}
     return {"first_ns": int(events.t_ns[0]), "last_ns": int(events.t_ns[-1])}
 
 
 def check_events(events: Events) -> None:
-    """Make sure that events are in order of time and lie on their sensor.
+    """Check that events are ordered by time and within the sensor's resolution.
 
     Raises:
-        ValueError: they are not; it says which.
+        ValueError: they are not; the message says which.
     """
     if np.any(np.diff(events.t_ns) < 0):
         raise ValueError(f"events of {events.sensor} are not in order of time")
     if np.any(events.x >= events.width_px) or np.any(events.y >= events.height_px):
         size = f"{events.width_px}x{events.height_px}"
-        raise ValueError(f"events of {events.sensor} lie off its {size} pixels")
+        raise ValueError(f"events of {events.sensor} lie outside its {size} pixels")
 
 
 def _store_image(folder: Path, image: Image) -> dict[str, Any]:
@@ -128,12 +129,12 @@ def _encode_png(image: Image) -> bytes:
     pixels = image.pixels
     if pixels.dtype != np.uint8 or not (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)):
         raise ValueError(
-            f"a picture of {image.sensor} is {pixels.dtype} {pixels.shape}, not 8-bit grey or BGR"
+            f"an image of {image.sensor} is {pixels.dtype} {pixels.shape}, not 8-bit grey or BGR"
         )
     # OpenCV's PNG compression 1 is five times faster than its 9 and 10 % larger.
     is_done, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not is_done:
-        raise ValueError(f"a picture of {image.sensor} could not be encoded as PNG")
+        raise ValueError(f"an image of {image.sensor} could not be encoded as PNG")
     return bytes(data)
 
 
@@ -147,7 +148,7 @@ def _encode_scan(scan: Scan) -> bytes:
     }
     comments = ["frame of the lidar: x forward, y left, z up; m; ring 0 is the lowest"]
     if scan.offset_ns is not None:
-        # 32 bits hold 4.3 s and are all that many viewers know; a longer scan needs 64.
+        # 32 bits hold 4.3 s, and many viewers read no other type; a longer scan needs 64.
         fits = len(scan.offset_ns) == 0 or (scan.offset_ns.min() >= 0 and scan.offset_ns.max() < 2**32)
         columns["time"] = ("u4" if fits else "i8", scan.offset_ns)
         comments.append("time: ns after the first firing")

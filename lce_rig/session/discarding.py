@@ -10,20 +10,20 @@ _MADE = frozenset({MARKER, PROFILE, JOURNAL, LOCK, CAPTURES})
 
 
 def discard_if_empty(path: Path) -> bool:
-    """Remove a session's folder where it holds nothing but what making it wrote.
+    """Remove a session's folder if it holds nothing but the files of its creation.
 
     Args:
-        path: the folder; nobody writes to it.
+        path: the folder, without a writer.
 
     Returns:
-        Whether it is gone. A folder with a capture, or with anything else in it, is left as it is.
+        Whether it was removed. A folder with a capture or any other file is left unchanged.
     """
     with suppress(OSError):
         if {entry.name for entry in path.iterdir()} - _MADE:
             return False
         if (path / CAPTURES).is_dir():
             (path / CAPTURES).rmdir()  # fails where there is a capture
-        # The marker last: what is left of an interrupted removal is still a session.
+        # The marker last, so that an interrupted removal leaves a session.
         for name in (LOCK, JOURNAL, PROFILE, MARKER):
             (path / name).unlink(missing_ok=True)
         path.rmdir()

@@ -7,15 +7,15 @@ from pathlib import Path
 
 from lce_rig.core.errors import SessionError
 
-# A link that somebody put in a file's place must not lead elsewhere.
+# A link in a file's place must not lead out of the session.
 _WRITE_OWN = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def own_path(root: Path, path: Path) -> Path:
-    """Pass a path through that leads, links followed, to a place in a folder.
+    """Return a path that, with links followed, stays in a folder.
 
     Raises:
-        OSError: it leads elsewhere; sessions come from others, and must not make us write over files of ours.
+        OSError: it leads elsewhere. A session from another source must not make us overwrite files.
     """
     try:
         is_own = path.resolve().is_relative_to(root.resolve())
@@ -27,7 +27,7 @@ def own_path(root: Path, path: Path) -> Path:
 
 
 def write_new_file(path: Path, data: bytes) -> None:
-    """Write a file that is not there yet and flush it to the disk.
+    """Write a new file and flush it to the disk.
 
     Raises:
         OSError: FileExistsError, a full disk, no permission.
@@ -39,7 +39,7 @@ def write_new_file(path: Path, data: bytes) -> None:
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Put `data` in place of a file in one step: a reader sees the old or the new content, never a part.
+    """Replace a file's content by `data` in one step: readers see the old or the new content, never a part.
 
     Raises:
         OSError: a full disk, no permission.
@@ -80,7 +80,7 @@ def flush_folder(path: Path) -> None:
 
 
 def append_line(path: Path, line: str) -> None:
-    """Append one line and flush it; takes back what it wrote where the disk is full.
+    """Append one line and flush it; undo a partial write if the disk is full.
 
     A torn last line of an earlier run that was killed is closed by a line break first.
 
@@ -111,7 +111,7 @@ class WriterLock:
     stale. The file names the holder, for the message only.
 
     Raises:
-        BlockingIOError: somebody else writes; its argument is the holder's process id, or "".
+        BlockingIOError: another process writes; the argument is its process id, or "".
     """
 
     def __init__(self, path: Path) -> None:
@@ -127,7 +127,7 @@ class WriterLock:
         os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
 
     def release(self) -> None:
-        """Let the next writer in; does nothing the second time."""
+        """Release the lock; a second call does nothing."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1

@@ -27,14 +27,14 @@ def marker_of(rig: Rig) -> bytes:
 
 
 def check_marker(path: Path) -> None:
-    """Make sure that a folder is a session this version reads.
+    """Check that a folder is a session this version reads.
 
     Raises:
-        SessionError: it is none, or damaged, or made by a newer version.
+        SessionError: it is not a session, is damaged, or was made by a newer version.
     """
     if path.is_file():
-        hint = "Name the session's folder; `lce-rig collect --from FILE` makes one of a recording."
-        raise SessionError(f"{path} is a file, a session is a folder", hint)
+        hint = "Give the session's folder. `lce-rig collect --from FILE` makes a session from a recording."
+        raise SessionError(f"{path} is a file, but a session is a folder", hint)
     version = read_marker(path)["format_version"]
     if version > FORMAT_VERSION:
         raise SessionError(f"{path} was made by a newer lce-rig (format {version})", "Update lce-rig.")
@@ -51,7 +51,7 @@ def read_marker(path: Path) -> dict[str, Any]:
             marker = read_json(path / MARKER)
         except FileNotFoundError:
             hint = "Make one with `lce-rig collect` or `lce-rig simulate`."
-            raise SessionError(f"{path} is no session: it has no {MARKER}", hint) from None
+            raise SessionError(f"{path} is not a session: it has no {MARKER}", hint) from None
     if not isinstance(marker, dict) or type(marker.get("format_version")) is not int:
         raise SessionError(f"{path / MARKER}: it has no format_version")
     return marker
@@ -77,8 +77,8 @@ class DifferingKey:
 def differing_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
     """List the keys in which two profiles differ, with both values.
 
-    The description and the nominal extrinsics may differ, on which no capture depends, and how attached
-    sensors are reached: a camera is /dev/video2 today.
+    The description, the nominal extrinsics and the addresses of attached sensors (such as /dev/video2) may
+    differ, as no capture depends on them.
     """
     a, b = (_flatten(yaml.safe_load(dump_rig(rig))) for rig in (theirs, ours))
     paths = sorted(path for path in a.keys() | b.keys() if a.get(path) != b.get(path))

@@ -1,4 +1,4 @@
-"""The samples that a session accepts: one per sensor of its rig."""
+"""Check the samples of a capture: at most one per sensor of the rig."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from lce_rig.session.capture import Capture
 
 
 def check_samples(rig: Rig, images: Sequence[Image], scans: Sequence[Scan], events: Sequence[Events]) -> None:
-    """Make sure that samples can be one capture of a rig.
+    """Check that samples can be one capture of a rig.
 
     Raises:
         SessionError: there are none, two of one sensor, one of a sensor that the rig lacks, or events of
@@ -19,8 +19,8 @@ def check_samples(rig: Rig, images: Sequence[Image], scans: Sequence[Scan], even
     keys += [(s.sensor, "") for s in scans] + [(e.sensor, "raw events") for e in events]
     if len(set(keys)) < len(keys) or not keys:
         raise SessionError(
-            "a capture needs one picture a camera channel, one scan a lidar and one stretch of events "
-            "a camera at most, and not nothing"
+            "a capture holds at most one image per camera channel, one scan per lidar and one stretch of "
+            "events a camera at most, and not nothing"
         )
     _check_sensors(rig, [(i.sensor, i.channel) for i in images], [s.sensor for s in scans])
     for stretch in events:
@@ -28,17 +28,17 @@ def check_samples(rig: Rig, images: Sequence[Image], scans: Sequence[Scan], even
         size, wanted = (stretch.width_px, stretch.height_px), rig.cameras[stretch.sensor].resolution_px
         if size != wanted:
             raise SessionError(
-                f"events of {stretch.sensor} are of {size[0]}x{size[1]} pixels; "
+                f"events of {stretch.sensor} are {size[0]}x{size[1]} px; "
                 f"rig {rig.name!r} gives it {wanted[0]}x{wanted[1]}",
-                "Is it another camera's recording? Else correct resolution_px in the profile.",
+                "Use this camera's recording, or correct resolution_px in the profile.",
             )
 
 
 def check_capture(rig: Rig, capture: Capture) -> None:
-    """Make sure that a capture that was read names sensors of its rig only.
+    """Check that a capture that was read names sensors of its rig only.
 
     Raises:
-        SessionError: it does not, or its manifest is damaged.
+        SessionError: it names another sensor, or its manifest is damaged.
     """
     images, lidars, event_cameras = capture.image_keys, capture.lidars, capture.event_cameras
     try:
@@ -47,7 +47,7 @@ def check_capture(rig: Rig, capture: Capture) -> None:
             event_channel(rig, camera)
     except SessionError as error:
         raise SessionError(
-            f"capture {capture.name} is of another rig: {error.what}",
+            f"capture {capture.name} belongs to another rig: {error.what}",
             f"Remove {capture.path} and collect again; the other captures are not affected.",
         ) from None
 
@@ -73,5 +73,5 @@ def event_channel(rig: Rig, camera: str) -> str:
         return channel
     raise SessionError(
         f"rig {rig.name!r} has no camera {camera!r} with events",
-        f"Give it a channel of `kind: events` in the profile, under cameras.{camera}.channels.",
+        f"Add a channel with `kind: events` to the profile, under cameras.{camera}.channels.",
     )

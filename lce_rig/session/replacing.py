@@ -1,4 +1,4 @@
-"""Folders of results, replaced as a whole: a reader finds all earlier files or all new ones, at any time.
+"""Replace folders of results in one step: a reader always finds all earlier files or all new ones.
 
 The writer fills a draft beside the session's other folders (`.new-calibration-XXXX`), then exchanges both in
 one system call (renameat2). A killed process leaves one complete folder, and a draft that the next process
@@ -19,7 +19,7 @@ from lce_rig.session.durable import flush_folder, own_path
 
 DRAFT, ASIDE = ".new-", ".old-"
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
-# What says that this kernel, C library or file system (NFS, FAT) cannot exchange.
+# Errors if this kernel, C library or file system (NFS, FAT) cannot exchange.
 _NO_EXCHANGE = {errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EPERM}
 
 
@@ -31,16 +31,16 @@ def replacing(
     *,
     can_exchange: bool = True,
 ) -> Iterator[Path]:
-    """Yield an empty draft; what is in it when the block ends takes the place of a folder.
+    """Yield an empty draft that replaces a folder when the block ends.
 
-    Where the block raises, or anything goes wrong before the change of places, the folder stays as it was.
+    If the block raises, or anything fails before the exchange, the folder stays unchanged.
 
     Args:
         root: the session's folder, in which drafts are made.
-        folder: to be replaced, anywhere below `root`; need not exist.
-        finish: called with the folder and the draft just before they change places, while no other process
-            may replace folders of this session: what is to be kept goes into the draft here.
-        can_exchange: False takes the way of file systems that cannot exchange two folders in one step.
+        folder: the folder to replace, anywhere below `root`; need not exist.
+        finish: called with the folder and the draft just before the exchange, while no other process may
+            replace folders of this session; it copies files to be kept into the draft.
+        can_exchange: False uses the method for file systems that cannot exchange two folders in one step.
 
     Raises:
         OSError: a full disk, no permission; or a file, or a link, is in the folder's place.
@@ -66,10 +66,10 @@ def replacing(
 
 
 def check_folder(path: Path) -> None:
-    """Pass where a folder is, or nothing.
+    """Check that a path is a folder or does not exist.
 
     Raises:
-        NotADirectoryError: there is a file, or a link: an exchange would take it away from where it is.
+        NotADirectoryError: there is a file or a link, which an exchange would move away.
     """
     if path.is_symlink() or (path.exists() and not path.is_dir()):
         what = "link" if path.is_symlink() else "file"
@@ -77,7 +77,7 @@ def check_folder(path: Path) -> None:
 
 
 def recover(root: Path) -> None:
-    """Put a folder back that a process was killed over, on file systems that cannot exchange two.
+    """Restore a folder after a process was killed, on file systems that cannot exchange two.
 
     Raises:
         OSError: no permission.
@@ -123,7 +123,7 @@ def _change_places(draft: Path, folder: Path, root: Path, *, can_exchange: bool)
 
 
 def _exchange(a: Path, b: Path) -> bool:
-    """Let two folders change places in one step; False where the system cannot."""
+    """Exchange two folders in one step; False if the system cannot."""
     try:
         renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
     except AttributeError:
@@ -137,10 +137,10 @@ def _exchange(a: Path, b: Path) -> bool:
 
 
 def _put_back(root: Path) -> None:
-    """Give each folder that stands aside its place back where nothing took it, else remove it."""
+    """Move each folder that was put aside back if its place is free, else remove it."""
     for aside in root.glob(f"{ASIDE}*"):
         parts = aside.name.removeprefix(ASIDE).split("+")
-        # A session may come from others: its names must not move folders out of it.
+        # In a session from another source, names must not move folders out of it.
         if aside.is_symlink() or not aside.is_dir() or not {"", ".", ".."}.isdisjoint(parts):
             continue
         folder = root.joinpath(*parts)
@@ -154,7 +154,7 @@ def _put_back(root: Path) -> None:
 
 
 def _remove_drafts(root: Path, name: str) -> None:
-    """Remove what killed processes left; what a living one fills is locked."""
+    """Remove drafts of killed processes; those of living ones are locked."""
     for draft in root.glob(f"{DRAFT}{name}-*"):
         with suppress(OSError), _locked(draft, waits=False):
             shutil.rmtree(draft, ignore_errors=True)
@@ -162,7 +162,7 @@ def _remove_drafts(root: Path, name: str) -> None:
 
 @contextmanager
 def _locked(folder: Path, *, waits: bool = True) -> Iterator[None]:
-    """Hold a folder's lock, which the kernel drops with the process; none where there is no flock (NFS).
+    """Hold a folder's lock, which the kernel drops with the process; no lock without flock (NFS).
 
     Raises:
         BlockingIOError: another process holds it, and this one does not wait.

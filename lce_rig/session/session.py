@@ -36,10 +36,10 @@ from lce_rig.session.replacing import recover, replacing
 
 
 def read_entries(path: Path) -> list[dict[str, Any]]:
-    """List the entries of a journal; lines that are none, such as one torn by a crash, are skipped.
+    """List the entries of a journal; skip invalid lines, such as one torn by a crash.
 
     Args:
-        path: its file; one that is not there has no entries.
+        path: its file; a missing file has no entries.
 
     Raises:
         OSError: it cannot be read.
@@ -89,7 +89,7 @@ class Session:
         """Start a session in a new or empty folder and open it for writing.
 
         Raises:
-            SessionError: the folder holds something already, or cannot be written.
+            SessionError: the folder is not empty, or cannot be written.
         """
         path = Path(path)
         if (path / MARKER).exists():
@@ -101,7 +101,7 @@ class Session:
             others = {entry.name for entry in path.iterdir()} - {PROFILE, LOCK, JOURNAL, CAPTURES}
             if any(not name.startswith((f".{PROFILE}.", f".{MARKER}.")) for name in others):
                 raise SessionError(
-                    f"{path} is not empty and no session: it holds {sorted(others)[0]}",
+                    f"{path} is not empty and not a session: it holds {sorted(others)[0]}",
                     "Choose another folder.",
                 )
             lock = _take_lock(path)
@@ -126,7 +126,7 @@ class Session:
         path = Path(path)
         check_marker(path)
         _check_links(path)
-        with suppress(OSError):  # without permission to write nothing was ever put aside
+        with suppress(OSError):  # without permission to write, nothing was put aside
             recover(path)
         try:
             rig = load_rig(path / PROFILE)
@@ -180,13 +180,13 @@ class Session:
         self.close()
 
     def close(self) -> None:
-        """Let the next writer in; reading goes on working."""
+        """Release the lock for the next writer; reading continues to work."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None
 
     def _adopt(self, rig: Rig) -> None:
-        """Take over what may differ in the profile: how attached sensors are reached."""
+        """Adopt what may differ in the profile: the addresses of attached sensors."""
         if rig == self.rig:
             return
         try:
@@ -198,7 +198,7 @@ class Session:
 
     @property
     def captures(self) -> list[Capture]:
-        """Every whole capture, by name.
+        """All complete captures, sorted by name.
 
         Raises:
             SessionError: their folder may not be read.
@@ -271,7 +271,7 @@ class Session:
     def find_duplicate(
         self, images: Iterable[Image], scans: Iterable[Scan], events: Iterable[Events] = ()
     ) -> str | None:
-        """Name the capture, rejected ones included, that holds exactly this data; None where it is new."""
+        """Return the capture, even if rejected, that already holds exactly this data; None if it is new."""
         return self._contents().get(content_hash(images, scans, events))
 
     def add_capture(
@@ -281,7 +281,7 @@ class Session:
         meta: Mapping[str, Any],
         events: Iterable[Events] = (),
     ) -> str:
-        """Store one capture so that it survives whatever happens after this returns.
+        """Store one capture; after the return it survives a crash or power failure.
 
         Args:
             images: at most one for each camera channel.
@@ -294,7 +294,7 @@ class Session:
 
         Raises:
             SessionError: the session is open read-only, a sensor is not in the rig, events are out of
-                order or off their sensor, or the disk is full; what was captured before is not affected.
+                order or outside their sensor, or the disk is full; earlier captures are not affected.
         """
         images, scans, events = list(images), list(scans), list(events)
         self._require_lock()
@@ -329,7 +329,7 @@ class Session:
             raise SessionError(f"{self.path} is open for reading only")
 
     def journal(self, event: str, **fields: Any) -> None:
-        """Append what happened, with the time, to journal.jsonl.
+        """Append an entry with the time to journal.jsonl.
 
         Raises:
             SessionError: the disk is full or read-only.
@@ -342,7 +342,7 @@ class Session:
             raise _not_writable(self.path / JOURNAL, error, len(self.captures)) from error
 
     def read_journal(self) -> list[dict[str, Any]]:
-        """List what happened; a line torn by a crash is skipped.
+        """List the journal's entries; skip a line torn by a crash.
 
         Raises:
             SessionError: the journal cannot be read.
@@ -352,7 +352,7 @@ class Session:
             return read_entries(path)
 
     def store_cached(self, key: str, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, Any]) -> bool:
-        """Keep arrays and JSON values under a key such as "3f9a1c/000012" for `load_cached`.
+        """Store arrays and JSON values under a key such as "3f9a1c/000012" for `load_cached`.
 
         Returns:
             Whether it could be written; a full or read-only disk only costs the time saved.
@@ -360,17 +360,17 @@ class Session:
         return cache.store(self._cache_path(key), arrays, values)
 
     def load_cached(self, key: str) -> cache.Cached | None:
-        """Give back what `store_cached` kept; None where there is nothing, or it is damaged."""
+        """Return what `store_cached` stored; None if there is no entry or it is damaged."""
         return cache.load(self._cache_path(key))
 
     def _cache_path(self, key: str) -> Path:
         parts = key.split("/")
         if not all(SAFE_NAME.fullmatch(part) for part in parts):
-            raise ValueError(f"{key!r} is no cache key")
+            raise ValueError(f"{key!r} is not a cache key")
         return self.own(DETECTIONS, *parts[:-1], parts[-1] + ".npz")
 
     def own(self, *parts: str) -> Path:
-        """Give the path of a file or folder of the session that is to be written.
+        """Return the path of a file or folder of the session that is to be written.
 
         Raises:
             SessionError: a link there leads out of the session.
@@ -385,7 +385,7 @@ class Session:
     def replacing(
         self, *parts: str, finish: Callable[[Path, Path], None] = lambda _old, _draft: None
     ) -> Iterator[Path]:
-        """Yield an empty folder that takes the place of one of the session's when the block ends.
+        """Yield an empty folder that replaces one of the session's when the block ends.
 
         Readers find the earlier folder or the new one, whole, whatever happens in between.
 
@@ -411,7 +411,7 @@ class Session:
                 try:
                     self._names_by_content.setdefault(capture.content_sha256, capture.name)
                 except SessionError:
-                    # A damaged capture is named when it is read; nothing is a duplicate of it.
+                    # A damaged capture is reported when it is read; nothing is a duplicate of it.
                     continue
         return self._names_by_content
 
@@ -425,17 +425,17 @@ def _captures_in(folder: Path) -> list[Capture]:
 
 
 def _check_rig(path: Path, rig: Rig) -> None:
-    """Refuse a session whose marker names another rig than its profile."""
+    """Refuse a session whose marker and profile name different rigs."""
     named = read_marker(path).get("rig")
     if named != rig.name:
         raise SessionError(
             f"{path}: {MARKER} is of rig {named!r}, {PROFILE} of rig {rig.name!r}",
-            "Put back the profile that the session was made with.",
+            "Restore the profile that the session was made with.",
         )
 
 
 def _check_links(path: Path) -> None:
-    """Refuse a session in which what is written here leads elsewhere, before anything is done with it.
+    """Refuse a session with links that lead out of the folders written here.
 
     Raises:
         SessionError: it names the link.

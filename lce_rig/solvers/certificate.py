@@ -35,6 +35,7 @@ from lce_rig.solvers.registration import (
 
 RELATIVE_GAP = 1e-6
 _ROUNDING = 1e-11
+_BARRIER_STEPS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,17 +58,15 @@ class Certificates:
         return np.asarray(self.gap / np.maximum(self.cost, 1e-300))
 
 
-def certify(Q: Array, R: Array, relative_gap: float = RELATIVE_GAP, max_iterations: int = 60) -> Certificates:
+def certify(Q: Array, R: Array) -> Certificates:
     """Bound how far each R may be from the global minimum of z^T Q z.
 
     Args:
         Q: (B, 10, 10).
         R: (B, 3, 3) candidates, as `minimise_on_so3` gives them.
-        relative_gap: what counts as optimal.
-        max_iterations: of the barrier method; 0 leaves it out.
     """
     cost = rotation_cost(Q, R)
-    tolerance = relative_gap * cost + _ROUNDING * np.trace(Q, axis1=-2, axis2=-1)
+    tolerance = RELATIVE_GAP * cost + _ROUNDING * np.trace(Q, axis1=-2, axis2=-1)
     Z, bound, stationarity = _least_norm_dual(Q, R)
 
     def gap_at(eigenvalue: Array, rows: NDArray[np.intp]) -> Array:
@@ -75,7 +74,7 @@ def certify(Q: Array, R: Array, relative_gap: float = RELATIVE_GAP, max_iteratio
         return np.asarray(np.maximum(cost[rows] - bound[rows], 0) + 4 * slack)  # equation (2)
 
     gap = gap_at(_least_eigenvalue(Z), np.arange(len(Z)))
-    for improve in (_flatten, lambda z: _raise_least_eigenvalue(z, max_iterations)):
+    for improve in (_flatten, _raise_least_eigenvalue):
         # No multipliers help where R is not stationary.
         left = np.flatnonzero((gap > tolerance) & (4 * stationarity <= tolerance))
         if len(left) == 0:
@@ -207,7 +206,7 @@ def _flatten(Z: Array) -> Array:
     return np.asarray(Z - np.tensordot(along, family, axes=1))
 
 
-def _raise_least_eigenvalue(Z: Array, max_iterations: int) -> Array:
+def _raise_least_eigenvalue(Z: Array) -> Array:
     """Maximise s subject to Z + sum c_j N_j >= s I by Newton's method on s + mu log det(. - s I), mu -> 0."""
     family = _dual().family
     m = len(family)
@@ -218,7 +217,7 @@ def _raise_least_eigenvalue(Z: Array, max_iterations: int) -> Array:
     s = best - 1e-2 * (1 + np.abs(best))
     mu = np.full(len(Z), 0.1)
     active = np.arange(len(Z))
-    for _ in range(max_iterations):
+    for _ in range(_BARRIER_STEPS):
         slack = Z[active] + np.tensordot(c[active], family, axes=1) - s[active, None, None] * np.eye(9)
         inverse = np.linalg.inv(slack)
         # Derivatives of the slack: N_j along c_j, -I along s.

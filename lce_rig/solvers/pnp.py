@@ -28,7 +28,7 @@ class PlanarPose:
     Attributes:
         T_cam_board: (4, 4) the lower minimum.
         cov: (6, 6) of T_cam_board, sigma^2 (J^T J)^-1, tangent (translation m, rotation rad).
-        T_cam_board_alternative: (4, 4) the other minimum; None where both starts reach the same one.
+        T_cam_board_alternative: (4, 4) the other minimum; None if both starts reach the same one.
         chi2_gap: (f_alternative - f) / sigma^2; infinite without an alternative.
         reprojection_px: rms distance of a corner from its prediction.
         sigma_px: noise per coordinate, sqrt(f / (2 n - 6)).
@@ -59,7 +59,7 @@ def solve_planar_pose(
             the homography is then not needed, and fewer steps are.
 
     Returns:
-        The minima, or None where the corners admit no pose in front of the camera.
+        The minima, or None if the corners admit no pose in front of the camera.
 
     References:
         T. Collins, A. Bartoli: Infinitesimal plane-based pose estimation. IJCV 109 (2014).
@@ -160,7 +160,7 @@ def mirror_tilt(T_cam_board: Array, centre_board: Array) -> Array:
 
 
 def _pose_from_homography(corners_board: Array, rays: Array) -> Array | None:
-    """Decompose the homography board plane -> rays, H ~ [r1 r2 t]; None where the corners have no rays.
+    """Decompose the homography board plane -> rays, H ~ [r1 r2 t]; None if the corners have no rays.
 
     Rays beyond 90 deg from the axis have no x/z; turning all rays so that their mean is the axis keeps the
     homography finite for wide fisheye images too.

@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 from lce_rig.core.geometry import Array, exp_so3, project_to_so3, skew
 
 N_ROTATION = 9
+_MAX_STEPS, _TOLERANCE_RAD = 50, 1e-8
+# Eigenvalues of the linear block below this share of the largest count as unseen.
+_RELATIVE_FLOOR = 1e-12
 
 
 def vec_rotation(R: Array) -> Array:
@@ -48,14 +51,13 @@ def tangent_basis(R: Array, n_linear: int) -> Array:
     return J
 
 
-def eliminate_linear(M: Array, relative_floor: float = 1e-12) -> tuple[Array, Array]:
+def eliminate_linear(M: Array) -> tuple[Array, Array]:
     """Minimise over t and s in closed form (Schur complement), equation (3).
 
     Directions that no residual sees are left at zero.
 
     Args:
         M: (..., m, m) moments.
-        relative_floor: eigenvalues of the linear block below this share of the largest count as unseen.
 
     Returns:
         Q (..., 10, 10), and L (..., m - 10, 10) with [t; s] = L z.
@@ -64,7 +66,7 @@ def eliminate_linear(M: Array, relative_floor: float = 1e-12) -> tuple[Array, Ar
     linear = np.arange(N_ROTATION, M.shape[-1] - 1)
     cross = M[..., linear[:, None], rest]
     values, vectors = np.linalg.eigh(M[..., linear[:, None], linear])
-    is_seen = values > relative_floor * values[..., -1:]
+    is_seen = values > _RELATIVE_FLOOR * values[..., -1:]
     inverse = np.where(is_seen, 1.0 / np.where(is_seen, values, 1.0), 0.0)
     L = -(vectors * inverse[..., None, :]) @ (np.swapaxes(vectors, -1, -2) @ cross)
     Q = M[..., rest[:, None], rest] + np.swapaxes(cross, -1, -2) @ L
@@ -82,19 +84,17 @@ def linear_unknowns(L: Array, R: Array) -> Array:
     return np.asarray((L @ with_one(vec_rotation(R))[..., None])[..., 0])
 
 
-def rotation_from_directions(targets: Array, sources: Array, weights: Array | None = None) -> Array:
+def rotation_from_directions(targets: Array, sources: Array) -> Array:
     """Find the R that best turns source into target directions (Wahba's problem).
 
     Args:
         targets: (..., n, 3).
         sources: (..., n, 3).
-        weights: (..., n); ones by default.
 
     References:
         Wahba, "A least squares estimate of satellite attitude", SIAM Review, 1965.
     """
-    weighted = targets if weights is None else targets * weights[..., None]
-    return project_to_so3(np.swapaxes(weighted, -1, -2) @ sources)
+    return project_to_so3(np.swapaxes(targets, -1, -2) @ sources)
 
 
 def cube_rotations() -> Array:
@@ -105,16 +105,12 @@ def cube_rotations() -> Array:
     return np.asarray(signed[np.linalg.det(signed) > 0])
 
 
-def minimise_on_so3(
-    Q: Array, R_start: Array, max_iterations: int = 50, tolerance_rad: float = 1e-8
-) -> tuple[Array, Array]:
+def minimise_on_so3(Q: Array, R_start: Array) -> tuple[Array, Array]:
     """Minimise z^T Q z over SO(3) by damped Newton steps R <- R exp(w^), saddle-free where not convex.
 
     Args:
         Q: (B, 10, 10).
         R_start: (B, 3, 3).
-        max_iterations: steps at most.
-        tolerance_rad: a shorter step ends the iteration.
 
     Returns:
         R (B, 3, 3) and f (B,) at it.
@@ -125,7 +121,7 @@ def minimise_on_so3(
     cost, gradient, hessian = _expand(Q, R)
     damping = np.zeros(len(R))
     active = np.arange(len(R))
-    for _ in range(max_iterations):
+    for _ in range(_MAX_STEPS):
         if len(active) == 0:
             break
         step, is_convex = _newton_step(hessian[active], gradient[active], damping[active])
@@ -142,7 +138,7 @@ def minimise_on_so3(
         relaxed = np.where(damping[active] > 1e-10 * scale, 0.1 * damping[active], 0.0)
         raised = np.maximum(10 * damping[active], 1e-3 * scale)
         damping[active] = np.where(is_better, relaxed, raised)
-        is_done = (is_better & (length < tolerance_rad)) | (damping[active] > 1e12 * scale)
+        is_done = (is_better & (length < _TOLERANCE_RAD)) | (damping[active] > 1e12 * scale)
         active = active[~is_done]
     return R, cost
 

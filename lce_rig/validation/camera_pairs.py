@@ -1,7 +1,7 @@
-"""Two cameras that saw the same boards: where their pictures put them, and whether their extrinsics agree.
+"""Two cameras that saw the same boards: their relative pose from images, and whether their extrinsics agree.
 
-Each board held still that both see gives T_second_first = T_second_board T_first_board^-1 without any LiDAR.
-The extrinsics of both cameras with one LiDAR say the same thing by another way.
+Each still board that both see gives T_second_first = T_second_board T_first_board^-1 without any LiDAR. The
+extrinsics of both cameras with one LiDAR give the same pose independently.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,16 +22,16 @@ from lce_rig.residuals.placements import group_placements
 from lce_rig.residuals.quadratics import Quadratics, without_prior
 from lce_rig.rig import CalibrationSettings, VerdictSettings
 from lce_rig.solvers.covariance import symmetric_inverse
-from lce_rig.validation.split_consistency import contrast_halves, doubt_halves
-from lce_rig.validation.weighing import SURPRISING_CHI2, doubt
+from lce_rig.validation.split_consistency import contrast_halves, split_findings
+from lce_rig.validation.weighing import SURPRISING_CHI2, reason
 
-# Fewer placements show no scatter.
+# Fewer placements do not determine the scatter.
 _MIN_PLACEMENTS = 4
-# Of fewer, the scatter has no shape that could be told: that of usual errors is taken.
+# Fewer placements do not determine the shape of the scatter; that of typical errors is used.
 _MIN_JACKKNIFE = 10
-# Freedoms of the Student distribution that weighs single boards: one in some may be seen wrongly.
+# Degrees of freedom of the Student distribution that weights single boards, as some may be outliers.
 _STUDENT = 5.0
-# Boards scatter for a reason where they do so by this many times what is usual.
+# Scatter of boards above this multiple of the typical value has a cause.
 _MAX_SCATTER = 2.0
 
 _BY_IMAGES = {
@@ -42,16 +42,16 @@ _BY_IMAGES = {
 
 @dataclass(frozen=True, eq=False)
 class PicturePose:
-    """Where one camera sits to another by the pictures of both.
+    """The relative pose of two cameras from their images.
 
     Attributes:
         T_second_first: (4, 4), p_second = R p_first + t.
         cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the second camera: from the scatter
             between placements.
         captures: (F,) that both cameras used, as the first names them.
-        board_rms_m: how far apart the two cameras put the middle of a board, rms.
-        scatter: of single boards about it, in standard deviations that poses in pictures usually have.
-        expansion: of the cost about T_second_first, capture by capture.
+        board_rms_m: rms distance between both cameras' positions of a board's middle.
+        scatter: of single boards about it, in typical standard deviations of poses in images.
+        expansion: of the cost about T_second_first, per capture.
         centres: (F, 3) middle of the board in each, frame of the first camera, m.
     """
 
@@ -71,10 +71,10 @@ class CameraPair:
     Attributes:
         captures: that both used, as the first names them.
         T_second_first: (4, 4) to which their extrinsics compose.
-        pictures: what their pictures say; None where too few boards were seen by both.
-        apart: (6,) tangent from the extrinsics' pose to the pictures'; None likewise.
-        surprise: square of its length in standard deviations that both claim.
-        board_rms_m: how far apart the extrinsics' pose puts the middle of a board, rms.
+        pictures: the relative pose from their images; None if both saw too few boards.
+        apart: (6,) tangent from the extrinsics' pose to the images'; None likewise.
+        surprise: its squared length in reported standard deviations.
+        board_rms_m: rms distance between positions of a board's middle under the extrinsics' pose.
     """
 
     captures: tuple[str, ...]
@@ -88,7 +88,7 @@ class CameraPair:
 def shared_boards(
     first: Mapping[str, Observation], second: Mapping[str, Observation]
 ) -> list[tuple[Observation, Observation]]:
-    """Pair observations of two cameras of the same board in the same scan, whatever captures they lie in.
+    """Pair observations of two cameras of the same board in the same scan, in any captures.
 
     Args:
         first: observations by capture, of one camera.
@@ -100,10 +100,10 @@ def shared_boards(
 
 
 def relate(first: CalibrationEstimate, second: CalibrationEstimate) -> CameraPair | None:
-    """Hold the extrinsics of two cameras, whose boards stood still, against their pictures.
+    """Compare the extrinsics of two cameras with their images of still boards.
 
     Returns:
-        None where the cameras share no capture.
+        None if the cameras share no capture.
     """
     shared = shared_boards(first.observations, second.observations)
     if not shared:
@@ -115,16 +115,16 @@ def relate(first: CalibrationEstimate, second: CalibrationEstimate) -> CameraPai
     if pictures is None:
         return CameraPair(captures, T, None, None, 0.0, board_rms_m)
     apart = difference(pictures.T_second_first, T)
-    # Errors that both ways share, those of the pictures, are counted twice: the surprise is rather too small.
+    # Errors of the images enter both poses and are counted twice, so that the surprise is conservative.
     cov = relative_covariance(J, second.cov, first.cov) + pictures.cov
     surprise = float(apart @ np.linalg.solve(cov, apart))
     return CameraPair(captures, T, pictures, apart, surprise, board_rms_m)
 
 
 def pose_from_pictures(shared: Sequence[tuple[Observation, Observation]]) -> PicturePose | None:
-    """Estimate T_second_first from what both cameras' pictures say of the same boards.
+    """Estimate T_second_first from both cameras' images of the same boards.
 
-    A picture's pose errs by its corners' noise and by what corners have in common (`picture_terms`).
+    An image's pose has the errors of its corners' noise and errors that corners share (`picture_terms`).
 
     Returns:
         None for fewer than four placements.
@@ -163,7 +163,7 @@ def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
 
 
 def _student_weights(chi2: Array) -> Array:
-    """Weigh poses by their squared distances (F,) from the mean, in units of what is usual among them."""
+    """Weight poses by their squared distances (F,) from the mean, in units of the typical value."""
     return np.asarray((_STUDENT + 6) / (_STUDENT + chi2 / max(float(np.median(chi2)) / 6, 1.0)))
 
 
@@ -179,10 +179,10 @@ def _board_rms_m(shared: Sequence[tuple[Observation, Observation]], T_second_fir
     return float(np.sqrt(np.mean(np.sum((np.array(middles) - seen) ** 2, axis=1))))
 
 
-def doubt_cameras(
+def camera_findings(
     pair: CameraPair, names: tuple[str, str], target: CalibrationSettings, limits: VerdictSettings
 ) -> list[Finding]:
-    """Doubt the extrinsics of two cameras that contradict the cameras' own pictures.
+    """Find contradictions between the extrinsics of two cameras and their images.
 
     Args:
         pair: the cameras.
@@ -192,10 +192,10 @@ def doubt_cameras(
     """
     if pair.pictures is None or pair.apart is None:
         return []
-    # Pictures are exact enough to show any change that matters.
+    # Images are accurate enough to show any relevant change.
     strict = limits.model_copy(update={"max_change": limits.max_camera_difference})
     halves = contrast_halves(pair.pictures.expansion, pair.pictures.centres)
-    changed = doubt_halves(halves, pair.pictures.captures, target, strict)
+    changed = split_findings(halves, pair.pictures.captures, target, strict)
     by_images = [replace(each, code=_BY_IMAGES[each.code], subject=" to ".join(names)) for each in changed]
     return [
         *by_images,
@@ -208,7 +208,7 @@ def _scattered(pictures: PicturePose, names: tuple[str, str], limits: VerdictSet
     if pictures.scatter <= _MAX_SCATTER or pictures.board_rms_m <= limits.max_plane_misfit_m:
         return []
     figures = {"rms_m": pictures.board_rms_m, "scatter": pictures.scatter}
-    return [doubt("verdict.cameras_scatter", figures, is_fail=False, subject=" to ".join(names))]
+    return [reason("verdict.cameras_scatter", figures, is_fail=False, subject=" to ".join(names))]
 
 
 def _elsewhere(
@@ -230,4 +230,4 @@ def _elsewhere(
         "translation_m": translation_m,
     }
     is_fail = excess > limits.fail_factor
-    return [doubt("verdict.cameras_differ", figures, is_fail=is_fail, subject=" to ".join(names))]
+    return [reason("verdict.cameras_differ", figures, is_fail=is_fail, subject=" to ".join(names))]

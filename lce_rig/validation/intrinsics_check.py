@@ -1,8 +1,8 @@
-"""Do the profile's intrinsics still fit the camera? Held against the boards of a calibration.
+"""Check whether the profile's intrinsics still fit the camera, with the boards of a calibration.
 
-Residuals alone do not tell: a focal length 2 % off moves the boards 2 % away and leaves corners a tenth of
-their noise worse. What tells is the lens that the boards themselves ask for, and how far it is from the
-profile's in units of its own uncertainty.
+Residuals alone are insufficient: a focal length error of 2 % moves the boards 2 % away and increases corner
+residuals by a tenth of their noise. The check therefore fits intrinsics to the boards and compares them with
+the profile's in units of their uncertainty.
 """
 
 from collections.abc import Sequence
@@ -19,37 +19,37 @@ from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
 from lce_rig.lens.difference import LensDifference, compare_lenses
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import model_of
-from lce_rig.validation.weighing import Verdict, doubt
+from lce_rig.validation.weighing import Verdict, reason
 
-# A difference is real where chance makes it this seldom.
+# A difference is significant below this probability.
 _CHANCE = 0.002
-# In units of the rotation to reach. A picture bent by as much as that cannot give it; a camera turned by its
-# principal point turns the extrinsic by the same angle, and three times the target counts as wrong.
+# In units of the target rotation. An image bent by as much as that cannot reach it; a camera rotated by its
+# principal point rotates the extrinsics by the same angle, and three times the target counts as wrong.
 _BENT_MARGINAL, _BENT_FAIL = 0.5, 1.0
 _TURN_MARGINAL, _TURN_FAIL = 1.5, 2.5
 _N_FOLDS = 2
-# Residuals by this much above the possible ones can be seen with the eye.
+# Residuals that exceed the possible ones by this much are visible.
 _VISIBLE = 1.2
 
 
 @dataclass(frozen=True)
 class IntrinsicsCheck:
-    """Intrinsics against the lens that the boards ask for.
+    """Given intrinsics compared with those fitted to the boards.
 
     Attributes:
-        n_captures: behind the check.
+        n_captures: number of captures used.
         rms_px: rms distance of a corner from its prediction by the given intrinsics.
-        possible_px: the same by a fitted lens, on captures it was not fitted to.
-        displacement_px: by how much the fitted lens draws elsewhere, rms where boards were seen, after the
-            turn of the camera that makes it least.
+        possible_px: the same for fitted intrinsics on held-out captures.
+        displacement_px: rms displacement of pixels between both where boards were seen, after the rotation of
+            the camera that minimises it.
         displacement_sigma_px: standard deviation of that.
         displacement_deg: the same as an angle.
-        turn_deg: that turn; an extrinsic under the given intrinsics is off by it.
+        turn_deg: that rotation, which is an error of extrinsics under the given intrinsics.
         turn_sigma_deg: standard deviation of that.
         focal_ratio: fitted over given focal length.
         focal_sigma: standard deviation of that.
-        chance: probability that boards seen by the given lens ask for one as different as the fitted one;
-            None where the models are not of one family.
+        chance: probability of a difference this large if the given intrinsics are right; None if the models
+            are of different families.
     """
 
     n_captures: int
@@ -65,12 +65,12 @@ class IntrinsicsCheck:
     chance: float | None
 
     def verdict(self, target_deg: float = 0.2) -> Verdict:
-        """Judge the given intrinsics: what is not surely different from the fitted ones passes.
+        """Judge the given intrinsics; they pass unless significantly different from the fitted ones.
 
         Args:
-            target_deg: standard deviation of the extrinsic's rotation to reach.
+            target_deg: target standard deviation of the extrinsics' rotation.
         """
-        # Noise alone displaces pixels: what exceeds it counts.
+        # Noise alone displaces pixels; only the excess counts.
         noise = min(self.displacement_sigma_px / max(self.displacement_px, 1e-12), 1.0)
         bent = self.displacement_deg * float(np.sqrt(1 - noise**2)) if self.is_bent else 0.0
         turned = self.turn_deg if self.is_turned else 0.0
@@ -81,23 +81,23 @@ class IntrinsicsCheck:
 
     @property
     def is_bent(self) -> bool:
-        """Whether pixels surely lie elsewhere: by how far they do, or by all parameters together."""
+        """Whether pixels are significantly displaced, by their displacement or by all parameters together."""
         is_other = self.chance is not None and self.chance < _CHANCE
         return is_other or self.displacement_px > self._sure * self.displacement_sigma_px
 
     @property
     def is_turned(self) -> bool:
-        """Whether the camera is surely turned."""
+        """Whether the camera is significantly rotated."""
         return self.turn_deg > self._sure * self.turn_sigma_deg
 
     @property
     def is_focal_off(self) -> bool:
-        """Whether the focal length is surely another one."""
+        """Whether the focal length differs significantly."""
         return abs(self.focal_ratio - 1) > self._sure * self.focal_sigma
 
     @property
     def _sure(self) -> float:
-        """How many standard deviations are no chance; few captures know their own deviation badly."""
+        """Number of standard deviations that is significant, with few captures more than for a normal one."""
         from scipy.special import stdtrit  # scipy.stats takes a second to import
 
         return float(stdtrit(self.n_captures - 1, 1 - _CHANCE / 2))
@@ -106,17 +106,17 @@ class IntrinsicsCheck:
 def check_intrinsics(
     image_boards: Sequence[BoardView], intrinsics: Intrinsics, board: Board
 ) -> IntrinsicsCheck | None:
-    """Hold intrinsics against the corners of the boards that were seen with them.
+    """Compare intrinsics with the corners of detected boards.
 
     Args:
         image_boards: of one camera, by capture and channel.
-        intrinsics: to be checked.
+        intrinsics: the intrinsics to check.
         board: the board.
 
     Returns:
-        None where there are too few boards, or too little tilt, to fit a lens at all.
+        None if there are too few boards, or too little tilt, to fit intrinsics.
     """
-    # Intrinsics that are wrong beyond measure lead nowhere; without their distortion they may.
+    # If grossly wrong intrinsics do not converge, they may do so without their distortion.
     plain = replace(intrinsics, distortion=(0.0,) * 4)
     for start in (intrinsics, plain):
         with suppress(NotEnoughDataError):
@@ -128,11 +128,11 @@ def check_intrinsics(
 def compare_with_given(
     fitted: IntrinsicsEstimate, intrinsics: Intrinsics, board: Board
 ) -> tuple[IntrinsicsCheck, LensDifference]:
-    """Hold intrinsics against a fitted lens.
+    """Compare intrinsics with fitted ones.
 
     Args:
         fitted: of any model.
-        intrinsics: to be checked, at the same resolution.
+        intrinsics: the intrinsics to check, at the same resolution.
         board: the board.
     """
     given_px = distances_under(intrinsics, fitted.views, board)
@@ -176,21 +176,21 @@ def _chance(fitted: IntrinsicsEstimate, intrinsics: Intrinsics) -> float | None:
 
 
 def describe(check: IntrinsicsCheck) -> str:
-    """State the figures of a check, whatever the verdict."""
+    """State the figures of a check, for any verdict."""
     return (
-        f"profile   corners off by {check.rms_px:.3f} px ({check.possible_px:.3f} px possible); pixels "
-        f"{check.displacement_px:.2f} +- {check.displacement_sigma_px:.2f} px elsewhere, turned by "
-        f"{check.turn_deg:.2f} +- {check.turn_sigma_deg:.2f} deg; focal length "
+        f"profile   reprojection error {check.rms_px:.3f} px (possible {check.possible_px:.3f} px); pixels "
+        f"displaced by {check.displacement_px:.2f} +- {check.displacement_sigma_px:.2f} px, camera "
+        f"rotated by {check.turn_deg:.2f} +- {check.turn_sigma_deg:.2f} deg; focal length "
         f"{100 * (check.focal_ratio - 1):+.2f} +- {100 * check.focal_sigma:.2f} %"
     )
 
 
 def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
-    """Find that the given intrinsics do not fit, and what is different.
+    """Return the finding that the given intrinsics do not fit, and how they differ.
 
     Args:
-        check: whose verdict is not "pass".
-        target_deg: standard deviation of the extrinsic's rotation to reach.
+        check: with a verdict other than "pass".
+        target_deg: target standard deviation of the extrinsics' rotation.
     """
     figures: dict[str, Figure] = {
         **asdict(check),
@@ -200,4 +200,4 @@ def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
         "is_focal_off": check.is_focal_off,
     }
     action = "refocused" if check.is_focal_off else ""
-    return doubt("verdict.intrinsics", figures, is_fail=check.verdict(target_deg) == "fail", action=action)
+    return reason("verdict.intrinsics", figures, is_fail=check.verdict(target_deg) == "fail", action=action)

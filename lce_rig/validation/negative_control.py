@@ -1,7 +1,7 @@
-"""A control that must fail: an extrinsic known to be bad has to fit captures worse that were left out.
+"""A negative control: extrinsics known to be wrong must fit held-out captures worse.
 
-Where it does not, the captures cannot tell the result from one that is several of its standard deviations,
-and as much as the target, away: the result is not the best one, or it is less certain than it says.
+If they do not, the captures cannot distinguish the result from one that is several of its standard deviations
+and at least the target away: the result is not the optimum, or its covariance is too small.
 """
 
 from collections.abc import Sequence
@@ -13,24 +13,24 @@ from lce_rig.core.board import Board
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import Observation
-from lce_rig.extrinsics.observability import lever_arm, name_direction
+from lce_rig.extrinsics.observability import lever_arm, main_motion
 from lce_rig.residuals.features import extract_features
 from lce_rig.residuals.plane_and_ends import capture_costs, feature_sigmas
 from lce_rig.residuals.quadratics import Quadratics
 from lce_rig.rig import CalibrationSettings
-from lce_rig.validation.weighing import doubt
+from lce_rig.validation.weighing import reason
 
-# A gain in the wrong direction that is this many of its standard errors sure is no chance.
+# A gain in the wrong direction of this many standard errors is significant.
 _SURE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class NegativeControl:
-    """What moving the result does to the residuals of captures left out.
+    """Effect of moving the result on the residuals of held-out captures.
 
     Attributes:
         moves: (B, 6) tangents by which the result was moved.
-        worse: (B,) mean increase of a left-out capture's cost over the result's own, in units of that.
+        worse: (B,) mean relative increase of a held-out capture's cost over that of the result.
         worse_sigma: (B,) standard error of it.
     """
 
@@ -48,18 +48,18 @@ def run_control(
     target: CalibrationSettings,
     n_sigmas: float,
 ) -> NegativeControl:
-    """Move an extrinsic both ways along the axes of its covariance, and judge it on captures left out.
+    """Move extrinsics both ways along the axes of its covariance, and judge it on held-out captures.
 
-    Each capture is judged under the extrinsic that the captures of the other placements give.
+    Each capture is judged under the extrinsics from the captures of the other placements.
 
     Args:
         observations: F captures.
         board: the board.
         T_cam_lidar: (4, 4) the result.
-        cov: (6, 6) as it claims.
+        cov: (6, 6) its reported covariance.
         expansion: of these captures, settled.
-        target: the result is moved by no less than this, in rotation or in translation.
-        n_sigmas: by how many standard deviations it is moved otherwise.
+        target: minimum move of the result, in rotation or in translation.
+        n_sigmas: number of standard deviations by which it is moved otherwise.
     """
     features = [extract_features(seen, board) for seen in observations]
     lever_m = lever_arm(features)
@@ -88,8 +88,8 @@ def run_control(
     )
 
 
-def doubt_control(control: NegativeControl) -> list[Finding]:
-    """Doubt a result that captures left out do not tell from a bad one."""
+def control_findings(control: NegativeControl) -> list[Finding]:
+    """Find a result that held-out captures do not distinguish from a wrong one."""
     worst = int(np.argmin(control.worse / control.worse_sigma))
     if control.worse[worst] > 0:
         return []
@@ -97,7 +97,7 @@ def doubt_control(control: NegativeControl) -> list[Finding]:
     figures: dict[str, Figure] = {
         "rotation_deg": float(np.degrees(np.linalg.norm(move[3:]))),
         "translation_m": float(np.linalg.norm(move[:3])),
-        "direction": name_direction(move),
+        "direction": main_motion(move),
     }
     is_fail = bool(control.worse[worst] < -_SURE * control.worse_sigma[worst])
-    return [doubt("verdict.control", figures, is_fail=is_fail)]
+    return [reason("verdict.control", figures, is_fail=is_fail)]

@@ -1,7 +1,7 @@
-"""What the uncertainty of an extrinsic means for a point that the LiDAR measures: pixels, and centimetres.
+"""The effect of the extrinsics' uncertainty on a point measured by the LiDAR, in pixels and centimetres.
 
-A point p = R q + t before the camera moves with the extrinsic by [I, -(p - t)^] times its tangent, as a
-rotation turns it about the LiDAR's origin.
+A point p = R q + t in the camera frame moves with the extrinsics by [I, -(p - t)^] times their tangent, as a
+rotation moves it about the LiDAR's origin.
 """
 
 import numpy as np
@@ -11,13 +11,13 @@ from lce_rig.core.geometry import Array, skew
 from lce_rig.core.results import PointUncertainty
 
 DISTANCES_M = (5.0, 10.0, 20.0)
-# Beyond some radius a lens's distortion is not defined: corners are taken as far out as it is.
+# Beyond some radius the distortion is undefined; corners are moved to that radius.
 _INWARDS = np.linspace(0.0, 1.0, 41)[:-1]
 _STEP_M = 1e-4
 
 
 def point_uncertainties(T_cam_lidar: Array, cov: Array, lens: Intrinsics) -> tuple[PointUncertainty, ...]:
-    """Propagate a covariance to points in the middle and in the corners of the picture.
+    """Propagate a covariance to points in the middle and in the corners of the image.
 
     Args:
         T_cam_lidar: (4, 4).
@@ -25,7 +25,7 @@ def point_uncertainties(T_cam_lidar: Array, cov: Array, lens: Intrinsics) -> tup
         lens: of the camera.
 
     Returns:
-        One for each of `DISTANCES_M`: of the four corners the least certain counts.
+        One for each of `DISTANCES_M`, with the worst of the four corners.
     """
     middle = np.array([[(lens.width_px - 1) / 2, (lens.height_px - 1) / 2]])
     rays = lens.unproject(np.concatenate([middle, _corners(lens, middle[0])]))
@@ -38,7 +38,7 @@ def point_uncertainties(T_cam_lidar: Array, cov: Array, lens: Intrinsics) -> tup
 
 
 def _corners(lens: Intrinsics, middle: Array) -> Array:
-    """Find the picture's corners (4, 2), or where the lens ends on the way to them."""
+    """Find the image's corners (4, 2), or where the lens ends on the way to them."""
     w, h = lens.width_px - 1.0, lens.height_px - 1.0
     corners = []
     for corner in np.array([[0, 0], [w, 0], [0, h], [w, h]]):
@@ -49,7 +49,7 @@ def _corners(lens: Intrinsics, middle: Array) -> Array:
 
 
 def _sigmas(point: Array, t: Array, cov: Array, lens: Intrinsics) -> tuple[float, float]:
-    """Compute the expected size of a point's error in the picture, px, and in space, m."""
+    """Compute the expected size of a point's error in the image, px, and in space, m."""
     by_tangent = np.concatenate([np.eye(3), -skew(point - t)], axis=1)
     cov_point = by_tangent @ cov @ by_tangent.T
     steps = _STEP_M * np.concatenate([np.eye(3), -np.eye(3)])

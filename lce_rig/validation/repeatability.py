@@ -1,6 +1,6 @@
-"""Do independent calibrations of one rig agree, as far as their stated uncertainties let expect?"""
+"""Compare calibrations of one rig with their reported uncertainties."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -11,22 +11,22 @@ from lce_rig.core.geometry import Array, difference, log_so3
 from lce_rig.core.results import Calibration
 from lce_rig.extrinsics.mean_pose import mean_pose
 
-# Agreement is denied where chance spreads sound calibrations so far this seldom.
+# Calibrations disagree if correct ones spread this far with less than this probability.
 _CHANCE = 0.01
-# Where chance spreads sound calibrations farther this often, the stated uncertainties are generous.
+# If correct ones spread farther with more than this probability, reported uncertainties are conservative.
 _GENEROUS = 0.95
 
 
 @dataclass(frozen=True)
 class PairDifference:
-    """How far two calibrations lie apart.
+    """The difference of two calibrations.
 
     Attributes:
         first, second: names of their sessions or results.
         rotation_deg, translation_m: angle and distance between the extrinsics.
         distance: Mahalanobis distance d, d^2 = x^T (cov_1 + cov_2)^-1 x with x the tangent between them;
             for results of the same captures with 2 (cov_1 + cov_2).
-        p: probability that sound calibrations lie this far apart or farther.
+        p: probability that correct calibrations differ this much or more.
     """
 
     first: str
@@ -43,20 +43,20 @@ class Repeatability:
 
     Attributes:
         names: of the sessions, or of the results of one session.
-        camera, lidar: what is calibrated.
-        T_cam_lidar: (4, 4) mean, all sessions alike.
+        camera, lidar: the calibrated sensors.
+        T_cam_lidar: (4, 4) mean with equal weights.
         deviations: (K, 6) tangents from the mean to each, translation m, rotation rad.
         spread_rotation_deg, spread_translation_m: standard deviation of one calibration, from these.
-        claimed_rotation_deg, claimed_translation_m: the same as the calibrations state it, rms.
-        scatter_rotation_deg, scatter_translation_m: the part of it that differs from session to session;
-            None where a calibration does not say. The rest, constant errors of the LiDAR, all share.
-        chi2: least sum of squared distances from one common extrinsic, in units of the stated covariances.
-        dof: what it is on average where these are true.
-        p: probability that sound calibrations spread so far or farther.
-        differences: of each two.
-        odd_one: the session without which the others agree; None where all agree or none can be blamed.
-        are_independent: whether each was made from captures of its own. If not, errors that they share do not
-            show, and chi2, dof and p are those of the two that differ most, p times the number of pairs.
+        claimed_rotation_deg, claimed_translation_m: the same as reported by the calibrations, rms.
+        scatter_rotation_deg, scatter_translation_m: the part of it that is independent between sessions; None
+            if a calibration does not report it. All share the rest, constant errors of the LiDAR.
+        chi2: least sum of squared distances from one common extrinsic, in units of the reported covariances.
+        dof: its mean if these are right.
+        p: probability that correct calibrations spread this far or farther.
+        differences: of each pair.
+        odd_one: the session without which the others agree; None if all agree or none can be identified.
+        are_independent: whether each has its own captures. If not, common errors stay hidden, and chi2, dof
+            and p are those of the pair that differs most, with p times the number of pairs.
     """
 
     names: tuple[str, ...]
@@ -79,12 +79,12 @@ class Repeatability:
 
     @property
     def agrees(self) -> bool:
-        """Whether the stated uncertainties explain the spread."""
+        """Whether the reported uncertainties explain the spread."""
         return self.p >= _CHANCE
 
     @property
     def ratio(self) -> float:
-        """Spread over what the stated uncertainties predict."""
+        """Ratio of the spread to the prediction of the reported uncertainties."""
         return float(np.sqrt(self.chi2 / self.dof))
 
     @property
@@ -99,7 +99,7 @@ class Repeatability:
 
     @property
     def finding(self) -> Finding:
-        """Whether they agree, "repeat.agree" or "repeat.disagree", for somebody who signs for it."""
+        """Whether they agree, "repeat.agree" or "repeat.disagree", with its figures."""
         figures: dict[str, Figure] = {
             "camera": self.camera,
             "lidar": self.lidar,
@@ -139,11 +139,12 @@ def compare_calibrations(
         ValueError: there are fewer than two.
     """
     if len(calibrations) < 2:
-        raise ValueError("one calibration has nothing to be compared with")
+        raise ValueError("a comparison requires two calibrations, 1 given")
     names = tuple(calibrations)
     T = np.array([calibrations[name].T_cam_lidar for name in names])
     cov = np.array([calibrations[name].cov for name in names])
-    # Weighted by full covariances a mean may lie beside all it is made of: right for chi2, odd to look at.
+    # A mean weighted by full covariances may lie outside all values, which is right for chi2 but confusing in
+    # a table.
     mean, _ = mean_pose(T, np.broadcast_to(np.eye(6), cov.shape))
     deviations = difference(T, mean)
     pairs = list(combinations(range(len(names)), 2))
@@ -156,8 +157,8 @@ def compare_calibrations(
         chi2, dof = max(pair.distance for pair in differences) ** 2, 6
         p = min(1.0, len(pairs) * _tail(chi2, dof))
     first = calibrations[names[0]]
-    scatter_deg = _rms_figure(calibrations.values(), "sigma_scatter_rotation_deg")
-    scatter_m = _rms_figure(calibrations.values(), "sigma_scatter_translation_m")
+    scatter_deg = _rms([c.diagnostics.sigma_scatter_rotation_deg for c in calibrations.values()])
+    scatter_m = _rms([c.diagnostics.sigma_scatter_translation_m for c in calibrations.values()])
     spread = np.sum(deviations**2, axis=0) / (len(names) - 1)
     return Repeatability(
         names=names,
@@ -196,7 +197,7 @@ def _difference(names: Sequence[str], T: Array, cov: Array, i: int, j: int) -> P
 
 
 def _odd_one(names: Sequence[str], T: Array, cov: Array) -> str | None:
-    """Name the calibration without which the others agree, if there is exactly one such."""
+    """Name the calibration without which the others agree, if there is exactly one."""
     if len(names) < 3:
         return None
     blamed = []
@@ -207,8 +208,8 @@ def _odd_one(names: Sequence[str], T: Array, cov: Array) -> str | None:
     return blamed[0] if len(blamed) == 1 else None
 
 
-def _rms_figure(calibrations: Iterable[Calibration], key: str) -> float | None:
-    values = np.array([calibration.diagnostics.get(key, np.nan) for calibration in calibrations])
+def _rms(values: Sequence[float]) -> float | None:
+    """Give None where one of them is unknown."""
     return float(np.sqrt(np.mean(np.square(values)))) if np.isfinite(values).all() else None
 
 

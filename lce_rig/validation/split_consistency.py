@@ -1,7 +1,7 @@
-"""Do two shares of the captures give the same extrinsic? Early and late, near and far, left and right.
+"""Compare extrinsics from two subsets of the captures: early and late, near and far, left and right.
 
-Shares drawn by lot differ by noise; so do these, unless something changed on the way or is bent: a sensor
-that was nudged, a lens that is not the profile's. How far shares drawn by lot differ is the measure.
+Random subsets differ by noise. These subsets differ by more if a sensor moved during the session, or if the
+intrinsics are wrong. The difference of random subsets is the reference.
 """
 
 from collections.abc import Sequence
@@ -13,27 +13,27 @@ from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, tangent_sizes
 from lce_rig.residuals.quadratics import Quadratics
 from lce_rig.rig import CalibrationSettings, VerdictSettings
-from lce_rig.validation.weighing import doubt
+from lce_rig.validation.weighing import reason
 
-# Fewer placements are not worth halving.
+# Fewer placements are not split.
 _MIN_PLACEMENTS = 6
 _MIN_SHARE = 3
 _N_LOTS = 400
-# Median of the chi-squared distribution of six freedoms.
+# Median of the chi-squared distribution with six degrees of freedom.
 _MEDIAN_CHI2 = 5.348
-# Differences beyond this many limits leave nothing to be used.
+# Differences beyond this many limits fail.
 _FAIL = 2.0
 
 
 @dataclass(frozen=True)
 class Contrast:
-    """Two shares of the captures, calibrated apart.
+    """Two subsets of the captures, calibrated separately.
 
     Attributes:
-        first, second: what tells them apart, in words: "near" and "far".
+        first, second: their names, such as "near" and "far".
         rotation_deg, translation_m: angle and distance between their extrinsics.
-        chance: how often shares drawn by lot differ as much, in units of their noise.
-        n_first: captures in the first share.
+        chance: probability that random subsets differ as much, in units of their noise.
+        n_first: number of captures in the first subset.
     """
 
     first: str
@@ -45,15 +45,15 @@ class Contrast:
 
 
 def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tuple[Contrast, ...]:
-    """Compare shares that ought to agree.
+    """Compare subsets that should agree.
 
     Args:
         expansion: of F captures in the order in which they were taken, settled.
         centres: (F, 3) middle of the board in each, frame camera, m.
-        seed: of the lots.
+        seed: of the random subsets.
 
     Returns:
-        Before and after the capture where the session splits best, near and far, left and right, upper and
+        Subsets before and after the capture of the largest change, near and far, left and right, upper and
         lower; none for fewer than 6 placements.
     """
     n_placements = len(expansion.groups)
@@ -76,7 +76,7 @@ def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tup
 
 
 def _changed_on_the_way(expansion: Quadratics, unit: float) -> Contrast:
-    """Find the capture from which on the others differ most; with as many chances as there are captures."""
+    """Find the capture from which on the results differ most, corrected for the number of captures tried."""
     n = len(expansion.gradients)
     cuts = np.arange(_MIN_SHARE, n - _MIN_SHARE + 1)
     chi2, apart = _chi2(expansion, (np.arange(n)[None] < cuts[:, None]).astype(np.float64))
@@ -92,12 +92,12 @@ def _tail(chi2: float) -> float:
 
 
 def _chi2(expansion: Quadratics, shares: Array) -> tuple[Array, Array]:
-    """Hold shares (B, F) against the rest: squared distance (B,) in units of noise, tangents (B, 6)."""
+    """Compare subsets (B, F) with the rest: squared distance (B,) in units of noise, tangents (B, 6)."""
     H_first = np.tensordot(shares, expansion.hessians, axes=1)
     g_first = shares @ expansion.gradients
     H_rest = expansion.hessians.sum(axis=0) - H_first
     g_rest = expansion.gradients.sum(axis=0) - g_first
-    # A share of few captures may leave a direction all but open; a floor of 1 m and 1 rad keeps it finite.
+    # A subset of few captures may leave a direction undetermined; a floor of 1 m and 1 rad keeps it finite.
     floor = np.eye(6)
     C_first, C_rest = np.linalg.inv(H_first + floor), np.linalg.inv(H_rest + floor)
     apart = -(C_first @ g_first[..., None] - C_rest @ g_rest[..., None])[..., 0]
@@ -110,13 +110,13 @@ def _contrast(first: str, second: str, apart: Array, chance: float, n_first: int
     return Contrast(first, second, rotation_deg, translation_m, chance, n_first)
 
 
-def doubt_halves(
+def split_findings(
     contrasts: Sequence[Contrast],
     captures: Sequence[str],
     target: CalibrationSettings,
     limits: VerdictSettings,
 ) -> list[Finding]:
-    """Doubt a result whose shares differ by more than the target, and more than lots make them.
+    """Find subsets that differ by more than the target and significantly more than random ones.
 
     Args:
         contrasts: see `contrast_halves`.
@@ -124,7 +124,7 @@ def doubt_halves(
         target: standard deviations to reach.
         limits: of the profile.
     """
-    doubts = []
+    findings = []
     for c in contrasts:
         is_change = c.first == "before"
         excess = target.in_targets(c.rotation_deg, c.translation_m)
@@ -134,9 +134,9 @@ def doubt_halves(
         apart = {"rotation_deg": c.rotation_deg, "translation_m": c.translation_m, "chance": c.chance}
         if is_change:
             figures: dict[str, Figure] = {"capture": captures[c.n_first], **apart}
-            doubts.append(doubt("verdict.changed", figures, is_fail=excess > _FAIL))
+            findings.append(reason("verdict.changed", figures, is_fail=excess > _FAIL))
         else:
             figures = {"first": c.first, "second": c.second, **apart}
             action = "near" if c.first == "near" else ""
-            doubts.append(doubt("verdict.shares_differ", figures, is_fail=excess > _FAIL, action=action))
-    return doubts
+            findings.append(reason("verdict.shares_differ", figures, is_fail=excess > _FAIL, action=action))
+    return findings

@@ -1,4 +1,4 @@
-"""What is held against a result before it is judged: checks that need the captures themselves."""
+"""Checks of a result on its own captures, before the verdict."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ from lce_rig.validation.negative_control import NegativeControl, run_control
 from lce_rig.validation.nuisances import Nuisances, estimate_nuisances
 from lce_rig.validation.split_consistency import Contrast, contrast_halves
 
-# Is the claimed uncertainty as large as captures drawn anew, left out singly or split in halves show?
+# Check the reported uncertainty with bootstrap samples, leave-one-out results and random halves.
 
 _N_DRAWS = 300
 
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """How far resampled captures spread the extrinsic; covariances (6, 6) of the result from each way.
+    """Spread of the extrinsics under resampling: covariances (6, 6) of the result from each method.
 
     Attributes:
         bootstrap: placements drawn with replacement.
@@ -38,11 +38,11 @@ class Spread:
     halves: Array
 
     def ratio_to(self, cov: Array) -> tuple[float, str]:
-        """Compare with a claimed covariance (6, 6).
+        """Compare with a reported covariance (6, 6).
 
         Returns:
-            By how much the largest of the three exceeds the claim, in standard deviations of rotation or of
-            translation, and which it is.
+            Largest ratio of the three to the reported standard deviation, in rotation or translation, and the
+            name of its method.
         """
         ways = {
             "bootstrap": self.bootstrap,
@@ -65,7 +65,7 @@ class Spread:
 
 
 def resample(expansion: Quadratics, seed: int = 0) -> Spread:
-    """Spread the extrinsic by resampling placements.
+    """Estimate the spread of the extrinsics by resampling placements.
 
     Args:
         expansion: of the captures, settled.
@@ -75,7 +75,7 @@ def resample(expansion: Quadratics, seed: int = 0) -> Spread:
     groups = expansion.groups
     n = len(groups)
     drawn = rng.multinomial(n, np.full(n, 1 / n), size=_N_DRAWS).astype(np.float64)
-    # Draws of few different placements may leave a direction open.
+    # Samples of few different placements may leave a direction undetermined.
     drawn = drawn[np.count_nonzero(drawn, axis=1) >= min(n, 4)]
     halves = (np.argsort(rng.random((_N_DRAWS, n)), axis=1) < n // 2).astype(np.float64)
     without = expansion.without_each()[:, :6]
@@ -88,9 +88,9 @@ def resample(expansion: Quadratics, seed: int = 0) -> Spread:
 
 
 def _robust_cov(tangents: Array) -> Array:
-    """Estimate a covariance (6, 6) by those nine tenths of the draws (B, 6) that lie nearest to the middle.
+    """Estimate a covariance (6, 6) by the nine tenths of the samples (B, 6) nearest to the middle.
 
-    A draw that happens to leave a direction nearly open lies anywhere, and says nothing of all captures.
+    Samples that nearly leave a direction undetermined are outliers and do not represent all captures.
     """
     about = tangents - np.median(tangents, axis=0)
     scale = np.median(np.abs(about), axis=0) + 1e-12
@@ -100,16 +100,16 @@ def _robust_cov(tangents: Array) -> Array:
 
 
 def widening(cov: Array, spread: Spread, limits: VerdictSettings) -> tuple[float, Finding | None]:
-    """Compare a claimed covariance with the spread of resampled captures.
+    """Compare a reported covariance with the spread of resampled captures.
 
     Args:
-        cov: (6, 6) as the method claims it.
-        spread: of the same extrinsic.
+        cov: (6, 6) of the method.
+        spread: of the same extrinsics.
         limits: of the verdict.
 
     Returns:
-        By how many times standard deviations are to be widened, 1 where the claim is large enough; and a
-        note that says why, else None.
+        The factor by which to widen standard deviations, 1 if they are large enough, and a note with the
+        reason, else None.
     """
     ratio, way = spread.ratio_to(cov)
     if ratio <= limits.max_spread_ratio:
@@ -117,24 +117,24 @@ def widening(cov: Array, spread: Spread, limits: VerdictSettings) -> tuple[float
     return ratio, Finding("verdict.widened", "note", figures={"ratio": ratio, "spread": way})
 
 
-# Fewer placements leave nothing to be left out.
+# Fewer placements do not allow leave-one-out.
 _MIN_PLACEMENTS = 4
-# More pictures say no more about a lens that is wrong, and take their time.
+# More images do not improve the check of the intrinsics, and take time.
 _MAX_VIEWS = 40
 
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """What checks on its own captures found about an estimate.
+    """Results of checks of an estimate on its own captures.
 
     Attributes:
-        cov: (6, 6) to report: the estimate's, widened where captures spread it farther than it claims.
-        widened_by: by how many times the standard deviations were widened; 1 where they were not.
-        remark: why; None where they were not.
-        contrasts: shares of the captures that ought to agree.
-        control: what happens to left-out captures when the result is moved.
-        nuisances: what the captures share beside the extrinsic.
-        intrinsics: the profile's, against those that the boards ask for; None where too few boards tell.
+        cov: (6, 6) to report: the estimate's, widened if resampling spreads it farther.
+        widened_by: factor by which the standard deviations were widened; 1 if they were not.
+        remark: why; None if they were not.
+        contrasts: subsets of the captures that should agree.
+        control: residuals of held-out captures when the result is moved.
+        nuisances: the nuisance parameters.
+        intrinsics: the profile's compared with those fitted to the boards; None for too few boards.
     """
 
     cov: Array
@@ -158,9 +158,9 @@ def validate(
     Args:
         estimate: the result of any method.
         rig: board, targets and limits.
-        lidar: which errors its ranges may have.
+        lidar: its range error settings.
         lens: of the camera.
-        views: its pictures of the board, of the captures used.
+        views: its boards in the captures used.
     """
     board = rig.board.to_board()
     intrinsics = check_intrinsics(_thinned(views), lens, board) if views else None
@@ -175,7 +175,7 @@ def validate(
     if len(expansion.groups) < _MIN_PLACEMENTS:
         return Validation(estimate.cov, 1.0, None, (), None, None, intrinsics)
     settled = expansion.hold(SCALE).settled()
-    # A cost made anew scatters as it does itself: a claim is held against the scatter of its own method.
+    # Compare a covariance with the scatter of its own method, as another cost scatters differently.
     widened_by, remark = widening(estimate.cov, resample(estimate.expansion or settled), rig.verdict)
     cov = widened_by**2 * estimate.cov
     control = run_control(

@@ -1,4 +1,4 @@
-"""May this extrinsic be used? Each doubt is one reason with its figure and what to do about it."""
+"""The verdict on extrinsics: each finding is a reason with its figures and an action."""
 
 from collections.abc import Sequence
 
@@ -11,13 +11,13 @@ from lce_rig.core.results import Metrics
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 from lce_rig.validation.intrinsics_check import explain
-from lce_rig.validation.negative_control import doubt_control
-from lce_rig.validation.nuisances import doubt_nuisances
-from lce_rig.validation.split_consistency import doubt_halves
+from lce_rig.validation.negative_control import control_findings
+from lce_rig.validation.nuisances import nuisance_findings
+from lce_rig.validation.split_consistency import split_findings
 from lce_rig.validation.validate import Validation
-from lce_rig.validation.weighing import SURPRISING_CHI2, Verdict, doubt, verdict_of
+from lce_rig.validation.weighing import SURPRISING_CHI2, Verdict, reason, verdict_of
 
-# A side of the plate counts as measured below this deviation; 5 % of it is more than the beam's spot.
+# A side of the plate counts as measured below this standard deviation; 5 % of it exceeds the beam's spot.
 PLATE_KNOWN_M, PLATE_FAIL = 0.03, 0.05
 
 
@@ -30,27 +30,27 @@ def judge(
     n_captures: int,
     between_cameras: Sequence[Finding] = (),
 ) -> tuple[Verdict, tuple[Finding, ...]]:
-    """Weigh everything known about an extrinsic.
+    """Judge extrinsics by all checks.
 
     Args:
-        estimate: the extrinsic with its residuals and refusals, and what each channel says.
-        examination: what checks on its captures found.
+        estimate: the extrinsic with its residuals and refusals, and the result of each channel.
+        examination: results of the checks on its captures.
         rig: thresholds, targets and the nominal extrinsic.
         camera: name of the camera.
         lidar: name of the LiDAR.
-        n_captures: captures looked at, with those in which no board was found.
-        between_cameras: where this camera and another contradict each other.
+        n_captures: number of captures, including those without a board.
+        between_cameras: contradictions between this camera and others.
 
     Returns:
-        The verdict, and the reasons for anything but a pass: worst first, causes before symptoms. A remark on
-        a widened standard deviation may stand beside a pass.
+        The verdict, and the reasons for anything but a pass: worst first, causes before symptoms. A note on
+        a widened standard deviation is compatible with a pass.
     """
-    doubts = [
+    findings = [
         *_certificate(estimate),
         *_intrinsics(examination, rig),
         *_plate(estimate, rig.board.to_board()),
         *_shared(examination, rig, lidar),
-        *doubt_halves(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
+        *split_findings(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
         *between_cameras,
         *_motion(estimate, rig.verdict.max_plane_misfit_m),
         *_channels(estimate, rig),
@@ -63,8 +63,8 @@ def judge(
         *_precision(estimate, examination.cov, rig),
     ]
     if examination.remark is not None:
-        doubts.append(examination.remark)
-    return verdict_of(doubts), ranked(doubts)
+        findings.append(examination.remark)
+    return verdict_of(findings), ranked(findings)
 
 
 def _intrinsics(examination: Validation, rig: Rig) -> list[Finding]:
@@ -77,50 +77,50 @@ def _intrinsics(examination: Validation, rig: Rig) -> list[Finding]:
 def _shared(examination: Validation, rig: Rig, lidar: str) -> list[Finding]:
     if examination.nuisances is None:
         return []
-    return doubt_nuisances(examination.nuisances, rig.board.to_board(), rig.lidars[lidar], rig.verdict)
+    return nuisance_findings(examination.nuisances, rig.board.to_board(), rig.lidars[lidar], rig.verdict)
 
 
 def _control(examination: Validation) -> list[Finding]:
-    return [] if examination.control is None else doubt_control(examination.control)
+    return [] if examination.control is None else control_findings(examination.control)
 
 
 def _certificate(estimate: CalibrationEstimate) -> list[Finding]:
     if estimate.certificate.is_optimal:
         return []
     if np.isinf(estimate.certificate.gap):
-        return [doubt("verdict.no_certificate", {"method": estimate.method}, is_fail=False)]
-    return [doubt("verdict.not_certified", {"gap": estimate.certificate.gap}, is_fail=True)]
+        return [reason("verdict.no_certificate", {"method": estimate.method}, is_fail=False)]
+    return [reason("verdict.not_certified", {"gap": estimate.certificate.gap}, is_fail=True)]
 
 
 def _precision(estimate: CalibrationEstimate, cov: Array, rig: Rig) -> list[Finding]:
+    sigmas, target, of_lidar = np.sqrt(np.diag(cov)), rig.calibration, estimate.diagnostics
+    turns_deg, shifts_m = np.degrees(sigmas[3:]), sigmas[:3]
+    rotation = ("verdict.rotation_uncertain", "deg", turns_deg, target.target_sigma_deg)
+    translation = ("verdict.translation_uncertain", "m", shifts_m, target.target_sigma_m)
     found = []
-    target = rig.calibration
-    sigmas = np.sqrt(np.diag(cov))
-    for axes, goal, what, code in (
-        (np.degrees(sigmas[3:]), target.target_sigma_deg, "rotation_deg", "verdict.rotation_uncertain"),
-        (sigmas[:3], target.target_sigma_m, "translation_m", "verdict.translation_uncertain"),
+    for (code, unit, axes, goal), of_lidar_alone in (
+        (rotation, of_lidar.sigma_systematic_rotation_deg),
+        (translation, of_lidar.sigma_systematic_translation_m),
     ):
         sigma = float(np.linalg.norm(axes))
         if sigma > goal:
-            # Where the LiDAR's own errors alone miss the target, no number of captures will reach it.
-            is_lidar = estimate.diagnostics.get(f"sigma_systematic_{what}", 0.0) > goal
-            unit = what.partition("_")[2]
             figures: dict[str, Figure] = {
                 f"sigma_{unit}": sigma,
                 f"target_{unit}": goal,
                 f"by_axis_{unit}": tuple(float(axis) for axis in axes),
-                "weakest": estimate.weak_direction,
+                **estimate.weakest.figures(),
             }
             is_fail = sigma > rig.verdict.fail_factor * goal
-            action = "measure_ranges" if is_lidar else ""
-            found.append(doubt(code, figures, is_fail=is_fail, action=action))
+            # If the LiDAR's own errors alone exceed the target, no number of captures will reach it.
+            action = "measure_ranges" if of_lidar_alone > goal else ""
+            found.append(reason(code, figures, is_fail=is_fail, action=action))
     return found
 
 
 def residuals_beyond(metrics: Metrics, limits: QualitySettings) -> list[Finding]:
-    """List the mean residuals of an extrinsic that exceed the profile's limits."""
+    """List the mean residuals of extrinsics that exceed the profile's limits."""
     return [
-        doubt(code, {"mean_m": value, "limit_m": limit}, is_fail=True)
+        reason(code, {"mean_m": value, "limit_m": limit}, is_fail=True)
         for value, limit, code in (
             (metrics.mpe_m, limits.max_mpe_m, "verdict.plane_residual"),
             (metrics.mee_m, limits.max_mee_m, "verdict.edge_residual"),
@@ -134,21 +134,21 @@ def _residuals(estimate: CalibrationEstimate, rig: Rig) -> list[Finding]:
     fitted_m = float(np.mean([np.hypot(r.plane_rms_m, r.edge_rms_m) for r in estimate.residuals]))
     if np.isfinite(estimate.held_out_m) and estimate.held_out_m > rig.verdict.max_held_out_ratio * fitted_m:
         figures = {"held_out_m": estimate.held_out_m, "fitted_m": fitted_m}
-        found.append(doubt("verdict.held_out", figures, is_fail=False))
+        found.append(reason("verdict.held_out", figures, is_fail=False))
     return found
 
 
 def _motion(estimate: CalibrationEstimate, limit_m: float) -> list[Finding]:
-    rms_m = estimate.diagnostics.get("fit_plane_rms_m", 0.0)
-    if rms_m <= limit_m:
+    rms_m = estimate.diagnostics.fit_plane_rms_m
+    if not rms_m > limit_m:  # NaN where the method has no such residual
         return []
     is_compensated = any(channel.time_offset_s is not None for channel in estimate.channels)
     action = "compensated" if is_compensated else ""
-    return [doubt("verdict.planes_apart", {"rms_m": rms_m}, is_fail=False, action=action)]
+    return [reason("verdict.planes_apart", {"rms_m": rms_m}, is_fail=False, action=action)]
 
 
 def _channels(estimate: CalibrationEstimate, rig: Rig) -> list[Finding]:
-    """Hold the channels of one camera against each other: it cannot sit in two places."""
+    """Compare the channels of one camera, which has one pose."""
     apart, cov = estimate.channel_difference, estimate.channel_difference_cov
     if apart is None or cov is None:
         return []
@@ -164,7 +164,7 @@ def _channels(estimate: CalibrationEstimate, rig: Rig) -> list[Finding]:
         "rotation_deg": rotation_deg,
         "translation_m": translation_m,
     }
-    return [doubt("verdict.channels_differ", figures, is_fail=excess > rig.verdict.fail_factor)]
+    return [reason("verdict.channels_differ", figures, is_fail=excess > rig.verdict.fail_factor)]
 
 
 def _refusals(estimate: CalibrationEstimate) -> list[Finding]:
@@ -173,24 +173,27 @@ def _refusals(estimate: CalibrationEstimate) -> list[Finding]:
     n = len(disagreeing) + len(estimate.used)
     if 4 * len(disagreeing) <= n:
         return []
-    shown = ", ".join(disagreeing[:4]) + (" ..." if len(disagreeing) > 4 else "")
-    figures: dict[str, Figure] = {"n_refused": len(disagreeing), "n_captures": n, "captures": shown}
-    return [doubt("verdict.sensors_disagree", figures, is_fail=2 * len(disagreeing) > n)]
+    figures: dict[str, Figure] = {
+        "n_refused": len(disagreeing),
+        "n_captures": n,
+        "captures": tuple(disagreeing),
+    }
+    return [reason("verdict.sensors_disagree", figures, is_fail=2 * len(disagreeing) > n)]
 
 
 def _detected(estimate: CalibrationEstimate, n_captures: int, min_fraction: float) -> list[Finding]:
     if len(estimate.used) >= min_fraction * n_captures:
         return []
     figures = {"n_used": len(estimate.used), "n_captures": n_captures}
-    return [doubt("verdict.few_used", figures, is_fail=False)]
+    return [reason("verdict.few_used", figures, is_fail=False)]
 
 
 def _placements(estimate: CalibrationEstimate, needed: int) -> list[Finding]:
-    n = int(estimate.diagnostics.get("n_placements", len(estimate.used)))
+    n = int(estimate.diagnostics.n_placements)
     if n >= needed:
         return []
     figures = {"n_used": len(estimate.used), "n_placements": n, "n_needed": needed}
-    return [doubt("verdict.few_placements", figures, is_fail=False)]
+    return [reason("verdict.few_placements", figures, is_fail=False)]
 
 
 def _nominal(estimate: CalibrationEstimate, nominal: NominalExtrinsic | None) -> list[Finding]:
@@ -208,11 +211,11 @@ def _nominal(estimate: CalibrationEstimate, nominal: NominalExtrinsic | None) ->
         "tolerance_deg": nominal.tolerance_deg,
         "tolerance_m": nominal.tolerance_m,
     }
-    return [doubt("verdict.far_from_nominal", figures, is_fail=True)]
+    return [reason("verdict.far_from_nominal", figures, is_fail=True)]
 
 
 def _plate(estimate: CalibrationEstimate, board: Board) -> list[Finding]:
-    """Compare the plate as the LiDAR measures it with the profile; sigmas are mostly the beam's spot."""
+    """Compare the plate's size from the LiDAR with the profile; the uncertainty is mainly the beam's spot."""
     found = []
     records = [estimate.observations[name].lidar.quality for name in estimate.used]
     for side, wanted_m, sides in (
@@ -231,5 +234,5 @@ def _plate(estimate: CalibrationEstimate, board: Board) -> list[Finding]:
                 "profile_m": wanted_m,
             }
             is_fail = abs(measured_m - wanted_m) > PLATE_FAIL * wanted_m
-            found.append(doubt("verdict.plate_size", figures, is_fail=is_fail))
+            found.append(reason("verdict.plate_size", figures, is_fail=is_fail))
     return found

@@ -1,4 +1,4 @@
-"""Findings against a result, and the verdict that they amount to."""
+"""Findings against a result, and the resulting verdict."""
 
 from collections.abc import Iterable, Mapping
 from typing import Literal
@@ -7,17 +7,17 @@ from lce_rig.core.findings import Figure, Finding, Severity, worst
 
 Verdict = Literal["pass", "marginal", "fail"]
 SURPRISING_CHI2 = 16.81
-"""99 % of the chi-squared distribution of six freedoms: differences beyond it are no chance."""
+"""99 % of the chi-squared distribution with six degrees of freedom: differences beyond it are significant."""
 _VERDICTS: Mapping[Severity, Verdict] = {"note": "pass", "warning": "marginal", "error": "fail"}
 
 
-def doubt(
+def reason(
     code: str, figures: Mapping[str, Figure], *, is_fail: bool, subject: str = "", action: str = ""
 ) -> Finding:
-    """Make a finding that allows no pass: an error where the result fails by it, else a warning."""
+    """Return a finding that prevents a pass: an error if the result fails by it, else a warning."""
     return Finding(code, "error" if is_fail else "warning", subject, figures, action)
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
-    """Give the verdict that findings amount to."""
+    """Return the verdict that results from findings."""
     return _VERDICTS[worst(findings)]

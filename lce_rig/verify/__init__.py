@@ -1,1 +1,1 @@
-"""Pictures to judge a calibration by: the scan drawn into the camera's picture, and what each stage saw."""
+"""Images for judging a calibration: point clouds projected into images, and detections of each stage."""

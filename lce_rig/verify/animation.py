@@ -1,4 +1,4 @@
-"""Pictures one after the other: GIF and video files."""
+"""Write GIF and video files."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -9,7 +9,7 @@ import numpy as np
 from lce_rig.core.errors import SourceError
 from lce_rig.verify.canvas import Picture
 
-# By the file's ending, codecs that OpenCV's own builds bring along.
+# Codecs of OpenCV's own builds, by the file's suffix.
 _CODECS = {".mp4": "mp4v", ".avi": "MJPG", ".mkv": "mp4v"}
 
 
@@ -19,8 +19,7 @@ def write_gif(path: Path, pictures: Iterable[Picture], period_s: float) -> None:
     Args:
         path: the file.
         pictures: grey (H, W) or BGR (H, W, 3), all of one size, at least one; taken one at a time.
-        period_s: from one to the next; GIFs count in hundredths of a second, and viewers show less than two
-            of them more slowly.
+        period_s: time between images; GIFs count in steps of 10 ms, and viewers slow down below 20 ms.
 
     Raises:
         SourceError: pillow is not installed, or the file cannot be written.
@@ -28,9 +27,7 @@ def write_gif(path: Path, pictures: Iterable[Picture], period_s: float) -> None:
     try:
         from PIL import Image as PillowImage
     except ImportError as error:
-        raise SourceError(
-            "GIFs are written by pillow, which is not installed", "pip install pillow"
-        ) from error
+        raise SourceError("GIFs require pillow, which is not installed", "Run: pip install pillow") from error
 
     def frames() -> Iterator[PillowImage.Image]:
         for picture in pictures:
@@ -47,19 +44,21 @@ def write_gif(path: Path, pictures: Iterable[Picture], period_s: float) -> None:
 
 
 def write_video(path: Path, pictures: Iterable[Picture], period_s: float) -> None:
-    """Write a video by OpenCV.
+    """Write a video with OpenCV.
 
     Args:
-        path: the file; its ending, .mp4, .avi or .mkv, says of which kind.
+        path: the file; its suffix, .mp4, .avi or .mkv, gives the format.
         pictures: grey (H, W) or BGR (H, W, 3), all of one size; taken one at a time.
-        period_s: from one to the next.
+        period_s: time between images.
 
     Raises:
-        SourceError: another ending, a codec that this OpenCV lacks, or a file that cannot be written.
+        SourceError: another suffix, a codec that this OpenCV lacks, or a file that cannot be written.
     """
     codec = _CODECS.get(path.suffix.lower())
     if codec is None:
-        raise SourceError(f"{path}: a video ends with {', '.join(_CODECS)}", "or write a GIF")
+        raise SourceError(
+            f"{path}: unknown video format", f"Choose one of: {', '.join(_CODECS)}, or write a GIF."
+        )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
@@ -81,9 +80,9 @@ def write_video(path: Path, pictures: Iterable[Picture], period_s: float) -> Non
     if path.stat().st_size == 0:
         path.unlink()
         raise SourceError(
-            f"{path}: this OpenCV cannot write videos (codec {codec})", "write a GIF, or try another ending"
+            f"{path}: this OpenCV cannot write videos (codec {codec})", "Write a GIF, or try another suffix."
         )
 
 
 def _not_written(path: Path, error: OSError) -> SourceError:
-    return SourceError(f"{path}: cannot be written: {error.strerror or error}", "choose another place")
+    return SourceError(f"{path}: cannot be written: {error.strerror or error}", "Choose another folder.")

@@ -1,4 +1,4 @@
-"""Anti-aliased marks, colour scales and text on BGR pictures; sizes follow the picture's width."""
+"""Anti-aliased marks, colour scales and text on BGR images; sizes follow the image's width."""
 
 from collections.abc import Sequence
 
@@ -11,8 +11,8 @@ from lce_rig.core.geometry import Array
 Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
-# BGR. The marks differ in lightness and shape too, so that no pair needs hue to be told apart; magenta is in
-# no part of the turbo scale.
+# BGR. The marks also differ in lightness and shape, so that they can be distinguished without hue; magenta is
+# not in the turbo scale.
 WHITE: Colour = (255, 255, 255)
 BLACK: Colour = (0, 0, 0)
 INK: Colour = (235, 235, 235)
@@ -27,7 +27,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def enlarged(pixels: Picture, min_width_px: int = 960) -> tuple[Picture, int]:
-    """Make a BGR copy of a picture, enlarged by a whole factor to at least `min_width_px`.
+    """Make a BGR copy of an image, enlarged by a whole factor to at least `min_width_px`.
 
     Returns:
         The copy (H, W, 3) and the factor; a pixel at u lies at (u + 0.5) factor - 0.5 in it.
@@ -40,7 +40,7 @@ def enlarged(pixels: Picture, min_width_px: int = 960) -> tuple[Picture, int]:
 
 
 def fitted(picture: Picture, width_px: int, height_px: int, colour: Colour = PANEL) -> Picture:
-    """Scale a picture to fit into a box, centred on plain colour."""
+    """Scale an image to fit into a box, centred on plain colour."""
     scale = min(width_px / picture.shape[1], height_px / picture.shape[0])
     size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
@@ -51,7 +51,7 @@ def fitted(picture: Picture, width_px: int, height_px: int, colour: Colour = PAN
 
 
 def panel(width_px: int, height_px: int, colour: Colour = PANEL) -> Picture:
-    """Make a plain picture."""
+    """Make a plain image."""
     return np.full((height_px, width_px, 3), colour, dtype=np.uint8)
 
 
@@ -71,7 +71,7 @@ def draw_discs(
     radius_px: float,
     rim: Colour | None = None,
 ) -> None:
-    """Draw anti-aliased discs at (N, 2) px, in order, each with a rim where asked for."""
+    """Draw anti-aliased discs at (N, 2) px, in order, each with a rim if requested."""
     table = np.broadcast_to(np.asarray(colours), (len(pixels), 3))
     if rim is not None:
         for centre in _fixed(pixels):
@@ -94,7 +94,7 @@ def draw_diamonds(
 def draw_line(
     picture: Picture, pixels: Array, colour: Colour, width_px: int = 2, casing: Colour | None = BLACK
 ) -> None:
-    """Draw a polyline through (N, 2) px, interrupted where a pixel is NaN, cased to stand out anywhere."""
+    """Draw a polyline through (N, 2) px, interrupted where a pixel is NaN, cased to be visible anywhere."""
     ends = np.flatnonzero(~np.isfinite(pixels).all(axis=1))
     for part in np.split(pixels, ends):
         part = part[np.isfinite(part).all(axis=1)]

@@ -1,4 +1,4 @@
-"""One picture a capture: what was seen in the camera and in the LiDAR, and why it was refused."""
+"""One image per capture: the detections of camera and LiDAR, or the cause of refusal."""
 
 from collections.abc import Mapping, Sequence
 
@@ -21,7 +21,7 @@ _PANORAMA_PX = 190
 _TEXT_PX = 12
 _REPORT_PX = 190
 
-# Figures worth reading beside a picture, in this order, with how to write them.
+# Figures beside an image, in this order, with their formats.
 _IMAGE_FIGURES = {
     "distance_m": "distance {:.2f} m",
     "tilt_deg": "tilt {:.0f} deg",
@@ -59,18 +59,18 @@ def draw_debug(
     chosen: int = 0,
     events: Events | None = None,
 ) -> Picture:
-    """Draw the camera's picture beside three views of the scan, with figures or cause and action below.
+    """Draw the camera's image beside three views of the scan, with figures or cause and action below.
 
     Args:
-        image: None where it could not be read.
-        scan: None where it could not be read.
-        image_result: the board in the picture or why there is none.
-        lidar_result: candidates, best first, or why there is none.
+        image: None if it could not be read.
+        scan: None if it could not be read.
+        image_result: the board in the image, or why it was refused.
+        lidar_result: candidates, best first, or why the scan was refused.
         board: the board.
         intrinsics: the camera.
         title: one line above.
-        chosen: which candidate is used; it is the one drawn enlarged.
-        events: those that shortly precede a picture made of events; they are drawn below it, over it.
+        chosen: index of the candidate used, which is drawn enlarged.
+        events: the events shortly before an image reconstructed from events, drawn over it below.
 
     Returns:
         (H, 1600, 3) uint8 BGR.
@@ -103,7 +103,7 @@ def _camera_pane(
 ) -> Picture:
     if image is None:
         pane = canvas.panel(_PANE_PX, height_px, BLACK)
-        canvas.draw_text(pane, "no picture", _PANE_PX / 2, height_px / 2, 16, FAINT, align=0.5)
+        canvas.draw_text(pane, "no image", _PANE_PX / 2, height_px / 2, 16, FAINT, align=0.5)
         return pane
     picture, factor = canvas.enlarged(image.pixels)
     if isinstance(result, ImageBoard):
@@ -120,7 +120,7 @@ def _event_pane(
     intrinsics: Intrinsics,
     height_px: int,
 ) -> Picture:
-    """Draw recent events over the picture, and the way of the board while it was followed."""
+    """Draw recent events over the image, and the board's tracked path."""
     picture, factor = draw_events(image, events)
     if isinstance(result, ImageBoard):
         poses = [result.T_cam_board]
@@ -135,12 +135,12 @@ def _event_pane(
     pane[:24] = BLACK
     draw_event_key(pane, events, 8, 16, 10)
     if isinstance(result, ImageBoard) and result.track_ns is not None:
-        canvas.draw_text(pane, "grey: where it was followed from, and to", _PANE_PX - 8, 16, 10, FAINT, 1.0)
+        canvas.draw_text(pane, "grey: tracked from, and to", _PANE_PX - 8, 16, 10, FAINT, 1.0)
     return pane
 
 
 def _draw_axes(picture: Picture, factor: int, found: ImageBoard, board: Board) -> None:
-    """Mark the first corner, its row (x) and its column (-y), so that a flipped order shows."""
+    """Mark the first corner, its row (x) and its column (-y), so that a flipped order is visible."""
     grid = ((found.corners_px + 0.5) * factor - 0.5).reshape(board.rows, board.cols, 2)
     unit = picture.shape[1] / 1000
     canvas.draw_line(picture, grid[0], ORANGE, max(2, round(3 * unit)))
@@ -229,7 +229,7 @@ def _board_view(
         return pane
     found = candidates[chosen]
     centre = found.T_lidar_board[:3, 3]
-    # Seen from the LiDAR, up stays up: the axes are those of the room turned into the board's plane.
+    # Seen from the LiDAR, up stays up: the room's axes rotated into the board's plane.
     normal = found.plane[:3]
     right = np.cross([0.0, 0.0, 1.0], normal)
     right /= np.linalg.norm(right)
@@ -260,7 +260,7 @@ def _label(pane: Picture, text: str) -> None:
 def _image_report(result: ImageBoard | Refusal) -> Picture:
     if isinstance(result, Refusal):
         return _refusal("camera", result)
-    notes = ["pose ambiguous from the picture alone"] if result.is_ambiguous else []
+    notes = ["pose ambiguous from the image alone"] if result.is_ambiguous else []
     return _figures("camera: board found", result.figures(), _IMAGE_FIGURES, notes)
 
 

@@ -1,4 +1,4 @@
-"""Recent events over the picture that was made of them: red where it became brighter, blue where darker."""
+"""Recent events over the image reconstructed from them: red for brighter, blue for darker."""
 
 from dataclasses import dataclass
 
@@ -9,10 +9,10 @@ from lce_rig.core.data import Events, Image
 from lce_rig.verify import canvas
 from lce_rig.verify.canvas import INK, Colour, Picture
 
-# BGR; told apart by lightness too.
+# BGR; they also differ in lightness.
 BRIGHTER: Colour = (70, 70, 255)
 DARKER: Colour = (255, 150, 60)
-# Of a slow board all events of this time are drawn, of a fast one the latest so many a pixel.
+# For a slow board all events of this time are drawn, for a fast one the latest per pixel.
 _RECENT_NS = 100_000_000
 _MOST_EVENTS_PX = 0.06
 _DIM = 0.45
@@ -20,11 +20,11 @@ _DIM = 0.45
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """What a camera saw.
+    """A camera's view.
 
     Attributes:
-        image: the picture, taken or made from events.
-        events: those shortly before it; None where the picture was taken, or made by others.
+        image: the image, captured or reconstructed from events.
+        events: those shortly before it; None if the image was not reconstructed here.
     """
 
     image: Image
@@ -32,7 +32,7 @@ class CameraView:
 
     @classmethod
     def of_events(cls, image: Image, events: Events) -> "CameraView":
-        """Take the events along that came shortly before a picture."""
+        """Keep the events shortly before an image."""
         stamp_ns = image.stamp_ns if image.stamp_ns is not None else int(events.t_ns[-1])
         recent = events.between(stamp_ns - _RECENT_NS, stamp_ns)
         n_most = round(_MOST_EVENTS_PX * events.width_px * events.height_px)
@@ -40,11 +40,11 @@ class CameraView:
 
 
 def draw_events(image: Image, events: Events) -> tuple[Picture, int]:
-    """Draw events over their picture, dimmed, enlarged.
+    """Draw events over their image, dimmed, enlarged.
 
     Args:
-        image: the picture.
-        events: at most one colour is drawn a pixel, that of more of its events.
+        image: the image.
+        events: each pixel gets the colour of the majority of its events.
 
     Returns:
         The drawing (H, W, 3) BGR and the factor, as `canvas.enlarged`.

@@ -1,4 +1,4 @@
-"""One page about measured intrinsics: what the corners say about the lens, and where they say nothing."""
+"""One page about measured intrinsics: what the corners determine, and where they determine nothing."""
 
 from collections.abc import Sequence
 from textwrap import wrap
@@ -13,7 +13,7 @@ from lce_rig.verify.canvas import Picture
 
 _INK, _GREY, _FAINT, _SHADE = "#22262b", "#5b636b", "#9aa3ad", "#e9ecef"
 _BLUE, _ORANGE = "#1f6fb4", "#d9730d"
-# The map of certainty from a hundredth of a pixel to ten; beyond, nobody should measure anything.
+# The standard deviation map covers 0.01 to 10 px; beyond, the intrinsics are unusable.
 _CERTAIN_PX, _UNKNOWN_PX = 0.01, 10.0
 _CELLS, _MIN_IN_CELL = 16, 4
 _RINGS = 14
@@ -28,12 +28,12 @@ def draw_intrinsics(
     title: str,
     weaknesses: Sequence[str] = (),
 ) -> Picture:
-    """Draw residuals over the picture and over the radius, certainty, and the difference from the profile.
+    """Draw residuals over the image and over the radius, certainty, and the difference from the profile.
 
     Args:
         estimate: of the lens.
         certainty: of the same.
-        difference: of the estimate from the profile's intrinsics; None where these are of another resolution.
+        difference: of the estimate from the profile's intrinsics; None if these are of another resolution.
         title: of the page.
         weaknesses: sentences to print below.
 
@@ -69,14 +69,14 @@ def draw_intrinsics(
 def _summary(estimate: IntrinsicsEstimate) -> str:
     n = len({view.capture for view in estimate.views})
     return (
-        f"{estimate.model.name}, {len(estimate.views)} pictures of {n} captures.   Corners lie "
-        f"{estimate.rms_px:.3f} px rms from their prediction, {estimate.held_out_rms_px:.3f} px on captures "
-        "left out of the fit."
+        f"{estimate.model.name}, {len(estimate.views)} images of {n} captures.   Corners lie "
+        f"{estimate.rms_px:.3f} px rms from their prediction, {estimate.held_out_rms_px:.3f} px on "
+        "held-out captures."
     )
 
 
 def _frame(axis: Any, estimate: IntrinsicsEstimate, title: str, note: str) -> None:
-    """Lay out an axis as the picture: pixels, v down."""
+    """Lay out an axis as the image: pixels, v down."""
     lens = estimate.intrinsics
     axis.set_xlim(-0.5, lens.width_px - 0.5)
     axis.set_ylim(lens.height_px - 0.5, -0.5)
@@ -100,7 +100,7 @@ def _style(axis: Any, title: str, note: str) -> None:
 
 def _draw_residuals(axis: Any, estimate: IntrinsicsEstimate) -> None:
     note = f"mean of each cell with at least {_MIN_IN_CELL} corners; nothing was seen in the blank area"
-    _frame(axis, estimate, "Residuals over the picture", note)
+    _frame(axis, estimate, "Residuals over the image", note)
     corners, residuals = estimate.corners_px.reshape(-1, 2), estimate.residuals_px.reshape(-1, 2)
     axis.plot(*corners.T, ".", color=_FAINT, markersize=1.6, alpha=0.7, zorder=1)
     cell_px = estimate.intrinsics.width_px / _CELLS
@@ -115,7 +115,7 @@ def _draw_residuals(axis: Any, estimate: IntrinsicsEstimate) -> None:
 
 
 def _arrows(axis: Any, at: Array, vectors_px: Array, reach_px: float, colour: str) -> None:
-    """Draw arrows so long that a usual one fills its cell, with a key of a round length."""
+    """Draw arrows scaled so that a typical one fills its cell, with a key of a round length."""
     lengths = np.linalg.norm(vectors_px, axis=1)
     usual = max(float(np.percentile(lengths, 90)), 1e-6)
     magnification = reach_px / usual
@@ -146,8 +146,8 @@ def _draw_certainty(figure: Any, axis: Any, estimate: IntrinsicsEstimate, certai
     from matplotlib.colors import LogNorm
 
     covered = 100 * float(certainty.is_covered.mean())
-    note = f"boards were seen inside the orange line: {covered:.0f} % of the picture"
-    _frame(axis, estimate, "How well the lens is known", note)
+    note = f"boards were seen inside the orange line: {covered:.0f} % of the image"
+    _frame(axis, estimate, "Standard deviation of the intrinsics", note)
     lens = estimate.intrinsics
     extent = (-0.5, lens.width_px - 0.5, lens.height_px - 0.5, -0.5)
     sigma = np.clip(certainty.sigma_px, _CERTAIN_PX, _UNKNOWN_PX)
@@ -186,8 +186,8 @@ def _draw_radial(axis: Any, estimate: IntrinsicsEstimate) -> None:
     axis.axvspan(radius.max(), farthest, color=_SHADE, zorder=0)
     if radius.max() < 0.93 * farthest:
         middle = (radius.max() + farthest) / 2
-        axis.text(middle, 0.85 * limit, "never seen", ha="center", fontsize=10, color=_INK)
-    axis.set_xlabel("distance from the principal point, px, up to the picture's farthest corner", color=_INK)
+        axis.text(middle, 0.85 * limit, "not covered", ha="center", fontsize=10, color=_INK)
+    axis.set_xlabel("distance from the principal point, px, up to the image's farthest corner", color=_INK)
     axis.set_ylabel("residual outwards, px", color=_INK)
     note = "blue: means with their standard errors; a wrong lens model would bend the line"
     _style(axis, "Residuals along the radius", note)
@@ -196,15 +196,15 @@ def _draw_radial(axis: Any, estimate: IntrinsicsEstimate) -> None:
 def _draw_difference(axis: Any, estimate: IntrinsicsEstimate, difference: LensDifference | None) -> None:
     if difference is None:
         axis.axis("off")
-        text = "The profile's intrinsics belong to another resolution."
+        text = "The profile's intrinsics are for another resolution."
         axis.text(0.5, 0.5, text, transform=axis.transAxes, ha="center", fontsize=12, color=_INK)
         return
     turn_deg = np.degrees(np.linalg.norm(difference.turn_rad))
     note = (
-        f"{difference.rms_px:.2f} px rms (known to {difference.sigma_px:.2f}), {difference.max_px:.2f} px at "
-        f"most; turned by {turn_deg:.2f} deg"
+        f"{difference.rms_px:.2f} px rms (standard deviation {difference.sigma_px:.2f}), "
+        f"{difference.max_px:.2f} px at most; rotated by {turn_deg:.2f} deg"
     )
-    _frame(axis, estimate, "From the profile's intrinsics to these", note)
+    _frame(axis, estimate, "Difference from the profile's intrinsics", note)
     moved, pixels = difference.displacement_px, difference.pixels
     is_shown = difference.is_covered & np.isfinite(moved).all(axis=1)
     for side in pixels.T:

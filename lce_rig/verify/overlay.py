@@ -1,4 +1,4 @@
-"""The scan drawn into the camera's picture through an extrinsic, with the board as either sensor saw it."""
+"""Project the point cloud into the camera's image, with the board as detected by both sensors."""
 
 from collections.abc import Mapping
 
@@ -31,26 +31,26 @@ def draw_overlay(
     title: str,
     events: Events | None = None,
 ) -> Picture:
-    """Draw a whole scan coloured by range into the picture, and what both sensors say of the board.
+    """Project a whole scan, coloured by range, into the image, and draw both sensors' detections.
 
-    Points behind the image plane, and those that the distortion polynomial would fold back into the picture,
+    Points behind the image plane, and those that the distortion polynomial would fold back into the image,
     are not drawn; near points are drawn last.
 
     Args:
-        image: the picture; small ones are enlarged to at least 960 px wide.
+        image: the image; small ones are enlarged to at least 960 px wide.
         scan: points in frame lidar.
         intrinsics: the camera.
-        T_cam_lidar: (4, 4) the extrinsic to judge.
-        lidar_board: its points and ring ends are marked; None draws the scan only.
-        image_board: its outline and corners are drawn; None draws none.
+        T_cam_lidar: (4, 4) the extrinsics to judge.
+        lidar_board: its points and ring ends are marked; None for the scan only.
+        image_board: its outline and corners are drawn; None for none.
         board: the board, for its outline.
-        residuals: figures by name with unit, such as {"plane (mm)": 4.2}, in the order to be shown.
-        title: one line above the picture.
-        events: those that shortly precede a picture made of events; drawn below it with the board's ring ends
-            and outline.
+        residuals: figures by name with unit, such as {"plane (mm)": 4.2}, in display order.
+        title: one line above the image.
+        events: those shortly before an image reconstructed from events; drawn below it with the board's ring
+            ends and outline.
 
     Returns:
-        (H, W, 3) uint8 BGR, with a strip above and a legend below the picture.
+        (H, W, 3) uint8 BGR, with a strip above and a legend below the image.
     """
     picture, factor = canvas.enlarged(image.pixels)
     unit = picture.shape[1] / 1000
@@ -81,7 +81,7 @@ def _event_picture(
     board: Board,
     intrinsics: Intrinsics,
 ) -> Picture:
-    """Draw recent events with the LiDAR's ring ends (M, 2) px: a board's border makes events."""
+    """Draw recent events with the LiDAR's ring ends (M, 2) px, as a board's border makes events."""
     picture, factor = draw_events(image, events)
     unit = picture.shape[1] / 1000
     if image_board is not None:
@@ -93,7 +93,7 @@ def _event_picture(
 
 
 def camera_part(overlay: Picture, image: Image) -> Picture:
-    """Cut the camera's picture out of what `draw_overlay` made of it, without title and legend."""
+    """Cut the camera's image out of the output of `draw_overlay`, without title and legend."""
     width_px = overlay.shape[1]
     top = _title_strip("", width_px).shape[0]
     return overlay[top : top + image.pixels.shape[0] * width_px // image.pixels.shape[1]]
@@ -129,7 +129,7 @@ def _draw_outline(
 def _to_picture(
     points_lidar: Array, T_cam_lidar: Array, intrinsics: Intrinsics, factor: int
 ) -> tuple[Array, Array]:
-    """Project points (N, 3) to pixels (M, 2) of the enlarged picture, with the ranges (M,) of those in it."""
+    """Project points (N, 3) to pixels (M, 2) of the enlarged image, with the ranges (M,) of those in it."""
     points_camera = transform(T_cam_lidar, points_lidar)
     pixels, _ = intrinsics.project(points_camera)
     is_seen = intrinsics.is_inside(pixels, -0.5) & _is_before_fold(points_camera, intrinsics)
@@ -138,7 +138,7 @@ def _to_picture(
 
 
 def _is_before_fold(points_camera: Array, intrinsics: Intrinsics) -> NDArray[np.bool_]:
-    """Tell which points lie clear of the radius where the distortion folds; near it pixels hardly move."""
+    """Return which points are clear of the radius where the distortion folds; near it pixels hardly move."""
     rho, z = np.hypot(points_camera[:, 0], points_camera[:, 1]), points_camera[:, 2]
     if intrinsics.model == "equidistant":
         return np.asarray(np.arctan2(rho, z) < _FOLD_MARGIN * intrinsics.max_radius)
@@ -173,7 +173,7 @@ def _legend(
     has_lidar: bool,
     has_image: bool,
 ) -> Picture:
-    """Explain marks and colours and list the residuals, in columns below the picture."""
+    """Explain marks and colours and list the residuals, in columns below the image."""
     unit = width_px / 1000
     text_px = 11 * unit
     line_px = 2.1 * text_px

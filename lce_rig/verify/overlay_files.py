@@ -1,4 +1,4 @@
-"""Pictures into a folder."""
+"""Write images into a folder."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -12,7 +12,7 @@ from lce_rig.session.durable import write_atomically
 from lce_rig.verify import canvas
 from lce_rig.verify.canvas import INK, Picture
 
-# Many pictures on one sheet.
+# Many images on one sheet.
 
 _GAP_PX = 10
 _CAPTION_PX = 30
@@ -21,18 +21,18 @@ _CAPTION_PX = 30
 def contact_sheet(
     tiles: Sequence[tuple[str, Picture]], *, columns: int | None = None, tile_width_px: int = 480
 ) -> Picture:
-    """Lay named pictures out in rows, each scaled to the same width with its name below.
+    """Arrange named images in rows, each scaled to the same width with its name below.
 
     Args:
-        tiles: names and BGR pictures, in order.
-        columns: pictures in a row; by default about as many as rows, at most 6.
-        tile_width_px: width of one picture.
+        tiles: names and BGR images, in order.
+        columns: images per row; by default about the number of rows, at most 6.
+        tile_width_px: width of one image.
 
     Raises:
         ValueError: there are no tiles.
     """
     if not tiles:
-        raise ValueError("a contact sheet needs at least one picture")
+        raise ValueError("a contact sheet needs at least one image")
     n_columns = min(columns or min(6, int(np.ceil(np.sqrt(len(tiles))))), len(tiles))
     height_px = max(round(tile_width_px * picture.shape[0] / picture.shape[1]) for _, picture in tiles)
     n_rows = -(-len(tiles) // n_columns)
@@ -48,21 +48,22 @@ def contact_sheet(
 
 CONTACT_SHEET = "contact_sheet.png"
 _TILE_PX = 480
-# Overlays have large even areas and thin marks: runs pack them as tightly as a search does, in half the time.
+# Overlays have large even areas and thin marks: run lengths compress them as well as a search, in half the
+# time.
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 
 
 def write_overlays(folder: Path, overlays: Iterable[tuple[str, Picture, Picture]]) -> list[Path]:
-    """Write one PNG per named picture and a contact sheet of them all.
+    """Write one PNG per named image and a contact sheet of them all.
 
-    Pictures are taken one at a time and only small copies are kept: a long session needs little memory.
+    Images are taken one at a time and only small copies are kept, so that a long session needs little memory.
 
     Args:
-        folder: is made where it does not exist.
-        overlays: name (of the capture), BGR picture, and the part of it that goes onto the contact sheet.
+        folder: created if it does not exist.
+        overlays: name (of the capture), BGR image, and the part of it that goes onto the contact sheet.
 
     Returns:
-        The files, the contact sheet last; none where there are no pictures.
+        The files, the contact sheet last; none if there are no images.
 
     Raises:
         SessionError: a file cannot be written.
@@ -79,19 +80,19 @@ def write_overlays(folder: Path, overlays: Iterable[tuple[str, Picture, Picture]
 
 
 def is_overlay(path: Path) -> bool:
-    """Tell by its name whether a file is one that `write_overlays` makes of a session's captures."""
+    """Return whether a file has a name that `write_overlays` gives to a session's captures."""
     return path.name == CONTACT_SHEET or re.fullmatch(r"[0-9]{6,}\.png", path.name) is not None
 
 
 def write_picture(path: Path, picture: Picture) -> Path:
-    """Write one PNG, whole or not at all.
+    """Write one PNG in one step.
 
     Raises:
         SessionError: the file cannot be written.
     """
     is_encoded, data = cv2.imencode(".png", picture, _PNG)
     if not is_encoded:
-        raise SessionError(f"{path}: a picture of shape {picture.shape} cannot be written as PNG")
+        raise SessionError(f"{path}: an image of shape {picture.shape} cannot be written as PNG")
     write_atomically(path, np.asarray(data).tobytes())
     return path
 

@@ -1,4 +1,4 @@
-"""An extrinsic compared with every capture of a session: residuals, one image each, one sheet for all."""
+"""Compare extrinsics with every capture of a session: residuals, one image each, one contact sheet."""
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -30,7 +30,7 @@ from lce_rig.verify.overlay import camera_part, draw_overlay
 from lce_rig.verify.overlay_files import write_overlays
 from lce_rig.words import as_json
 
-# Boards that moved between picture and sweep, brought together as the calibration brought them.
+# Boards that moved between image and scan, motion-compensated as in the calibration.
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +38,9 @@ class Meeting:
     """One capture's board, seen by both sensors at one time.
 
     Attributes:
-        measured: as either sensor saw it, in its own time.
-        at_sweep: both as they were when the LiDAR saw the board: for residuals.
-        in_picture: the LiDAR's as it was when the picture was taken: for drawing.
+        measured: as each sensor saw it, at its own time.
+        at_sweep: both at the time at which the LiDAR saw the board, for residuals.
+        in_picture: the LiDAR's at the time of the image, for drawing.
     """
 
     measured: Observation
@@ -49,7 +49,7 @@ class Meeting:
 
     @property
     def way_m(self) -> float:
-        """How far the board's middle moved between sweep and picture."""
+        """Distance that the board's middle moved between scan and image."""
         before, after = self.measured.lidar.T_lidar_board, self.in_picture.T_lidar_board
         return float(np.linalg.norm(after[:3, 3] - before[:3, 3]))
 
@@ -57,13 +57,13 @@ class Meeting:
 def bring_together(
     observations: Mapping[str, Sequence[Observation]], channel: str, calibration: Calibration, clocks: Clocks
 ) -> dict[str, Meeting]:
-    """Take out of each capture what the board moved between a channel's picture and the sweep.
+    """Compensate each capture for the board's motion between a channel's image and the scan.
 
     Args:
-        observations: by channel of the calibration; other channels tell how boards moved.
-        channel: whose captures are wanted.
-        calibration: with its channels' time offsets; without any, boards are taken to have stood still.
-        clocks: as the calibration had them.
+        observations: by channel of the calibration; other channels show how boards moved.
+        channel: the channel of the captures.
+        calibration: with its channels' time offsets; without any, boards are assumed to be still.
+        clocks: as in the calibration.
 
     Returns:
         By name of the capture.
@@ -89,7 +89,7 @@ def bring_together(
 def _join(
     observations: Mapping[str, Sequence[Observation]], channel: str, steadiest_first: Sequence[str]
 ) -> tuple[list[SharedScan], list[Observation]]:
-    """Gather, for each of a channel's observations, the pictures of all channels that go with its scan."""
+    """Collect, for each of a channel's observations, the images of all channels with the same scan."""
     by_scan: dict[bytes, dict[str, ImageBoard]] = {}
     for name in steadiest_first:
         for o in observations[name]:
@@ -97,14 +97,14 @@ def _join(
     own = list(observations[channel])
     scans = []
     for o in own:
-        # This capture's own picture, where several hold the same scan.
+        # This capture's own image, if several hold the same scan.
         images = {**by_scan[o.lidar.points.tobytes()], channel: o.image}
-        scans.append(SharedScan(o.capture, images, o.lidar))
+        scans.append(SharedScan((o.capture,), images, o.lidar))
     return scans, own
 
 
 def _in_picture(swept: Observation, image: ImageBoard, T_cam_lidar: Array) -> LidarBoard:
-    """Carry the LiDAR's board from the time of the sweep to that of the picture."""
+    """Move the LiDAR's board from the time of the scan to that of the image."""
     moved = invert(T_cam_lidar) @ image.T_cam_board @ invert(swept.image.T_cam_board) @ T_cam_lidar
     lidar = swept.lidar
     return replace(
@@ -115,17 +115,17 @@ def _in_picture(swept: Observation, image: ImageBoard, T_cam_lidar: Array) -> Li
     )
 
 
-# Which LiDAR candidate and which camera pose of a capture an extrinsic says belong together.
+# Matching of a capture's LiDAR candidates and camera poses under given extrinsics.
 
 
 def match_candidates(candidates: CaptureCandidates, board: Board, T_cam_lidar: Array) -> Observation:
-    """Pair the candidates of one capture that lie closest to each other under a known extrinsic.
+    """Pair the candidates of one capture that are closest to each other under known extrinsics.
 
-    Centres and normals decide, the angle weighed by the plate's half diagonal; turns in the plane do not
+    Centres and normals decide, the angle weighted by the plate's half diagonal; rotations in the plane do not
     count, since a scan cannot tell a rectangle's.
 
     Args:
-        candidates: what both sensors saw.
+        candidates: detections of both sensors.
         board: its size weighs angles against distances.
         T_cam_lidar: (4, 4).
     """
@@ -149,22 +149,22 @@ def match_candidates(candidates: CaptureCandidates, board: Board, T_cam_lidar: A
 
 
 Progress = Callable[[int, int], None]
-# Boards that a wrong extrinsic puts a little off are measured; what lies farther away is another thing.
+# Boards displaced by slightly wrong extrinsics are measured; farther surfaces are other objects.
 _ELSEWHERE_M = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class SessionCheck:
-    """How an extrinsic fits what one channel and the LiDAR saw in the captures of a session.
+    """Residuals of extrinsics for one channel and the LiDAR on the captures of a session.
 
     Attributes:
         pair: the sensors.
-        calibration: that is checked.
-        doubts: why these captures contradict it; empty where they agree.
+        calibration: the calibration to check.
+        doubts: why these captures contradict it; empty if they agree.
         residuals: of each capture in which both sensors see the board.
         metrics: their summary; None without any.
-        meetings: by capture, the boards behind the residuals.
-        pictures: one a capture, once they are drawn.
+        meetings: by capture, the boards of the residuals.
+        pictures: one per capture, once they are drawn.
         contact_sheet: all of them on one sheet; None before.
     """
 
@@ -178,7 +178,7 @@ class SessionCheck:
     contact_sheet: Path | None = None
 
     def moved(self, old: Path, new: Path) -> "SessionCheck":
-        """Name the files by the folder that theirs has become."""
+        """Update the files' paths to a new folder."""
 
         def renamed(path: Path) -> Path:
             return new / path.relative_to(old)
@@ -210,16 +210,16 @@ def _figures(residual: CaptureResidual, used: tuple[str, ...]) -> dict[str, Any]
 def check_session(
     rig: Rig, detections: Detections, calibration: Calibration, channel: str, clocks: Clocks
 ) -> SessionCheck:
-    """Measure how an extrinsic fits what one channel and the LiDAR saw in every capture of a session.
+    """Measure the residuals of extrinsics for one channel and the LiDAR on every capture of a session.
 
-    Boards are brought to the time at which the LiDAR saw them, where the calibration did so.
+    Boards are motion-compensated to the LiDAR's time if the calibration was.
 
     Args:
         rig: the session's.
         detections: of the session.
-        calibration: the extrinsic; it may come from another session of the same rig.
+        calibration: the extrinsics; they may come from another session of the same rig.
         channel: of the calibration's channels.
-        clocks: what the profile says of the two sensors' times.
+        clocks: the profile's settings of the two sensors' times.
     """
     pair = Pair(calibration.camera, channel, calibration.lidar)
     board = rig.board.to_board()
@@ -242,18 +242,18 @@ def draw_check(
     view_of: Callable[[Capture], CameraView | None],
     progress: Progress,
 ) -> SessionCheck:
-    """Draw the LiDAR of every capture into its picture, and say where the pictures are.
+    """Project the point cloud of every capture into its image, and return the images' paths.
 
     Args:
-        session: whose captures are drawn.
+        session: the source of the captures.
         detections: of the session.
         check: of one channel on these captures.
         folder: receives `<capture>.png` and `contact_sheet.png`.
-        view_of: gives the channel's picture in a capture; None where it cannot be read.
+        view_of: returns the channel's image in a capture; None if it cannot be read.
         progress: called with (done, total).
 
     Raises:
-        SessionError: a picture cannot be written.
+        SessionError: an image cannot be written.
     """
     residuals = {residual.capture: residual for residual in check.residuals}
 
@@ -275,14 +275,14 @@ def draw_check(
 
 
 def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: int) -> tuple[Finding, ...]:
-    """Find where captures contradict an extrinsic: large residuals, or no board where it should be.
+    """Find contradictions of captures and extrinsics: large residuals, or no board at the expected place.
 
     Args:
-        metrics: of the captures in which both sensors see the board in one place; None without any.
+        metrics: of the captures in which both sensors agree on the board's place; None without any.
         rig: its limits.
-        n_elsewhere: captures in which no place in the scan is near the one the camera sees; a board that the
-            LiDAR missed among other things of its size is no contradiction, many are.
-        n_seen: captures in which both sensors saw something.
+        n_elsewhere: captures without a surface in the scan near the camera's detection. One such capture may
+            be a board that the LiDAR missed among objects of its size; many are a contradiction.
+        n_seen: captures with detections of both sensors.
     """
     doubts = [] if metrics is None else residuals_beyond(metrics, rig.quality)
     if 4 * n_elsewhere > n_seen:
@@ -301,7 +301,7 @@ def _sees_board(detections: Detections, pair: Pair, name: str) -> bool:
 def _meetings(
     rig: Rig, detections: Detections, channel: str, calibration: Calibration, clocks: Clocks
 ) -> dict[str, Meeting]:
-    """Bring both sensors' boards together in each capture of a channel in which they agree."""
+    """Match both sensors' boards in each capture of a channel in which they agree."""
     observations = {}
     for name in calibration.channels:
         pair = Pair(calibration.camera, name, calibration.lidar)
@@ -315,7 +315,7 @@ def _meetings(
 def _observe(
     rig: Rig, detections: Detections, pair: Pair, name: str, calibration: Calibration
 ) -> Observation | None:
-    """Pair what both sensors saw; None where nothing in the scan is near the board that the camera sees."""
+    """Pair both sensors' detections; None if no surface in the scan is near the camera's board."""
     image, lidar = detections.of(pair, name)
     if not isinstance(image, ImageBoard) or not isinstance(lidar, list):
         return None
@@ -336,7 +336,7 @@ def _draw(
     legend: Mapping[str, float | str],
     title: str,
 ) -> Iterator[tuple[str, Picture, Picture]]:
-    """Draw one capture; nothing where its scan cannot be read."""
+    """Draw one capture; None if its scan cannot be read."""
     try:
         scan = capture.scan(calibration.lidar)
     except SessionError:
@@ -357,7 +357,7 @@ def _draw(
 
 
 def _without(scan: Scan, lidar: LidarBoard) -> Scan:
-    """Leave out a board's points, which are drawn where they were when the picture was taken."""
+    """Remove a board's points, which are drawn separately, moved to the image's time."""
     points, on_board = (np.ascontiguousarray(p, dtype=np.float32) for p in (scan.points, lidar.points))
     row = np.dtype((np.void, points.dtype.itemsize * 3))
     return scan.select(~np.isin(points.view(row).ravel(), on_board.view(row).ravel()))

@@ -1,11 +1,11 @@
-"""Why a capture, an image or a scan is not used: codes begin with the stage that refuses."""
+"""Phrases for refused captures, images and scans; codes begin with the stage that refuses."""
 
 from dataclasses import replace
 
 from lce_rig.core.findings import Finding
 from lce_rig.words.rendering import Phrase, Template, describe, recommend
 
-MOVE_SLOWLY = "move the board sideways slowly, about 10 cm/s, from a second before the capture on"
+MOVE_SLOWLY = "move the board sideways slowly, about 10 cm/s, from 1 s before the capture"
 _SLOWER = "move it slower, about 10 cm/s"
 _CORNERS = "{n_cols}x{n_rows} inner corners"
 _OTHER = _CORNERS + " expected, {n_cols_seen}x{n_rows_seen} detected"
@@ -14,7 +14,7 @@ _UNCOVER = "uncover the whole pattern; if it has these corners, correct board.in
 _FOCUS = "hold the board still, expose shorter, come closer, focus the lens"
 _LENS = "check the camera's intrinsics ({model} at {width_px}x{height_px} px) and that the board is flat"
 _CLOCKS = "check that both sensors' clocks agree"
-_NO_FLICKER = "record by daylight or under lamps that do not flicker"
+_NO_FLICKER = "record in daylight or under lamps that do not flicker"
 _PLATE = "{board_width_m:.2f} x {board_height_m:.2f} m"
 _HOLD_STILL = "hold the board still while capturing, with nothing in front of it or close behind its rim"
 _REMOVE_OTHERS = "remove other things of the board's size, or cover them"
@@ -85,7 +85,7 @@ PHRASES: dict[str, Phrase] = {
         "start the event camera first, or check that both sensors' clocks agree",
     ),
     "read.events_gone_by": Phrase(
-        "the scan comes after the events that follow it",
+        "the scan arrived after the events that follow it",
         "split the recording where the LiDAR's clock was set back",
     ),
     "read.no_events_at_scan": Phrase(
@@ -95,10 +95,10 @@ PHRASES: dict[str, Phrase] = {
     "read.no_image_at_scan": Phrase(_no_image),
     "image.none": Phrase("no board in any image"),
     "lidar.none": Phrase("no board in the scan"),
-    "calibrate.same_placement": Phrase("the board stood as in a capture before"),
+    "calibrate.same_placement": Phrase("same placement as in an earlier capture"),
     "image.text": Phrase("{text}", "{advice}"),
     "image.error": Phrase("{what}", "{hint}"),
-    "image.not_at_first_sight": Phrase("no board at first sight", "search the image thoroughly"),
+    "image.not_at_first_sight": Phrase("no board found by the quick search", "search the image thoroughly"),
     "image.too_dark": Phrase(
         "too dark: 99 % of the image below grey {grey_99:.0f}", "expose longer or add light"
     ),
@@ -122,7 +122,7 @@ PHRASES: dict[str, Phrase] = {
         {"events": f"{_WHOLE}; {MOVE_SLOWLY}"},
     ),
     "image.unclear": Phrase(
-        "the " + _CORNERS + " are there but too unclear to measure",
+        "the " + _CORNERS + " are too unclear to measure",
         "hold the board still, closer and better lit",
         {"events": f"{MOVE_SLOWLY}; come closer"},
     ),
@@ -190,7 +190,7 @@ PHRASES: dict[str, Phrase] = {
     "image.made_few_events": Phrase(
         "the board made few events at {speed_mps:.2f} m/s: {events_px:.1f} events/px in 1 s "
         "(minimum {min_events_px:g})",
-        "move it sideways slowly, about 10 cm/s, rather than to and fro, and in better light",
+        "move it sideways slowly, about 10 cm/s, in one direction, and in better light",
     ),
     "lidar.text": Phrase("{text}", "{advice}"),
     "lidar.no_returns": Phrase(
@@ -214,7 +214,7 @@ PHRASES: dict[str, Phrase] = {
     "lidar.outline": Phrase(
         "plate outline at {distance_m:.1f} m: error {error_m:mm} (limit {max_error_m:mm}), "
         "{hidden_share:percent} of the board occluded",
-        "show the whole board, with nothing before it and nothing at its edges",
+        "show the whole board, with nothing in front of it or at its edges",
     ),
     "lidar.other_plate": Phrase(
         "the plate nearest to the board's size is {width_m:.2f} x {height_m:.2f} m, at {distance_m:.1f} m; "
@@ -236,6 +236,11 @@ PHRASES: dict[str, Phrase] = {
         "ring ends {rms_m:mm} rms from a rectangle (limit {max_rms_m:mm})",
         "keep hands and other things away from the board's border",
     ),
+    "lidar.elsewhere": Phrase(
+        "best of {n_candidates} candidates in the scan: {distance_m:.2f} m, {rotation_deg:.0f} deg from the "
+        "pose predicted by the image and the nominal extrinsics",
+        "hold the board clear of other things, where more of the LiDAR's rings meet it",
+    ),
     "lidar.lost": Phrase(_lost, _find_again),
     "lidar.turned_away": Phrase(
         "the only plate near the board's last place is rotated by over {max_turn_deg:.0f} deg",
@@ -243,7 +248,7 @@ PHRASES: dict[str, Phrase] = {
     ),
     "pair.text": Phrase("{text}", "{advice}"),
     "pair.no_candidate": Phrase(
-        "no place in the scan looks like the board", "move the board clear of other things"
+        "no surface in the scan fits the board", "move the board clear of other things"
     ),
     "pair.elsewhere": Phrase(
         _candidates,
@@ -251,7 +256,7 @@ PHRASES: dict[str, Phrase] = {
         {"hold_still": "hold the board still and clear of other things while capturing"},
     ),
     "pair.two_places": Phrase(
-        "{first} and {second} put the board at different places of the scan", _REMOVE_OTHERS
+        "{first} and {second} give different board positions in the scan", _REMOVE_OTHERS
     ),
     "calibrate.text": Phrase("{text}", "{advice}"),
     "calibrate.outlier": Phrase(
@@ -264,12 +269,13 @@ PHRASES: dict[str, Phrase] = {
         "check with `lce-rig check --debug-images` whether the board is bent, cut off or moving",
     ),
     "calibrate.known_placement": Phrase(
-        "the board stands where capture {capture} shows it",
+        "the board is at the placement of capture {capture}",
         "{instruction}",
-        {"nowhere": "no other place is left, you may stop"},
+        {"nowhere": "stop the collection: no new placement is left"},
     ),
     "calibrate.little_gain": Phrase(
-        "this placement makes the result {gain:1percent} better, another {best_gain:percent}", "{instruction}"
+        "this placement improves the result by {gain:1percent}, another by {best_gain:percent}",
+        "{instruction}",
     ),
 }
 for _stage, _unit in (("image", "camera"), ("lidar", "LiDAR")):

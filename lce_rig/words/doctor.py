@@ -1,4 +1,4 @@
-"""What the doctor looks at: the computer, each sensor's stream, clock, pulses and images, the board."""
+"""Phrases of the doctor: computer, profile, each sensor's stream, clock, pulses and images, the board."""
 
 from collections.abc import Mapping
 from textwrap import shorten
@@ -8,7 +8,7 @@ from lce_rig.words.rendering import Phrase
 
 _MAX_COMMAND = 50
 _EVERY_PULSE = (
-    "make every pulse trigger one frame: set the camera's trigger mode in driver.controls, check the line"
+    "make every pulse trigger one image: set the camera's trigger mode in driver.controls, check the line"
 )
 
 
@@ -93,13 +93,13 @@ def _received(finding: Finding) -> str:
 
 
 def _complete(finding: Finding) -> str:
-    """Of {n_packets} packets and all samples none is lost."""
+    """No packet of {n_packets} and no sample is lost."""
     return f"{_received(finding)}none lost"
 
 
 def _losses(finding: Finding) -> str:
-    """Of {n_packets} packets {n_lost} were lost, {n_dropped} samples not taken in time: {share} of all."""
-    late = f", {finding.figures['n_dropped']} not taken in time" if finding.figures["n_dropped"] else ""
+    """Of {n_packets} packets {n_lost} were lost, {n_dropped} samples not read in time: {share} of all."""
+    late = f", {finding.figures['n_dropped']} not read in time" if finding.figures["n_dropped"] else ""
     return f"{_received(finding)}{finding.figures['n_lost']} lost{late}"
 
 
@@ -175,7 +175,7 @@ _COMPUTER: Mapping[str, Phrase] = {
     ),
     "computer.clock": Phrase("synchronised, error at most {max_error_ms:.0f} ms"),
     "computer.clock_not_synchronised": Phrase(
-        "not synchronised, says the kernel",
+        "not synchronised, according to the kernel",
         "run: timedatectl set-ntp true, or let chrony follow the rig's GPS",
     ),
 }
@@ -201,7 +201,7 @@ _SENSORS: Mapping[str, Phrase] = {
     ),
     "settings.unknown": Phrase(
         "firmware and settings unknown: {what}",
-        "check that driver.address is its own, and that no firewall is in the way",
+        "check that driver.address is its own, and that no firewall blocks it",
     ),
     "settings.read": Phrase(_settings),
 }
@@ -215,12 +215,12 @@ _CLOCKS: Mapping[str, Phrase] = {
     "clock.offset": Phrase(_offset),
     "clock.drifts": Phrase(
         "the clock of {subject} drifts by {drift_ppm:+.0f} ppm (limit {limit_ppm:.0f} ppm)",
-        "let nothing set this computer's clock, and close other programs",
+        "stop programs that set this computer's clock, and close other programs",
     ),
     "edges.fitted": Phrase(
         "{n_edges} of {n_pulses} pulses, drift {drift_ppm:+.1f} ppm, scatter {rms_us:.1f} us"
     ),
-    "edges.not_fitted": Phrase("{n_edges} edges seen of {n_pulses} pulses, clock not fitted"),
+    "edges.not_fitted": Phrase("{n_edges} edges of {n_pulses} pulses detected, clock not fitted"),
     "pulses.line": Phrase("{line} {rate_hz:.3g} Hz"),
     "pulses.line_off": Phrase(
         "{line} {rate_hz:.3g} Hz ({expected_hz:g} Hz expected)",
@@ -233,9 +233,9 @@ _CLOCKS: Mapping[str, Phrase] = {
         {"pps": ""},
     ),
     "pulses.lost": Phrase("{n} lost"),
-    "pulses.frames": Phrase("{n_frames} frames of {n_pulses} pulses"),
+    "pulses.frames": Phrase("{n_frames} images of {n_pulses} pulses"),
     "pulses.counted_only": Phrase("counted only, not matched yet"),
-    "pulses.unequal": Phrase("frames and pulses differ", _EVERY_PULSE),
+    "pulses.unequal": Phrase("image and pulse counts differ", _EVERY_PULSE),
     "pulses.not_matched": Phrase("not matched"),
     "pulses.delay": Phrase("delay {delay_ms:.2f} +- {delay_scatter_ms:.2f} ms"),
     "pulses.missed": Phrase("{n_missed} pulses missed, count slipped {n_slips} times", _EVERY_PULSE),
@@ -260,6 +260,17 @@ _IMAGES: Mapping[str, Phrase] = {
         "{distance_m:.2f} m away, {n_corners:.0f} corners to {corner_rms_px:.2f} px rms, "
         "sharpness {sharpness:.1f}"
     ),
-    "board.in_events": Phrase("{distance_m:.2f} m away, seen in its events"),
+    "board.in_events": Phrase("{distance_m:.2f} m away, detected in its events"),
 }
-PHRASES: Mapping[str, Phrase] = {**_COMPUTER, **_SENSORS, **_CLOCKS, **_IMAGES}
+_PROFILE: Mapping[str, Phrase] = {
+    "profile.swapped_sides": Phrase(
+        "{subject}: {n_cols}x{n_rows} inner corners run along the shorter side of the plate "
+        "{width_m:g} x {height_m:g} m",
+        "check whether to swap width_m and height_m, or the inner_corners",
+    ),
+    "profile.drifting_clock": Phrase(
+        "{subject}: the sensor's own clock without sync drifts away from the others",
+    ),
+    "profile.shared": Phrase("{subject}: {value} equals {other}, but two sensors cannot share it"),
+}
+PHRASES: Mapping[str, Phrase] = {**_COMPUTER, **_SENSORS, **_CLOCKS, **_IMAGES, **_PROFILE}

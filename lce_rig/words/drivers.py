@@ -1,4 +1,4 @@
-"""What drivers report: devices, their streams, their clocks, and how pulses and edges tie these together."""
+"""Phrases of drivers: devices, streams, clocks, and the pulses and edges that synchronise them."""
 
 from collections.abc import Mapping
 
@@ -27,7 +27,7 @@ def _nmea_of_other_second(finding: Finding) -> str:
 def _mid_exposure(finding: Finding) -> str:
     """The timestamps are of mid exposure, from {mark} by {clock}; images arrive {delay_ms} old."""
     mark = str(finding.figures["mark"]).replace("_", " ")
-    moved = f"{mark} by clock {finding.figures['clock']}, as this computer's UTC, moved to mid exposure"
+    moved = f"{mark} by clock {finding.figures['clock']}, as this computer's UTC, corrected to mid exposure"
     return moved + _delay(finding)
 
 
@@ -45,9 +45,9 @@ def _delay(finding: Finding) -> str:
 
 
 def _board_clock(finding: Finding) -> str:
-    """The timestamps are the board's own clock, tied to the computer's and to UTC by {host_by}, {utc_by}."""
+    """The timestamps are the board's clock, synchronised with the computer and UTC by {host_by}, {utc_by}."""
     parts = [_tie(finding, "host", "the computer's"), _tie(finding, "utc", "UTC")]
-    known = [part for part in parts if part] or ["not yet tied to the computer's"]
+    known = [part for part in parts if part] or ["not yet synchronised with the computer's"]
     text = f"the board's own clock, {'; '.join(known)}"
     has_asked = "round_trip_ms" in finding.figures
     return text + (f"; round trip {finding.figure('round_trip_ms'):.1f} ms" if has_asked else "")
@@ -59,7 +59,7 @@ def _tie(finding: Finding, name: str, to: str) -> str:
     sigma_us = finding.figure(f"{name}_sigma_us")
     sigma = f"{sigma_us / 1000:.1f} ms" if sigma_us >= 1000 else f"{sigma_us:.3g} us"
     drift = f"drift {finding.figure(f'{name}_drift_ppm'):+.1f} ppm, standard deviation {sigma}"
-    return f"tied to {to} by {finding.figures[f'{name}_by']}: {drift}"
+    return f"synchronised with {to} by {finding.figures[f'{name}_by']}: {drift}"
 
 
 def _ages(finding: Finding) -> str:
@@ -70,7 +70,7 @@ def _ages(finding: Finding) -> str:
 
 def _none_fits(finding: Finding) -> str:
     """No clock of this computer fits the timestamps, {delays_ms} by clock; the arrival is used."""
-    return f"no clock fits the timestamps (image age by {_ages(finding)}), the arrival is used"
+    return f"no clock fits the timestamps (image age by {_ages(finding)}); arrival times are used"
 
 
 def _ambiguous_clock(finding: Finding) -> str:
@@ -80,7 +80,7 @@ def _ambiguous_clock(finding: Finding) -> str:
 
 
 def _pulse_lines_lost(finding: Finding) -> str:
-    """Messages of {n} pulses never arrived, {by_line}."""
+    """Messages of {n} pulses were lost, {by_line}."""
     by_line = finding.figures["by_line"]
     assert isinstance(by_line, tuple)
     lines = ", ".join(f"{_number(line)} {_number(n)}" for line, n in map(_pair, by_line))
@@ -116,7 +116,7 @@ _DEVICE: Mapping[str, Phrase] = {
     "device.board_silent": Phrase(
         "no message from the board for {silent_s:.0f} s", "check its cable and power, press its reset"
     ),
-    "device.commands_not_taken": Phrase("the board did not take {n} commands", "press its reset"),
+    "device.commands_not_taken": Phrase("the board did not accept {n} commands", "press its reset"),
     "device.board_restarted": Phrase(
         "the board restarted {n} times, last {ago_s:.0f} s ago",
         "check its power, and that no other program opens its port",
@@ -218,20 +218,20 @@ _CAMERA_CLOCK: Mapping[str, Phrase] = {
     "clock.mid_exposure": Phrase(_mid_exposure),
     "clock.davis": Phrase(_davis),
     "clock.missing": Phrase(
-        "this computer has no clock {clock}, the arrival is used", "set driver.frame_timing.clock"
+        "this computer has no clock {clock}; arrival times are used", "set driver.frame_timing.clock"
     ),
     "clock.does_not_fit": Phrase(
         "by clock {clock} images are {delay_ms:.3g} ms old", "correct driver.frame_timing.clock"
     ),
     "clock.none_fits": Phrase(_none_fits, "set driver.frame_timing.clock if you know it"),
     "clock.ambiguous": Phrase(_ambiguous_clock, "set driver.frame_timing.clock if you know it"),
-    "clock.changed": Phrase("the timestamps left their clock {n} times", "check the camera's driver (dmesg)"),
+    "clock.changed": Phrase("the timestamps changed clock {n} times", "check the camera's driver (dmesg)"),
     "clock.exposure_unknown": Phrase(
-        "the camera does not report its exposure: timestamps are off by half of it",
+        "the camera does not report its exposure: timestamps are wrong by half of it",
         "set driver.frame_timing.exposure_us",
     ),
     "clock.trigger_input_off": Phrase(
-        "the trigger input does not switch on: its edges are not seen, and its clock drifts",
+        "the trigger input cannot be switched on: no edges are detected, and the clock drifts",
         "update the camera's firmware",
     ),
     "clock.follows_other_camera": Phrase(
@@ -239,7 +239,7 @@ _CAMERA_CLOCK: Mapping[str, Phrase] = {
     ),
     "clock.differs_from_computer": Phrase(
         "its clock and this computer's differ by {difference_s:.3g} s (limit 0.5 s)",
-        "open the camera again; let nothing set this computer's clock",
+        "open the camera again; stop programs that set this computer's clock",
     ),
     "clock.restarted": Phrase(
         "its clock restarted {n} times: a sync cable sent a reset", "open the camera again"
@@ -249,15 +249,15 @@ _BOARD_CLOCK: Mapping[str, Phrase] = {
     "clock.board": Phrase(_board_clock),
     "clock.receiver": Phrase("UTC by whole seconds; no pulses"),
     "clock.board_not_tied": Phrase(
-        "the board's clock is not tied to the computer's: it answers no time requests and sends no pulses",
+        "the board's clock is not synchronised with the computer's: no answers to time requests, no pulses",
         "check its firmware and sync.type",
     ),
     "clock.board_by_arrivals": Phrase(
-        "the board answers no time requests: its clock is tied by arrivals only, to about 1 ms"
+        "the board answers no time requests: its clock is synchronised by arrivals only, to about 1 ms"
     ),
     "clock.computer_jumped": Phrase(
         "the computer's clock jumped {n} times, last by {last_s:+.3f} s",
-        "let nothing set it while you collect (chrony slews, ntpdate jumps)",
+        "do not set it while you collect (chrony slews, ntpdate jumps)",
     ),
     "clock.receiver_no_time": Phrase("the receiver has no time yet", "give its antenna a view of the sky"),
     "clock.receiver_not_valid": Phrase(
@@ -273,7 +273,7 @@ _BOARD_CLOCK: Mapping[str, Phrase] = {
 _PULSES: Mapping[str, Phrase] = {
     "pulses.nothing_yet": Phrase("no images and pulses yet"),
     "pulses.images_not_numbered": Phrase("its images carry no numbers: they cannot be matched to pulses"),
-    "pulses.clock_not_tied": Phrase("its clock is not tied yet: images cannot be matched to pulses"),
+    "pulses.clock_not_tied": Phrase("its clock is not synchronised yet: images cannot be matched to pulses"),
     "pulses.none": Phrase("images and no pulses", "check the board's line to the computer"),
     "pulses.images_without": Phrase(
         "images without pulses", "set the camera to trigger mode, and check its line"
@@ -296,12 +296,12 @@ _PULSES: Mapping[str, Phrase] = {
         "its count slipped against the pulses {n_slips} times and restarted {n_restarts} times; "
         "{n_matched} images matched, {n_unmatched} not"
     ),
-    "edges.none_seen": Phrase("no edges seen yet", "wire its trigger input, and switch it on"),
+    "edges.none_seen": Phrase("no edges detected yet", "wire its trigger input, and switch it on"),
     "edges.too_close": Phrase(
         "its clock is uncertain by {sigma_ms:.0f} ms, too much for pulses every {period_ms:.0f} ms",
         "wire the pulse per second, or begin slower",
     ),
-    "edges.not_the_pulses": Phrase("the edges seen are not the board's pulses", "check the wire"),
+    "edges.not_the_pulses": Phrase("the detected edges are not the board's pulses", "check the wire"),
     "sync.boards_may_move": Phrase("boards may move while they are captured"),
     "sync.boards_must_stand": Phrase(
         "boards must stand still while they are captured",
@@ -310,10 +310,10 @@ _PULSES: Mapping[str, Phrase] = {
             "see_lines": "see the lines of these sensors and of the sync board",
         },
     ),
-    "sync.no_board": Phrase("no sync board ties the cameras' clocks to the LiDAR's", actions={"named": ""}),
+    "sync.no_board": Phrase("no sync board synchronises the cameras with the LiDAR", actions={"named": ""}),
     "sync.none_in_profile": Phrase("{key} is none", actions={"named": ""}),
     "sync.not_tied": Phrase(
-        "the clock of {subject} is not tied to the rig's", "run `lce-rig doctor`", {"named": ""}
+        "the clock of {subject} is not synchronised with the rig's", "run `lce-rig doctor`", {"named": ""}
     ),
     "sync.too_uncertain": Phrase(
         "time of {subject}: standard deviation {sigma_ms:.1f} ms (limit {limit_ms:.1f} ms)",

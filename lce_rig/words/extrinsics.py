@@ -1,8 +1,10 @@
-"""Why an extrinsic is doubted: the reasons of a verdict, its notes, other captures, other sessions."""
+"""Phrases for extrinsics: reasons and notes of a verdict, checks on other captures and sessions."""
 
 import math
+from collections.abc import Mapping
 
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.results import WeakestMotion
 from lce_rig.words.rendering import Phrase, Template
 
 _AXES = ("x right", "y down", "z forward")
@@ -17,6 +19,51 @@ _WAYS = {
     "halves": "random halves of the captures",
 }
 _APART = "{rotation_deg:deg}, {translation_m:mm}"
+_CAMERA_AXES = {"x": "x axis (right)", "y": "y axis (down)", "z": "z axis (line of sight)"}
+
+
+def motion_words(motion: str) -> str:
+    """Name a motion by its code, "translation_x" to "rotation_z"; what is no code is taken as words."""
+    kind, _, axis = motion.partition("_")
+    if axis not in _CAMERA_AXES:
+        return motion
+    return f"{kind} {'along' if kind == 'translation' else 'about'} the camera's {_CAMERA_AXES[axis]}"
+
+
+def weakest_words(weakest: WeakestMotion) -> str:
+    """Name the least certain motion with its standard deviation."""
+    return _weakest(weakest.figures())
+
+
+def _weakest(figures: Mapping[str, Figure]) -> str:
+    sigma, unit, digits = figures.get("weakest_sigma_deg"), "deg", 3
+    if sigma is None:
+        sigma, unit, digits = 1e3 * float(str(figures["weakest_sigma_m"])), "mm", 1
+    return f"{motion_words(str(figures['weakest']))}, sigma {sigma:.{digits}f} {unit}"
+
+
+def _least_determined(advice: str) -> Template:
+    def text(finding: Finding) -> str:
+        return f"{advice}; least determined: {_weakest(finding.figures)}"
+
+    text.__doc__ = f"{advice}; least determined: {{weakest}}, {{weakest_sigma_m}} or {{weakest_sigma_deg}}."
+    return text
+
+
+def _control(finding: Finding) -> str:
+    """Control failed: moved by {rotation_deg}, {translation_m} ({direction}), the others fit as well."""
+    apart = f"{finding.figure('rotation_deg'):.2f} deg, {1000 * finding.figure('translation_m'):.0f} mm"
+    direction = motion_words(str(finding.figures["direction"]))
+    return f"control failed: moved by {apart} ({direction}), the result fits held-out captures no worse"
+
+
+def _sensors_disagree(finding: Finding) -> str:
+    """The sensors disagree in {n_refused} of {n_captures} captures, {captures}."""
+    q = finding.figures
+    names = q["captures"]
+    assert isinstance(names, tuple)
+    shown = ", ".join(map(str, names[:4])) + (" ..." if len(names) > 4 else "")
+    return f"the sensors disagree in {q['n_refused']} of {q['n_captures']} captures ({shown})"
 
 
 def _sigma(unit: str, scale: float) -> Template:
@@ -43,7 +90,7 @@ def _intrinsics(finding: Finding) -> str:
     """Intrinsics do not fit: {rms_px}, {possible_px}, {displacement_px}, {turn_deg}, {focal_ratio}."""
     q = finding.figures
     how = "do not fit" if finding.severity == "error" else "fit only roughly"
-    parts = ["corners fit, but only because the boards' poses are off"]
+    parts = ["corners fit, but only with wrong board poses"]
     if q["is_visible"]:
         rms_px, possible_px = finding.figure("rms_px"), finding.figure("possible_px")
         parts = [f"reprojection error {rms_px:.2f} px, possible {possible_px:.2f} px"]
@@ -95,6 +142,25 @@ def _plate(finding: Finding) -> str:
     )
 
 
+def _commonest(finding: Finding) -> str:
+    """The commonest of {causes} of refusal with their counts, or: collect more captures."""
+    causes = finding.figures["causes"]
+    assert isinstance(causes, tuple)
+    lines = [f"{cause[0]} x {cause[2]}" for cause in causes if isinstance(cause, tuple)]
+    return "\n".join(lines) or "collect more captures"
+
+
+def _undetermined(finding: Finding) -> str:
+    """{motions} open after {n_captures} captures: boards nearly parallel, normals spread by {spread_deg}."""
+    motions, n_captures = finding.figures["motions"], finding.figures["n_captures"]
+    assert isinstance(motions, tuple)
+    names = " and ".join(motion_words(str(motion)) for motion in motions)
+    return (
+        f"{names} cannot be told from {n_captures} captures: their boards are nearly parallel "
+        f"(normals spread by {finding.figure('spread_deg'):.1f} deg)"
+    )
+
+
 def _agree(finding: Finding) -> str:
     """The {n_sessions} calibrations of {camera} and {lidar} agree: {rotation_deg}, {translation_m} apart.
 
@@ -110,7 +176,7 @@ def _agree(finding: Finding) -> str:
 
 
 PHRASES: dict[str, Phrase] = {
-    "verdict.text": Phrase("{text}"),
+    "verdict.text": Phrase("{text}", "{advice}"),
     "verdict.no_certificate": Phrase(
         "not certified: method {method} has no certificate", "use --method paper"
     ),
@@ -119,13 +185,13 @@ PHRASES: dict[str, Phrase] = {
     ),
     "verdict.rotation_uncertain": Phrase(
         _sigma("deg", 1.0),
-        "collect more captures; least determined: {weakest}",
-        {"measure_ranges": _RANGES + "; least determined: {weakest}"},
+        _least_determined("collect more captures"),
+        {"measure_ranges": _least_determined(_RANGES)},
     ),
     "verdict.translation_uncertain": Phrase(
         _sigma("mm", 1000.0),
-        "collect more captures; least determined: {weakest}",
-        {"measure_ranges": _RANGES + "; least determined: {weakest}"},
+        _least_determined("collect more captures"),
+        {"measure_ranges": _least_determined(_RANGES)},
     ),
     "verdict.plane_residual": Phrase(
         "LiDAR points {mean_m:mm} on average from the camera's board planes (limit {limit_m:mm})",
@@ -146,14 +212,14 @@ PHRASES: dict[str, Phrase] = {
     ),
     "verdict.channels_differ": Phrase(
         "{first} and {second} of one camera differ by " + _APART + ", beyond their uncertainty",
-        "calibrate each alone (--channels) and see which captures contradict it",
+        "calibrate each alone (--channels) and find the captures that contradict it",
     ),
     "verdict.sensors_disagree": Phrase(
-        "the sensors disagree in {n_refused} of {n_captures} captures ({captures})",
+        _sensors_disagree,
         "look for a moving board, a second board, or wrong matching",
     ),
     "verdict.few_used": Phrase(
-        "{n_used} of {n_captures} captures could be used", "see the causes with `lce-rig check`"
+        "{n_used} of {n_captures} captures could be used", "run `lce-rig check` for the causes"
     ),
     "verdict.few_placements": Phrase(
         "{n_used} captures show {n_placements} different placements (minimum {n_needed})",
@@ -184,7 +250,7 @@ PHRASES: dict[str, Phrase] = {
         {"near": "check the squares' size and the focal length, and that the board is flat"},
     ),
     "verdict.control": Phrase(
-        "control failed: moved by " + _APART + " ({direction}), the result fits held-out captures no worse",
+        _control,
         "collect more captures; if this persists, re-measure the board",
     ),
     "verdict.scale": Phrase(_scale, "measure the squares"),
@@ -197,32 +263,34 @@ PHRASES: dict[str, Phrase] = {
         "correct them in the LiDAR's driver",
     ),
     "verdict.camera_changed": Phrase(
-        "{subject}, by their images alone, change significantly at capture {capture}, by " + _APART,
+        "{subject}: relative pose from the images changes significantly at capture {capture}, by " + _APART,
         "fasten the cameras, one may have moved, and collect again",
     ),
     "verdict.camera_shares_differ": Phrase(
-        "{subject}, by their images alone: {first} and {second} boards differ significantly, by " + _APART,
+        "{subject}: relative poses from images of {first} and {second} boards differ significantly, by "
+        + _APART,
         _LENS,
         {"near": "check the squares' size and the focal length, and that the board is flat"},
     ),
     "verdict.cameras_scatter": Phrase(
-        "{subject}: images put the same board {rms_m:mm} apart, rms, wherever the cameras sit "
+        "{subject}: board positions from the images differ by {rms_m:mm} rms for any relative pose "
         "({scatter:.1f} times the typical value)",
         "hold the board still between the images and check the intrinsics",
     ),
     "verdict.cameras_differ": Phrase(
-        "{subject}: the same board {rms_m:mm} apart ({images_rms_m:mm} by the images alone), "
-        "extrinsics and images differ by " + _APART,
+        "{subject}: board positions differ by {rms_m:mm} rms ({images_rms_m:mm} from the images alone), "
+        "relative poses from extrinsics and images by " + _APART,
         "check whether a camera has moved, and the intrinsics",
     ),
     "verdict.widened": Phrase(_widened),
     "verify.elsewhere": Phrase(
-        "in {n_elsewhere} of {n_captures} captures nothing in the scan is where the extrinsics put the board"
+        "in {n_elsewhere} of {n_captures} captures the scan has no surface where the extrinsics place the "
+        "board"
     ),
-    "verify.unseen": Phrase("no capture shows the board to both sensors"),
+    "verify.unseen": Phrase("both sensors detect the board in no capture"),
     "results.agree": Phrase(
         "the {n_sessions} results of {camera} and {lidar} agree: they differ by up to {rotation_deg:3deg} "
-        "and {translation_m:1mm}; errors that they share do not show, as they are of the same captures",
+        "and {translation_m:1mm}; common errors stay hidden, as they share captures",
     ),
     "results.disagree": Phrase(
         "{first} and {second} of {camera} and {lidar} disagree: results differ by up to {rotation_deg:3deg} "
@@ -237,14 +305,32 @@ PHRASES: dict[str, Phrase] = {
     "repeat.disagree": Phrase(
         "the {n_sessions} calibrations of {camera} and {lidar} disagree: they differ by up to "
         "{rotation_deg:3deg} and {translation_m:1mm}, {ratio:.1f} times as much as predicted",
-        "use none of them before the cause is known",
-        {"odd_one": "find out what is wrong with {odd_one}, without it the others agree"},
+        "do not use any of them until the cause is known",
+        {"odd_one": "find the fault in {odd_one}, without it the others agree"},
     ),
     "repeat.failed": Phrase(
-        "the calibration of {subject} ({camera} and {lidar}) failed by itself",
-        "see its reasons with `lce-rig calibrate`",
+        "the calibration of {subject} ({camera} and {lidar}) failed",
+        "run `lce-rig calibrate` for its reasons",
     ),
-    "repeat.not_calibrated": Phrase("{subject}: {what}", "{hint}"),
+    "shortage.few_detected": Phrase(
+        "the board was found by both sensors in {n_detected} of {n_captures} captures, at least {n_needed} "
+        "are needed",
+        _commonest,
+    ),
+    "shortage.few_captures": Phrase(
+        "{n_captures} captures show the board in both sensors (minimum {n_needed})",
+        "add captures: ten or more, with the board at different places and tilts",
+    ),
+    "shortage.few_agree": Phrase(
+        "only {n_agreeing} of {n_captures} captures agree with one set of extrinsics, {n_needed} are needed",
+        "check the board's size, the intrinsics and the pairing of images with scans; add captures",
+    ),
+    "shortage.undetermined": Phrase(
+        _undetermined,
+        "add captures with the board tilted by 20 deg or more, left and right as well as up and down",
+    ),
+    "shortage.text": Phrase("{text}", "{advice}"),
+    "repeat.not_calibrated": Phrase("{subject}: {sensors}: {what}", "{hint}"),
     "repeat.only_one": Phrase("{camera} and {lidar} are calibrated in {subject} only"),
     "repeat.other_board": Phrase("{first} and {subject} were taken with different boards"),
 }

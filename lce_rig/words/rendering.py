@@ -8,6 +8,7 @@ from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Figure, Finding
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ class Phrase:
 
     Attributes:
         text: what was found, with figures; no action.
-        action: what to do, in the imperative; "" where nothing is to be done.
+        action: what to do, in the imperative; "" if nothing is to be done.
         actions: other actions by the name that `Finding.action` gives.
     """
 
@@ -65,7 +66,7 @@ _FORMATTER = _Figures()
 
 @cache
 def phrases() -> Mapping[str, Phrase]:
-    """Gather the tables of all families: code -> phrase."""
+    """Merge the tables of all families: code -> phrase."""
     table: dict[str, Phrase] = {}
     for family in FAMILIES:
         table |= import_module(f"lce_rig.words.{family}").PHRASES
@@ -78,7 +79,7 @@ def describe(finding: Finding) -> str:
 
 
 def recommend(finding: Finding) -> str:
-    """Say what to do; "" where nothing is to be done."""
+    """Say what to do; "" if nothing is to be done."""
     phrase = phrases()[finding.code]
     chosen = (phrase.actions or {})[finding.action] if finding.action else phrase.action
     return _render(chosen, finding)
@@ -91,17 +92,27 @@ def sentence(finding: Finding) -> str:
 
 
 def as_line(text: str) -> str:
-    """Write words as a line of their own: a capital first, a full stop last."""
+    """Write words as a sentence, with a capital and a full stop."""
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
 def enumerated(finding: Finding, reasons: Iterable[Finding]) -> str:
-    """Say what was found and what makes it so, in one line."""
+    """Say what was found and the reasons, in one line."""
     return f"{describe(finding)}: {'; '.join(sentence(reason) for reason in reasons)}"
 
 
+def not_enough(finding: Finding) -> NotEnoughDataError:
+    """Make the error that says what data are lacking, of what."""
+    whose = f"{finding.subject}: " if finding.subject else ""
+    action = recommend(finding)
+    # Several causes, a line each, are no sentence.
+    return NotEnoughDataError(
+        whose + describe(finding), action if "\n" in action else as_line(action), finding
+    )
+
+
 def as_json(finding: Finding) -> dict[str, object]:
-    """Write a finding for programs: texts may change, everything else is stable."""
+    """Write a finding for programs; all but the texts is stable."""
     return {
         "code": finding.code,
         "severity": finding.severity,
@@ -114,7 +125,7 @@ def as_json(finding: Finding) -> dict[str, object]:
 
 
 def refusal_as_json(refusal: "Refusal") -> dict[str, object]:
-    """Write why a capture is refused for programs: stage, code, figures and action's code are stable."""
+    """Write a refusal for programs; stage, code, figures and the action's code are stable."""
     record = as_json(refusal)
     return {
         "stage": refusal.stage,
@@ -127,7 +138,7 @@ def refusal_as_json(refusal: "Refusal") -> dict[str, object]:
 
 
 def is_renderable(finding: Finding) -> bool:
-    """Tell whether code, figures and action of a finding, as a file gives them, have words here."""
+    """Return whether a finding read from a file has a known code and action and all figures of its phrase."""
     try:
         sentence(finding)
     except (KeyError, TypeError, ValueError, AttributeError):
@@ -136,7 +147,7 @@ def is_renderable(finding: Finding) -> bool:
 
 
 def _finite(figure: Figure) -> Figure:
-    """Give None for a number that JSON has no word for."""
+    """Return None for a number that JSON cannot represent."""
     if isinstance(figure, tuple):
         return tuple(_finite(each) for each in figure)
     return None if isinstance(figure, float) and not math.isfinite(figure) else figure

@@ -57,12 +57,12 @@ def bench_events(n_seeds: int, n_captures: int = 30) -> None:
     work = partial(_session, n_captures=n_captures)
     with ProcessPoolExecutor(2) as pool:
         sessions = list(pool.map(work, range(n_seeds)))
-    head = "channels, sessions, boards found, corner rms px, rms deg, rms mm, claimed deg / mm, NEES"
+    head = "channels, sessions, boards found, corner rms px, rms deg, rms mm, reported deg / mm, NEES"
     print_head(*head.split(", "), "clock rms ms")
     for name in ("frames", "events", "events+frames"):
         print_row(*_row(name, [network for network, _ in sessions]))
     print()
-    print_head("pictures from events by", "boards found", "corner rms px", "rms deg", "rms mm")
+    print_head("images from events by", "boards found", "corner rms px", "rms deg", "rms mm")
     for title, index in (("network", 0), ("event map", 1)):
         found, corners, deg, mm = _row("events", [session[index] for session in sessions])[2:6]
         print_row(title, found, corners, deg, mm)

@@ -31,6 +31,7 @@ HANGS_S = 3600.0
 _TRY_S = 7.0
 _ENDED = "ended: "
 _VERDICTS = ("PASS", "WARN", "FAIL")
+_KEPT = ("uncertainty", "reference")
 #: A placement nearer than both to a capture is not new.
 NEW_M, NEW_DEG = Novelty().min_move_m, Novelty().min_turn_deg
 
@@ -179,7 +180,7 @@ def _judge(path: Path) -> str:
     """Calibrate a session and compare it with the truth: verdicts and errors, or the exit code."""
     code, said = _run("calibrate", str(path), "--reference", str(path / "truth.json"))
     lines = [" ".join(line.split()) for line in said.splitlines()]
-    kept = [line for line in lines if line.endswith(_VERDICTS) or line.startswith(("known to", "reference"))]
+    kept = [line for line in lines if line.endswith(_VERDICTS) or line.startswith(_KEPT)]
     return "; ".join(kept) or f"exit code {code}"
 
 

@@ -64,7 +64,7 @@ class Outcome:
 
 def bench_guidance(n_seeds: int, n_captures: int = 15, rigs: Sequence[str] = RIGS) -> None:
     """Tabulate the errors of random and guided sessions, and of guided ones a third shorter."""
-    head = "rig, placements, seeds, captures, offset, rms deg, rms mm, predicted deg / mm, claimed deg / mm"
+    head = "rig, placements, seeds, captures, offset, rms deg, rms mm, predicted deg / mm, reported deg / mm"
     print_head(*head.split(", "))
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     for name in rigs:
@@ -238,7 +238,7 @@ def judge_session(name: str, seed: int, visits: list[Visit], *, is_offset: bool)
     used = np.array([v.T_cam_board for n, v in zip(names, visits, strict=True) if n in result.captures_used])
     model = model_sensors(rig, camera, lidar)
     figures = result.diagnostics
-    errors = model.errors.learned(figures["fit_plane_rms_m"], figures["fit_edge_rms_m"], len(used))
+    errors = model.errors.learned(figures.fit_plane_rms_m, figures.fit_edge_rms_m, len(used))
     errors = errors if is_offset else replace(errors, range_offset_m=0.0)
     nominal = rig.nominal(camera, lidar)
     assert nominal is not None

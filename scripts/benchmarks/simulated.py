@@ -14,7 +14,7 @@ from lce_rig.rig import load_rig
 
 def bench_simulated(n_seeds: int, n_captures: int = 30) -> None:
     """Tabulate errors against exact truth."""
-    head = "rig, seeds, captures, found by both, rms deg, rms mm, claimed deg / mm, NEES, not passed"
+    head = "rig, seeds, captures, found by both, rms deg, rms mm, reported deg / mm, NEES, not passed"
     print_head(*head.split(", "))
     for name in ("rlfs",):
         rows = list(_simulated_runs(name, n_seeds, n_captures))

@@ -72,7 +72,8 @@ def bench_uncertainty(n_seeds: int, folder: Path, only: str = "", n_captures: in
         n_captures: of each session.
     """
     head = (
-        "rig, sessions, captures, rms deg / mm, bound deg / mm, ratio, claimed deg / mm, NEES (95 % interval)"
+        "rig, sessions, captures, rms deg / mm, bound deg / mm, ratio, reported deg / mm, NEES (95 % "
+        "interval)"
     )
     print_head(*head.split(", "), "95 % regions hold")
     for case in CASES:

@@ -13,7 +13,6 @@ INK, BLUE, RED = "#1c2733", "#2f5d8a", "#c2410c"
 
 def draw_board(rig: Rig) -> Any:
     """Draw plate and pattern twice: upright with dimensions, and as a diamond before the LiDAR's rings."""
-    plt.rcParams["font.size"] = 13
     figure, (left, right) = plt.subplots(1, 2, figsize=(12.6, 5.2), width_ratios=(1.65, 1))
     _draw_plate(left, rig)
     _draw_dimensions(left, rig)
@@ -62,7 +61,7 @@ def _draw_dimensions(axes: Any, rig: Rig) -> None:
     axes.annotate(
         f"inner_corners [{board.cols}, {board.rows}]:\nwhere four squares meet",
         xy=(x_low, y_low),
-        xytext=(-w - 520, -h * 0.5),
+        xytext=(-w - 545, -h * 0.5),
         color=RED,
         arrowprops={"arrowstyle": "->", "color": RED},
         va="center",
@@ -71,13 +70,13 @@ def _draw_dimensions(axes: Any, rig: Rig) -> None:
     axes.annotate(
         "pattern_offset_m [right, up]:\npattern's centre from\nthe plate's centre",
         xy=(0, 0),
-        xytext=(-w - 520, h * 0.5),
+        xytext=(-w - 545, h * 0.5),
         color=BLUE,
         arrowprops={"arrowstyle": "->", "color": BLUE},
         va="center",
         zorder=5,
     )
-    axes.set_xlim(-w - 530, w + 130)
+    axes.set_xlim(-w - 555, w + 130)
     axes.set_ylim(-h - 120, h + 110)
 
 

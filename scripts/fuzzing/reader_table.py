@@ -227,11 +227,11 @@ def _profile(folder: Path) -> None:
 
 
 def _read_rig(rig: Any) -> None:
-    """Use a profile as the verbs do: write it, doubt it, and project a point with its lenses."""
+    """Use a profile as the verbs do: write it, list its warnings, and project a point with its lenses."""
     from lce_rig.rig import dump_rig, parse_rig
 
     sanity.require(parse_rig(dump_rig(rig)) == rig, "a profile that reads back as another")
-    rig.doubts()
+    rig.warnings()
     rig.board.to_board()
     for camera in rig.cameras.values():
         pixels, _ = camera.to_intrinsics().project(

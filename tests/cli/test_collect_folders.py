@@ -58,8 +58,8 @@ def test_one_camera_named_once_is_that_of_all_folders(lce_rig, folders, tmp_path
     [
         ([], 5, "camera is not known"),
         (["--camera", "left", "--camera", "right"], 2, "--camera is given 2 times for 1 recording"),
-        (["--camera", "left,right"], 2, "there is no camera 'left,right'; there is left, right"),
-        (["--lidar", "top"], 2, "there is no lidar 'top'; there is lidar"),
+        (["--camera", "left,right"], 2, "the rig has no camera 'left,right'"),
+        (["--lidar", "top"], 2, "the rig has no lidar 'top'"),
     ],
 )
 def test_what_does_not_tell_whose_pictures_they_are_is_refused(lce_rig, folders, tmp_path, words, code, told):

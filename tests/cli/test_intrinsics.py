@@ -56,7 +56,7 @@ def test_stale_intrinsics_are_called_so_and_json_says_it_too(lce_rig, few):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["--camera", "thermal"], "there is no camera 'thermal'; there is davis"),
+        (["--camera", "thermal"], "the rig has no camera 'thermal'"),
         (["--channels", "frames,colour"], "has no channel 'colour'"),
         (["--model", "brown"], "'brown' is not one of"),
     ],

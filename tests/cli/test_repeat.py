@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.data import Image
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import perturb
 from lce_rig.core.results import Calibration, Certificate, Metrics
 from lce_rig.export.result import write_result
@@ -14,6 +15,7 @@ from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
 from lce_rig.session import Session
 
 RLES = find_profile("rles").read_text(encoding="utf-8")
+BENT = Finding("verdict.few_used", figures={"n_used": 3, "n_captures": 20})
 COV = np.diag([4e-6] * 3 + [1e-6] * 3)
 
 
@@ -30,7 +32,7 @@ def made(tmp_path):
         T = load_rig("rles").nominal_extrinsics[0].to_matrix()
         calibration = Calibration(
             camera="davis",
-            channel="frames",
+            channels=("frames",),
             lidar=lidar,
             T_cam_lidar=perturb(T, np.array(tangent, dtype=float)),
             cov=COV,
@@ -41,7 +43,7 @@ def made(tmp_path):
             captures_used=("000000",),
             captures_refused={},
             verdict=verdict,
-            reasons=() if verdict == "pass" else ("the board was bent",),
+            findings=() if verdict == "pass" else (BENT,),
         )
         write_result(tmp_path / name / "calibration" / "result.json", rig.name, [calibration])
         return tmp_path / name
@@ -118,7 +120,7 @@ def test_other_rigs_and_other_lenses_are_refused_and_another_board_is_remarked(l
     other = made("other", [0] * 6, set_value(RLES, "name", "rles02"))
     outcome = lce_rig("repeat", a, other)
     assert outcome.code == 4
-    assert "monday is of rig 'rles', other of rig 'rles02'" in outcome.err
+    assert "monday belongs to rig 'rles', other to rig 'rles02'" in outcome.err
     refocused = made("refocused", [0] * 6, set_value(RLES, "cameras.davis.intrinsics.fx_px", "355.0"))
     outcome = lce_rig("repeat", a, refocused)
     assert outcome.code == 4
@@ -149,7 +151,7 @@ def test_a_session_that_cannot_be_calibrated_is_named(lce_rig, made, tmp_path):
         pass
     outcome = lce_rig("repeat", a, tmp_path / "empty")
     assert outcome.code == 6
-    assert "error: empty: the session holds no capture with a picture and a scan" in outcome.err
+    assert "error: empty: the session has no capture with an image and a scan" in outcome.err
     uncalibrated = made("unfinished", [0] * 6)
     shutil.rmtree(uncalibrated / "calibration")
     outcome = lce_rig("repeat", a, uncalibrated)

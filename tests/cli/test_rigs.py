@@ -53,7 +53,7 @@ def test_check_exits_by_what_it_finds(capsys: pytest.CaptureFixture[str], tmp_pa
     path.write_text(path.read_text(encoding="utf-8").replace("fx_px", "fx_pix"), encoding="utf-8")
     assert run(["rigs", "check", str(path)]) == 3
     said = capsys.readouterr().err
-    assert "cameras.cam.intrinsics.fx_pix:" in said and "fx_px?" in said
+    assert "cameras.cam.intrinsics.fx_pix:" in said and "nearest is fx_px" in said
     assert run(["rigs", "check", str(path), "--json"]) == 3
     found = json.loads(capsys.readouterr().out)
     assert not found["is_valid"]
@@ -64,8 +64,12 @@ def test_check_warns_of_what_is_rarely_meant(capsys: pytest.CaptureFixture[str],
     path = tmp_path / "mine.yaml"
     turned = ["--from", "sss", "--set", "board.inner_corners=[6, 8]"]
     assert run(["rigs", "new", "mine", *turned, "-o", str(path)]) == 0
+    capsys.readouterr()
+    assert run(["rigs", "check", str(path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [each["code"] for each in found["findings"]] == ["profile.swapped_sides"]
     assert run(["rigs", "check", str(path)]) == 0
-    assert "shorter side" in capsys.readouterr().err
+    assert found["warnings"][0] in " ".join(capsys.readouterr().err.split())
 
 
 def test_new_writes_a_profile_and_never_over_another(
@@ -96,9 +100,9 @@ def test_a_full_disk_leaves_no_part_of_a_profile(capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
-        (["--set", "board.square_m=70"], 3, "board.square_m: did you mean 0.070 m?"),
+        (["--set", "board.square_m=70"], 3, "board.square_m: 70 looks like millimetres"),
         (["--set", "board.square_m"], 2, "KEY=VALUE"),
-        (["--from", "rlsf"], 3, "did you mean rlfs?"),
+        (["--from", "rlsf"], 3, "The nearest is rlfs"),
         (["--from", "missing.yaml"], 3, "there is no such file"),
     ],
 )

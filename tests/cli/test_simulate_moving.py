@@ -204,17 +204,17 @@ def test_a_still_board_makes_no_events_and_help_says_so(lce_rig: Any, tmp_path: 
 @pytest.mark.parametrize(
     ("words", "cause"),
     [
-        (("s", "--speed", "0.1", "0.2"), "--speed is of a moving board"),
-        (("s", "--event-offset", "0"), "--event-offset is of a moving board"),
-        (("s", "--motion", "still", "--flicker", "0.3"), "--flicker is of a moving board"),
-        (("s", "--motion", "moving", "--speed", "0.3", "0.1"), "the slowest comes first"),
+        (("s", "--speed", "0.1", "0.2"), "--speed applies to a moving board"),
+        (("s", "--event-offset", "0"), "--event-offset applies to a moving board"),
+        (("s", "--motion", "still", "--flicker", "0.3"), "--flicker applies to a moving board"),
+        (("s", "--motion", "moving", "--speed", "0.3", "0.1"), "MIN exceeds MAX"),
         (("s", "--motion", "moving", "--speed", "nan", "1"), "nan"),
-        (("s", "--duration", "3"), "belong to a recording"),
-        (("s", "--ros", "2"), "belong to a recording"),
+        (("s", "--duration", "3"), "apply to recordings only"),
+        (("s", "--ros", "2"), "apply to recordings only"),
         (("s", "--recording", "r"), "the session s exclude each other"),
         (("--captures", "3", "--recording", "r"), "--captures exclude each other"),
-        (("--motion", "still", "--recording", "r"), "carried from place to place"),
-        (("--speed", "0", "0", "--recording", "r"), "must move"),
+        (("--motion", "still", "--recording", "r"), "--motion still: the board moves"),
+        (("--speed", "0", "0", "--recording", "r"), "--speed: MAX is 0"),
     ],
 )
 def test_choices_that_cannot_be_meant_exit_with_2_and_write_nothing(

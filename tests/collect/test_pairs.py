@@ -164,5 +164,5 @@ def test_a_recording_by_others_becomes_a_session(tmp_path, recordings):
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, recordings / "rlfs01", rig)
     assert len(report.captured) == 18 and not report.refused and not report.duplicates
-    assert any("ring field" in note and "elevations" in note for note in report.notes)
+    assert any("ring field" in note and "elevation" in note for note in report.notes)
     assert Session.open(tmp_path / "s").captures[17].scan("lidar").ring.max() == 15

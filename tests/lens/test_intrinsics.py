@@ -64,7 +64,7 @@ def test_a_lens_moves_to_a_larger_model_unchanged_and_to_another_nearly():
     for name, limit_px in (("radtan5", 1e-9), ("rational", 1e-9), ("equidistant", 0.6)):
         moved, _, _ = MODELS[name].project(convert(WIDE, MODELS[name]), points)
         assert np.abs(moved - pixels).max() < limit_px
-    with pytest.raises(ValueError, match="is no radtan5"):
+    with pytest.raises(ValueError, match="is not radtan5"):
         RADTAN5.vector(FISHEYE)
 
 
@@ -162,14 +162,14 @@ def test_views_of_one_capture_are_left_out_together(views):
 
 
 def test_too_few_captures_are_refused_with_their_number(views):
-    with pytest.raises(NotEnoughDataError, match="in at least 4 captures, it is in 3"):
+    with pytest.raises(NotEnoughDataError, match="the board is in 3 captures"):
         estimate_intrinsics(views[:3], BOARD, WIDE, RADTAN5)
 
 
 def test_parallel_boards_leave_the_focal_length_open():
     # All in the middle and parallel to the picture: depth and focal length are one.
     scene = Scene(tilt_deg=(0.0, 0.5), spread=(0.49, 0.51), sigma_px=0.3)
-    with pytest.raises(NotEnoughDataError, match="the focal length is known to"):
+    with pytest.raises(NotEnoughDataError, match="focal length standard deviation"):
         estimate_intrinsics(photograph(8, 0, scene), BOARD, WIDE, RADTAN5)
 
 

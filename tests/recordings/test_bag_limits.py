@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from lce_rig.core import limits
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Image, Scan, join_events
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings import open_recording
-from lce_rig.recordings.events.stream import DamageCounts, join
+from lce_rig.recordings.events.stream import DamageCounts
 from lce_rig.recordings.events.word_codec import EVT3, WordDecoder
 from lce_rig.recordings.protocol import ContinuousRecording
 from lce_rig.recordings.ros.bag_file import BagFile
@@ -446,5 +446,5 @@ def test_a_packet_whose_words_hold_many_events_each_is_decoded_in_pieces() -> No
     pieces = [*decoder.decode(packet), *decoder.finish()]
     whole = WordDecoder(EVT3).decode(words.astype(np.uint16))
     assert len(pieces) > 2 and max(map(len, pieces)) < len(whole) / 2
-    together = join(pieces)
+    together = join_events(pieces)
     assert np.array_equal(together.t_ns, whole.t_ns) and np.array_equal(together.x, whole.x)

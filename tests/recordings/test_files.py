@@ -71,7 +71,7 @@ def test_missing_and_foreign_files_are_named(tmp_path):
     with pytest.raises(SourceError, match=r"gone\.png: cannot be read: No such file"):
         read_image(tmp_path / "gone.png")
     (tmp_path / "text.png").write_text("no picture")
-    with pytest.raises(SourceError, match=r"text\.png: it is damaged, or no picture"):
+    with pytest.raises(SourceError, match=r"text\.png: it is damaged, or no image"):
         read_image(tmp_path / "text.png")
     with pytest.raises(SourceError, match=r"gone\.pcd: cannot be read: No such file"):
         read_cloud(tmp_path / "gone.pcd")

@@ -19,8 +19,8 @@ def test_the_shipped_profiles_are_those_of_the_paper_and_named_as_their_files() 
     assert all(load_rig(name).name == name for name in shipped_profiles())
 
 
-def test_no_shipped_profile_raises_a_doubt() -> None:
-    assert [load_rig(name).doubts() for name in shipped_profiles()] == [[], [], []]
+def test_no_shipped_profile_gives_a_warning() -> None:
+    assert [load_rig(name).warnings() for name in shipped_profiles()] == [(), (), ()]
 
 
 @pytest.mark.parametrize("name", ["rlfs", "rles", "sss"])
@@ -73,7 +73,7 @@ def test_a_path_loads_a_file(tmp_path: Path) -> None:
 def test_a_misspelt_name_lists_the_known_ones_and_the_nearest() -> None:
     with pytest.raises(ProfileError) as caught:
         load_rig("rlsf")
-    assert " rlfs?" in caught.value.hint
+    assert "nearest is rlfs" in caught.value.hint
     assert all(name in caught.value.hint for name in ("rles", "rlfs", "sss"))
 
 
@@ -104,13 +104,13 @@ def test_an_unreadable_file_is_named(tmp_path: Path) -> None:
         (b"# only a comment\n", "is empty"),
         (b"\xff\xfe\x00", "is not UTF-8"),
         (b"\x00", "not YAML"),
-        (b"- 1\n- 2\n", "a mapping of keys is expected, a list found"),
-        (b"PNG", "a mapping of keys is expected, a text found"),
+        (b"- 1\n- 2\n", "expected a mapping of keys, found a list"),
+        (b"PNG", "expected a mapping of keys, found a text"),
         (b"name: [1, 2", "mine.yaml:1: not YAML"),
         (b"name: a\nboard:\n  x: 1\n  x: 2\n", "mine.yaml:4: board.x is given twice, first on line 3"),
         (
             b"name: !!python/object/apply:os.system [ls]\n",
-            "os.system has no place here",
+            "os.system is not allowed",
         ),
         (b"a: &a [*a, *a]\n", "too deeply nested"),
         (b"[" * 5000, "nested"),

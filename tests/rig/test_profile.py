@@ -87,28 +87,28 @@ def test_profile_cannot_be_changed() -> None:
             "square_m: 0.070",
             "square_m: 70",
             "board.square_m",
-            "did you mean 0.070 m? 70 looks like millimetres",
+            "70 looks like millimetres: write 0.070",
         ),
         (
             "square_m: 0.070",
             "square_m: 7",
             "board.square_m",
-            "did you mean 0.070 m? 7 looks like centimetres",
+            "7 looks like centimetres: write 0.070",
         ),
         (
             "width_m: 0.767",
             "width_m: 767",
             "board.width_m",
-            "did you mean 0.767 m? 767 looks like millimetres",
+            "767 looks like millimetres: write 0.767",
         ),
         ("square_m: 0.070", "square_m: -0.07", "board.square_m", "greater than 0"),
         ("square_m: 0.070", "square_m: .nan", "board.square_m", "finite"),
         ("square_m: 0.070", "square_m: yes", "board.square_m", "truth value"),
         ("[8, 6]           #", "[8]   #", "board.inner_corners", "too few values"),
-        ("fx_px: 897.4566", "fx: 897.4566", "cameras.cam.intrinsics.fx", "did you mean fx_px?"),
-        ("cx_px: 635.4040", "cx_pix: 635", "cameras.cam.intrinsics.cx_pix", "did you mean cx_px?"),
+        ("fx_px: 897.4566", "fx: 897.4566", "cameras.cam.intrinsics.fx", "the nearest is fx_px"),
+        ("cx_px: 635.4040", "cx_pix: 635", "cameras.cam.intrinsics.cx_pix", "the nearest is cx_px"),
         ("fx_px: 897.4566", "fx_px: 0.897", "cameras.cam.intrinsics.fx_px", "implausible"),
-        ("cx_px: 635.4040", "cx_px: 1300", "cameras.cam.intrinsics.cx_px", "outside the picture"),
+        ("cx_px: 635.4040", "cx_px: 1300", "cameras.cam.intrinsics.cx_px", "outside the image"),
         (
             "-0.0730]",
             "-0.0730, 1.0]",
@@ -157,7 +157,7 @@ def test_pattern_that_is_larger_than_the_plate_is_refused_with_both_sizes() -> N
 
 
 def test_swapped_width_and_height_are_named() -> None:
-    assert "look swapped" in refusal(
+    assert "swap width_m and height_m" in refusal(
         ("width_m: 0.767", "width_m: 0.626"), ("height_m: 0.626", "height_m: 0.767")
     )
 
@@ -166,18 +166,18 @@ def test_squares_counted_for_inner_corners_are_named() -> None:
     text = refusal(
         ("[8, 6]", "[9, 7]"), ("width_m: 0.767", "width_m: 0.64"), ("height_m: 0.626", "height_m: 0.5")
     )
-    assert "squares counted" in text and "inner corners" in text
+    assert "count inner corners" in text
 
 
-def test_board_that_fits_both_ways_round_raises_a_doubt() -> None:
+def test_board_that_fits_both_ways_round_gives_a_warning() -> None:
     turned = find_profile("sss").read_text(encoding="utf-8").replace("[8, 6]", "[6, 8]")
-    assert any("shorter side" in doubt for doubt in parse_rig(turned).doubts())
-    assert not load_rig("sss").doubts()
+    assert [warning.code for warning in parse_rig(turned).warnings()] == ["profile.swapped_sides"]
+    assert not load_rig("sss").warnings()
 
 
 @pytest.mark.parametrize("size", ["[640, 360]", "[960, 540]", "[1920, 1080]", "[2560, 1440]"])
 def test_intrinsics_of_another_resolution_are_noticed(size: str) -> None:
-    assert "(about 1271x751)" in refusal(("[1280, 720]", size))
+    assert "(about 1271x751 px)" in refusal(("[1280, 720]", size))
 
 
 def test_all_problems_are_listed_at_once_in_the_files_order() -> None:
@@ -192,7 +192,7 @@ def test_all_problems_are_listed_at_once_in_the_files_order() -> None:
 
 
 def test_a_key_in_the_wrong_block_is_sent_to_the_right_one() -> None:
-    assert "into calibration" in refusal(("board:", "target_sigma_m: 0.02\nboard:"))
+    assert "move it to calibration" in refusal(("board:", "target_sigma_m: 0.02\nboard:"))
 
 
 def test_weights_in_profiles_of_earlier_sessions_change_nothing() -> None:
@@ -269,13 +269,14 @@ def test_documented_defaults_are_those_of_the_code() -> None:
                 assert float(documented[key]) == field.default, key
 
 
-def test_what_a_copied_camera_shares_with_the_first_is_doubted() -> None:
+def test_what_a_copied_camera_shares_with_the_first_is_a_warning() -> None:
     document = load_rig("rlfs").model_dump(exclude_none=True)
     right = document["cameras"]["cam"] | {"frame": "right_link", "optical_frame": "right_optical"}
     document["cameras"]["right"] = right
-    topic, device = Rig.model_validate(document).doubts()
-    for doubt, key, value in (
+    topic, device = Rig.model_validate(document).warnings()
+    for warning, key, value in (
         (topic, "channels.frames.topic", "/camera/image_raw"),
         (device, "driver.device", "/dev/video0"),
     ):
-        assert doubt.startswith(f"cameras.right.{key}: {value} ") and f" cameras.cam.{key}" in doubt
+        assert (warning.code, warning.subject) == ("profile.shared", f"cameras.right.{key}")
+        assert warning.figures == {"value": value, "other": f"cameras.cam.{key}"}

@@ -59,7 +59,7 @@ def test_a_profile_without_the_block_dumps_without_it() -> None:
             "window_events: window_s and window_events exclude each other",
         ),
         ("{method: map, model: x.onnx}", "reconstruction.model: the event map needs no network"),
-        ("{windows_s: 0.05}", "unknown key; did you mean window_s?"),
+        ("{windows_s: 0.05}", "unknown key; the nearest is window_s"),
         ("{window_s: 50}", "window_s: must be less than or equal to 10"),
         ("{window_events: 0}", "window_events: must be greater than or equal to 1"),
         ("{method: e2vid}", "method: must be 'network' or 'map'"),

@@ -46,11 +46,11 @@ def test_a_profile_with_a_board_reads_back_the_same():
     ("old", "new", "said"),
     [
         ("cam: {", "kam: {", "sync.triggers.kam: no camera is called kam; there is cam"),
-        ("rate_hz: 20", "rate_hz: 20, pulse_us: 50000", "do not fit into a period of 50000 us"),
+        ("rate_hz: 20", "rate_hz: 20, pulse_us: 50000", "exceed the period of 50000 us"),
         ("rate_hz: 20", "rate_hz: 20, phase_us: 50000", "beyond the period of 50000 us"),
-        ("rate_hz: 20", "rate: 20", "sync.triggers.cam.rate: unknown key; did you mean rate_hz?"),
+        ("rate_hz: 20", "rate: 20", "sync.triggers.cam.rate: unknown key; the nearest is rate_hz"),
         ("channel: 0", "channel: 16", "sync.triggers.cam.channel: must be less than or equal to 15"),
-        ("device:", "type: nmea\n  device:", "tells the time, and nothing of triggers"),
+        ("device:", "type: nmea\n  device:", "cannot trigger cameras"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_with_its_key(old, new, said):

@@ -131,9 +131,9 @@ def test_captures_that_differ_in_their_events_alone_are_no_duplicates(tmp_path: 
     ("changes", "cause"),
     [
         ({"sensor": "front"}, "has no camera 'front' with events"),
-        ({"width_px": 640, "height_px": 480}, "are of 640x480 pixels; rig 'rles' gives it 346x260"),
+        ({"width_px": 640, "height_px": 480}, "are 640x480 px; rig 'rles' gives it 346x260"),
         ({"t_ns": noise_events(0).t_ns[::-1]}, "not in order of time"),
-        ({"x": np.full(500, 346, np.uint16)}, "lie off its 346x260 pixels"),
+        ({"x": np.full(500, 346, np.uint16)}, "lie outside its 346x260 pixels"),
     ],
 )
 def test_events_that_cannot_be_the_rigs_are_refused(

@@ -73,7 +73,7 @@ def test_a_sensor_named_twice_is_refused(capture):
 )
 def test_sensors_that_the_rig_lacks_are_named(capture, rig, index, changes):
     change(capture, index, **changes)
-    with pytest.raises(SessionError, match="capture 000000 is of another rig"):
+    with pytest.raises(SessionError, match="capture 000000 belongs to another rig"):
         check_capture(rig, capture)
 
 

@@ -137,9 +137,9 @@ def test_a_lock_file_without_a_living_holder_is_no_lock(tmp_path, rig):
 
 def test_folders_that_are_no_session_are_left_alone(tmp_path, rig):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(SessionError, match=r"not empty and no session: it holds notes\.txt"):
+    with pytest.raises(SessionError, match=r"not empty and not a session: it holds notes\.txt"):
         Session.create(tmp_path, rig)
-    with pytest.raises(SessionError, match="is no session"):
+    with pytest.raises(SessionError, match="is not a session"):
         Session.open(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
 

@@ -9,7 +9,7 @@ from lce_rig.core.geometry import difference, invert, perturb
 from lce_rig.core.results import Observation
 from lce_rig.extrinsics import EstimateSettings, fit_extrinsic
 from lce_rig.rig.thresholds import CalibrationSettings, VerdictSettings
-from lce_rig.validation.camera_pairs import doubt_cameras, pose_from_pictures, relate, shared_boards
+from lce_rig.validation.camera_pairs import camera_findings, pose_from_pictures, relate, shared_boards
 from tests.extrinsics.boards import BOARD
 from tests.extrinsics.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, simulate_two
 
@@ -34,8 +34,8 @@ def related(session):
     return relate(left, right)
 
 
-def doubts(pair):
-    return doubt_cameras(pair, (LEFT, RIGHT), TARGET, LIMITS)
+def findings(pair):
+    return camera_findings(pair, (LEFT, RIGHT), TARGET, LIMITS)
 
 
 @pytest.fixture(scope="module")
@@ -64,12 +64,12 @@ def test_of_few_boards_the_claim_is_that_of_usual_errors(sound):
 
 
 @pytest.mark.long
-def test_sound_sessions_are_not_doubted(sound):
+def test_sound_sessions_are_not_questioned(sound):
     for session in sound:
         pair = related(session)
         assert len(pair.captures) == 12
         assert pair.surprise < 16.81
-        assert doubts(pair) == []
+        assert findings(pair) == []
 
 
 @pytest.mark.parametrize(
@@ -79,8 +79,8 @@ def test_sound_sessions_are_not_doubted(sound):
 )
 @pytest.mark.parametrize("seed", range(2))
 def test_a_camera_that_is_nudged_on_the_way_is_found_by_the_pictures(seed, nudge, figure, size):
-    found = doubts(related(simulate_two(12, seed, nudge=nudge, nudged_from=6)))
-    (change,) = (doubt for doubt in found if doubt.code == "verdict.camera_changed")
+    found = findings(related(simulate_two(12, seed, nudge=nudge, nudged_from=6)))
+    (change,) = (finding for finding in found if finding.code == "verdict.camera_changed")
     assert change.subject.split(" to ") == [LEFT, RIGHT]
     assert change.figures["capture"] == "000006"
     assert change.figure(figure) == pytest.approx(size, rel=0.25)
@@ -92,7 +92,7 @@ def test_extrinsics_that_contradict_the_pictures_are_told_with_how_far_apart_the
     session = simulate_two(12, seed)
     left, right = (fit_extrinsic(session[name], BOARD, OPTIONS) for name in (LEFT, RIGHT))
     stale = replace(right, T_cam_lidar=perturb(right.T_cam_lidar, 2 * TURNED))
-    (apart,) = doubts(relate(left, stale))
+    (apart,) = findings(relate(left, stale))
     assert apart.code == "verdict.cameras_differ"
     assert apart.subject.split(" to ") == [LEFT, RIGHT]
     # Boards lie 1.2 to 3.5 m away: 1 deg is 21 to 61 mm.
@@ -130,7 +130,7 @@ def test_few_boards_tell_nothing_and_none_no_pair(sound):
     three = relate(left, fit_extrinsic(session[RIGHT][3:], BOARD, OPTIONS))
     assert three.pictures is None
     assert len(three.captures) == 3
-    assert doubts(three) == []
+    assert findings(three) == []
     T = TRUTH[RIGHT] @ invert(TRUTH[LEFT])
     assert np.linalg.norm(difference(three.T_second_first, T)[:3]) < 0.05
 

@@ -10,9 +10,9 @@ from lce_rig.core.results import Observation
 from lce_rig.extrinsics import EstimateSettings, fit_extrinsic
 from lce_rig.extrinsics.local_quadratic import SCALE, SHIFT, expand
 from lce_rig.rig import CalibrationSettings, VerdictSettings, load_rig
-from lce_rig.validation.negative_control import doubt_control, run_control
-from lce_rig.validation.nuisances import doubt_nuisances, estimate_nuisances
-from lce_rig.validation.split_consistency import contrast_halves, doubt_halves
+from lce_rig.validation.negative_control import control_findings, run_control
+from lce_rig.validation.nuisances import estimate_nuisances, nuisance_findings
+from lce_rig.validation.split_consistency import contrast_halves, split_findings
 from lce_rig.validation.validate import resample, validate, widening
 from tests.extrinsics.boards import BOARD, CAMERA, T_FORWARD, Scenario, simulate
 
@@ -91,17 +91,17 @@ def test_scales_agree_within_their_sigma_where_the_board_is_right():
     assert np.sqrt(np.mean(np.square(errors))) < 1.6
 
 
-def test_what_cannot_be_is_doubted_and_what_can_is_not():
+def test_what_cannot_be_gives_findings_and_what_can_is_not():
     found = nuisances(observed())
     lidar = RIG.lidars["lidar"]
-    assert doubt_nuisances(found, BOARD, lidar, LIMITS) == []
+    assert nuisance_findings(found, BOARD, lidar, LIMITS) == []
     for changed, code in (
         (replace(found, scale=0.03, scale_sigma=0.001), "verdict.scale"),
         (replace(found, edge_shift_m=0.05), "verdict.edge_shift"),
         (replace(found, laser_offset_m=-0.06, laser=7), "verdict.laser_offset"),
     ):
-        (doubt,) = doubt_nuisances(changed, BOARD, lidar, LIMITS)
-        assert doubt.code == code
+        (finding,) = nuisance_findings(changed, BOARD, lidar, LIMITS)
+        assert finding.code == code
 
 
 @pytest.mark.parametrize(("angle_deg", "severity"), [(0.0, None), (0.6, "warning"), (2.0, "error")])
@@ -113,8 +113,8 @@ def test_a_sensor_nudged_on_the_way_is_found_with_the_capture(angle_deg, severit
     ]
     contrasts = contrast_halves(expanded(nudged).settled(), middles(nudged))
     names = [seen.capture for seen in nudged]
-    doubts = doubt_halves(contrasts[:1], names, TARGET, LIMITS)
-    assert [doubt.severity for doubt in doubts] == ([] if severity is None else [severity])
+    findings = split_findings(contrasts[:1], names, TARGET, LIMITS)
+    assert [finding.severity for finding in findings] == ([] if severity is None else [severity])
     if severity is not None:
         assert abs(contrasts[0].n_first - 12) <= 1
         assert abs(contrasts[0].rotation_deg - angle_deg) < 0.3 * angle_deg
@@ -129,8 +129,8 @@ def test_near_boards_that_say_something_else_than_far_ones_are_found():
         for seen, distance_m in zip(boards, distances_m, strict=True)
     ]
     found = contrast_halves(expanded(boards).settled(), middles(boards))
-    doubts = doubt_halves(found, [seen.capture for seen in boards], TARGET, LIMITS)
-    assert any(doubt.figures.get("first") == "near" for doubt in doubts)
+    findings = split_findings(found, [seen.capture for seen in boards], TARGET, LIMITS)
+    assert any(finding.figures.get("first") == "near" for finding in findings)
 
 
 def test_a_sound_session_shows_no_contrast_more_often_than_by_chance():
@@ -148,10 +148,10 @@ def test_moving_a_sound_result_makes_left_out_captures_worse_and_moving_a_bad_on
     observations = [estimate.observations[name] for name in estimate.used]
     settled = expanded(observations, estimate.T_cam_lidar).settled()
     good = run_control(observations, BOARD, estimate.T_cam_lidar, estimate.cov, settled, TARGET, 3.0)
-    assert doubt_control(good) == []
+    assert control_findings(good) == []
     bad = perturb(estimate.T_cam_lidar, good.moves[-1])
-    doubts = doubt_control(run_control(observations, BOARD, bad, estimate.cov, settled, TARGET, 3.0))
-    assert [doubt.severity for doubt in doubts] == ["error"]
+    findings = control_findings(run_control(observations, BOARD, bad, estimate.cov, settled, TARGET, 3.0))
+    assert [finding.severity for finding in findings] == ["error"]
 
 
 def test_the_control_moves_a_result_by_no_less_than_the_target():

@@ -8,7 +8,7 @@ import lce_rig
 from lce_rig.core.results import STAGES
 from lce_rig.words.rendering import phrases
 
-MAKERS = ("Finding", "Refusal", "doubt", "_warn")
+MAKERS = ("Finding", "Refusal", "reason", "_warn")
 PACKAGE = Path(lce_rig.__file__).parent
 
 

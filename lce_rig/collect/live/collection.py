@@ -12,7 +12,13 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
+from lce_rig.collect.board_tracker import (
+    BoardDetection,
+    BoardTracker,
+    CaptureMoment,
+    TakenByHand,
+    without_samples,
+)
 from lce_rig.collect.live.capture_triggers import LiveGate, SlowBoards, StillBoards
 from lce_rig.collect.live.capture_writer import CaptureWriter, Task, record_streams
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
@@ -21,8 +27,8 @@ from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.live.monitor import Monitor
 from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_unseen
 from lce_rig.collect.live.state import Ending, Key, LiveOptions, LiveReport, LiveState
-from lce_rig.collect.live.worker import Worker
 from lce_rig.collect.placement_dedupe import Placements, capture_poses
+from lce_rig.collect.worker import Worker
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.results import Refusal
 from lce_rig.devices.disk_writer import DiskWriter
@@ -88,17 +94,13 @@ class _Search:
         self._longest_s = max(time.monotonic() - began_s, _FORGET * self._longest_s)
         self._tracker.thorough_interval_s = max(THOROUGH_S, _RARE * self._longest_s)
         self._tracker.rescan_interval_s = max(RESCAN_S, _RARE * self._longest_s)
-        return _without_samples(found)
+        return without_samples(found)
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
         found = self._tracker.confirm(moment)
         if isinstance(found, CaptureMoment):
-            return replace(found, detection=_without_samples(found.detection))
+            return replace(found, detection=without_samples(found.detection))
         return found
-
-
-def _without_samples(detection: BoardDetection) -> BoardDetection:
-    return replace(detection, frame=replace(detection.frame, images=(), scans=()))
 
 
 _WAIT_S = 0.1
@@ -340,7 +342,7 @@ class _Loop:
         if self._seeing_guide(detection) is None:
             self._monitor.cue("refused", "not captured: not every sensor sees the board")
             return
-        confirmed = self._search.confirm(CaptureMoment(detection, {"by_hand": 1.0}))
+        confirmed = self._search.confirm(CaptureMoment(detection, TakenByHand()))
         if isinstance(confirmed, CaptureMoment):
             self._capture(confirmed)
         else:

@@ -10,7 +10,7 @@ import numpy as np
 from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.collect.guidance import Planner
 from lce_rig.collect.live.guide import Guide, Learned, make_guides
-from lce_rig.collect.live.worker import Worker
+from lce_rig.collect.worker import Worker
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.extrinsics import CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.rig import Rig
@@ -107,8 +107,8 @@ class _Teacher:
         figures = estimate.diagnostics
         learned = Learned(
             estimate.T_cam_lidar,
-            figures["fit_plane_rms_m"],
-            figures["fit_edge_rms_m"],
+            figures.fit_plane_rms_m,
+            figures.fit_edge_rms_m,
             len(estimate.used),
         )
         return self._guides[k].prepare(learned)

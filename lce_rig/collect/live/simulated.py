@@ -18,7 +18,7 @@ import numpy as np
 
 from lce_rig.collect.guidance import HeldPose, Person, SensorPlace, build_pose, model_sensors
 from lce_rig.collect.live.state import LiveState
-from lce_rig.collect.live.worker import start_without_interrupts
+from lce_rig.collect.worker import start_without_interrupts
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError, ProfileError, SourceError
 from lce_rig.core.findings import Finding

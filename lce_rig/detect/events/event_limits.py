@@ -1,4 +1,4 @@
-"""The profile's limits on boards seen through events, and why none was seen, with what to do about it."""
+"""The profile's limits on boards in images from events, and refusals if none was detected."""
 
 import numpy as np
 
@@ -10,20 +10,20 @@ from lce_rig.detect.events.reconstruct.filters import hot_pixels
 from lce_rig.rig import QualitySettings
 
 _MAX_HOT_SHARE = 0.5
-# One event in a hundred pixels in a second is none.
+# One event per hundred pixels in 1 s counts as none.
 _MIN_EVENTS_PX = 0.01
 # Boards at 2 to 5 cm/s make 2 to 4 events a pixel in a second: with fewer one that is missing was too slow.
 _SLOW_EVENTS_PX = 4.0
 
 
 def gate_event_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:
-    """Hold a board seen through events against the profile's limits on events and motion.
+    """Compare a board in an image from events with the profile's limits on events and motion.
 
-    A figure that could not be measured, and pictures that others reconstructed, are not judged; speeds count
-    from where two standard deviations leave no doubt.
+    A figure that could not be measured, and images that others reconstructed, are not judged; speeds count
+    if they exceed the limit by two standard deviations.
 
     Args:
-        found: with what its events show.
+        found: the board with figures of its events.
         limits: `quality` of the rig profile.
     """
     q = found.events
@@ -50,12 +50,12 @@ def too_fast(speed_mps: float, limits: QualitySettings) -> Refusal:
 
 
 def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: QualitySettings) -> Refusal:
-    """Say what about the events keeps the board from being found; what was seen where they are not to blame.
+    """Return the fault of the events that prevents a detection; `seen` if there is none.
 
     Args:
-        events: about the picture.
-        stamp_ns: of the picture.
-        seen: why there is no picture, or no board in it.
+        events: about the image.
+        stamp_ns: of the image.
+        seen: why there is no image, or no board in it.
         limits: `quality` of the rig profile.
     """
     if len(events) and seen.stage == "read":
@@ -64,7 +64,7 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
 
 
 def events_problem(events: Events, stamp_ns: int, limits: QualitySettings) -> Refusal | None:
-    """Say what about the events before a stamp keeps a board from being found; None where nothing does."""
+    """Say what about the events before a timestamp keeps a board from being found; None if nothing does."""
     if not len(events):
         return Refusal("image.no_events")
     recent = events.between(stamp_ns - MEMORY_NS, stamp_ns)
@@ -85,7 +85,7 @@ def events_problem(events: Events, stamp_ns: int, limits: QualitySettings) -> Re
 
 
 def look_for_flicker(events: Events) -> Refusal | None:
-    """Name the lamps that make most of the events of about a second; None where none do."""
+    """Name the lamps that make most of the events of about a second; None if none do."""
     flicker = measure_flicker(events)
     if not flicker.is_storm:
         return None

@@ -1,4 +1,4 @@
-"""What events and a board followed through their pictures tell: event rate, speed, and smear in the LiDAR."""
+"""Figures from events and a board tracked through their images: event rate, speed, smear in the LiDAR."""
 
 import math
 from dataclasses import dataclass, replace
@@ -13,21 +13,21 @@ from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array, difference, transform
 from lce_rig.core.results import EventQuality, ImageBoard, LidarBoard
 
-#: What the network has seen longer ago no longer shows.
+#: Events older than this no longer show in the network's image.
 MEMORY_NS = 1_000_000_000
 _JUST_NS = 100_000_000
 _BLOCK_PX = 16
-# A board of 0.8 x 0.6 m takes up about this share of a DAVIS346's picture at 3.5 m.
+# A board of 0.8 x 0.6 m takes up about this share of a DAVIS346's image at 3.5 m.
 _BUSY_SHARE = 0.05
 _SUBPIXEL_BITS = 4
-# From poses nearer in time than this no speed can be told.
+# Poses nearer in time than this do not determine a speed.
 _MIN_TRACK_S = 0.03
 _ALONG = np.linspace(0, 1, 24)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
 class BoardMotion:
-    """How the board moves about the time of its main picture.
+    """How the board moves about the time of its main image.
 
     Attributes:
         velocity_mps: (3,) of the board's middle, frame camera.
@@ -42,7 +42,7 @@ class BoardMotion:
 
 
 def outline_px(T_cam_board: Array, board: Board, intrinsics: Intrinsics) -> Array:
-    """Draw the plate's outline as the lens bends it: (96, 2) px, NaN where it cannot be seen."""
+    """Draw the plate's outline as the lens bends it: (96, 2) px, NaN if it cannot be seen."""
     corners = board.outline()
     edges = [a + _ALONG * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     pixels, _ = intrinsics.project(transform(T_cam_board, np.concatenate(edges)))
@@ -53,8 +53,8 @@ def event_quality(events: Events, stamp_ns: int, around_px: Array) -> EventQuali
     """Measure how many events a board made; its motion stays unknown.
 
     Args:
-        events: about the picture.
-        stamp_ns: of the picture.
+        events: about the image.
+        stamp_ns: of the image.
         around_px: (M, 2) the board's outline in it.
     """
     outline = around_px[np.isfinite(around_px).all(axis=1)]
@@ -78,7 +78,7 @@ def _count_within(mask: NDArray[np.uint8], events: Events) -> int:
 def busiest_events(events: Events, stamp_ns: int) -> float:
     """Count the events a pixel in the time that the network remembers, where most of them are.
 
-    Of a picture in which no board was found: blocks of pixels together as large as a board, busiest first.
+    Of an image in which no board was found: blocks of pixels together as large as a board, busiest first.
     """
     recent = events.between(stamp_ns - MEMORY_NS, stamp_ns)
     n_cols, n_rows = -(-events.width_px // _BLOCK_PX), -(-events.height_px // _BLOCK_PX)
@@ -89,7 +89,7 @@ def busiest_events(events: Events, stamp_ns: int) -> float:
 
 
 def board_motion(found: ImageBoard) -> BoardMotion | None:
-    """Fit a steady motion to the poses of a board that was followed; None where it was not."""
+    """Fit a constant velocity to the poses of a tracked board; None if it was not tracked."""
     track_ns, track, track_cov = found.track_ns, found.track_T_cam_board, found.track_cov
     if track_ns is None or track is None or track_cov is None or found.stamp_ns is None:
         return None
@@ -119,12 +119,12 @@ def sweep_time_s(lidar: LidarBoard, period_s: float) -> float:
 
 
 def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None) -> EventQuality:
-    """Add what the board's motion amounts to; nothing without a track.
+    """Add figures of the board's motion; none without a track.
 
     Args:
-        measured: what the board's events show.
+        measured: figures of the board's events.
         found: with its track.
-        sweep_s: how long the LiDAR sees the board; None where it does not.
+        sweep_s: how long the LiDAR sees the board; None if it does not.
     """
     motion = board_motion(found)
     if motion is None:
@@ -146,8 +146,8 @@ def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None
 def _slope(time_s: Array, values: Array, cov: Array) -> tuple[Array, Array]:
     """Fit values (K, 3) = a + b t; return b (3,) and its covariance (3, 3).
 
-    All count alike: weighed by their covariances, in which depth and place go together, what a hand's way
-    deviates from the line sideways would pass for speed along the line of sight.
+    All have equal weights. With weights by covariance, in which depth and lateral position are correlated, a
+    hand's lateral deviation from the line would appear as speed along the line of sight.
     """
     since_s = time_s - time_s.mean()
     share = since_s / np.sum(since_s**2)

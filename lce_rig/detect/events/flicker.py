@@ -24,7 +24,7 @@ class Flicker:
 
     Attributes:
         frequency_hz: of the strongest regular alternation of polarity above 20 Hz; 0 in too short a stretch.
-        coherence: how much one polarity outweighs the other in a millisecond; near 1 where the whole picture
+        coherence: how much one polarity outweighs the other in a millisecond; near 1 where the whole image
             brightens and darkens at once, near 0 where edges move.
         peak_share: share of that alternation's power at the frequency and its multiples.
     """

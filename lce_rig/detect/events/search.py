@@ -1,4 +1,4 @@
-"""The board in a stream of events: a picture at the time asked for, and the board followed through others."""
+"""The board in a stream of events: detected in an image at the requested time, and tracked through others."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -20,23 +20,23 @@ from lce_rig.detect.limits_met import gate_image_board
 from lce_rig.rig import QualitySettings, ReconstructionSettings
 from lce_rig.solvers.pnp import pose_covariance
 
-# One order of corners, and one of the two poses, for all pictures of the same board.
+# One order of corners, and one of the two poses, for all images of the same board.
 
 
 def align_corner_order(found: ImageBoard, reference: ImageBoard, board: Board) -> ImageBoard:
-    """Count the corners from the same end of the print as another picture of about the same time does.
+    """Order the corners from the same end of the pattern as in another image of about the same time.
 
     The pattern looks the same when it is turned by 180 deg, a square one by 90 deg, but for the colours of
     its squares, and a reconstruction can have those wrong. The turn that brings the two poses nearest to each
-    other is taken; the board may not have turned by half of that between the pictures.
+    other is taken; the board may not have turned by half of that between the images.
 
     Args:
         found: the board whose corners are put in order.
-        reference: the board as another picture of the camera shows it; of frames and events, the frame.
+        reference: the board as another image of the camera shows it; of frames and events, the frame.
         board: the board.
 
     Returns:
-        `found` as it is, or with corners, poses, covariances and track turned.
+        `found` unchanged, or with corners, poses, covariances and track rotated.
     """
     turns = (0, 1, 2, 3) if board.rows == board.cols else (0, 2)
     R_reference = reference.T_cam_board[:3, :3]
@@ -100,17 +100,17 @@ EventImage = Literal["network", "map"]
 
 #: When the board is looked for besides the main picture, ns after it.
 TRACK_NS = (-100_000_000, -50_000_000, 50_000_000, 100_000_000)
-# Between neighbouring pictures no hand turns the board by more: it is another board, or misread.
+# Between neighbouring images no hand turns the board by more: it is another board, or misread.
 _MAX_TURN_RAD = np.radians(45)
 
 
 @dataclass(frozen=True, eq=False)
 class EventSighting:
-    """What a stream of events shows.
+    """The detection in a stream of events.
 
     Attributes:
         picture: at the time asked for, or why there is none.
-        board: in that picture and, as its track, in those about it; or why it is not there.
+        board: in that image and, as its track, in those about it; or why it is not there.
     """
 
     picture: Image | Refusal
@@ -120,12 +120,12 @@ class EventSighting:
 def reconstructor_for(
     settings: ReconstructionSettings | None, channel: str, method: EventImage | None = None
 ) -> Reconstructor:
-    """Set up a reconstructor as a profile says.
+    """Set up a reconstructor according to a profile.
 
     Args:
         settings: the channel's block; None for the shipped network and automatic windows.
-        channel: that the pictures are said to come from.
-        method: in place of the profile's.
+        channel: the channel of the images.
+        method: replaces the profile's.
 
     Raises:
         ProfileError: the network cannot be used.
@@ -152,19 +152,19 @@ def find_event_board(
     *,
     sweep_s: float | None = None,
 ) -> EventSighting:
-    """Make a picture of the events up to a stamp, find the board in it and follow it to either side.
+    """Make an image of the events up to a timestamp, find the board in it and follow it to either side.
 
     Args:
-        events: from long enough before the stamp for the network to settle.
+        events: from long enough before the timestamp for the network to settle.
         stamp_ns: on the events' clock.
         reconstructor: is reset.
         board: the board as the profile describes it.
         intrinsics: of the camera.
         limits: `quality` of the rig profile.
-        sweep_s: how long the LiDAR sees the board; None where it does not.
+        sweep_s: how long the LiDAR sees the board; None if it does not.
 
     Raises:
-        ProfileError: the intrinsics or the network are for pictures of another size.
+        ProfileError: the intrinsics or the network are for images of another size.
     """
     last_ns = int(events.t_ns[-1]) if len(events) else stamp_ns
     about = {min(stamp_ns + offset, max(last_ns, stamp_ns)) for offset in TRACK_NS}
@@ -189,7 +189,7 @@ def find_in_reconstruction(
     limits: QualitySettings,
     region: tuple[int, int, int, int] | None = None,
 ) -> ImageBoard | Refusal:
-    """Find the board in a picture that was made from events, ours or another's."""
+    """Find the board in an image that was made from events, ours or another's."""
     return find_image_board(
         picture,
         board,
@@ -210,7 +210,7 @@ def _followed(
     intrinsics: Intrinsics,
     limits: QualitySettings,
 ) -> ImageBoard:
-    """Follow the board from its main picture to either side, and keep its poses as the track."""
+    """Follow the board from its main image to either side, and keep its poses as the track."""
     assert main.stamp_ns is not None
     track: dict[int, tuple[Array, Array]] = {}
     stamps = sorted(others)

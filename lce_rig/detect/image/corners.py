@@ -1,4 +1,4 @@
-"""Inner corners of a checkerboard in a grey picture, in the order of `Board.corners()`."""
+"""Inner corners of a checkerboard in a grey image, in the order of `Board.corners()`."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -13,11 +13,11 @@ from lce_rig.detect.image.saddle import Crossings, fit_crossings, sample
 
 Grey = NDArray[np.uint8]
 
-# Pictures wider than this are first searched at half their size, narrower ones at twice: the finders want
+# Images wider than this are first searched at half their size, narrower ones at twice: the finders want
 # squares of 10 to 60 px.
 _WIDE_PX = 700
 _SEARCH_PX = 640
-# Of squares of a known size, pictures are searched in which they are so large: time goes with area.
+# Of squares of a known size, images are searched in which they are so large: time goes with area.
 _SQUARE_PX = 12.0
 _MOST_SCALE = 1.5
 # A grid of another size with this share of the wanted corners is another board, not a part of the board.
@@ -44,10 +44,10 @@ def find_grid(
         grey: (H, W).
         board: tells the number of inner corners.
         is_thorough: whether to go on after the quick attempts, which take a tenth of the time of all.
-        square_px: about how large its squares are, where that is known: only such are looked for.
+        square_px: approximate size of its squares, if known; only such are searched for.
 
     Returns:
-        The crossings, `grid_px` in the order of `Board.corners()`; None where no attempt finds that many.
+        The crossings, `grid_px` in the order of `Board.corners()`; None if no attempt finds that many.
     """
     width = grey.shape[1]
     lattice_scale = _SEARCH_PX / width if width > _WIDE_PX else 1.0
@@ -81,10 +81,10 @@ def seen_grid(grey: Grey, scale: float | None = None) -> Array | None:
 
     Args:
         grey: (H, W).
-        scale: of the picture that is searched; None for what suits pictures of this width.
+        scale: of the image that is searched; None for what suits images of this width.
 
     Returns:
-        (rows, cols, 2) px; which of the two is called rows means nothing. None where nothing is found.
+        (rows, cols, 2) px; rows and cols may be exchanged. None if nothing is found.
     """
     width = grey.shape[1]
     if scale is None:
@@ -97,15 +97,15 @@ def seen_grid(grey: Grey, scale: float | None = None) -> Array | None:
 
 
 def order_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
-    """Sort a grid of corners as `Board.corners()` does, row by row from the print's top left.
+    """Sort a grid of corners as `Board.corners()` does, row by row from the pattern's top left.
 
     A finder may start at any of the grid's ends. A camera looks at the front of the print, so the order that
-    turns from rows to columns clockwise in the picture (v points down) is the one that is not mirrored. Where
+    turns from rows to columns clockwise in the image (v points down) is the one that is not mirrored. Where
     the pattern is not symmetric under 180 deg, the outer square at the top left is black by convention; where
-    it is, the order with its top row up in the picture is taken.
+    it is, the order with its top row up in the image is taken.
 
     Args:
-        grey: (H, W) the picture, whose squares tell black from white.
+        grey: (H, W) the image, whose squares tell black from white.
         corners_px: (rows * cols, 2) row by row in any direction.
         board: the board.
     """
@@ -124,7 +124,7 @@ def order_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
 
 
 def black_top_left(grey: Grey, grid_px: Array) -> float:
-    """Tell by how many grey values the squares of the top left one's colour are darker than the others.
+    """Measure by how many grey values the squares of the top left one's colour are darker than the others.
 
     Args:
         grey: (H, W).
@@ -146,12 +146,12 @@ def _attempts(
 ) -> Iterator[Array | None]:
     """Run the finders one after the other, cheapest first; the caller stops at the first success.
 
-    The list is fixed, not timed, so that the same picture gives the same answer on any machine. The classic
+    The list is fixed, not timed, so that the same image gives the same answer on any machine. The classic
     finder takes seconds to fit one size into the squares of another: it is left out where another was seen.
     """
     width = grey.shape[1]
     if width <= _WIDE_PX:
-        # A far board in a small picture, of which `seen_grid` sees a part.
+        # A far board in a small image, of which `seen_grid` sees a part.
         yield _sector_based(grey, size, 2.0, cv2.CALIB_CB_NORMALIZE_IMAGE)
     if not is_thorough:
         return
@@ -169,12 +169,12 @@ def _attempts(
         yield _classic(grey, size, 2.0)
         yield _classic(level, size, 2.0)
     yield _sector_based(level, size, 1.5, _SB_THOROUGH)
-    # Squares of 4 px in a picture of full contrast, as those made from events are.
+    # Squares of 4 px in an image of full contrast, as those made from events are.
     yield _sector_based(grey, size, 2.0, _SB_THOROUGH)
 
 
 def level_contrast(grey: Grey) -> Grey:
-    """Bring every neighbourhood of a low-contrast picture to the same mean and spread."""
+    """Bring every neighbourhood of a low-contrast image to the same mean and spread."""
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
     mean = cv2.GaussianBlur(smooth, (0, 0), 8.0)
     spread = np.sqrt(cv2.GaussianBlur((smooth - mean) ** 2, (0, 0), 8.0)) + 4.0
@@ -182,7 +182,7 @@ def level_contrast(grey: Grey) -> Grey:
 
 
 def _sector_based(grey: Grey, size: tuple[int, int], scale: float, flags: int) -> Array | None:
-    """Run `cv2.findChessboardCornersSB` (A. Duda, U. Frese, BMVC 2018) at a scale of the picture."""
+    """Run `cv2.findChessboardCornersSB` (A. Duda, U. Frese, BMVC 2018) at a scale of the image."""
     is_found, corners = cv2.findChessboardCornersSB(_resize(grey, scale), size, flags=flags)
     return _to_full_scale(corners, scale) if is_found else None
 
@@ -202,7 +202,7 @@ def _resize(grey: Grey, scale: float) -> Grey:
 def _to_full_scale(corners: NDArray[Any] | None, scale: float) -> Array | None:
     if corners is None:
         return None
-    # Pixel centres are integers: the centre of the first pixel lies half a pixel inside the picture.
+    # Pixel centres are integers: the centre of the first pixel lies half a pixel inside the image.
     return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
 
 
@@ -219,7 +219,7 @@ def crossing_lattice(grey: Grey, size: tuple[int, int], scale: float) -> Array |
         scale: of the image that is searched.
 
     Returns:
-        (rows * cols, 2) px, row by row, to about half a pixel; None where no such grid is found.
+        (rows * cols, 2) px, row by row, to about half a pixel; None if no such grid is found.
     """
     points, edges, strengths = _saddle_points(_resize(grey, scale))
     if len(points) < size[0] * size[1]:
@@ -300,7 +300,7 @@ def _link(points: Array, edges: Array, strengths: Array) -> dict[int, dict[int, 
 def _follow_links(
     links: dict[int, dict[int, tuple[int, int]]], n_wanted: int
 ) -> dict[int, tuple[int, int]] | None:
-    """Give the points of one connected grid of at least so many (column, row); None where links disagree.
+    """Return the points of one connected grid of at least so many (column, row); None if links disagree.
 
     Corners of a grid have two neighbours at least: what has fewer hangs on to it by chance.
     """

@@ -29,7 +29,7 @@ NOT_SEEN_AT_ONCE = Refusal("image.not_at_first_sight")
 
 # The alternative pose is as good as the first where the difference of the costs could be noise (3 sigma).
 _AMBIGUOUS_CHI2 = 9.0
-# A part of the picture may be missing at its end (a cut-off readout); a larger difference is another mode.
+# A part of the image may be missing at its end (a cut-off readout); a larger difference is another mode.
 _CUT_FRACTION = 0.02
 # A canvas is larger than the sensor by as much at most; to look at more than that takes memory.
 _CANVAS_FRACTION = 3.0
@@ -37,9 +37,9 @@ _CANVAS_FRACTION = 3.0
 _MAX_MISPLACED = 0.08
 # A quarter of a full fit's time; corners are then known to 0.03 px, plenty for stillness and guidance.
 _FOLLOWED_SAMPLES = 13
-# A board whose corners have moved by less is where it was.
+# A board whose corners have moved by less stands still.
 _RESTING_PX = 0.5
-# A grid of corners of which fewer can be measured is none.
+# A grid of corners with a smaller measurable fraction is rejected.
 _MIN_FITTED = 0.5
 # The outer squares of a line that is not on the board are all alike.
 _MIN_OUTER_CONTRAST = 0.35
@@ -58,28 +58,28 @@ def find_image_board(
     is_from_events: bool = False,
     is_thorough: bool = True,
 ) -> ImageBoard | Refusal:
-    """Find the board's inner corners in one picture and T_cam_board in both its minima.
+    """Find the board's inner corners in one image and T_cam_board in both its minima.
 
     Corners are ordered as `Board.corners()` says. A pattern that is not symmetric under 180 deg is read with
-    the outer square at its top left black; a symmetric one with its top row up in the picture.
+    the outer square at its top left black; a symmetric one with its top row up in the image.
 
     Args:
-        image: the picture.
+        image: the image.
         board: the board as the profile describes it.
-        intrinsics: of the camera, at the picture's resolution.
-        region: (u0, v0, u1, v1) px to search first, from `region_around` the board in the last live picture;
-            the whole picture follows where it is not there.
+        intrinsics: of the camera, at the image's resolution.
+        region: (u0, v0, u1, v1) px to search first, from `region_around` the board in the last live image;
+            the whole image follows where it is not there.
         last: the board in the last live picture: where it is there still, or within a third of a square,
             nothing is searched.
-        max_reprojection_px: refuse where the corners' rms distance from the board's picture is larger.
+        max_reprojection_px: refuse where the corners' rms distance from the board's image is larger.
         min_contrast: refuse where black and white differ by fewer grey values.
         min_sharpness: refuse where fewer edge widths fit into a square.
-        is_from_events: whether the picture was made from events: what is to be done is another thing.
+        is_from_events: whether the image was reconstructed from events, which changes the action.
         is_thorough: whether a board that is not found at once is searched for at other scales, and its
             absence explained, which takes most of a second.
 
     Raises:
-        ProfileError: the intrinsics belong to pictures of another size.
+        ProfileError: the intrinsics belong to images of another size.
     """
     grey = crop_to_intrinsics(image, intrinsics)
     followed = _follow(grey, board, last)
@@ -111,12 +111,12 @@ def find_image_board(
 
 
 def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality | None = None) -> ImageBoard:
-    """Put together what a picture shows of the board, once its pose is solved for.
+    """Assemble an image's detection after its pose is solved.
 
     Args:
         corners_px: (rows * cols, 2) in the order of `Board.corners()`.
         solved: both poses that they admit.
-        quality: figures of the picture.
+        quality: figures of the image.
     """
     return ImageBoard(
         corners_px=corners_px,
@@ -132,10 +132,10 @@ def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality
 
 
 def region_around(found: ImageBoard, image: Image, margin: float = 0.5) -> Region:
-    """Name the part of the next picture to search: the corners' box, larger by `margin` of its size.
+    """Name the part of the next image to search: the corners' box, larger by `margin` of its size.
 
     Returns:
-        (u0, v0, u1, v1) px, within the picture.
+        (u0, v0, u1, v1) px, within the image.
     """
     height, width = image.pixels.shape[:2]
     low, high = found.corners_px.min(axis=0), found.corners_px.max(axis=0)
@@ -146,10 +146,10 @@ def region_around(found: ImageBoard, image: Image, margin: float = 0.5) -> Regio
 
 
 def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:
-    """Return the grey picture at the size the intrinsics belong to.
+    """Return the grey image at the size of the intrinsics.
 
     Two harmless differences occur in recordings: a readout that ends a few lines early, and a canvas larger
-    than the sensor, blank beyond it (pictures reconstructed from events).
+    than the sensor, blank beyond it (images reconstructed from events).
 
     Raises:
         ProfileError: any other size, naming both.
@@ -165,18 +165,18 @@ def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8
         grey = image.grey
         if _is_blank_beyond(grey, wanted_width, wanted_height):
             return grey[:wanted_height, :wanted_width]
-    hint = "use the intrinsics of this mode, or record in the mode the intrinsics were calibrated in"
+    hint = "Use the intrinsics of this mode, or record in the mode of the intrinsics"
     if abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width:
-        hint += f"; if the picture is only scaled, multiply fx, fy, cx, cy by {width / wanted_width:.4g}"
+        hint += f"; if the image is only scaled, multiply fx, fy, cx, cy by {width / wanted_width:.4g}"
     raise ProfileError(
-        f"camera {image.sensor}, channel {image.channel}: the picture is {width}x{height} px, the profile's "
+        f"camera {image.sensor}, channel {image.channel}: the image is {width}x{height} px, the profile's "
         f"intrinsics belong to {wanted_width}x{wanted_height} px",
         hint,
     )
 
 
 def _is_blank_beyond(grey: NDArray[np.uint8], width_px: int, height_px: int) -> bool:
-    """Tell whether nothing but a smooth background lies right of and below the sensor's size."""
+    """Return whether nothing but a smooth background lies right of and below the sensor's size."""
     steps = np.abs(np.diff(grey.astype(np.int16), axis=1))
     inside = np.percentile(steps[:height_px, : width_px - 1], 99)
     beyond = np.concatenate([steps[height_px:].ravel(), steps[:height_px, width_px + 8 :].ravel()])
@@ -186,7 +186,7 @@ def _is_blank_beyond(grey: NDArray[np.uint8], width_px: int, height_px: int) -> 
 
 
 def _follow(grey: NDArray[np.uint8], board: Board, last: ImageBoard | None) -> Crossings | None:
-    """Fit the corners from where they were; None where the board is not all there.
+    """Fit the corners from where they were; None if the board is not all there.
 
     A board that moved by a whole square is not taken for itself: on one side squares are missing then.
     """
@@ -243,7 +243,7 @@ def _solve(
     intrinsics: Intrinsics,
     near: Sequence[Array] = (),
 ) -> tuple[PlanarPose | None, Crossings]:
-    """Solve for the pose; corners far from the board's picture are looked for again where they should be.
+    """Solve for the pose; corners far from the board's image are looked for again where they should be.
 
     A finder puts single corners onto an artefact now and then. Few of them are fitted again from where the
     others put them; what cannot be fitted there takes that place and no longer counts in `n_corners`.

@@ -13,7 +13,7 @@ from lce_rig.detect.lidar.plates import propose_plates, screen_plates
 from lce_rig.detect.lidar.segments import Indices, OrderedScan, cut_segments, order_scan
 from lce_rig.detect.lidar.template import Placement, PlaneView, beams_about, plane_axes, view_plane
 
-# Why no board was found in a scan: the nearest miss, with its figures.
+# Refusals of a scan: the nearest candidate, with its figures.
 
 # Share of returns beyond the outline, in the board's plane, from which something touches the board.
 TOUCHING_SHARE = 0.10
@@ -102,10 +102,10 @@ def no_plate(
 
     Args:
         scan: all returns.
-        board: what was looked for.
+        board: the board searched for.
         limit_m: largest error of an outline.
-        min_range_m: from where it was looked for.
-        max_range_m: up to where.
+        min_range_m: minimum distance of the search.
+        max_range_m: maximum distance of the search.
     """
     coarse = replace(scan, sigma_m=scan.sigma_m + SCATTER_M)
     plates, ends = propose_plates(coarse, cut_segments(coarse, max_range_m), board, is_any_size=True)
@@ -146,7 +146,7 @@ PATCH_SHARE = 0.20
 
 @dataclass(frozen=True)
 class Limits:
-    """What a plate must meet to be taken for the board.
+    """Limits for accepting a plate as the board.
 
     Attributes:
         template_m: largest mean distance of the outline from where the rings end.
@@ -192,7 +192,7 @@ def find_lidar_boards(
         min_rings: fewest rings on the board.
         max_template_m: largest mean distance of the outline from where the rings end, without noise.
         max_rms_m: largest rms distance of the board's returns from its plane, without noise.
-        beam: light spot of the LiDAR; that of a VLP-16 where None.
+        beam: light spot of the LiDAR; that of a VLP-16 if None.
 
     Returns:
         At most 4 boards that do not overlap, or why there is none.
@@ -245,11 +245,11 @@ def measure_plate(
         origin: (3,) m, the point of the plane the first guess is counted from.
         start: first guess of the outline.
         limits: with the scan's noise.
-        beam: light spot of the LiDAR; that of a VLP-16 where None.
+        beam: light spot of the LiDAR; that of a VLP-16 if None.
         max_beyond: largest share of returns in the plane beyond the outline, as it is guessed.
 
     Returns:
-        The board, why it is refused, None where there is no plate.
+        The board, why it is refused, None if there is no plate.
     """
     refined = refine(ordered, plane, origin, start, limits.template_m, max_beyond)
     if refined is None:
@@ -276,7 +276,7 @@ def _is_clear(found: LidarBoard) -> bool:
 def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
     """Rank the candidates and drop those that overlap a better one."""
     distinct: list[LidarBoard] = []
-    for candidate in sorted(found, key=lambda c: _doubt(c, board)):
+    for candidate in sorted(found, key=lambda c: _penalty(c, board)):
         centre = candidate.T_lidar_board[:3, 3]
         away = [float(np.linalg.norm(centre - other.T_lidar_board[:3, 3])) for other in distinct]
         if all(a > min(board.width_m, board.height_m) / 2 for a in away):
@@ -284,17 +284,17 @@ def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
     return distinct[:MAX_CANDIDATES]
 
 
-def _doubt(found: LidarBoard, board: Board) -> float:
-    """Rate a candidate in m: misfit of outline and size, what no ring shows, what else is in its plane."""
+def _penalty(found: LidarBoard, board: Board) -> float:
+    """Rate a candidate in m: residual of outline and size, unobserved parts, other returns in its plane."""
     q = found.quality
-    doubt = q.template_m + 0.03 / q.n_rings + 0.15 * (q.width_sigma_m + q.height_sigma_m)
-    doubt += 0.05 * q.beyond_share
+    penalty = q.template_m + 0.03 / q.n_rings + 0.15 * (q.width_sigma_m + q.height_sigma_m)
+    penalty += 0.05 * q.beyond_share
     for measured_m, sigma_m, wanted_m in (
         (q.width_m, q.width_sigma_m, board.width_m),
         (q.height_m, q.height_sigma_m, board.height_m),
     ):
-        doubt += 0.5 * max(0.0, abs(measured_m - wanted_m) - 2 * sigma_m - 0.005)
-    return doubt
+        penalty += 0.5 * max(0.0, abs(measured_m - wanted_m) - 2 * sigma_m - 0.005)
+    return penalty
 
 
 # Follow the board from one scan to the next.
@@ -329,7 +329,7 @@ def track_lidar_board(
         min_range_m: nearer returns are ignored.
         min_rings: fewest rings on the board.
         max_rms_m: largest rms distance of the board's returns from its plane, without noise.
-        beam: light spot of the LiDAR; that of a VLP-16 where None.
+        beam: light spot of the LiDAR; that of a VLP-16 if None.
 
     Returns:
         The best candidate in the box, or why there is none.
@@ -375,7 +375,7 @@ def _near(scan: Scan, board: Board, previous: LidarBoard, margin_m: float) -> In
 def _measure_again(
     nearby: Scan, board: Board, previous: LidarBoard, min_range_m: float, limits: Limits, beam: Beam | None
 ) -> LidarBoard | None:
-    """Start from the last pose, which a board held still hardly leaves; None unless it fits as well again."""
+    """Start from the last pose, valid for a still board; None unless it fits as well again."""
     T = previous.T_lidar_board
     half = np.array([board.width_m / 2, board.height_m / 2, 3.0 * previous.sigma_m])
     is_on = (np.abs((nearby.points - T[:3, 3]) @ T[:3, :3]) <= half).all(axis=1)

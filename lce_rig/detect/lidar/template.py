@@ -163,7 +163,7 @@ def register(scan: OrderedScan, view: PlaneView, start: Placement) -> Placement 
         start: first guess; gives the size.
 
     Returns:
-        The placement, None where no ring shows the plate.
+        The placement, None if no ring shows the plate.
     """
     samples, kind = _samples(scan, view, start)
     if not (kind == END).any():

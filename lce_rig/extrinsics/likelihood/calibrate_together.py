@@ -9,23 +9,13 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation, Refusal
 from lce_rig.extrinsics.estimate import CalibrationEstimate
-from lce_rig.extrinsics.likelihood.calibrate_jointly import describe, expand_joint, figures_of, what_is_known
+from lce_rig.extrinsics.likelihood.calibrate_jointly import add_figures, describe, expand_joint, what_is_known
 from lce_rig.extrinsics.likelihood.levels import PoseLevels
 from lce_rig.extrinsics.likelihood.refine import refine
 from lce_rig.extrinsics.likelihood.spread import inflate
 from lce_rig.extrinsics.options import EstimateSettings
-from lce_rig.extrinsics.shared_scans import scan_key, take_apart
+from lce_rig.extrinsics.shared_scans import scan_key
 from lce_rig.residuals.placements import group_shared_placements
-
-# Diagnostics that hold a camera's pose errors beyond corner noise, by the level that they are.
-_POSE_FIGURES = {
-    "tilt_rad": "noise_tilt_deg",
-    "spin_rad": "noise_spin_deg",
-    "depth_m": "noise_depth_m",
-    "across_m": "noise_across_m",
-}
-# Those that say what a camera's own estimate did, and nothing of this one.
-_OF_ONE = ("algorithm_1_offset_deg", "algorithm_1_offset_m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +34,7 @@ class TogetherEstimate:
     cov: Array
 
     def covariance_of(self, first: str, second: str) -> Array:
-        """Take the covariance (12, 12) of two cameras' extrinsics out."""
+        """Return the covariance (12, 12) of two cameras' extrinsics."""
         places = [np.arange(6) + 6 * self.cameras.index(name) for name in (first, second)]
         mine = np.concatenate(places)
         return self.cov[mine[:, None], mine]
@@ -55,15 +45,15 @@ def calibrate_together(
 ) -> TogetherEstimate:
     """Estimate the extrinsics of cameras that share scans of one LiDAR in one likelihood.
 
-    What a camera alone says is where the estimate starts, and how large the errors of its pictures are
-    compared with those of the others'. Scans of which the cameras use different places are left out.
+    Each camera's own estimate gives the start, and the size of its images' errors relative to the others'.
+    Scans in which the cameras use different surfaces are rejected.
 
     Args:
         alone: by camera, its estimate by the joint likelihood without the others; boards stood still.
         board: its specification.
-        options: what is known of the LiDAR's ranges.
+        options: with priors of the LiDAR's range errors.
     """
-    # The order of cameras must not matter to the last digit.
+    # The order of cameras must not change the last digit.
     names = tuple(sorted(alone))
     conflicts = _conflicts(alone)
     starts = [_without(alone[name], conflicts) for name in names]
@@ -80,13 +70,14 @@ def calibrate_together(
         n_seen = len(np.unique(placement[[order[o.capture] for o in labelled[k]]]))
         cov, inflation = inflate(joint, placement, k, n_seen)
         scales.append(np.full(6, np.sqrt(inflation)))
-        figures = {**figures_of(joint, k), "covariance_inflation": inflation}
+        figures = add_figures(start.diagnostics, joint, k, inflation)
         estimate = describe(joint, k, cov, start, used[k], board, options, figures)
         estimates[name] = replace(
             estimate,
             method=start.method,
             expansion=expand_joint(joint, k, placement),
             estimated_with=tuple(other for other in names if other != name),
+            same_scan=start.same_scan,
         )
     scale = np.concatenate(scales)
     cov = scale[:, None] * (J @ joint.cost.covariance() @ J.T) * scale
@@ -94,8 +85,8 @@ def calibrate_together(
 
 
 def _without(start: CalibrationEstimate, conflicts: Mapping[str, Refusal]) -> CalibrationEstimate:
-    """Leave captures out, and figures that hold for the camera alone."""
-    singles = [take_apart([name]) for name in start.used]
+    """Remove captures, and figures that apply to the camera alone."""
+    singles = [start.captures_of([name]) for name in start.used]
     kept = [k for k, names in enumerate(singles) if not names & conflicts.keys()]
     mine = {name: why for name, why in conflicts.items() if name in set().union(*singles)}
     return replace(
@@ -103,18 +94,18 @@ def _without(start: CalibrationEstimate, conflicts: Mapping[str, Refusal]) -> Ca
         used=tuple(start.used[k] for k in kept),
         residuals=tuple(start.residuals[k] for k in kept),
         refused={**start.refused, **mine},
-        diagnostics={name: value for name, value in start.diagnostics.items() if name not in _OF_ONE},
+        diagnostics=replace(start.diagnostics, algorithm_1_offset_deg=np.nan, algorithm_1_offset_m=np.nan),
     )
 
 
 def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
-    """Find captures in which cameras put the board at different places of the scan."""
+    """Find captures in which cameras use different surfaces of the scan."""
     seen: dict[str, tuple[str, bytes]] = {}
     found = {}
     for camera, estimate in sorted(alone.items()):
         for observation in estimate.observations.values():
             key = scan_key(observation)
-            for capture in sorted(take_apart([observation.capture])):
+            for capture in sorted(estimate.captures_of([observation.capture])):
                 other, held = seen.setdefault(capture, (camera, key))
                 if held != key:
                     figures = {"first": other, "second": camera}
@@ -123,7 +114,7 @@ def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
 
 
 def _label_scans(used: Sequence[Sequence[Observation]]) -> list[list[Observation]]:
-    """Give observations of the same scan the same name, whatever captures they lie in."""
+    """Rename observations so that those of the same scan share a name, in any capture."""
     names: dict[bytes, str] = {}
     labelled = []
     for own in used:
@@ -135,6 +126,7 @@ def _label_scans(used: Sequence[Sequence[Observation]]) -> list[list[Observation
 
 def _pose_ratios(starts: Sequence[CalibrationEstimate]) -> list[PoseLevels]:
     """Compare cameras' pose errors, as each alone estimates them, with their geometric mean."""
-    logs = np.log([[start.diagnostics[name] for name in _POSE_FIGURES.values()] for start in starts])
+    each = [start.diagnostics for start in starts]
+    logs = np.log([[d.noise_tilt_deg, d.noise_spin_deg, d.noise_depth_m, d.noise_across_m] for d in each])
     ratios = np.exp(logs - logs.mean(axis=0))
-    return [PoseLevels(**dict(zip(_POSE_FIGURES, own, strict=True))) for own in ratios.tolist()]
+    return [PoseLevels(*own) for own in ratios.tolist()]

@@ -1,4 +1,4 @@
-"""Sizes of the errors that the likelihood knows, and what is believed of them before any capture is seen."""
+"""Levels of the errors in the likelihood, and their priors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M
 
 
 class PoseLevels(NamedTuple):
-    """Errors of a board's pose in a picture beyond corner noise, as in `Levels`; or ratios of them."""
+    """Errors of a board's pose in an image beyond corner noise, as in `Levels`; or ratios of them."""
 
     tilt_rad: float
     spin_rad: float
@@ -24,15 +24,15 @@ class PoseLevels(NamedTuple):
 class Levels:
     """Standard deviations of errors that differ from one measurement to the next; estimated.
 
-    The defaults are what recordings show; how far from that they may well lie stands in `LOG_SIGMA`.
+    The defaults are from recordings; `LOG_SIGMA` holds their prior standard deviations.
 
     Attributes:
         range_m: noise of a single range.
         ring_m: error that the returns of one ring in one capture share, beyond the laser's offset.
         edge_rad: blur of the ends of a ring end's interval, across the beam, by range (`along_rays`).
-        backed_rad: the same where something stands close behind.
-        lost_share: of ring ends whose last returns are missing; a share, not a deviation.
-        tilt_rad, spin_rad: errors of a board's turn in a picture beyond corner noise.
+        backed_rad: the same with an object close behind.
+        lost_share: fraction of ring ends whose last returns are missing.
+        tilt_rad, spin_rad: errors of a board's turn in an image beyond corner noise.
         depth_m, across_m: errors of its place, along and across the line of sight.
         laser_m: of the lasers' range offsets about their mean.
     """
@@ -50,11 +50,11 @@ class Levels:
 
     @property
     def pose(self) -> PoseLevels:
-        """Those of a picture's pose."""
+        """The levels of an image's pose."""
         return PoseLevels(self.tilt_rad, self.spin_rad, self.depth_m, self.across_m)
 
     def blurred(self, blur_rad: float) -> "Levels":
-        """Blur ring ends by so much at least."""
+        """Set a minimum blur of ring ends."""
         edge_rad, backed_rad = max(self.edge_rad, blur_rad), max(self.backed_rad, blur_rad)
         return replace(self, edge_rad=edge_rad, backed_rad=backed_rad)
 
@@ -71,8 +71,8 @@ LOG_SIGMA: Mapping[str, float] = {
     "across_m": 0.7,
     "laser_m": 0.3,
 }
-"""One deviation of the logarithm of each level, a priori; the lasers' spread is the profile's to state."""
-# Most ring ends are where the board ends, or there would be nothing to go by.
+"""Prior standard deviation of the logarithm of each level; the profile gives the lasers' spread."""
+# Most ring ends must be at the board's edge, or the board could not be located.
 MOST_LOST = 0.6
 
 
@@ -84,11 +84,11 @@ class Priors:
         offset_m: range offset common to all lasers.
         shift_m: edge shift d_0, `along_rays`.
         growth: c, its change with range; recordings show none.
-        background_m: d_1, d_2 and d_3, by what is behind the edge.
+        background_m: d_1, d_2 and d_3, by the background of the edge.
         displacement_m: displacement of all ring ends against the returns between them.
         lateral_m: lens beside the LiDAR's axis, `along_rays`.
         vertical_m: its height, per rad of elevation.
-        scale: of the camera's distances, by which squares or focal length are off.
+        scale: relative error of the camera's distances, from squares or focal length.
     """
 
     offset_m: float = 0.005
@@ -106,5 +106,5 @@ class Priors:
         return np.array([self.shift_m, self.growth, *self.background_m, *2 * [self.displacement_m]])
 
 
-# Offsets of lasers that the profile says have none.
+# Offsets of lasers without any in the profile.
 NO_LASER_M = 1e-6

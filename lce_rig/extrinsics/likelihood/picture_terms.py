@@ -1,8 +1,8 @@
-"""Poses of boards in pictures against T_cam_lidar T_lidar_board.
+"""Residuals of board poses in images from T_cam_lidar T_lidar_board.
 
-Corners act through the pose that fits them and its covariance, which holds to first order all that they
-say. Beyond their noise a picture's pose errs by what its corners have in common: the lens model's misfit in
-that part of the picture, the print, the board's bend, its motion. The covariance of that error is
+Corners enter by their fitted pose and its covariance, which hold their information to first order. Besides
+their noise, an image's pose has errors that its corners share: the lens model's misfit in that part of the
+image, the pattern, the board's bend, its motion. The covariance of these errors is
 
     Q = sigma_tilt^2 about axes in the board's plane, sigma_spin^2 about its normal,
         sigma_depth^2 along the line of sight, sigma_across^2 across it                                   (1)
@@ -21,7 +21,7 @@ from lce_rig.residuals.along_rays import Indices
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """What one camera saw of boards, in P captures.
+    """One camera's board poses in P captures.
 
     Attributes:
         capture: (P,) which of the stacked captures.
@@ -43,18 +43,18 @@ class Pictures:
         return self.cov + Q
 
     def with_larger_errors(self, ratios: PoseLevels) -> "Pictures":
-        """Let the pictures err beyond corner noise by so many times what levels say."""
+        """Scale the images' errors beyond corner noise relative to the levels."""
         shapes = {name: getattr(ratios, name) ** 2 * shape for name, shape in self.shapes.items()}
         return replace(self, shapes=shapes)
 
 
 def stack_pictures(capture: Indices, images: Sequence[ImageBoard], n_repeats: Array) -> Pictures:
-    """Stack the pictures of one camera.
+    """Stack the images of one camera.
 
     Args:
         capture: (P,) which of the stacked captures they belong to.
         images: P of them.
-        n_repeats: (P,) pictures that show the board in the same place: they share the error Q, and count
+        n_repeats: (P,) images that show the board in the same place: they share the error Q, and count
             together as one.
     """
     T = np.array([image.T_cam_board for image in images])
@@ -74,7 +74,7 @@ def picture_rows(pictures: Pictures, T_cam_lidar: Array, T_lidar_board: Array, s
 
     Returns:
         (P, 6, 14): by extrinsic (6), by board pose (6), by scale, residual. A scale s stretches what the
-        camera measures to t_cam_board (1 + s): squares or a focal length that are not what the profile
+        camera measures to t_cam_board (1 + s): squares or a focal length that differ from the profile
         says.
     """
     Y = T_lidar_board[pictures.capture]

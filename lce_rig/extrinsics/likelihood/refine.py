@@ -1,6 +1,6 @@
 """Joint refinement: extrinsics of cameras that share one LiDAR, board poses, constant errors, noise levels.
 
-Fisher scoring: Gauss-Newton on ranges and pictures, mean information and score for the density of ring ends
+Fisher scoring: Gauss-Newton on ranges and images, mean information and score for the density of ring ends
 (`end_density`); noise levels are fitted in between.
 """
 
@@ -19,15 +19,14 @@ from lce_rig.residuals.along_rays import N_FIELDS, N_SHIFTS, StackedScans, inter
 from lce_rig.residuals.placements import group_placements
 from lce_rig.residuals.quadratics import Quadratics
 
-# Noise levels from the data: the ones under which the data are most probable.
+# Noise levels from the data: those of maximum likelihood.
 #
-# All unknowns are integrated out (restricted maximum likelihood), so that residuals which the fit itself
-# made
-# small are not taken for small noise. The terms stay linearised: an evaluation is some small matrices, no
-# pass over points.
+# All unknowns are integrated out (restricted maximum likelihood), so that residuals reduced by the fit are
+# not mistaken for small noise. The terms stay linearised: an evaluation involves small matrices only, no
+# points.
 
 _STEP = 1e-3
-# Levels lie within these factors of what is usual, e^-4.6 and e^3.
+# Levels lie within these factors of the typical value, e^-4.6 and e^3.
 _BELOW, _ABOVE = -4.6, 3.0
 
 
@@ -37,7 +36,7 @@ def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, n_rou
     Args:
         terms: linearised near the optimum.
         start: levels to start from.
-        usual: middle of what is believed of them; lasers that have no offsets there have none.
+        usual: centre of their prior; lasers without offsets there have none.
         priors: of the constants.
         n_rounds: of the search, at most.
     """
@@ -65,12 +64,12 @@ def _logs(levels: Levels, names: list[str]) -> Array:
     return np.log([getattr(levels, name) for name in names])
 
 
-# Steps between changes of the levels, and at most in the end.
+# Steps between changes of the levels, and their maximum at the end.
 _STEPS, _LAST_STEPS = 3, 20
-# Rounds of the search for noise levels, after each of which all is linearised anew.
+# Rounds of the search for noise levels, each followed by a new linearisation.
 _LEVEL_ROUNDS = (12, 4, 4)
 _SETTLED = 1e-7
-# Blurs that ring ends are first given: as long as the edge shift is unknown, all of them may lie outside
+# First blurs of ring ends: as long as the edge shift is unknown, all of them may lie outside
 # their intervals, where a sharp density is flat.
 _BLURS_RAD = (4e-3, 1.5e-3)
 
@@ -82,12 +81,12 @@ class JointEstimate:
     Attributes:
         T_cam_lidar: (C, 4, 4).
         T_lidar_board: (F, 4, 4).
-        cov: (C, 6, 6) of each extrinsic, everything else marginalised, tangent (translation m, rotation rad).
-        to_extrinsics: (C, 6, G) derivative of each extrinsic's tangent by the unknowns z of `system`.
-        offset_m: (L,) by which ranges of each ring read too long.
+        cov: (C, 6, 6) of each result, everything else marginalised, tangent (translation m, rotation rad).
+        to_extrinsics: (C, 6, G) derivative of each result's tangent by the unknowns z of `system`.
+        offset_m: (L,) range error of each ring, positive for too long.
         lens_m: (2,) lateral and vertical displacement of the LiDAR's lens, `along_rays`.
         shifts: (7,) of ring ends, `along_rays.SHIFTS`.
-        scale: (C,) by how much of themselves each camera's distances are too short.
+        scale: (C,) relative error of each camera's distances, positive for too short.
         constants_sigma: (L + 9,) standard deviations of offsets, lens and shifts.
         levels: of the noise.
         cost: of the F captures at the optimum, in the unknowns z of `system`.
@@ -120,12 +119,11 @@ def refine(
     Args:
         cameras: observations of each.
         board: the board.
-        T_cam_lidar: (4, 4) of each, good to some degrees and centimetres.
+        T_cam_lidar: (4, 4) of each, accurate to some degrees and centimetres.
         priors: of the constant errors.
-        usual: what the noise levels usually are.
-        levels: of the noise, where they are known; else estimated.
-        pose_ratios: for each camera, by how many times its pictures' errors beyond corner noise are larger
-            than `levels` says; 1 where None.
+        usual: typical noise levels.
+        levels: of the noise, if known; else estimated.
+        pose_ratios: for each camera, ratio of its images' errors beyond corner noise to `levels`; 1 if None.
     """
     priors, usual = priors or Priors(), usual or Levels()
     usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
@@ -153,7 +151,7 @@ def refine(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What stays the same while the unknowns are sought."""
+    """Constants of the optimisation."""
 
     scans: StackedScans
     pictures: tuple[Pictures, ...]
@@ -181,13 +179,13 @@ def _pictures(observations: Sequence[Observation], order: dict[str, int]) -> Pic
 
 
 def to_extrinsic(T_cam_lidar: Array, camera: int, n_unknowns: int) -> Array:
-    """Differentiate a camera's extrinsic, as it is reported, by the unknowns z.
+    """Differentiate a camera's reported extrinsics by the unknowns z.
 
-    Straight ahead of the camera a lens beside the axis is a shift of the whole LiDAR: that goes to the
-    extrinsic, which is to be used with points as the driver gives them.
+    Straight ahead of the camera, a lens beside the axis equals a shift of the whole LiDAR. That shift is part
+    of the extrinsics, which apply to points as the driver gives them.
 
     Args:
-        T_cam_lidar: (4, 4) for points whose displacement is taken off.
+        T_cam_lidar: (4, 4) for points without that displacement.
         camera: its number.
         n_unknowns: G.
 

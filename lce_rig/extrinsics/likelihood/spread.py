@@ -1,8 +1,8 @@
-"""Do placements disagree by more than the likelihood says they may?
+"""Check the likelihood's covariance against the spread over placements.
 
-The spread of the optimum without each placement (`lce_rig.residuals.quadratics`) knows nothing of the noise
-model; where it exceeds the model's covariance by more than chance allows, errors are at work that the model
-does not have, and the covariance is multiplied.
+The spread of the optimum without each placement (`lce_rig.residuals.quadratics`) is independent of the noise
+model. If it significantly exceeds the model's covariance, there are errors that the model lacks, and the
+covariance is multiplied.
 """
 
 from dataclasses import replace
@@ -15,23 +15,23 @@ from lce_rig.extrinsics.likelihood.refine import JointEstimate
 from lce_rig.residuals.quadratics import jackknife_scatter
 from lce_rig.solvers.covariance import symmetric_inverse
 
-# So many standard deviations of its own must the ratio of covariances lie above 1 to count.
+# Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.
 _SURE = 2.0
 
 
 def inflate(
     joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0, n_seen: int | None = None
 ) -> tuple[Array, float]:
-    """Multiply a camera's covariance (6, 6) by what the spread over placements shows.
+    """Multiply a camera's covariance (6, 6) according to the spread over placements.
 
     Args:
         joint: of F captures.
         placement: (F,) number of each capture's placement.
         camera: its number.
-        n_seen: placements that it saw; all where None.
+        n_seen: number of placements that it saw; all if None.
 
     Returns:
-        The covariance and the factor, 1 where model and spread agree.
+        The covariance and the factor, 1 if model and spread agree.
     """
     cov = joint.cov[camera]
     n = int(placement.max()) + 1 if n_seen is None else n_seen
@@ -43,6 +43,6 @@ def inflate(
 
 
 def jackknife(joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0) -> Array:
-    """Compute the jackknife covariance (6, 6) of a camera's extrinsic over placements."""
+    """Compute the jackknife covariance (6, 6) of a camera's extrinsics over placements."""
     cost = replace(joint.cost, placement=placement)
     return jackknife_scatter(cost.moves() @ joint.to_extrinsics[camera].T)

@@ -1,11 +1,11 @@
-"""All terms at one state, and their normal equations for any levels of noise.
+"""All terms at one state, and their normal equations for any noise levels.
 
 Unknowns are the tangent y_k (6) of each board's T_lidar_board, and z, which all captures share:
 
     z = [tangent of T_cam_lidar (6) and scale of each camera, range offset of each ring (L), lens (2),
          shifts of ring ends (7)]
 
-A board pose meets only the terms of its own capture: the matrix is an arrow head, and y_k is eliminated
+A board pose enters only the terms of its own capture: the matrix is an arrow head, and y_k is eliminated
 capture by capture (Schur complement).
 """
 
@@ -32,30 +32,24 @@ from lce_rig.residuals.along_rays import (
 )
 from lce_rig.residuals.quadratics import Quadratics
 
-# How a ring's last return on the board lies to the board's edge: the density, its score and information.
+# Density, score and information of the distance between a ring's last return on the board and the edge.
 #
-# In units of the step to the next ray, let x be the distance of the last return inside the edge, less half
-# a
-# step, beam width included. Without noise x is uniform in -1/2..1/2: the edge lies somewhere between the
-# last
-# ray that met the board and the first that did not. Three things blur that:
+# In units of the step to the next ray, let x be the distance of the last return inside the edge, less half a
+# step, beam width included. Without noise x is uniform in -1/2..1/2: the edge lies between the last ray that
+# hit the board and the first that did not. Three effects blur that:
 #
-#     p(x) = (1 - a - b) core + a lost + b stray
-#     (1)
+#     p(x) = (1 - a - b) core + a lost + b stray                                                           (1)
 #
-# core   the uniform interval, its ends blurred by t (print, width of the beam): what remains of the
-# interval
-#        tells more of the edge than a normal distribution of the same variance would;
-# lost   the last returns on the board are missing (weak, or blended with whoever holds it): an exponential
-# tail
-#        inwards, of few ring ends where the board is on a stand, of a fifth where a person stands behind
-#        it;
-# stray  anything else (the neighbouring ray met something just behind the board), Cauchy's distribution.
+# core   the uniform interval, its ends blurred by t (pattern, width of the beam); it determines the edge
+# better        than a normal distribution of the same variance;
+# lost   the last returns on the board are missing (weak, or merged with the person who holds it): an
+#        exponential tail inwards, for few ring ends with a stand, for a fifth with a person behind the board;
+# stray  anything else (the neighbouring ray hit an object just behind the board), a Cauchy distribution.
 
 STRAY = 0.01
-"""Share b of (1), as in simulated and recorded captures; a is theirs to say."""
+"""Fraction b of (1), from simulated and recorded captures; a is estimated."""
 _LOST_STEPS = 1.1
-# Blurs and lost shares that the table of informations spans. Narrower ones count as the narrowest; wider
+# Range of blurs and lost fractions in the information table. Narrower ones count as the narrowest; wider
 # ones leave a normal density.
 _NARROWEST = 0.01
 _BLURS = np.geomspace(_NARROWEST, 30.0, 60)
@@ -97,7 +91,7 @@ def _exponential_with_noise(x: Array, t: Array) -> Array:
 
     s = t / _LOST_STEPS
     z = x / t - s
-    # Both forms are the same; either overflows where the other does not.
+    # Both forms are equal; each overflows where the other does not.
     below = np.exp(-0.5 * (x / t) ** 2) * erfcx(-np.minimum(z, 0.0) / np.sqrt(2)) / 2
     above = np.exp(np.minimum(s**2 / 2 - x / _LOST_STEPS, 0.0)) * ndtr(z)
     return np.asarray(np.where(z < 0, below, above) / _LOST_STEPS)
@@ -119,8 +113,8 @@ def edge_system(
     """Expand -2 ln p of the ring ends to second order, by capture: (F, 16, 16).
 
     With J a row without its residual: J J^T times the information, J times the score in the last column, and
-    -2 ln p itself in the corner. The information is the mean over all ring ends of such a blur: that of a
-    single one is zero in the middle of its interval, and no Hessian to step by.
+    -2 ln p itself in the corner. The information is the mean over all ring ends of such a blur, as that of a
+    single one is zero in the middle of its interval and unusable as a Hessian.
     """
     size = edges.rows.shape[1]
     system = np.zeros((n_captures, size, size))
@@ -157,7 +151,7 @@ def _normal(z: Array) -> Array:
 
 
 PER_CAMERA = 7
-# The mean of the lasers' own offsets is not theirs but the common one: this much of it is left.
+# The lasers' own offsets have zero mean, as the mean is the common offset; this much of it is left.
 _MEAN_FLOOR_M = 1e-6
 
 
@@ -248,7 +242,7 @@ class Reduced:
 
 
 def assemble(terms: Terms, levels: Levels, priors: Priors) -> Reduced:
-    """Weigh all terms and eliminate the board poses.
+    """Weight all terms and eliminate the board poses.
 
     Args:
         terms: of F captures.
@@ -261,7 +255,7 @@ def assemble(terms: Terms, levels: Levels, priors: Priors) -> Reduced:
 class Assembly:
     """The normal equations of terms at one level of noise after another.
 
-    A search for levels changes one at a time: what the others weigh is kept from the evaluations before.
+    A search for levels changes one at a time; the others' terms are cached.
 
     Args:
         terms: of F captures.
@@ -275,7 +269,7 @@ class Assembly:
         self._picture_block = lru_cache(maxsize=2)(partial(_picture_block, terms))
 
     def at(self, levels: Levels) -> Reduced:
-        """Weigh all terms and eliminate the board poses."""
+        """Weight all terms and eliminate the board poses."""
         of_ranges, range_volume = self._range_block(levels.range_m, levels.ring_m)
         of_edges = self._edge_block(levels.edge_rad, levels.backed_rad, levels.lost_share)
         of_pictures, picture_volume = self._picture_block(levels.pose)
@@ -289,7 +283,7 @@ class Assembly:
 
 
 def _range_block(terms: Terms, range_m: float, ring_m: float) -> tuple[Array, float]:
-    """Weigh what the returns say, and add up the logs of their covariances' determinants."""
+    """Weight the returns' terms, and sum the log determinants of their covariances."""
     block = _no_block(terms)
     weighted, log_volumes = weigh_ranges(terms.ranges, range_m, ring_m)
     place = np.r_[
@@ -300,7 +294,7 @@ def _range_block(terms: Terms, range_m: float, ring_m: float) -> tuple[Array, fl
 
 
 def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: float) -> Array:
-    """Weigh what the ring ends say."""
+    """Weight the ring ends' terms."""
     block = _no_block(terms)
     place = np.r_[0:6, block.shape[1] - 1 - N_FIELDS - N_SHIFTS : block.shape[1]]
     block[:, place[:, None], place] = edge_system(terms.edges, edge_rad, backed_rad, lost_share, len(block))
@@ -308,7 +302,7 @@ def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: fl
 
 
 def _picture_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, float]:
-    """Weigh what the pictures say, and add up the logs of their covariances' determinants."""
+    """Weight the images' terms, and sum the log determinants of their covariances."""
     block, log_volume = _no_block(terms), 0.0
     for c, (pictures, rows) in enumerate(zip(terms.pictures, terms.picture_rows, strict=True)):
         cov = pictures.total_cov(pose_levels)
@@ -321,13 +315,13 @@ def _picture_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, float]
 
 
 def _no_block(terms: Terms) -> Array:
-    """Make room for products of [board pose (6), z (G), residual] by capture."""
+    """Allocate products of [board pose (6), z (G), residual] by capture."""
     size = 6 + len(terms.constants) + 1
     return np.zeros((len(terms.ranges.sums), size, size))
 
 
 def _eliminate(M: Array, terms: Terms, levels: Levels, priors: Priors, log_volume: float) -> Reduced:
-    """Take the board poses out of M (F, 6 + G + 1, 6 + G + 1) and add the priors."""
+    """Eliminate the board poses from M (F, 6 + G + 1, 6 + G + 1) and add the priors."""
     of_boards, rest = M[:, :6, :6], M[:, :6, 6:]
     steps = np.linalg.solve(of_boards, rest)
     reduced = M[:, 6:, 6:] - np.swapaxes(rest, 1, 2) @ steps

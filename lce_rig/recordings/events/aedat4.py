@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits
+from lce_rig.core.data import EventColumns
 from lce_rig.recordings.events.aedat4_file import Aedat4File, field_at, vector_at
 from lce_rig.recordings.events.stream import (
     NS_PER_US,
     DamageCounts,
-    EventColumns,
     NoEventsError,
     join_small,
     parse_size,

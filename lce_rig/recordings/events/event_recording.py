@@ -9,17 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits
-from lce_rig.core.data import Events, join_events
+from lce_rig.core.data import EventColumns, Events, join_events
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.events.stream import (
     NO_EVENTS,
     NS_PER_US,
     DamageCounts,
-    EventColumns,
     EventStream,
     KnowsItsLength,
     NoEventsError,
-    join,
     seconds_in,
 )
 
@@ -95,7 +93,7 @@ class _Sorter:
             yield self.held
             self._delivered_ns, together = int(self.held.t_ns[-1]), current
         else:
-            together = join([self.held, current])
+            together = join_events([self.held, current])
         if _never_falls(together.t_ns):
             self.held = together
             return
@@ -220,8 +218,7 @@ class EventRecording:
     """Events of one camera from one file or topic.
 
     Iterating yields stretches of `Events` from the beginning, in the order of time, and holds only a few of
-    them in memory; it may be done again and again. `read` cuts out windows; windows that go forward in time
-    are read in one pass through the file.
+    them in memory; it may be done again and again. `read` cuts out a window.
 
     Attributes:
         path: the file or folder.
@@ -250,7 +247,6 @@ class EventRecording:
         self._findings = DamageCounts()
         self._assumed: list[str] = []
         self._span_ns: tuple[int, int] | None = None
-        self._window = _TimeWindow(self)
         if not any(len(stretch) for stretch in self._stretches(self._findings)):
             said = "; ".join(self._findings.lines())
             raise NoEventsError(f"{path} holds no events" + (f": {said}" if said else ""))
@@ -337,7 +333,14 @@ class EventRecording:
         Raises:
             SourceError: as iterating does.
         """
-        return self._window.read(start_ns, end_ns)
+        parts = [self.to_events(NO_EVENTS)]
+        for stretch in self:
+            if stretch.t_ns[-1] >= start_ns:
+                parts.append(stretch.between(start_ns, end_ns))
+            if stretch.t_ns[-1] >= end_ns:
+                break
+        # Arrival is known of a stretch's first event, not of a window's.
+        return replace(join_events(parts), host_ns=None)
 
     def _stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
         """Read the stream; a disk that fails is an error the user can repair."""
@@ -401,33 +404,6 @@ class EventRecording:
             )
         findings.add("events off the sensor skipped", f"column {right}, row {bottom}", n_off)
         return stretch.select(is_on)
-
-
-class _TimeWindow:
-    """The ranges of the last window, and the pass through the recording that continues there."""
-
-    def __init__(self, recording: EventRecording) -> None:
-        self._recording = recording
-        self._rest: Iterator[Events] = iter(())
-        self._kept: list[Events] = []
-        self._from_ns: int | None = None
-
-    def read(self, start_ns: int, end_ns: int) -> Events:
-        if self._from_ns is None or start_ns < self._from_ns:
-            self._rest, self._kept = iter(self._recording), []
-        self._from_ns = start_ns
-        self._kept = [stretch for stretch in self._kept if stretch.t_ns[-1] >= start_ns]
-        while not self._kept or self._kept[-1].t_ns[-1] < end_ns:
-            stretch = next(self._rest, None)
-            if stretch is None:
-                break
-            if stretch.t_ns[-1] >= start_ns:
-                self._kept.append(stretch)
-        parts = [stretch.between(start_ns, end_ns) for stretch in self._kept]
-        if not any(map(len, parts)):
-            return self._recording.to_events(NO_EVENTS)
-        # Arrival is known of a stretch's first event, not of a window's.
-        return replace(join_events(parts), host_ns=None)
 
 
 def _size(resolution_px: tuple[int, int]) -> str:

@@ -4,9 +4,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.core.event_file import EventArchive
-from lce_rig.recordings.events.stream import DamageCounts, EventColumns, open_recorded
+from lce_rig.recordings.events.stream import DamageCounts, open_recorded
 
 _STRETCH_EVENTS = 1 << 20
 

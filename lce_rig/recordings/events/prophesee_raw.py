@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits
+from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.events.counter import WrappingCounter
-from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, EventColumns, open_recorded, parse_size
+from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, open_recorded, parse_size
 from lce_rig.recordings.events.word_codec import EVT3, WordDecoder
 
 # Prophesee's EVT2 (32-bit words) and EVT2.1 (64-bit words, 32 pixels of a row each).

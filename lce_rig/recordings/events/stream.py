@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits
+from lce_rig.core.data import EventColumns, join_events
 from lce_rig.core.errors import SourceError, reading
 
 NS_PER_US = 1000
@@ -20,47 +21,9 @@ class NoEventsError(SourceError):
     """A recording that could hold events and holds none."""
 
 
-@dataclass(frozen=True, eq=False)
-class EventColumns:
-    """Events as read: not checked against a resolution, not sorted.
-
-    Attributes:
-        t_ns: (N,) int64 device time.
-        x, y: (N,) uint16 px.
-        polarity: (N,) bool, True where it became brighter.
-        host_ns: arrival of the first event at the host; None where unknown.
-    """
-
-    t_ns: NDArray[np.int64]
-    x: NDArray[np.uint16]
-    y: NDArray[np.uint16]
-    polarity: NDArray[np.bool_]
-    host_ns: int | None = None
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-    def select(self, keep: NDArray[Any] | slice) -> "EventColumns":
-        """Keep the events of a mask, an index or a slice."""
-        return EventColumns(self.t_ns[keep], self.x[keep], self.y[keep], self.polarity[keep], self.host_ns)
-
-
 NO_EVENTS = EventColumns(
     np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.bool_)
 )
-
-
-def join(parts: list[EventColumns]) -> EventColumns:
-    """Put stretches of events one behind the other; host time is the first one's."""
-    if len(parts) == 1:
-        return parts[0]
-    return EventColumns(
-        np.concatenate([part.t_ns for part in parts]),
-        np.concatenate([part.x for part in parts]),
-        np.concatenate([part.y for part in parts]),
-        np.concatenate([part.polarity for part in parts]),
-        parts[0].host_ns,
-    )
 
 
 def join_small(stretches: Iterator[EventColumns], n_events: int) -> Iterator[EventColumns]:
@@ -71,10 +34,10 @@ def join_small(stretches: Iterator[EventColumns], n_events: int) -> Iterator[Eve
         parts.append(stretch)
         n_held += len(stretch)
         if n_held >= n_events:
-            yield join(parts)
+            yield join_events(parts)
             parts, n_held = [], 0
     if parts:
-        yield join(parts)
+        yield join_events(parts)
 
 
 @dataclass

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits, unpacking
+from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import DamageCounts, EventColumns, open_recorded, parse_size, to_ns
+from lce_rig.recordings.events.stream import DamageCounts, open_recorded, parse_size, to_ns
 
 _BLOCK_BYTES = 1 << 18
 _N_COLUMNS = 4

@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.data import EventColumns
 from lce_rig.recordings.events.counter import WrappingCounter
-from lce_rig.recordings.events.stream import NS_PER_US, EventColumns
+from lce_rig.recordings.events.stream import NS_PER_US
 
 # Time-high words count 4.096 ms each, wrap every 16.8 s, and may step back a little without having wrapped.
 _HIGH_BITS = 12

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits
-from lce_rig.core.data import Events
-from lce_rig.recordings.events.stream import EventColumns
+from lce_rig.core.data import EventColumns, Events
 from lce_rig.recordings.ros.message_fields import EventHeader, MessageReader, read_header
 
 _FIELDS = [("x", "<u2"), ("y", "<u2"), ("sec", "<u4"), ("nsec", "<u4"), ("polarity", "?")]

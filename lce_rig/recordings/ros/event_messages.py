@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import limits
+from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, EventColumns, seconds_in
+from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, seconds_in
 from lce_rig.recordings.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
 from lce_rig.recordings.ros.bag_file import BagFile, list_topics
 from lce_rig.recordings.ros.event_array import decode_event_array

@@ -1,6 +1,5 @@
 """A bag as a stream of images, scans and events, by the timestamps in their headers."""
 
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from lce_rig.core.data import Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.events.choice import CameraEvents
 from lce_rig.recordings.events.event_recording import EventRecording
-from lce_rig.recordings.events.stream import NoEventsError
+from lce_rig.recordings.events.stream import DamageCounts, NoEventsError
 from lce_rig.recordings.folder.cloud import to_scan
 from lce_rig.recordings.folder.image_file import decode_image, to_8_bit
 from lce_rig.recordings.merging import merge_by_time
@@ -189,6 +188,7 @@ def decode_pointcloud2(message: Any) -> NDArray[Any]:
 CLOCK_JUMP_NS = 1_000_000_000
 # Drivers start within this many messages of each other; the span of a later one is not known beforehand.
 _N_PROBED = 500
+_NOT_DECODED = "could not be decoded"
 
 
 @dataclass
@@ -197,9 +197,8 @@ class _BagStream:
 
     last_ns: int | None = None
     n_yielded: int = 0
-    counts: Counter[str] = field(default_factory=Counter)
+    findings: DamageCounts = field(default_factory=DamageCounts)
     notes: set[str] = field(default_factory=set)
-    first_failure: str = ""
 
 
 class BagRecording:
@@ -268,8 +267,8 @@ class BagRecording:
         finally:
             self._summarise(streams)
         for topic, stream in streams.items():
-            if stream.n_yielded == 0 and stream.counts:
-                cause = stream.first_failure or "its timestamps do not increase"
+            if stream.n_yielded == 0 and stream.findings.counts:
+                cause = stream.findings.first.get(_NOT_DECODED, "its timestamps do not increase")
                 raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}")
 
     def _open_events(self) -> dict[Stream, CameraEvents]:
@@ -333,8 +332,7 @@ class BagRecording:
             return self._to_sample(message, content, target, stamp_ns, stream)
         except (SourceError, ValueError) as error:
             cause = error.what if isinstance(error, SourceError) else str(error)
-            stream.first_failure = stream.first_failure or cause
-            stream.counts["could not be decoded"] += 1
+            stream.findings.add(_NOT_DECODED, cause)
             return None
 
     def _to_sample(
@@ -353,18 +351,13 @@ class BagRecording:
         cloud = decode_pointcloud2(content)
         reading = to_scan(cloud, target.sensor, settings, message.topic, stamp_ns, message.log_ns)
         stream.notes.update(reading.notes)
-        n_dropped = reading.n_not_finite + reading.n_zero_range
-        stream.counts["points without a return"] += n_dropped
+        stream.findings.add("points without a return", n=reading.n_not_finite + reading.n_zero_range)
         return reading.scan
 
     def _summarise(self, streams: dict[str, _BagStream]) -> None:
         for topic, stream in streams.items():
-            for note in sorted(stream.notes):
-                self.notes.append(f"{topic}: {note}")
-            for what, count in sorted(stream.counts.items()):
-                cause = f" ({stream.first_failure})" if what == "could not be decoded" else ""
-                if count:
-                    self.notes.append(f"{topic}: {count} {what}{cause}")
+            lines = sorted(stream.notes) + stream.findings.lines()
+            self.notes += [f"{topic}: {line}" for line in lines]
 
 
 def _header_stamp_ns(content: Any) -> int:
@@ -393,11 +386,11 @@ def _is_in_order(sample: Image | Scan, stream: _BagStream) -> bool:
         stream.last_ns = stamp_ns
         return True
     if stamp_ns == stream.last_ns:
-        stream.counts["sent twice (equal timestamps)"] += 1
+        stream.findings.add("sent twice (equal timestamps)")
         return False
     if stream.last_ns - stamp_ns < CLOCK_JUMP_NS:
-        stream.counts["out of order (timestamps decrease)"] += 1
+        stream.findings.add("out of order (timestamps decrease)")
         return False
-    stream.counts["jumps of the clock back by more than 1 s"] += 1
+    stream.findings.add("jumps of the clock back by more than 1 s")
     stream.last_ns = stamp_ns
     return True

@@ -114,7 +114,7 @@ def test_losses_of_the_network_are_counted_and_shown_and_collection_goes_on(
         collecting.wait_for_captures(n_before + 1)
         assert collecting.end() == 0
     n_withheld = rig.stop()["withheld"]
-    found = re.search(r"lost on the way: .*lidar (\d+)", collecting.said)
+    found = re.search(r"dropped: .*lidar (\d+)", collecting.said)
     assert n_withheld > 300 and found is not None
     # A busy computer may lose some itself.
     assert n_withheld <= int(found[1]) < 1.2 * n_withheld

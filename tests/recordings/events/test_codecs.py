@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.core.data import Events
+from lce_rig.core.data import EventColumns, Events, join_events
 from lce_rig.recordings.events.prophesee_raw import Evt2Decoder
-from lce_rig.recordings.events.stream import EventColumns, join
 from lce_rig.recordings.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
 from lce_rig.recordings.ros.event_array import decode_event_array, encode_event_array
 from lce_rig.recordings.ros.event_messages import PacketDecoder, parse_packet
@@ -40,7 +39,7 @@ def test_streams_come_back_however_they_are_cut_into_blocks(
     words = np.frombuffer(encode(truth), dtype)
     decoder = decoder_of(name)
     parts = [decoder.decode(block) for block in np.split(words, sorted(min(c, len(words)) for c in cuts))]
-    assert columns_listed(join(parts)) == truth
+    assert columns_listed(join_events(parts)) == truth
     assert (decoder.n_unknown, decoder.n_untimed) == (0, 0)
 
 
@@ -129,7 +128,7 @@ def test_packets_of_every_encoding_come_back(encoding: str, is_ros1: bool, seed:
         data = encoders.packet(payload, encoding, is_ros1=is_ros1, base_ns=start_us * 1000, stamp_ns=77)
         parts += list(decoder.decode(parse_packet(data, "ros1" if is_ros1 else "cdr")))
     parts += list(decoder.finish())
-    assert columns_listed(join(parts)) == truth
+    assert columns_listed(join_events(parts)) == truth
     assert parts[0].host_ns == 77
 
 

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.core.event_file import encode_events
 from lce_rig.recordings.events import open_events
 from lce_rig.recordings.events.aedat4 import decode_frame
-from lce_rig.recordings.events.stream import DamageCounts, EventColumns, parse_size, to_ns
+from lce_rig.recordings.events.stream import DamageCounts, parse_size, to_ns
 from lce_rig.recordings.events.text import TextEvents
 from tests.notes import has_note, kinds
 from tests.recordings.events import encoders

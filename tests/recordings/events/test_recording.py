@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.events.event_recording import REORDER_NS, EventRecording
-from lce_rig.recordings.events.stream import DamageCounts, EventColumns
+from lce_rig.recordings.events.stream import DamageCounts
 from tests.notes import has_note
 from tests.recordings.events.encoders import random_events
 
@@ -155,23 +156,6 @@ def test_windows_hold_what_lies_between_their_ends_in_any_order(
         assert window.t_ns.tolist() == events.t_ns[inside].tolist()
         assert window.x.tolist() == events.x[inside].tolist()
         assert (window.width_px, window.height_px, window.sensor) == (346, 260, "events")
-
-
-def test_windows_that_go_forward_are_read_in_one_pass() -> None:
-    class CountedStream(ListedStream):
-        n_read = 0
-
-        def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
-            for stretch in self._stretches:
-                self.n_read += 1
-                yield stretch
-
-    stream = CountedStream([columns(np.arange(100) + 100 * i) for i in range(50)])
-    recording = EventRecording(PATH, stream, "events", None)
-    stream.n_read = 0
-    for start_us in range(0, 4900, 10):
-        assert len(recording.read(start_us * 1000, (start_us + 60) * 1000)) == 60
-    assert stream.n_read <= 51
 
 
 def test_the_host_clock_is_taken_from_the_packet_that_waited_least() -> None:

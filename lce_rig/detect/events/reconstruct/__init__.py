@@ -1,4 +1,4 @@
-"""Pictures from events: voxel grids, the recurrent network, the event map, and pictures at any stamp."""
+"""Images from events: voxel grids, the recurrent network, the event map, and images at any timestamp."""
 
 from lce_rig.detect.events.reconstruct.model import ReconstructionModel, model_bytes
 from lce_rig.detect.events.reconstruct.reconstructor import ReconstructionOptions, Reconstructor

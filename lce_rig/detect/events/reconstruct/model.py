@@ -1,4 +1,4 @@
-"""The network file: what it must offer, and one step of it."""
+"""The network file: its required inputs and outputs, and one step of it."""
 
 import math
 import re
@@ -19,14 +19,14 @@ _MAX_MULTIPLE = 256
 
 _EXPECTED = (
     "expected the inputs voxels (1, bins, height, width) and states (1, channels, height_2, width_2) with "
-    "height_2 meaning half of the height and so on, and the outputs picture (1, 1, height, width) and the "
+    "height_2 meaning half of the height and so on, and the outputs image (1, 1, height, width) and the "
     "next states in the same order; docs/model-card.md says how to export such a file"
 )
 
 
 @dataclass(frozen=True)
 class StateSpec:
-    """A recurrent state's channels and its size as a fraction of the picture's: 2 is half."""
+    """A recurrent state's channels and its size as a fraction of the image's: 2 is half."""
 
     name: str
     n_channels: int
@@ -37,7 +37,7 @@ class ReconstructionModel:
     """A recurrent event-to-image network in ONNX, its state explicit.
 
     Args:
-        path: ONNX file; None takes the one shipped with the package.
+        path: ONNX file; None for the one shipped with the package.
         n_threads: threads of onnxruntime.
 
     Raises:
@@ -53,10 +53,10 @@ class ReconstructionModel:
             raise self._refused(f"{len(inputs)} inputs and {len(outputs)} outputs")
         self.n_bins = self._check_voxels(inputs[0])
         self.states = tuple(self._read_state(item) for item in inputs[1:])
-        # The picture is padded so that every state has a whole number of rows and columns.
+        # The image is padded so that every state has a whole number of rows and columns.
         self.size_multiple = math.lcm(2, *(state.divisor for state in self.states))
         if self.size_multiple > _MAX_MULTIPLE:
-            raise self._refused(f"pictures would be padded to multiples of {self.size_multiple} px")
+            raise self._refused(f"images would be padded to multiples of {self.size_multiple} px")
 
     def initial_states(self, height_px: int, width_px: int) -> States:
         """Make the states before the first window for a sensor of this size: zeros.
@@ -83,7 +83,7 @@ class ReconstructionModel:
             states: as the last step or `initial_states` gave them.
 
         Returns:
-            picture (H, W), arbitrary scale; next states.
+            image (H, W), arbitrary scale; next states.
         """
         _, height, width = voxels.shape
         rows, cols = self._padded(height) - height, self._padded(width) - width
@@ -127,7 +127,7 @@ def model_bytes(path: Path | None) -> bytes:
     """
     if path is None:
         return (resources.files("lce_rig") / "models" / "reconstruction.onnx").read_bytes()
-    hint = "leave the key out for the shipped one"
+    hint = "Omit the key to use the shipped one."
     try:
         return read_file(path)
     except FileNotFoundError as error:
@@ -144,7 +144,7 @@ def _load(path: Path | None, name: str, n_threads: int) -> NetworkSession:
     try:
         return LocalSession(content, n_threads) if path is None else ProcessSession(content, n_threads)
     except ImportError as error:
-        raise SourceError("onnxruntime is not installed", "pip install onnxruntime") from error
+        raise SourceError("onnxruntime is not installed", "Run: pip install onnxruntime") from error
     except NetworkError as error:
         hint = error.hint or _EXPECTED
         raise ProfileError(f"reconstruction model {name}: cannot be loaded: {error}", hint) from error

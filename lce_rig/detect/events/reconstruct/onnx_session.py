@@ -13,11 +13,11 @@ Shape = tuple[int | str | None, ...]
 
 
 class NetworkError(Exception):
-    """What onnxruntime, or the process it runs in, says is wrong.
+    """An error of onnxruntime or of its process.
 
     Args:
         what: one line.
-        hint: what to do about it; empty where the file is not what is expected.
+        hint: what to do about it; empty if the file is not what is expected.
     """
 
     def __init__(self, what: str, hint: str = "") -> None:

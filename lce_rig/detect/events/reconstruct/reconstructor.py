@@ -1,4 +1,4 @@
-"""Pictures from an event stream, at any time asked for."""
+"""Images from an event stream at any requested time."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,22 +17,22 @@ from lce_rig.detect.events.reconstruct.model import ReconstructionModel, States
 from lce_rig.detect.events.reconstruct.voxels import FloatArray, event_map, normalise_voxels, voxel_grid
 from lce_rig.detect.events.reconstruct.windows import WindowOptions, WindowRule, active_share, window_rule
 
-# Why there is no picture at a stamp.
+# Why there is no image at a timestamp.
 
 
 def still_cold(n_steps: int, n_warm_up: int, seen_ns: int) -> Refusal:
-    """Too little of the stream precedes the stamp for the network's state to have settled."""
+    """Too little of the stream precedes the timestamp for the network's state to have settled."""
     figures = {"n_steps": n_steps, "n_warm_up": n_warm_up, "seen_s": 1e-9 * seen_ns}
     return Refusal("read.network_settling", figures=figures)
 
 
 def too_early(stamp_ns: int, first_ns: int) -> Refusal:
-    """The stamp lies before the stream."""
+    """The timestamp lies before the stream."""
     return Refusal("read.before_events", figures={"gap_s": 1e-9 * (first_ns - stamp_ns)})
 
 
 def too_late(stamp_ns: int, last_ns: int | None) -> Refusal:
-    """The stamp lies after the stream, or there is no stream."""
+    """The timestamp lies after the stream, or there is no stream."""
     if last_ns is None:
         return Refusal("read.no_events")
     return Refusal("read.after_events", figures={"gap_s": 1e-9 * (stamp_ns - last_ns)})
@@ -46,10 +46,10 @@ _MIN_SPREAD = 0.05
 
 
 class GreyScale(Protocol):
-    """What maps the pictures of a stream to 8 bits."""
+    """Mapping of a stream's images to 8 bits."""
 
     def follow(self, picture: FloatArray) -> None:
-        """Take the next picture of the stream into account, (H, W)."""
+        """Take the next image of the stream into account, (H, W)."""
         ...
 
     def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
@@ -61,7 +61,7 @@ class SignedScale:
     """Nothing is grey 128, sums of polarities brighter and darker alike, but for the largest twentieth."""
 
     def follow(self, picture: FloatArray) -> None:
-        """Every map stands for itself."""
+        """Do nothing, as every map is independent."""
 
     def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
         """Map (H, W) to uint8."""
@@ -71,10 +71,10 @@ class SignedScale:
 
 
 class IntensityScale:
-    """Robust minimum and maximum, smoothed over pictures.
+    """Robust minimum and maximum, smoothed over images.
 
     Args:
-        memory: weight of the past, per picture, in [0, 1).
+        memory: weight of the past, per image, in [0, 1).
     """
 
     def __init__(self, memory: float = 0.8) -> None:
@@ -82,7 +82,7 @@ class IntensityScale:
         self._smooth: NDArray[np.float64] | None = None
 
     def follow(self, picture: FloatArray) -> None:
-        """Take the next picture of the stream into account, (H, W)."""
+        """Take the next image of the stream into account, (H, W)."""
         bounds = _bounds(picture)
         if self._smooth is not None:
             bounds = self._memory * self._smooth + (1 - self._memory) * bounds
@@ -106,11 +106,11 @@ def _bounds(picture: FloatArray) -> NDArray[np.float64]:
 
 
 class EventImager(Protocol):
-    """What turns windows of events into pictures, one step a window."""
+    """Turns windows of events into images, one step per window."""
 
     @property
     def n_warm_up(self) -> int:
-        """Steps before pictures can be trusted."""
+        """Steps before images can be trusted."""
         ...
 
     def initial_states(self, height_px: int, width_px: int) -> States:
@@ -118,13 +118,13 @@ class EventImager(Protocol):
         ...
 
     def grey_scale(self) -> GreyScale:
-        """Make what maps the pictures of one stream to 8 bits."""
+        """Make what maps the images of one stream to 8 bits."""
         ...
 
     def picture(
         self, events: Events, start_ns: int, end_ns: int, states: States
     ) -> tuple[FloatArray, States]:
-        """Make the picture (H, W) at end_ns from the window [start_ns, end_ns) and the states before it."""
+        """Make the image (H, W) at end_ns from the window [start_ns, end_ns) and the states before it."""
         ...
 
 
@@ -181,21 +181,21 @@ class MapImager:
 _MIN_FILL = 0.5
 # Nothing happens in a longer silence: it is passed over in one stride, states kept.
 _LONGEST_SILENCE_NS = 2_000_000_000
-# A stream cut off at the stamp ends with its last event, a little before.
+# A stream cut off at the timestamp ends with its last event, a little before.
 _MAX_AFTER_END_NS = 100_000_000
 _SHARE_MEMORY = 0.8
 
 
 @dataclass(frozen=True)
 class ReconstructionOptions:
-    """How events become pictures.
+    """How events become images.
 
     Attributes:
         method: "network" (recurrent reconstruction) or "map" (polarity sums, for comparison).
         windows: how the stream is cut.
-        n_warm_up: windows of the network before its pictures count.
+        n_warm_up: windows of the network before its images count.
         is_filtered: leave out hot pixels and background activity.
-        channel: the channel that pictures are said to come from.
+        channel: the channel of the images.
         n_threads: threads of onnxruntime.
     """
 
@@ -217,11 +217,11 @@ class _Window:
 
 
 class Reconstructor:
-    """Runs over one event stream; its recurrent state spans the whole stream.
+    """Runs over one event stream, with a recurrent state for the whole stream.
 
-    Windows are cut by the events alone, so that neither the batches in which events arrive nor the stamps
-    asked for change what the network has seen: a picture at a stamp is a side step from the running state
-    with the events up to the stamp.
+    Windows are cut by the events alone, so that neither the batches in which events arrive nor the timestamps
+    asked for change what the network has seen: an image at a timestamp is a side step from the running state
+    with the events up to the timestamp.
 
     Args:
         model: ONNX file; None takes the one shipped with the package.
@@ -256,15 +256,15 @@ class Reconstructor:
 
     @property
     def is_warm(self) -> bool:
-        """Whether enough of the stream has been seen for pictures to count."""
+        """Whether enough of the stream has been seen for images to count."""
         return self.n_steps >= self._imager.n_warm_up
 
     def step(self, events: Events, start_ns: int | None = None, end_ns: int | None = None) -> FloatArray:
-        """Advance by a window of the caller's choice and give its picture, (H, W), arbitrary scale.
+        """Advance by a window of the caller's choice and give its image, (H, W), arbitrary scale.
 
         Args:
             events: the window's events; following windows must follow in time.
-            start_ns, end_ns: its bounds; None takes the first and the last event's stamp.
+            start_ns, end_ns: its bounds; None takes the first and the last event's timestamp.
         """
         if start_ns is None:
             start_ns = int(events.t_ns[0]) if len(events) else 0
@@ -277,22 +277,22 @@ class Reconstructor:
         return self._commit(end_ns)
 
     def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
-        """Map a picture of `step` to uint8, (H, W), with percentiles smoothed over the steps so far."""
+        """Map an image of `step` to uint8, (H, W), with percentiles smoothed over the steps so far."""
         return self._scale.to_grey(picture)
 
     def reconstruct(
         self, batches: Iterable[Events], stamps_ns: Sequence[int] | None = None, every_ns: int | None = None
     ) -> Iterator[Image | Refusal]:
-        """Give one picture, or the reason for none, for every stamp, in the order of the stamps.
+        """Return one image, or the reason for none, for every timestamp, in the order of the timestamps.
 
         Args:
             batches: the stream from its beginning, in time order, cut anywhere.
-            stamps_ns: when pictures are wanted, never decreasing, the events' clock.
-            every_ns: in place of stamps: one picture every so many ns from the first event on.
+            stamps_ns: when images are wanted, never decreasing, the events' clock.
+            every_ns: instead of stamps_ns, one image per this period from the first event on.
 
         Raises:
             SourceError: the batches are of different sensors or go back in time.
-            UsageError: neither or both of stamps_ns and every_ns, or stamps out of order.
+            UsageError: neither or both of stamps_ns and every_ns, or timestamps out of order.
         """
         _check_request(stamps_ns, every_ns)
         self.reset()
@@ -315,10 +315,10 @@ class Reconstructor:
             yield self._picture_at(stamp_ns) if is_covered else too_late(stamp_ns, last_ns)
 
     def feed(self, events: Events) -> None:
-        """Take the next events of a stream that runs on; `picture_at` gives its pictures.
+        """Take the next events of a stream that runs on; `picture_at` gives its images.
 
         Args:
-            events: up to the next stamp that a picture will be asked for, or shorter.
+            events: up to the next timestamp that an image will be asked for, or shorter.
 
         Raises:
             SourceError: they are of another sensor or go back in time.
@@ -329,12 +329,12 @@ class Reconstructor:
             self._advance(self._fed_ns)
 
     def picture_at(self, stamp_ns: int, *, is_step: bool = False) -> Image | Refusal:
-        """Give the picture at a stamp up to which the stream was fed, or the reason for none.
+        """Return the image at a timestamp up to which the stream was fed, or the reason for none.
 
         Args:
             stamp_ns: on the events' clock.
-            is_step: end the window there where it is half full, so that the network does not run again over
-                its events; later pictures then depend on the stamps asked for.
+            is_step: end the window there if it is half full, so that the network does not run again over its
+                events; later images then depend on the requested timestamps.
         """
         if self._first_ns is None:
             return too_late(stamp_ns, None)
@@ -355,12 +355,12 @@ class Reconstructor:
         if size != expected:
             raise SourceError(
                 f"{batch.sensor}: events of {size} px follow events of {expected} px",
-                "name one sensor's stream",
+                "Give one sensor's stream.",
             )
         if last_ns is not None and int(batch.t_ns[0]) < last_ns:
             back_s = (last_ns - int(batch.t_ns[0])) / 1e9
             raise SourceError(
-                f"{batch.sensor}: events go back in time by {back_s:.6f} s", "sort the recording"
+                f"{batch.sensor}: events go back in time by {back_s:.6f} s", "Sort the recording."
             )
         self._current = replace(self._current, events=join_events([pending, batch]))
 
@@ -423,8 +423,8 @@ class Reconstructor:
 
 def _check_request(stamps_ns: Sequence[int] | None, every_ns: int | None) -> None:
     if (stamps_ns is None) == (every_ns is None):
-        raise UsageError("either stamps_ns or every_ns says when pictures are wanted")
+        raise UsageError("give either stamps_ns or every_ns")
     if stamps_ns is not None and np.any(np.diff(np.asarray(stamps_ns, dtype=np.int64)) < 0):
-        raise UsageError("stamps at which pictures are wanted must not decrease")
+        raise UsageError("stamps_ns must not decrease")
     if every_ns is not None and every_ns <= 0:
-        raise UsageError(f"a picture every {every_ns} ns makes no sense")
+        raise UsageError(f"every_ns is {every_ns} (minimum 1)")

@@ -18,7 +18,7 @@ def voxel_grid(
     Args:
         events: N events.
         n_bins: B.
-        start_ns, end_ns: t0 and t0 + dt; None takes the first and the last event's stamp.
+        start_ns, end_ns: t0 and t0 + dt; None takes the first and the last event's timestamp.
 
     Returns:
         (B, H, W) float32, polarity +-1.
@@ -37,7 +37,7 @@ def voxel_grid(
     pixel = _pixel_index(events)
     n_pixels = events.height_px * events.width_px
     voxels = np.zeros((n_bins, n_pixels))
-    # Events are in time order: those between two bins form a slice, counted into two pictures.
+    # Events are in time order: those between two bins form a slice, counted into two images.
     bounds = np.searchsorted(position, np.arange(n_bins))
     bounds[-1] = len(position)
     for bin_, (first, last) in enumerate(pairwise(bounds)):

@@ -49,7 +49,7 @@ class WindowRule:
     longest_ns: int
 
     def fill(self, n_events: int, age_ns: int) -> float:
-        """Tell how full a window is, 1 where it ends."""
+        """Return how full a window is, 1 where it ends."""
         by_count = min(n_events / self.n_events, age_ns / self.shortest_ns if self.shortest_ns else np.inf)
         return max(by_count, age_ns / self.longest_ns)
 
@@ -62,7 +62,7 @@ class WindowRule:
         ends = [longest_end] if len(events) and int(events.t_ns[-1]) >= longest_end else []
         if len(events) >= self.n_events:
             filled = max(int(events.t_ns[self.n_events - 1]) + 1, start_ns + self.shortest_ns)
-            # Equal stamps may go on in events yet to come: wait for a later one.
+            # Equal timestamps may go on in events yet to come: wait for a later one.
             if int(events.t_ns[-1]) >= filled:
                 ends.append(filled)
         return min(ends, default=None)
@@ -84,7 +84,7 @@ def active_share(events: Events) -> float:
     """Measure what share of the sensor the events come from: (sum n)^2 / (B sum n^2) over B blocks.
 
     The participation ratio does not depend on how many events there are, only on how they are spread; with it
-    a small board before a still background gets windows of the same few pixels of motion as a full picture.
+    a small board before a still background gets windows of the same few pixels of motion as a full image.
     """
     if not len(events):
         return 1.0

@@ -8,6 +8,7 @@ scan; a pipe would take ten and need both processes at once. What comes back is 
 import os
 import pickle
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from multiprocessing.sharedctypes import RawArray
-from types import TracebackType
+from types import ModuleType, TracebackType
 from typing import Any
 
 from lce_rig.core.errors import LceRigError, SourceError
@@ -96,7 +97,7 @@ class Worker:
         self._shared = memoryview(shared).cast("B")
         arguments = theirs, shared, self._nice, *self._made
         process = context.Process(target=_serve, args=arguments, name=self._name, daemon=True)
-        with _one_thread():
+        with _one_thread(), _without_main():
             start_without_interrupts(process)
         theirs.close()
         self._connection, self._process = ours, process
@@ -127,6 +128,17 @@ def _one_thread() -> Iterator[None]:
                     del os.environ[name]
                 else:
                     os.environ[name] = value
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Hide the program from a process that starts now: a script without a guard would run there once more."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _pack(request: object, shared: memoryview) -> tuple[bytes, _Spans]:
