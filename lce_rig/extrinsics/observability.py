@@ -46,7 +46,7 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
     names = list(dict.fromkeys(name_direction(vector) for vector in vectors[:, weak].T))
     spread_deg = normal_spread_deg(features)
     raise NotEnoughDataError(
-        f"{' and '.join(names)} cannot be told from {len(features)} captures: their boards are nearly "
+        f"{' and '.join(names)} cannot be determined from {len(features)} captures: their boards are nearly "
         f"parallel (normals spread by {spread_deg:.1f} deg)",
         "Add captures with the board tilted by 20 deg or more, left and right as well as up and down.",
     )
