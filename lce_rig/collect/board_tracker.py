@@ -1,6 +1,6 @@
 """The board followed from frame to frame, in every picture and scan."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -49,16 +49,46 @@ class BoardDetection:
         return bool(self.images.keys() - self.unfit.keys() and self.lidars)
 
 
-@dataclass(frozen=True, eq=False)
-class CaptureMoment:
-    """A sighting worth a capture.
+@dataclass(frozen=True)
+class HeldStill:
+    """A board that stood still: by how much it moved while the sensors saw it, m."""
+
+    motion_m: float
+
+
+@dataclass(frozen=True)
+class MovedSlowly:
+    """A board that moved before an event camera.
 
     Attributes:
-        figures: how still or how fast the board was, by name; kept with the capture.
+        speed_mps: of its middle.
+        unsteady_m: rms distance of its way from a straight and steady one.
+        events_px: events per pixel of the board in the second before its image.
     """
 
+    speed_mps: float
+    unsteady_m: float
+    events_px: float
+
+
+@dataclass(frozen=True)
+class TakenByHand:
+    """A board that somebody captured by a key, however it moved."""
+
+    by_hand: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureMoment:
+    """A sighting worth a capture, and how the board moved; both are kept."""
+
     sighting: BoardDetection
-    figures: dict[str, float]
+    motion: HeldStill | MovedSlowly | TakenByHand
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """List the figures of the motion by name, as the capture keeps them."""
+        return asdict(self.motion)
 
 
 @dataclass

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey, MovedSlowly
 from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
@@ -59,8 +59,7 @@ def judge_sighting(
         options: how a moving board is judged.
 
     Returns:
-        The moment with its figures speed_mps, unsteady_m (rms distance of the board's way from a straight and
-        steady one) and events_px; why it is none; or None where the watcher has counted why.
+        The moment; why it is none; or None where the watcher has counted why.
     """
     cuts = {cut.sensor: cut for cut in sighting.frame.events}
     if sighting.images and not cuts:
@@ -102,8 +101,8 @@ def _judge_camera(
         lamps = look_for_flicker(recent)
         if lamps is not None:
             return lamps
-    figures = {"speed_mps": speed_mps, "unsteady_m": unsteady_m, "events_px": events_px}
-    return CaptureMoment(sighting, {name: round(value, 5) for name, value in figures.items()})
+    slow = MovedSlowly(round(speed_mps, 5), round(unsteady_m, 5), round(events_px, 5))
+    return CaptureMoment(sighting, slow)
 
 
 def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, float] | None:

@@ -79,7 +79,8 @@ def calibrate_channels(
     estimate = _widened(calibrate_observations(mover.observations(), board, options, progress), offsets)
     for consensus in agreed.values():
         estimate = with_consensus(estimate, consensus)
-    estimate = replace(estimate, refused={**conflicts, **estimate.refused})
+    same_scan = {scan.capture: scan.captures for scan in scans if len(scan.captures) > 1}
+    estimate = replace(estimate, refused={**conflicts, **estimate.refused}, same_scan=same_scan)
     alone = {name: _alone_moved(mover, name, board, options, offsets) for name in agreed}
     results = tuple(
         _channel_result(
@@ -162,8 +163,8 @@ def _offsets(
     """Estimate the channels' time offsets; None if the boards did not move."""
     unit = 1 / NOMINAL_SIGMA_M**2
     weights = Weights(
-        plane=start.diagnostics["plane_weight"] * unit,
-        edge=start.diagnostics["edge_weight"] * unit,
+        plane=start.diagnostics.plane_weight * unit,
+        edge=start.diagnostics.edge_weight * unit,
         shift_prior=options.parts.edge_shift_precision,
     )
     moving = np.flatnonzero(samples.tells_motion).tolist()

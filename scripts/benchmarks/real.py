@@ -120,7 +120,7 @@ def _only(detections: Detections, names: set[str]) -> Detections:
 def _clock_rows(recorded: RecordedSet, rig: Rig, detections: Detections) -> Iterator[tuple[object, ...]]:
     (calibration, *_), _ = pipeline.calibrate_detections(rig, detections)
     figures = calibration.diagnostics
-    apart = f"{figures['channels_rotation_deg']:.2f} / {1000 * figures['channels_translation_m']:.1f}"
+    apart = f"{figures.channels_rotation_deg:.2f} / {1000 * figures.channels_translation_m:.1f}"
     for result in calibration.channel_results:
         clock = "-"
         if result.time_offset_s is not None and result.time_offset_sigma_s is not None:

@@ -12,7 +12,13 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment, without_samples
+from lce_rig.collect.board_tracker import (
+    BoardDetection,
+    BoardTracker,
+    CaptureMoment,
+    TakenByHand,
+    without_samples,
+)
 from lce_rig.collect.live.capture_triggers import LiveGate, SlowBoards, StillBoards
 from lce_rig.collect.live.capture_writer import CaptureWriter, Task, record_streams
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
@@ -337,7 +343,7 @@ class _Loop:
         if self._seeing_guide(sighting) is None:
             self._monitor.cue("refused", "not captured: not every sensor sees the board")
             return
-        confirmed = self._search.confirm(CaptureMoment(sighting, {"by_hand": 1.0}))
+        confirmed = self._search.confirm(CaptureMoment(sighting, TakenByHand()))
         if isinstance(confirmed, CaptureMoment):
             self._capture(confirmed)
         else:

@@ -107,8 +107,8 @@ class _Teacher:
         figures = estimate.diagnostics
         learned = Learned(
             estimate.T_cam_lidar,
-            figures["fit_plane_rms_m"],
-            figures["fit_edge_rms_m"],
+            figures.fit_plane_rms_m,
+            figures.fit_edge_rms_m,
             len(estimate.used),
         )
         return self._guides[k].prepare(learned)

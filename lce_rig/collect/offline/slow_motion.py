@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, MovedSlowly
 from lce_rig.collect.event_moment import MotionOptions, judge_sighting
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.losses import Losses
@@ -122,8 +122,10 @@ class _Chooser:
 
     def _badness(self, moment: CaptureMoment) -> tuple[bool, float]:
         is_short = any(cut.missing_ns > 0 for cut in moment.sighting.frame.events)
-        speed_ratio = max(moment.figures["speed_mps"], 1e-3) / self._options.best_speed_mps
-        return is_short, abs(float(np.log(speed_ratio))) + moment.figures["unsteady_m"] / _UNSTEADY_M
+        motion = moment.motion
+        assert isinstance(motion, MovedSlowly)
+        speed_ratio = max(motion.speed_mps, 1e-3) / self._options.best_speed_mps
+        return is_short, abs(float(np.log(speed_ratio))) + motion.unsteady_m / _UNSTEADY_M
 
 
 class _Neighbours:

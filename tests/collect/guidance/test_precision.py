@@ -86,7 +86,7 @@ def test_predicted_scatter_is_that_of_many_sessions(poses):
     figures = [run.diagnostics for run in runs]
     learned = SURROGATE
     for key, name in (("plane_m", "fit_plane_rms_m"), ("edge_m", "fit_edge_rms_m")):
-        learned = replace(learned, **{key: float(np.mean([each[name] for each in figures]))})
+        learned = replace(learned, **{key: float(np.mean([getattr(each, name) for each in figures]))})
     predicted = combine(weigh_placements(model(learned), poses, T_FORWARD), learned)
     for actual, expected in zip(sigmas(np.cov(errors.T)), sigmas(predicted.cov), strict=True):
         assert 0.75 < expected / actual < 1.33
