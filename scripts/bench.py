@@ -11,6 +11,8 @@
     scripts/bench.py goes_on     collections on the simulated rig: do all end with --captures?
     scripts/bench.py corruptions  sessions that are wrong as a whole: verdict, error and reported uncertainty
     scripts/bench.py live        live collection under load, over real transports, for --seconds
+    scripts/bench.py offline     a bag of VLP-16 and 1280x720 at 30 Hz, of --seconds, collected from
+    scripts/bench.py usable      are captures that are taken usable? live sessions, --record, recordings
     scripts/bench.py uncertainty  the joint estimate: errors against their bound, truth of its claim
     scripts/bench.py speed       detection, Algorithm 1, the command line
 
@@ -35,6 +37,8 @@ PARTS = {
     "uncertainty": 100,
     "goes_on": 10,
     "live": 0,
+    "offline": 0,
+    "usable": 20,
     "speed": 0,
 }
 
@@ -58,16 +62,18 @@ def main() -> None:
         help="folder of `paper`, and of what `uncertainty` keeps",
     )
     parser.add_argument(
-        "--captures", type=int, help="of each session of `uncertainty` (default 30) and `goes_on` (20)"
+        "--captures",
+        type=int,
+        help="of a session of `uncertainty` (default 30), `goes_on` (20), `usable` (5)",
     )
-    parser.add_argument("--first-seed", type=int, default=0, help="of `goes_on` (default 0)")
+    parser.add_argument("--first-seed", type=int, default=0, help="of `goes_on` and `usable` (default 0)")
     parser.add_argument(
         "--methods", default="", help="those `paper` runs anew (default: what is not kept); that of `real`"
     )
     parser.add_argument(
         "--scans", type=int, default=100, help="simulated sessions that `faults` draws from (100)"
     )
-    parser.add_argument("--seconds", type=float, default=60, help="that `live` takes (default 60)")
+    parser.add_argument("--seconds", type=float, help="that `live` takes (60), of the bag of `offline` (15)")
     arguments = parser.parse_args()
     bench = getattr(import_module(f"benchmarks.{arguments.part}"), f"bench_{arguments.part}")
     if arguments.part == "real":
@@ -85,12 +91,17 @@ def main() -> None:
     elif arguments.part == "goes_on":
         seeds = arguments.seeds or PARTS["goes_on"]
         bench(seeds, arguments.captures or 20, arguments.only, arguments.first_seed)
+    elif arguments.part == "usable":
+        seeds = PARTS["usable"] if arguments.seeds is None else arguments.seeds
+        bench(seeds, arguments.captures or 5, arguments.only, arguments.first_seed)
     elif arguments.part == "faults":
         bench(arguments.seeds or PARTS["faults"], n_sessions=arguments.scans)
     elif arguments.part == "corruptions":
         bench(arguments.only)
     elif arguments.part == "live":
-        bench(arguments.seconds)
+        bench(arguments.seconds or 60.0)
+    elif arguments.part == "offline":
+        bench(arguments.seconds or 15.0)
     elif arguments.part == "speed":
         bench()
     else:

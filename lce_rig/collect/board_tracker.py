@@ -1,16 +1,24 @@
-"""The board followed from frame to frame, in every picture and scan."""
+"""The board followed from frame to frame, in every image and scan."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
 
 from lce_rig.core.data import Image, Scan
+from lce_rig.core.geometry import Array, invert
 from lce_rig.core.losses import Losses
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.detect.finder import BoardFinder, ImageSearch
 from lce_rig.detect.image.search import NOT_SEEN_AT_ONCE
+from lce_rig.extrinsics.consensus import CENTRE_TOLERANCE_M, NORMAL_TOLERANCE_RAD
 from lce_rig.rig import Rig
+from lce_rig.rig.nominal import NominalExtrinsic
 from lce_rig.timing.scan_pairing import Frame
 
 ImageKey = tuple[str, str]
+
+# A candidate is the camera's board where it lies as far from it as nominal extrinsics may be off, and a half.
+_NOMINAL_MARGIN = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +32,7 @@ class BoardDetection:
         unseen: why it was not found, by (camera, channel), where it was looked for.
         unscanned: why there is no such candidate, by LiDAR, where it was looked for.
         unfit: why the profile's limits refuse a board of `images`, by (camera, channel).
+        is_moving: whether images were not searched because nothing that may be the board is at rest there.
     """
 
     frame: Frame
@@ -32,6 +41,7 @@ class BoardDetection:
     unseen: dict[ImageKey, Refusal] = field(default_factory=dict)
     unscanned: dict[str, Refusal] = field(default_factory=dict)
     unfit: dict[ImageKey, Refusal] = field(default_factory=dict)
+    is_moving: bool = False
 
     @property
     def is_usable(self) -> bool:
@@ -39,16 +49,46 @@ class BoardDetection:
         return bool(self.images.keys() - self.unfit.keys() and self.lidars)
 
 
-@dataclass(frozen=True, eq=False)
-class CaptureMoment:
-    """A sighting worth a capture.
+@dataclass(frozen=True)
+class HeldStill:
+    """A board that stood still: by how much it moved while the sensors saw it, m."""
+
+    motion_m: float
+
+
+@dataclass(frozen=True)
+class MovedSlowly:
+    """A board that moved before an event camera.
 
     Attributes:
-        figures: how still or how fast the board was, by name; kept with the capture.
+        speed_mps: of its middle.
+        unsteady_m: rms distance of its way from a straight and steady one.
+        events_px: events per pixel of the board in the second before its image.
     """
 
-    sighting: BoardDetection
-    figures: dict[str, float]
+    speed_mps: float
+    unsteady_m: float
+    events_px: float
+
+
+@dataclass(frozen=True)
+class TakenByHand:
+    """A board that somebody captured by a key, however it moved."""
+
+    by_hand: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureMoment:
+    """A detection worth a capture, and how the board moved; both are kept."""
+
+    detection: BoardDetection
+    motion: HeldStill | MovedSlowly | TakenByHand
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """List the figures of the motion by name, as the capture keeps them."""
+        return asdict(self.motion)
 
 
 @dataclass
@@ -57,7 +97,7 @@ class BoardTracker:
 
     Attributes:
         rig: the profile.
-        search_interval_s: how often a whole picture is searched while no board is in sight.
+        search_interval_s: how often a whole image is searched while no board is in sight.
         refusals: frames in which it was not found, and boards that were found and cannot be used.
         thorough_interval_s: how often such a search is thorough, which takes most of a second; 0 for always.
         rescan_interval_s: how often a whole scan is searched while all candidates are followed; 0 for as
@@ -74,12 +114,17 @@ class BoardTracker:
     _n_candidates: dict[str, int] = field(default_factory=dict)
     _searched_ns: dict[ImageKey | str, int] = field(default_factory=dict)
     _thorough_ns: dict[ImageKey | str, int] = field(default_factory=dict)
+    _are_proved: set[tuple[str, str]] = field(default_factory=set)
 
     def __post_init__(self) -> None:
         self.finder = BoardFinder(self.rig)
 
     def sight(self, frame: Frame) -> BoardDetection:
-        """Find the board in every picture and scan of a frame."""
+        """Find the board in every image and scan of a frame."""
+        return self.sight_in_scans(self.sight_in_images(frame))
+
+    def sight_in_images(self, frame: Frame) -> BoardDetection:
+        """Find the board in every image of a frame; what follows from scans is empty."""
         images: dict[ImageKey, ImageBoard] = {}
         unseen: dict[ImageKey, Refusal] = {}
         unfit: dict[ImageKey, Refusal] = {}
@@ -94,22 +139,28 @@ class BoardTracker:
             images[key] = found.board
             if isinstance(found.usable, Refusal):
                 unfit[key] = found.usable
-                self.refusals.add(found.usable)
+        return BoardDetection(frame, images, {}, unseen, {}, unfit)
+
+    def sight_in_scans(self, detection: BoardDetection) -> BoardDetection:
+        """Find the board in every scan too, where an image shows it, and count what cannot be used."""
+        for refusal in detection.unfit.values():
+            self.refusals.add(refusal)
         lidars: dict[str, list[LidarBoard]] = {}
         unscanned: dict[str, Refusal] = {}
         # Nothing is gained from scans while no camera sees the board.
-        for scan in frame.scans if images else ():
-            candidates = self._find_in_scan(scan, frame.time_ns)
+        for scan in detection.frame.scans if detection.images else ():
+            candidates = self._find_in_scan(scan, detection.frame.time_ns)
             if isinstance(candidates, Refusal):
                 unscanned[scan.sensor] = candidates
             else:
                 lidars[scan.sensor] = candidates
-        if not images:
+        if not detection.images:
             self._n_candidates.clear()  # A board that comes back is searched for at once.
-            self.refusals.add(Refusal("image.none"))
+            if not detection.is_moving:
+                self.refusals.add(Refusal("image.none"))
         elif not lidars:
             self.refusals.add(Refusal("lidar.none"))
-        return BoardDetection(frame, images, lidars, unseen, unscanned, unfit)
+        return replace(detection, lidars=lidars, unscanned=unscanned)
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
         """Search the frame of a moment without a prior, as `check` does: what is captured can be used later.
@@ -117,20 +168,44 @@ class BoardTracker:
         Returns:
             The moment with what was found; or why it cannot be used.
         """
-        sighting = moment.sighting
-        keys = sighting.images.keys()
+        detection = moment.detection
+        keys = detection.images.keys()
         images = {
             (image.sensor, image.channel): self.finder.image(image)
-            for image in sighting.frame.images
+            for image in detection.frame.images
             if (image.sensor, image.channel) in keys
         }
-        scans = {scan.sensor: self.finder.scan(scan) for scan in sighting.frame.scans}
+        scans = {scan.sensor: self.finder.scan(scan) for scan in detection.frame.scans}
         usable = {key: board for key, board in images.items() if isinstance(board, ImageBoard)}
         lidars = {name: boards for name, boards in scans.items() if isinstance(boards, list)}
         for found, refused in ((usable, images), (lidars, scans)):
             if not found:
                 return next(why for why in refused.values() if isinstance(why, Refusal))
-        return replace(moment, sighting=BoardDetection(sighting.frame, usable, lidars))
+        elsewhere = self._find_elsewhere(usable, lidars)
+        if elsewhere is not None:
+            return elsewhere
+        return replace(moment, detection=BoardDetection(detection.frame, usable, lidars))
+
+    def _find_elsewhere(
+        self, images: dict[ImageKey, ImageBoard], lidars: dict[str, list[LidarBoard]]
+    ) -> Refusal | None:
+        """Find whether the candidates in the scans are other things than the board in the images.
+
+        Nominal extrinsics may be wrong: they decide for a camera and a LiDAR once they have fitted a moment.
+        """
+        elsewhere: Refusal | None = None
+        for (camera, _), board in images.items():
+            for lidar, candidates in lidars.items():
+                nominal = self.rig.nominal(camera, lidar)
+                if nominal is None:
+                    return None
+                nearest = _compare(board, candidates, nominal)
+                if nearest is None:
+                    self._are_proved.add((camera, lidar))
+                if nearest is None or (camera, lidar) not in self._are_proved:
+                    return None
+                elsewhere = nearest
+        return elsewhere
 
     def _find_in_image(self, image: Image, key: ImageKey, time_ns: int) -> ImageSearch | None:
         last = self._seen.pop(key, None)
@@ -165,7 +240,7 @@ class BoardTracker:
         return _is_due(self._searched_ns, key, time_ns, self.search_interval_s)
 
     def _is_thorough_due(self, key: ImageKey, time_ns: int, *, was_seen: bool) -> bool:
-        """Tell whether it is time for a thorough search; a board just lost is soon seen again without."""
+        """Check whether it is time for a thorough search; a board just lost is soon seen again without."""
         if was_seen and self.thorough_interval_s > 0:
             self._thorough_ns[key] = time_ns
             return False
@@ -173,9 +248,42 @@ class BoardTracker:
 
 
 def _is_due(last_ns: dict[ImageKey | str, int], key: ImageKey | str, time_ns: int, interval_s: float) -> bool:
-    """Tell whether an interval has gone by since something was done last, and note that it is done now."""
+    """Check whether an interval has gone by since something was done last, and note that it is done now."""
     before_ns = last_ns.get(key)
     if before_ns is not None and 0 <= time_ns - before_ns < interval_s * 1e9:
         return False
     last_ns[key] = time_ns
     return True
+
+
+def _compare(board: ImageBoard, candidates: list[LidarBoard], nominal: NominalExtrinsic) -> Refusal | None:
+    """Compare candidates with where an image and nominal extrinsics have the board; None where one fits."""
+    T_lidar_cam = invert(nominal.to_matrix())
+    poses = [pose for pose in (board.T_cam_board, board.T_cam_board_alternative) if pose is not None]
+    distance, angle = np.array(
+        [_apart(T_lidar_cam @ pose, each.T_lidar_board) for pose in poses for each in candidates]
+    ).T
+    turn_rad = _NOMINAL_MARGIN * np.radians(nominal.tolerance_deg)
+    range_m = float(np.linalg.norm(board.T_cam_board[:3, 3]))
+    max_m = CENTRE_TOLERANCE_M + _NOMINAL_MARGIN * nominal.tolerance_m + range_m * turn_rad
+    misfit = np.maximum(distance / max_m, angle / (NORMAL_TOLERANCE_RAD + turn_rad))
+    best = int(np.argmin(misfit))
+    if misfit[best] <= 1:
+        return None
+    figures = {
+        "n_candidates": len(candidates),
+        "distance_m": float(distance[best]),
+        "rotation_deg": float(np.degrees(angle[best])),
+    }
+    return Refusal("lidar.elsewhere", figures=figures)
+
+
+def _apart(T_1: Array, T_2: Array) -> tuple[float, float]:
+    """Measure how far two boards' centres are apart in m, and the angle of their planes in rad."""
+    cosine = min(abs(float(T_1[:3, 2] @ T_2[:3, 2])), 1.0)
+    return float(np.linalg.norm(T_1[:3, 3] - T_2[:3, 3])), float(np.arccos(cosine))
+
+
+def without_samples(detection: BoardDetection) -> BoardDetection:
+    """Leave out the images and scans that were searched, which take long to send to another process."""
+    return replace(detection, frame=replace(detection.frame, images=(), scans=()))

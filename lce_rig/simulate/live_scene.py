@@ -82,11 +82,18 @@ class LiveScene:
 
     def take(self, stamp_ns: int) -> Iterator[Image | Scan]:
         """Take a scan of each LiDAR that begins at a time, and an image of each camera at its middle."""
-        stage = self.stage
-        period_ns = max(model.period_ns for model in stage.models.values())
-        for camera in stage.framed:
-            yield self._take_image(camera, stamp_ns + period_ns // 2)
-        for lidar in stage.models:
+        period_ns = max(model.period_ns for model in self.stage.models.values())
+        yield from self.take_images(stamp_ns + period_ns // 2)
+        yield from self.take_scans(stamp_ns)
+
+    def take_images(self, stamp_ns: int) -> Iterator[Image]:
+        """Take an image of each camera."""
+        for camera in self.stage.framed:
+            yield self._take_image(camera, stamp_ns)
+
+    def take_scans(self, stamp_ns: int) -> Iterator[Scan]:
+        """Take a scan of each LiDAR that begins at a time."""
+        for lidar in self.stage.models:
             yield self._take_scan(lidar, stamp_ns)
 
     def _show(self, T_world_board: Array, *, is_held: bool) -> None:

@@ -236,6 +236,11 @@ PHRASES: dict[str, Phrase] = {
         "ring ends {rms_m:mm} rms from a rectangle (limit {max_rms_m:mm})",
         "keep hands and other things away from the board's border",
     ),
+    "lidar.elsewhere": Phrase(
+        "best of {n_candidates} candidates in the scan: {distance_m:.2f} m, {rotation_deg:.0f} deg from the "
+        "pose predicted by the image and the nominal extrinsics",
+        "hold the board clear of other things, where more of the LiDAR's rings meet it",
+    ),
     "lidar.lost": Phrase(_lost, _find_again),
     "lidar.turned_away": Phrase(
         "the only plate near the board's last place is rotated by over {max_turn_deg:.0f} deg",

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
+from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment, HeldStill
+from lce_rig.collect.offline.search_ahead import RestingTracker, glance_at, sight_ahead
 from lce_rig.collect.offline.stillness import StillnessOptions, find_still_moments
 from lce_rig.core.geometry import transform
 from lce_rig.core.results import Refusal
@@ -21,14 +22,14 @@ def see(watcher: BoardTracker, k: int, time_s: float) -> BoardDetection:
     return watcher.sight(Frame(T0_NS + round(time_s * 1e9), capture.images[:1], capture.scans))
 
 
-def nearest_m(sighting: BoardDetection, k: int) -> float:
+def nearest_m(detection: BoardDetection, k: int) -> float:
     """Tell how far the nearest candidate lies from where the picture has the board."""
-    (image,) = sighting.images.values()
+    (image,) = detection.images.values()
     nominal = rig().nominal("davis", "lidar")
     assert nominal is not None
     seen = [
         transform(nominal.to_matrix(), each.T_lidar_board[:3, 3][None])[0]
-        for each in sighting.lidars["lidar"]
+        for each in detection.lidars["lidar"]
     ]
     return float(min(np.linalg.norm(each - image.T_cam_board[:3, 3]) for each in seen))
 
@@ -67,9 +68,9 @@ def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> 
 
 def test_candidates_beyond_the_profiles_limits_are_no_board_in_the_scan() -> None:
     watcher = BoardTracker(strict(min_points=100_000), 0.3)
-    sighting = see(watcher, 0, 0.0)
-    assert sighting.images and not sighting.lidars and not sighting.is_usable
-    assert sighting.unscanned["lidar"].figures["min_points"] == 100_000
+    detection = see(watcher, 0, 0.0)
+    assert detection.images and not detection.lidars and not detection.is_usable
+    assert detection.unscanned["lidar"].figures["min_points"] == 100_000
 
 
 def test_live_and_offline_take_the_same_boards() -> None:
@@ -77,24 +78,74 @@ def test_live_and_offline_take_the_same_boards() -> None:
         profile = strict(**limits)
         finder, watcher = BoardFinder(profile), BoardTracker(profile, 0.0)
         for k, capture in enumerate(placements()):
-            sighting = see(watcher, k, float(k))
+            detection = see(watcher, k, float(k))
             image, scan = finder.image(capture.images[0]), finder.scan(capture.scans[0])
             key = ("davis", "frames")
-            assert (key in sighting.images.keys() - sighting.unfit.keys()) != isinstance(image, Refusal)
-            if sighting.images:
-                assert ("lidar" in sighting.lidars) != isinstance(scan, Refusal)
+            assert (key in detection.images.keys() - detection.unfit.keys()) != isinstance(image, Refusal)
+            if detection.images:
+                assert ("lidar" in detection.lidars) != isinstance(scan, Refusal)
 
 
 def test_a_moment_is_confirmed_by_the_search_that_check_makes() -> None:
     watcher = BoardTracker(rig(), 0.3)
     for time_s in (0.0, 0.1, 0.2):
-        sighting = see(watcher, 0, time_s)
-    confirmed = watcher.confirm(CaptureMoment(sighting, {"motion_m": 0.001}))
+        detection = see(watcher, 0, time_s)
+    confirmed = watcher.confirm(CaptureMoment(detection, HeldStill(0.001)))
     assert isinstance(confirmed, CaptureMoment) and confirmed.figures == {"motion_m": 0.001}
     whole = watcher.finder.image(placements()[0].images[0])
     assert not isinstance(whole, Refusal)
-    assert np.array_equal(confirmed.sighting.images["davis", "frames"].corners_px, whole.corners_px)
-    blank = replace(sighting.frame.images[0], pixels=np.full_like(sighting.frame.images[0].pixels, 90))
-    gone = replace(sighting, frame=replace(sighting.frame, images=(blank,)))
-    refused = watcher.confirm(CaptureMoment(gone, {}))
+    assert np.array_equal(confirmed.detection.images["davis", "frames"].corners_px, whole.corners_px)
+    blank = replace(detection.frame.images[0], pixels=np.full_like(detection.frame.images[0].pixels, 90))
+    gone = replace(detection, frame=replace(detection.frame, images=(blank,)))
+    refused = watcher.confirm(CaptureMoment(gone, HeldStill(0.001)))
     assert isinstance(refused, Refusal) and refused.stage == "image"
+
+
+def test_other_things_in_the_scan_are_not_the_board_once_nominal_extrinsics_have_fitted() -> None:
+    watcher = BoardTracker(rig(), 0.0)
+    whole = see(watcher, 0, 0.0)
+    (scan,) = whole.frame.scans
+    # As if the LiDAR had missed the board, and seen another plate of its size.
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=np.float32)
+    elsewhere = replace(whole, frame=replace(whole.frame, scans=(replace(scan, points=scan.points @ turn),)))
+    assert isinstance(watcher.confirm(CaptureMoment(elsewhere, HeldStill(0.001))), CaptureMoment)
+    assert isinstance(watcher.confirm(CaptureMoment(whole, HeldStill(0.001))), CaptureMoment)
+    refused = watcher.confirm(CaptureMoment(elsewhere, HeldStill(0.001)))
+    assert isinstance(refused, Refusal) and refused.code == "lidar.elsewhere"
+    assert float(refused.figures["distance_m"]) > 1
+
+
+def test_images_searched_ahead_give_the_same_detections() -> None:
+    order = (0, 0, 0, 1, 1, 2, 3, 3, 0, 0, 1, 2)
+    frames = [see(BoardTracker(rig(), 0.3), k, 0.1 * i).frame for i, k in enumerate(order)]
+    one, two = BoardTracker(rig(), 0.3), BoardTracker(rig(), 0.3)
+    for alone, ahead in zip(
+        map(one.sight, frames), sight_ahead(two, frames, is_still_wanted=False), strict=True
+    ):
+        assert ahead.frame is alone.frame
+        assert ahead.images.keys() == alone.images.keys() and ahead.lidars.keys() == alone.lidars.keys()
+        for key, board in alone.images.items():
+            assert np.array_equal(board.corners_px, ahead.images[key].corners_px)
+    assert one.refusals.by_code() == two.refusals.by_code()
+
+
+def test_images_are_searched_where_a_board_rests_and_left_out_where_it_moves() -> None:
+    order = (0, 0, 0, 1, 2, 3, 1, 1, 1)
+    frames = [see(BoardTracker(rig(), 0.3), k, 0.1 * i).frame for i, k in enumerate(order)]
+    tracker = RestingTracker(rig(), 0.0, 1.0)
+    found = [tracker.look(frame, glances) for frame, glances in glance_at(frames)]
+    assert [bool(each.images) for each in found] == [True] * 3 + [False] * 3 + [True] * 3
+    assert [each.is_moving for each in found] == [False] * 3 + [True] * 3 + [False] * 3
+
+
+def test_a_scene_without_a_board_is_seldom_searched_while_nothing_changes() -> None:
+    frame = see(BoardTracker(rig(), 0.3), 0, 0.0).frame
+    (image,) = frame.images
+    noise = np.random.default_rng(0).integers(88, 93, (25, *image.pixels.shape)).astype(np.uint8)
+    flat = [replace(image, pixels=pixels) for pixels in noise]
+    frames = [replace(frame, images=(one,), time_ns=T0_NS + 100_000_000 * k) for k, one in enumerate(flat)]
+    tracker = RestingTracker(rig(), 0.0, 0.0)
+    found = [tracker.look(each, glances) for each, glances in glance_at(frames)]
+    assert not any(each.images or each.is_moving for each in found)
+    # A thorough search says why there is none.
+    assert [k for k, each in enumerate(found) if each.unseen] == [0]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from lce_rig.collect.board_tracker import BoardTracker, CaptureMoment, ImageKey
 from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.event_pictures import with_event_pictures
+from lce_rig.collect.offline.search_ahead import sight_ahead
 from lce_rig.collect.offline.slow_motion import find_moving_moments
 from lce_rig.collect.offline.stillness import StillnessOptions, find_still_moments
 from lce_rig.collect.offline.stored_events import StoredEvents
@@ -26,6 +27,10 @@ from lce_rig.words import describe
 
 # How often an image without a board is searched thoroughly, which takes most of a second.
 _THOROUGH_S = 1.0
+# A process of its own for images takes a second to start.
+_LONG_SAMPLES = 200
+# Of boards that may move by more while they count as still, no quick look tells that they move.
+_GLANCED_M = 0.01
 
 
 @dataclass
@@ -41,6 +46,7 @@ class MomentSearch:
         motion: how a moving board is judged.
         min_move_m, min_turn_deg: how far placements of a moving board must be apart.
         losses: what became no moment so far.
+        n_samples: images and scans to come, about.
     """
 
     rig: Rig
@@ -49,6 +55,7 @@ class MomentSearch:
     motion: MotionOptions
     min_move_m: float
     min_turn_deg: float
+    n_samples: int = 0
     losses: Losses = field(default_factory=Losses)
 
     @property
@@ -81,12 +88,15 @@ class MomentSearch:
         watcher = BoardTracker(self.rig, interval_s, self.losses, _THOROUGH_S)
         # Why a scan got no image made of events is counted where it was not made.
         frames = pair_by_time(samples, self.rig, Losses() if cameras else self.losses)
-        sightings = (watcher.sight(frame) for frame in frames)
+        is_long = self.n_samples >= _LONG_SAMPLES
+        are_still = not self.has_events and stillness.max_motion_m <= _GLANCED_M
+        ahead = sight_ahead(watcher, frames, is_still_wanted=are_still)
+        detections = ahead if is_long else map(watcher.sight, frames)
         if self.has_events:
             taken = Placements(self.min_move_m, self.min_turn_deg)
-            moments = find_moving_moments(sightings, self.rig, self.motion, taken, self.losses)
+            moments = find_moving_moments(detections, self.rig, self.motion, taken, self.losses)
         else:
-            moments = find_still_moments(sightings, self.rig.board.to_board(), stillness)
+            moments = find_still_moments(detections, self.rig.board.to_board(), stillness)
         for moment in moments:
             confirmed = watcher.confirm(moment)
             if isinstance(confirmed, Refusal):
@@ -96,7 +106,7 @@ class MomentSearch:
 
     def kept_images(self, moment: CaptureMoment) -> list[Image]:
         """List the pictures of a moment that its capture keeps: all but those that its events give again."""
-        images = moment.sighting.frame.images
+        images = moment.detection.frame.images
         return [image for image in images if (image.sensor, image.channel) not in self.reconstructed]
 
 
@@ -250,6 +260,7 @@ class _Collector:
             options.motion,
             options.min_move_m,
             options.min_turn_deg,
+            recording.n_samples,
         )
         self.report.has_events |= search.has_events
         torn: list[SourceError] = []
@@ -303,7 +314,7 @@ class _Collector:
     def _take_moment(
         self, recording_key: str, moment: CaptureMoment, images: Sequence[Image], known: Placements
     ) -> None:
-        frame, boards = moment.sighting.frame, moment.sighting.images
+        frame, boards = moment.detection.frame, moment.detection.images
         stamps = [scan.stamp_ns for scan in frame.scans] + [image.stamp_ns for image in images]
         key = f"{recording_key}:{'/'.join(str(stamp) for stamp in stamps)}"
         label = f"at {stamps[0]} ns"

@@ -8,6 +8,7 @@ scan; a pipe would take ten and need both processes at once. What comes back is 
 import os
 import pickle
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from multiprocessing.sharedctypes import RawArray
-from types import TracebackType
+from types import ModuleType, TracebackType
 from typing import Any
 
 from lce_rig.core.errors import LceRigError, SourceError
@@ -56,7 +57,7 @@ class Worker:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the process, whatever it does."""
+        """End the process at once."""
         if self._process is not None:
             self._connection.close()
             self._process.terminate()
@@ -96,7 +97,7 @@ class Worker:
         self._shared = memoryview(shared).cast("B")
         arguments = theirs, shared, self._nice, *self._made
         process = context.Process(target=_serve, args=arguments, name=self._name, daemon=True)
-        with _one_thread():
+        with _one_thread(), _without_main():
             start_without_interrupts(process)
         theirs.close()
         self._connection, self._process = ours, process
@@ -129,6 +130,17 @@ def _one_thread() -> Iterator[None]:
                     os.environ[name] = value
 
 
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Hide the program from a process that starts now: a script without a guard would run there once more."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
 def _pack(request: object, shared: memoryview) -> tuple[bytes, _Spans]:
     """Pickle a request, its arrays' content into shared memory where they fit; gives where each lies."""
     buffers: list[pickle.PickleBuffer] = []
@@ -157,7 +169,7 @@ def _serve(
     arguments: tuple[object, ...],
 ) -> None:
     """Answer calls until the other end is gone."""
-    # Whoever started this ends it; a closed terminal must not.
+    # The parent ends this; a closed terminal must not.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     os.nice(nice)
     shared = memoryview(array).cast("B")
@@ -171,7 +183,7 @@ def _serve(
                 answer = getattr(subject, method)(*given)
             except LceRigError as error:
                 answer = error
-            except Exception as error:  # Whoever called is told, of bugs too.
+            except Exception as error:  # The caller learns of bugs as well.
                 answer = RuntimeError(f"{method}: {error!r}")
             connection.send(answer)
     except (EOFError, OSError, KeyboardInterrupt):

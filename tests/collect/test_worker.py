@@ -6,8 +6,8 @@ import signal
 import numpy as np
 import pytest
 
-from lce_rig.collect.live import worker
-from lce_rig.collect.live.worker import Worker
+from lce_rig.collect import worker
+from lce_rig.collect.worker import Worker
 from lce_rig.core.errors import ProfileError, SourceError
 
 
