@@ -4,7 +4,7 @@
 
     rig = lce.load_rig("rlfs")
     session = lce.collect_from(rig, "recording.bag", "session/")
-    result = lce.calibrate(session)                  # .pairs[0].T_cam_lidar, .cov, .verdict, .reasons
+    result = lce.calibrate(session)                  # .pairs[0].T_cam_lidar, .cov, .verdict, .findings
     result.write()                                   # what `lce-rig calibrate` writes
     lce.verify(session, result).write("overlays/")
 
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from lce_rig.recordings.protocol import SourceOptions
     from lce_rig.rig import Rig, load_rig
     from lce_rig.session import Session
-    from lce_rig.words import describe, recommend
+    from lce_rig.words import describe, recommend, sentence
 
 __all__ = [
     "CalibrateOptions",
@@ -82,6 +82,7 @@ __all__ = [
     "read_result",
     "recommend",
     "repeat",
+    "sentence",
     "verify",
 ]
 __version__ = "0.1.0"
@@ -112,7 +113,7 @@ _HOMES = {
     "lce_rig.rig": ("Rig", "load_rig"),
     "lce_rig.session": ("Session",),
     "lce_rig.recordings.protocol": ("SourceOptions",),
-    "lce_rig.words": ("describe", "recommend"),
+    "lce_rig.words": ("describe", "recommend", "sentence"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

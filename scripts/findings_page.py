@@ -33,6 +33,7 @@ from results of earlier versions, which held words only.
 | `calibrate` | the content of result.json, with `findings` and `captures_refused` of each camera and LiDAR |
 | `verify` | residuals of each capture; `doubts`: findings by which captures contradict the extrinsics |
 | `repeat` | `findings` on the sessions; for each camera and LiDAR figures and a `finding`, the verdict |
+| `rigs check` | `findings`: what the profile allows but rarely means |
 | `doctor` | each check with its `findings` ([more](doctor.md)) |
 
 Exit codes are the same with and without `--json`.

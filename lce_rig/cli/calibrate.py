@@ -21,7 +21,8 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.results import Calibration, OtherCamera
 from lce_rig.detect.detection import Pair
-from lce_rig.words import sentence
+from lce_rig.words import not_enough, sentence
+from lce_rig.words.extrinsics import weakest_words
 
 # The uncertainty in the report: by axis, and for points at several distances.
 
@@ -36,7 +37,7 @@ def uncertainty_lines(calibration: Calibration) -> list[str]:
         f"  uncertainty  {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
         f"               about {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
         f"               along {_by_axis(1000 * sigmas[:3], '.1f')} mm",
-        f"  weakest: {c.weak_direction}",
+        *([f"  weakest: {weakest_words(c.weakest)}"] if c.weakest else []),
         *_at_distances(c),
     ]
 
@@ -66,9 +67,9 @@ def together_lines(calibration: Calibration) -> list[str]:
         return []
     figures = calibration.diagnostics
     alone = ""
-    if "alone_sigma_rotation_deg" in figures:
-        sigma_mm = 1000 * figures["alone_sigma_translation_m"]
-        alone = f"; uncertainty alone {figures['alone_sigma_rotation_deg']:.3f} deg, {sigma_mm:.1f} mm"
+    if math.isfinite(figures.alone_sigma_rotation_deg):
+        sigma_mm = 1000 * figures.alone_sigma_translation_m
+        alone = f"; uncertainty alone {figures.alone_sigma_rotation_deg:.3f} deg, {sigma_mm:.1f} mm"
     return [f"  together     with {', '.join(calibration.estimated_with)}{alone}"]
 
 
@@ -230,7 +231,7 @@ def calibrate(
                 progress=progress,
             )
         for shortage in result.shortages:
-            show.warn(str(shortage))
+            show.warn(str(not_enough(shortage)))
         if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
             show.warn(f"{reference} has no T_cam_lidar for these sensors")
         written = result.write(name=name, force=force)
@@ -303,7 +304,7 @@ def exit_by_verdict(calibrations: Sequence[Calibration], *, are_printed: bool = 
     failed = [c for c in calibrations if c.verdict == "fail"]
     if failed:
         pairs = ", ".join(str(Pair.of(c)) for c in failed)
-        causes = "\n".join(reason for c in failed for reason in c.reasons)
+        causes = "\n".join(sentence(finding) for c in failed for finding in c.findings)
         raise ResultRefusedError(f"failed: {pairs}; do not use this result", "" if are_printed else causes)
 
 
@@ -333,7 +334,7 @@ def _lines(calibration: Calibration) -> list[str]:
         )
     for name, why in c.captures_refused.items():
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {sentence(why)}')}[/]")
-    lines += [f"  [{colour}]{show.escape(reason)}[/]" for reason in c.reasons]
+    lines += [f"  [{colour}]{show.escape(sentence(finding))}[/]" for finding in c.findings]
     return lines
 
 
@@ -361,9 +362,9 @@ def _channel_lines(calibration: Calibration) -> list[str]:
             )
         texts.append(text)
     figures = calibration.diagnostics
-    if "channels_rotation_deg" in figures:
+    if math.isfinite(figures.channels_rotation_deg):
         texts.append(
-            f"channels differ by {figures['channels_rotation_deg']:.2f} deg, "
-            f"{1000 * figures['channels_translation_m']:.1f} mm"
+            f"channels differ by {figures.channels_rotation_deg:.2f} deg, "
+            f"{1000 * figures.channels_translation_m:.1f} mm"
         )
     return [f"  {'channels' if k == 0 else '':<13}{text}" for k, text in enumerate(texts)]

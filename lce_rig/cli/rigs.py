@@ -160,6 +160,7 @@ def _limit_table(rig: "Rig") -> Any:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def check_profile(file: str, as_json: bool) -> None:
     """Check the profile FILE and list every problem with its line. Exits with 3 if there is one."""
+    from lce_rig import words
     from lce_rig.core.errors import ProfileError
     from lce_rig.pipeline.detect_session import check_networks
     from lce_rig.rig import find_profile, load_rig
@@ -170,18 +171,28 @@ def check_profile(file: str, as_json: bool) -> None:
     except ProfileError as error:
         if as_json:
             problems = error.hint.splitlines() if error.hint else [error.what]
-            screen.print_json({"is_valid": False, "problems": problems, "warnings": []})
+            screen.print_json({"is_valid": False, "problems": problems, "warnings": [], "findings": []})
         raise
     if as_json:
-        screen.print_json({"is_valid": True, "problems": [], "warnings": rig.warnings()})
+        found = rig.warnings()
+        screen.print_json(
+            {
+                "is_valid": True,
+                "problems": [],
+                "warnings": [words.sentence(warning) for warning in found],
+                "findings": [words.as_json(warning) for warning in found],
+            }
+        )
         return
     click.echo(f"{find_profile(file)}: a valid profile of rig {rig.name}")
     _print_warnings(rig)
 
 
 def _print_warnings(rig: "Rig") -> None:
+    from lce_rig import words
+
     for warning in rig.warnings():
-        screen.warn(warning)
+        screen.warn(words.sentence(warning))
 
 
 @rigs.command("new")

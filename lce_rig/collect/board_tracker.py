@@ -1,6 +1,6 @@
-"""The board followed from frame to frame, in every picture and scan."""
+"""The board followed from frame to frame, in every image and scan."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -51,16 +51,46 @@ class BoardDetection:
         return bool(self.images.keys() - self.unfit.keys() and self.lidars)
 
 
-@dataclass(frozen=True, eq=False)
-class CaptureMoment:
-    """A sighting worth a capture.
+@dataclass(frozen=True)
+class HeldStill:
+    """A board that stood still: by how much it moved while the sensors saw it, m."""
+
+    motion_m: float
+
+
+@dataclass(frozen=True)
+class MovedSlowly:
+    """A board that moved before an event camera.
 
     Attributes:
-        figures: how still or how fast the board was, by name; kept with the capture.
+        speed_mps: of its middle.
+        unsteady_m: rms distance of its way from a straight and steady one.
+        events_px: events per pixel of the board in the second before its image.
     """
 
-    sighting: BoardDetection
-    figures: dict[str, float]
+    speed_mps: float
+    unsteady_m: float
+    events_px: float
+
+
+@dataclass(frozen=True)
+class TakenByHand:
+    """A board that somebody captured by a key, however it moved."""
+
+    by_hand: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureMoment:
+    """A detection worth a capture, and how the board moved; both are kept."""
+
+    detection: BoardDetection
+    motion: HeldStill | MovedSlowly | TakenByHand
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """List the figures of the motion by name, as the capture keeps them."""
+        return asdict(self.motion)
 
 
 @dataclass
@@ -69,7 +99,7 @@ class BoardTracker:
 
     Attributes:
         rig: the profile.
-        search_interval_s: how often a whole picture is searched while no board is in sight.
+        search_interval_s: how often a whole image is searched while no board is in sight.
         refusals: frames in which it was not found, and boards that were found and cannot be used.
         thorough_interval_s: how often such a search is thorough, which takes most of a second; 0 for always.
         rescan_interval_s: how often a whole scan is searched while all candidates are followed; 0 for as
@@ -92,11 +122,11 @@ class BoardTracker:
         self.finder = BoardFinder(self.rig)
 
     def sight(self, frame: Frame) -> BoardDetection:
-        """Find the board in every picture and scan of a frame."""
+        """Find the board in every image and scan of a frame."""
         return self.sight_in_scans(self.sight_in_images(frame))
 
     def sight_in_images(self, frame: Frame) -> BoardDetection:
-        """Find the board in every picture of a frame; what follows from scans is empty."""
+        """Find the board in every image of a frame; what follows from scans is empty."""
         images: dict[ImageKey, ImageBoard] = {}
         unseen: dict[ImageKey, Refusal] = {}
         unfit: dict[ImageKey, Refusal] = {}
@@ -113,26 +143,26 @@ class BoardTracker:
                 unfit[key] = found.usable
         return BoardDetection(frame, images, {}, unseen, {}, unfit)
 
-    def sight_in_scans(self, sighting: BoardDetection) -> BoardDetection:
-        """Find the board in every scan too, where a picture shows it, and count what cannot be used."""
-        for refusal in sighting.unfit.values():
+    def sight_in_scans(self, detection: BoardDetection) -> BoardDetection:
+        """Find the board in every scan too, where an image shows it, and count what cannot be used."""
+        for refusal in detection.unfit.values():
             self.refusals.add(refusal)
         lidars: dict[str, list[LidarBoard]] = {}
         unscanned: dict[str, Refusal] = {}
         # Nothing is gained from scans while no camera sees the board.
-        for scan in sighting.frame.scans if sighting.images else ():
-            candidates = self._find_in_scan(scan, sighting.frame.time_ns)
+        for scan in detection.frame.scans if detection.images else ():
+            candidates = self._find_in_scan(scan, detection.frame.time_ns)
             if isinstance(candidates, Refusal):
                 unscanned[scan.sensor] = candidates
             else:
                 lidars[scan.sensor] = candidates
-        if not sighting.images:
+        if not detection.images:
             self._n_candidates.clear()  # A board that comes back is searched for at once.
-            if not sighting.is_moving:
+            if not detection.is_moving:
                 self.refusals.add(Refusal("image.none"))
         elif not lidars:
             self.refusals.add(Refusal("lidar.none"))
-        return replace(sighting, lidars=lidars, unscanned=unscanned)
+        return replace(detection, lidars=lidars, unscanned=unscanned)
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
         """Search the frame of a moment without a prior, as `check` does: what is captured can be used later.
@@ -140,14 +170,14 @@ class BoardTracker:
         Returns:
             The moment with what was found; or why it cannot be used.
         """
-        sighting = moment.sighting
-        keys = sighting.images.keys()
+        detection = moment.detection
+        keys = detection.images.keys()
         images = {
             (image.sensor, image.channel): self.finder.image(image)
-            for image in sighting.frame.images
+            for image in detection.frame.images
             if (image.sensor, image.channel) in keys
         }
-        scans = {scan.sensor: self.finder.scan(scan) for scan in sighting.frame.scans}
+        scans = {scan.sensor: self.finder.scan(scan) for scan in detection.frame.scans}
         usable = {key: board for key, board in images.items() if isinstance(board, ImageBoard)}
         lidars = {name: boards for name, boards in scans.items() if isinstance(boards, list)}
         for found, refused in ((usable, images), (lidars, scans)):
@@ -156,7 +186,7 @@ class BoardTracker:
         elsewhere = self._find_elsewhere(usable, lidars)
         if elsewhere is not None:
             return elsewhere
-        return replace(moment, sighting=BoardDetection(sighting.frame, usable, lidars))
+        return replace(moment, detection=BoardDetection(detection.frame, usable, lidars))
 
     def _find_elsewhere(
         self, images: dict[ImageKey, ImageBoard], lidars: dict[str, list[LidarBoard]]
@@ -211,7 +241,7 @@ class BoardTracker:
         return _is_due(self._searched_ns, key, time_ns, self.search_interval_s)
 
     def _is_thorough_due(self, key: ImageKey, time_ns: int, *, was_seen: bool) -> bool:
-        """Tell whether it is time for a thorough search; a board just lost is soon seen again without."""
+        """Check whether it is time for a thorough search; a board just lost is soon seen again without."""
         if was_seen and self.thorough_interval_s > 0:
             self._thorough_ns[key] = time_ns
             return False
@@ -219,7 +249,7 @@ class BoardTracker:
 
 
 def _is_due(last_ns: dict[ImageKey | str, int], key: ImageKey | str, time_ns: int, interval_s: float) -> bool:
-    """Tell whether an interval has gone by since something was done last, and note that it is done now."""
+    """Check whether an interval has gone by since something was done last, and note that it is done now."""
     before_ns = last_ns.get(key)
     if before_ns is not None and 0 <= time_ns - before_ns < interval_s * 1e9:
         return False
@@ -259,6 +289,6 @@ def _apart(T_1: Array, T_2: Array) -> tuple[float, float]:
     return float(np.linalg.norm(T_1[:3, 3] - T_2[:3, 3])), float(np.arccos(cosine))
 
 
-def without_samples(sighting: BoardDetection) -> BoardDetection:
+def without_samples(detection: BoardDetection) -> BoardDetection:
     """Leave out the images and scans that were searched, which take long to send to another process."""
-    return replace(sighting, frame=replace(sighting.frame, images=(), scans=()))
+    return replace(detection, frame=replace(detection.frame, images=(), scans=()))

@@ -16,7 +16,7 @@ class Intrinsics:
 
     Attributes:
         fx_px, fy_px, cx_px, cy_px: the camera matrix.
-        width_px, height_px: size of the image the numbers belong to.
+        width_px, height_px: resolution of the images.
         model: "radtan" (k1 k2 p1 p2 [k3 [k4 k5 k6]], as OpenCV's plumb bob and rational models) or
             "equidistant" (k1..k4, as OpenCV's fisheye and Kalibr's equi).
         distortion: the coefficients, in the order above.

@@ -40,7 +40,7 @@ def parse_json(data: bytes, *, is_finite: bool = True) -> Any:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"it is not JSON: no UTF-8 text (byte {error.start})") from None
+        raise ValueError(f"it is not JSON: not UTF-8 text (byte {error.start})") from None
     if text.count("[") + text.count("{") > MAX_BLOCKS:
         raise ValueError(f"it has more than {MAX_BLOCKS} lists and mappings")
     try:
@@ -100,7 +100,7 @@ def _float(text: str) -> float:
 
 
 def _constant(name: str) -> float:
-    raise ValueError(f"{name} is no number")
+    raise ValueError(f"{name} is not a number")
 
 
 _WITH_NAN = json.JSONDecoder(object_pairs_hook=_unique, parse_int=_integer, parse_float=_float)

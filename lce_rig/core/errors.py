@@ -4,6 +4,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from lce_rig.core.findings import Finding
+
 
 class LceRigError(Exception):
     """Base of every error the user can repair.
@@ -49,9 +51,19 @@ class SourceError(LceRigError):
 
 
 class NotEnoughDataError(LceRigError):
-    """Too few captures, or captures that leave a direction undetermined."""
+    """Too few captures, or captures that leave a direction undetermined.
+
+    Args:
+        what: as of every error.
+        hint: as of every error.
+        finding: the same as code and figures, where a calibration lacks captures.
+    """
 
     exit_code = 6
+
+    def __init__(self, what: str, hint: str = "", finding: Finding | None = None) -> None:
+        super().__init__(what, hint)
+        self.finding = finding
 
 
 class ResultRefusedError(LceRigError):

@@ -102,7 +102,7 @@ class EventArchive:
         self._names = [self._time, *(self._find(name) for name in _ALIASES)]
         columns = [self._columns.open(name) for name in self._names]
         if flat := [column.name for column in columns if not column.shape]:
-            raise ValueError(f"its column {flat[0]} is no list of numbers")
+            raise ValueError(f"its column {flat[0]} is not a list of numbers")
         lengths = {column.n_left for column in columns}
         if len(lengths) != 1:
             raise ValueError(f"its columns are of unequal length: {sorted(lengths)}")
@@ -185,7 +185,7 @@ class _Column:
         self._ahead = head[begin:]
         self.n_left = math.prod(self.shape)
         if self._dtype.kind not in "biuf" or len(self.shape) > 1:
-            raise ValueError(f"its column {name} is no list of numbers")
+            raise ValueError(f"its column {name} is not a list of numbers")
         if begin + self.n_left * self._dtype.itemsize != member.file_size:
             raise ValueError(f"its column {name} declares {self.n_left} numbers and holds others")
 
@@ -221,14 +221,14 @@ def _damage_in_words() -> Iterator[None]:
     try:
         yield
     except Exception as error:  # A damaged archive fails in any way: zip, zlib, encryption, sizes, syntax.
-        raise ValueError(f"it is no archive of events, or a damaged one: {error}") from None
+        raise ValueError(f"it is not an archive of events, or it is damaged: {error}") from None
 
 
 def _npy_header(data: bytes, name: str) -> tuple[tuple[int, ...], np.dtype[Any], int]:
     """Read shape and type of an array, and where its numbers begin."""
     file = io.BytesIO(data)
     if not data.startswith(np.lib.format.MAGIC_PREFIX):
-        raise ValueError(f"its column {name} is no array")
+        raise ValueError(f"its column {name} is not an array")
     version = np.lib.format.read_magic(file)
     if version == (1, 0):
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)
@@ -270,7 +270,7 @@ def _resolution(columns: _Columns) -> tuple[int, int] | None:
     column = columns.open("resolution_px")
     size = column.read(2) if column.shape == (2,) else np.empty(0)
     if size.dtype.kind not in "iu":
-        raise ValueError("its resolution_px is no width and height")
+        raise ValueError("its resolution_px is not a width and height")
     width, height = map(int, size)
     if width * height > limits.MAX_EVENT_PIXELS:
         raise ValueError(f"its pixels are beyond any sensor: {width}x{height}")

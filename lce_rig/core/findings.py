@@ -1,4 +1,4 @@
-"""What was found about a sensor, a capture or a result, as facts; `words` renders them."""
+"""Facts about a sensor, a capture or a result; `words` renders them."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -16,9 +16,9 @@ class Finding:
     Attributes:
         code: what was found, "family.name"; stable, listed in docs/findings.md.
         severity: "note" changes nothing; "warning": usable, less well; "error": must not be used.
-        subject: what it is about: a sensor's or capture's name, a profile key, a file; "" where it is plain.
+        subject: a sensor's or capture's name, a profile key or a file; "" if clear.
         figures: by name with units ("rms_m"), for the words and for programs.
-        action: which of several actions applies, by its code in `words`; "" where the code has just one.
+        action: which of several actions applies, by its code in `words`; "" if the code has one only.
     """
 
     code: str
@@ -37,7 +37,7 @@ class Finding:
 
         Raises:
             KeyError: the finding has no such figure.
-            TypeError: it is no number.
+            TypeError: it is not a number.
         """
         value = self.figures[name]
         if not isinstance(value, float | int):

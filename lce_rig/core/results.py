@@ -8,8 +8,9 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.diagnostics import NO_DIAGNOSTICS, Diagnostics
 from lce_rig.core.errors import LceRigError
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, sigma_sizes
 
 Stage = Literal["read", "image", "lidar", "pair", "calibrate"]
@@ -327,7 +328,7 @@ class OtherCamera:
             extrinsics were not estimated together.
         T_cam_other_pictures: (4, 4) from the images of both alone; None if too few boards tell.
         apart_rotation_deg, apart_translation_m: how far that lies from what the extrinsics compose to, each
-            estimated by itself.
+            estimated separately.
         board_rms_m: how far apart those put the middle of the same board, rms.
     """
 
@@ -362,6 +363,42 @@ class CaptureResidual:
     reprojection_px: float
 
 
+Motion = Literal["translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z"]
+MOTIONS: tuple[Motion, ...] = (
+    "translation_x",
+    "translation_y",
+    "translation_z",
+    "rotation_x",
+    "rotation_y",
+    "rotation_z",
+)
+"""Motions along and about the camera's axes, in the order of a tangent (6,)."""
+
+
+@dataclass(frozen=True)
+class WeakestMotion:
+    """The motion of an extrinsic that its captures determine least.
+
+    Attributes:
+        motion: its main component, axes of the camera.
+        sigma: standard deviation of that, m or rad.
+    """
+
+    motion: Motion
+    sigma: float
+
+    @property
+    def is_rotation(self) -> bool:
+        """Whether the motion is a rotation."""
+        return MOTIONS.index(self.motion) >= 3
+
+    def figures(self) -> dict[str, Figure]:
+        """Give motion and standard deviation as figures of a finding."""
+        if self.is_rotation:
+            return {"weakest": self.motion, "weakest_sigma_deg": math.degrees(self.sigma)}
+        return {"weakest": self.motion, "weakest_sigma_m": self.sigma}
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """The extrinsics of one camera and one LiDAR, with everything needed to judge it.
@@ -369,29 +406,28 @@ class Calibration:
     result.json keeps all of it but the last four attributes, which are empty if it is read back.
 
     Attributes:
-        channel: of the camera, or several joined by "+".
+        channels: of the camera, names.
         channel_results: what each of these says alone.
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
         egt_rotation_deg, egt_translation_m: error against a reference given by the user; None without.
         verdict: "pass", "marginal" or "fail".
-        reasons: for it, worst first, in words.
-        findings: the same as codes and figures; empty in results of earlier versions.
+        findings: the reasons for it, worst first, and notes.
         captures_used: names of the captures behind the estimate.
         captures_refused: why each other capture is not.
-        diagnostics: further figures by name.
+        diagnostics: further figures.
         method: that found the extrinsics, as `CalibrateOptions.method`.
         uncertainty: what `cov` means for points at several distances; empty if no lens was at hand.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         other_cameras: those that saw the same boards held still.
-        weak_direction: the least certain motion, with its standard deviation.
+        weakest: the least determined motion; None if it is read back.
         held_out_m: rms residual of captures where they were not fitted; NaN if no method knows it.
         residuals: of each capture used.
         observations: capture -> the boards that were paired, as measured, for each capture used.
     """
 
     camera: str
-    channel: str
+    channels: tuple[str, ...]
     lidar: str
     T_cam_lidar: Array
     cov: Array
@@ -402,25 +438,24 @@ class Calibration:
     captures_used: tuple[str, ...]
     captures_refused: Mapping[str, Refusal]
     verdict: Literal["pass", "marginal", "fail"]
-    reasons: tuple[str, ...]
     findings: tuple[Finding, ...] = ()
     egt_rotation_deg: float | None = None
     egt_translation_m: float | None = None
-    diagnostics: Mapping[str, float] = field(default_factory=dict)
+    diagnostics: Diagnostics = NO_DIAGNOSTICS
     channel_results: tuple[ChannelResult, ...] = ()
     method: str = "paper"
     uncertainty: tuple[PointUncertainty, ...] = ()
     estimated_with: tuple[str, ...] = ()
     other_cameras: tuple[OtherCamera, ...] = ()
-    weak_direction: str = ""
+    weakest: WeakestMotion | None = None
     held_out_m: float = float("nan")
     residuals: tuple[CaptureResidual, ...] = ()
     observations: Mapping[str, Observation] = field(default_factory=dict)
 
     @property
-    def channels(self) -> tuple[str, ...]:
-        """Names of the channels behind the result."""
-        return tuple(self.channel.split("+"))
+    def channel(self) -> str:
+        """Names of the channels for people: several are joined by "+"."""
+        return "+".join(self.channels)
 
     @property
     def sigma_rotation_deg(self) -> float:

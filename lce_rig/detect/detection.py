@@ -1,4 +1,4 @@
-"""What the sensors saw of the board: by pair of sensors, and as flat arrays that a session can keep."""
+"""Detections of the board by pair of sensors, and as flat arrays for a session's cache."""
 
 import dataclasses
 import json
@@ -22,7 +22,7 @@ from lce_rig.core.results import (
 )
 from lce_rig.words import is_renderable
 
-# What the fields of a detection hold: an entry of a cache may come from somebody else, or be of old.
+# Types of the fields of a detection; an entry of a cache may be foreign or outdated.
 
 _Sizes = dict[str, int]
 _Check = Callable[[Any, _Sizes], bool]
@@ -36,7 +36,7 @@ def check_fields(kind: type, fields: Mapping[str, Any]) -> None:
         fields: by name; those that are missing have their defaults.
 
     Raises:
-        ValueError: one cannot, and which.
+        ValueError: a field cannot; the message names it.
     """
     sizes: _Sizes = {}
     for name, value in fields.items():
@@ -248,12 +248,12 @@ class Pair:
 
     @classmethod
     def of(cls, calibration: Calibration) -> "Pair":
-        """Name the sensors that a calibration is about."""
+        """Return the sensors of a calibration."""
         return cls(calibration.camera, calibration.channel, calibration.lidar)
 
     @property
     def folder_name(self) -> str:
-        """What a folder of this pair's files is called if there are several."""
+        """Name of the folder of this pair's files if there are several pairs."""
         return f"{self.camera}.{self.channel}.{self.lidar}"
 
     def __str__(self) -> str:
@@ -262,7 +262,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Detections:
-    """What every sensor saw of the board in every capture that holds a sample of it.
+    """The detections of every sensor in every capture with a sample of it.
 
     Attributes:
         images: (camera, channel) -> capture -> detection.
@@ -287,5 +287,5 @@ class Detections:
         return sorted(self.images[pair.camera, pair.channel].keys() & self.lidars[pair.lidar].keys())
 
     def of(self, pair: Pair, capture: str) -> tuple[ImageDetection, LidarDetection]:
-        """Return what both sensors of a pair saw in one capture."""
+        """Return the detections of both sensors of a pair in one capture."""
         return self.images[pair.camera, pair.channel][capture], self.lidars[pair.lidar][capture]

@@ -1,7 +1,6 @@
-"""The board as a profile describes it: found in images and scans, and compared with the profile's limits.
+"""Detection of a profile's board in images and scans, with the profile's limits.
 
-Everything that looks for a board asks here, live or offline, so that what one part of the program takes for
-a board the others do too.
+All parts of the program detect boards here, live and offline, so that they agree.
 """
 
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ from lce_rig.rig import Rig
 
 @dataclass(frozen=True, eq=False)
 class ImageSearch:
-    """What a search of one image found.
+    """The result of a search in one image.
 
     Attributes:
         board: what can be followed into the next image; or why there is nothing.
@@ -33,7 +32,7 @@ class ImageSearch:
 
 @dataclass(frozen=True, eq=False)
 class ScanSearch:
-    """What a search of one scan found.
+    """The result of a search in one scan.
 
     Attributes:
         boards: surfaces of the board's size, likeliest first, which can be followed into the next scan; or
@@ -104,7 +103,7 @@ class BoardFinder:
             image: of a camera of the rig.
             intrinsics: at the image's size.
             last: the board in the image before.
-            max_reprojection_px: in place of the profile's.
+            max_reprojection_px: replaces the profile's.
             is_thorough: see `find_image_board`.
 
         Raises:
@@ -142,7 +141,7 @@ class BoardFinder:
         return self._compared(found, scan)
 
     def follow_scan(self, scan: Scan, known: Sequence[LidarBoard]) -> ScanSearch:
-        """Find surfaces near where they were in the scan before; those that are lost are left out.
+        """Find surfaces near where they were in the scan before; lost ones are omitted.
 
         Args:
             scan: the next one of the same LiDAR.

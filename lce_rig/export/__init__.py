@@ -8,6 +8,7 @@ from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError, re
 from lce_rig.core.results import Calibration
 from lce_rig.export.frames import require_known
 from lce_rig.rig import Rig
+from lce_rig.words import sentence
 
 Exporter = Callable[[Sequence[Calibration], Rig, Path], list[Path]]
 
@@ -70,7 +71,7 @@ def export(
     failed = [c for c in calibrations if c.verdict == "fail"]
     if failed and not is_forced:
         pairs = ", ".join(f"{c.camera}/{c.channel} and {c.lidar}" for c in failed)
-        reasons = "; ".join(reason for c in failed for reason in c.reasons)
+        reasons = "; ".join(sentence(finding) for c in failed for finding in c.findings)
         raise ResultRefusedError(f"not exported: the calibration of {pairs} failed", reasons)
     paths: list[Path] = []
     try:

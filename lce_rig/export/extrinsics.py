@@ -23,6 +23,7 @@ from lce_rig.export.probes import TOLERANCE, check_pose
 from lce_rig.export.rotations import quaternion_wxyz, rotation_from_quaternion
 from lce_rig.rig import Rig
 from lce_rig.session.durable import write_atomically
+from lce_rig.words import sentence
 
 FILE_NAME = "extrinsics.yaml"
 
@@ -63,7 +64,7 @@ def _pair(calibration: Calibration, rig: Rig) -> list[str]:
         f"    camera_frame: {quoted(camera.optical_frame)}",
         f"    lidar_frame: {quoted(lidar.frame)}",
         f"    verdict: {calibration.verdict}",
-        f"    reasons: {texts(calibration.reasons)}",
+        f"    reasons: {texts(map(sentence, calibration.findings))}",
     ]
     lines += _pose_block("T_cam_lidar", forward, calibration.T_cam_lidar)
     lines += [

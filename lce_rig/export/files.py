@@ -14,6 +14,7 @@ from lce_rig.core.errors import LceRigError, ResultRefusedError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Calibration
 from lce_rig.rig import Rig
+from lce_rig.words import sentence
 
 _Arguments = ParamSpec("_Arguments")
 _Read = TypeVar("_Read")
@@ -77,7 +78,7 @@ def header(
         deg, mm = calibration.sigma_rotation_deg, 1e3 * calibration.sigma_translation_m
         lines.append(f"{pair}: {calibration.verdict}, standard deviation {deg:.3f} deg, {mm:.2f} mm")
         if calibration.verdict == "fail":
-            reasons = "; ".join(calibration.reasons) or "no reason given"
+            reasons = "; ".join(map(sentence, calibration.findings)) or "no reason given"
             lines.append(f"NOT FOR USE: the calibration of {pair} failed: {' '.join(reasons.split())}")
     held = {calibration.camera for calibration in calibrations}
     lacking = [camera for camera in rig.cameras if camera not in held]

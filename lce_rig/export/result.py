@@ -9,15 +9,16 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.documents import read_json
 from lce_rig.core.errors import ResultRefusedError, SessionError, reading
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Figure, Finding, Severity
 from lce_rig.core.geometry import FARTHEST_M
 from lce_rig.core.limits import describe
 from lce_rig.core.results import Calibration, ChannelResult, OtherCamera, PointUncertainty, Refusal
 from lce_rig.export.files import MADE_BY
 from lce_rig.session.durable import write_atomically
-from lce_rig.words import as_json, is_renderable, refusal_as_json
+from lce_rig.words import as_json, is_renderable, refusal_as_json, sentence
 
 # The schema of result.json; reading is strict.
 
@@ -107,7 +108,7 @@ class FindingRecord(_SavedRecord):
         known = Finding(self.code, self.severity, self.subject, self.figures, self.action_code)
         if is_renderable(known):
             return known
-        return Finding("verdict.text", self.severity, figures={"text": self.text})
+        return Finding("verdict.text", self.severity, figures={"text": self.text, "advice": self.action})
 
 
 class CertificateRecord(_SavedRecord):
@@ -269,7 +270,6 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
     calculated = {
         **vars(calibration.metrics),
         "mge_m": calibration.metrics.mge_m,
-        "diagnostics": dict(sorted(calibration.diagnostics.items())),
         "channels": calibration.channel_results,
     }
     written = {
@@ -277,6 +277,8 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
             name: refusal_as_json(refusal) for name, refusal in sorted(calibration.captures_refused.items())
         },
         "findings": [as_json(finding) for finding in calibration.findings],
+        "reasons": [sentence(finding) for finding in calibration.findings],
+        "diagnostics": calibration.diagnostics.figures(),
     }
     return {
         name: written[name]
@@ -382,7 +384,7 @@ def _calibration(pair: PairRecord) -> Calibration:
 
     return Calibration(
         camera=pair.camera,
-        channel=pair.channel,
+        channels=tuple(record.channel for record in pair.channels) or tuple(pair.channel.split("+")),
         lidar=pair.lidar,
         T_cam_lidar=np.array(pair.T_cam_lidar, dtype=np.float64),
         cov=np.array(pair.cov, dtype=np.float64),
@@ -395,16 +397,25 @@ def _calibration(pair: PairRecord) -> Calibration:
         captures_used=tuple(pair.captures_used),
         captures_refused={name: record.refusal for name, record in pair.captures_refused.items()},
         verdict=pair.verdict,
-        reasons=tuple(pair.reasons),
-        findings=tuple(record.finding for record in pair.findings),
+        findings=_findings(pair),
         egt_rotation_deg=pair.egt_rotation_deg,
         egt_translation_m=pair.egt_translation_m,
-        diagnostics={name: figure(value) for name, value in pair.diagnostics.items()},
+        diagnostics=Diagnostics.of(pair.diagnostics),
         channel_results=tuple(_channel_result(record) for record in pair.channels),
         method=pair.method,
         uncertainty=tuple(PointUncertainty(**each.model_dump()) for each in pair.uncertainty),
         estimated_with=tuple(pair.estimated_with),
         other_cameras=tuple(_other(record) for record in pair.other_cameras),
+    )
+
+
+def _findings(pair: PairRecord) -> tuple[Finding, ...]:
+    """Read the findings; files of earlier versions hold their sentences only."""
+    if pair.findings:
+        return tuple(record.finding for record in pair.findings)
+    severity: Severity = "error" if pair.verdict == "fail" else "warning"
+    return tuple(
+        Finding("verdict.text", severity, figures={"text": reason, "advice": ""}) for reason in pair.reasons
     )
 
 

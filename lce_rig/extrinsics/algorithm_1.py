@@ -7,12 +7,13 @@ References:
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import Array, pose, project_to_so3
 from lce_rig.core.results import Certificate, Observation, Refusal
 from lce_rig.extrinsics.background import estimate_shifts, move_ends
@@ -20,7 +21,7 @@ from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.metrics import error_to_reference
 from lce_rig.extrinsics.observability import require_observable
 from lce_rig.extrinsics.options import Algorithm1Parts, EstimateSettings
-from lce_rig.extrinsics.report import name_sigmas, report_estimate
+from lce_rig.extrinsics.report import report_estimate, with_parts
 from lce_rig.extrinsics.systematic import ring_sensitivities
 from lce_rig.residuals.features import CaptureFeatures, extract_features
 from lce_rig.residuals.moments import Problem, Solutions, Weights
@@ -260,8 +261,6 @@ def _judge(
 
 # Residuals for the first weights of captures; weights are reported in units of it.
 NOMINAL_SIGMA_M = 0.01
-# Names of what `estimate_shifts` finds.
-_SHIFTS = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m")
 
 
 def calibrate_by_algorithm_1(
@@ -284,14 +283,13 @@ def calibrate_by_algorithm_1(
     parts = options.parts
     features = [extract_features(observation, board, parts.features) for observation in observations]
     problem, T_planes = _start(features, board, _weights(parts, features, NOMINAL_SIGMA_M, NOMINAL_SIGMA_M))
-    fitted, shifts = list(observations), dict.fromkeys(_SHIFTS, 0.0)
+    fitted, shifts_m = list(observations), np.zeros(3)
     if problem.n_shift:
         shifts_m = estimate_shifts(observations, features, T_planes, board)
         if shifts_m.any():
             fitted = move_ends(observations, features, T_planes, board, shifts_m)
             features = [extract_features(observation, board, parts.features) for observation in fitted]
             problem = Problem(features, board, problem.weights)
-        shifts = dict(zip(_SHIFTS, shifts_m.tolist(), strict=True))
 
     outliers, sigmas = reject_outliers(features, problem, T_planes, parts)
     observations, fitted = (
@@ -318,7 +316,7 @@ def calibrate_by_algorithm_1(
         certificate=Certificate(bool(certificates.is_optimal[0]), float(certificates.relative_gap[0])),
         held_out_m=held_out,
         refused=outliers,
-        diagnostics={**_diagnostics(problem, solution, covariances, draws), **shifts},
+        diagnostics=_diagnostics(problem, solution, covariances, shifts_m, draws),
     )
 
 
@@ -385,29 +383,35 @@ def _diagnostics(
     problem: Problem,
     solution: Solutions,
     covariances: tuple[Array, Array],
+    shifts_m: Array,
     draws: Draws | None,
-) -> dict[str, float]:
+) -> Diagnostics:
     plane, edge = problem.errors(solution.x)
-    figures = {
-        "plane_weight": problem.weights.plane * NOMINAL_SIGMA_M**2,
-        "edge_weight": problem.weights.edge * NOMINAL_SIGMA_M**2,
-        "fit_plane_rms_m": float(np.sqrt(np.mean(plane**2))),
-        "fit_edge_rms_m": float(np.sqrt(np.mean(edge**2))),
-    }
-    for name, cov in zip(("scatter", "systematic"), covariances, strict=True):
-        figures |= name_sigmas(name, cov)
+    figures = Diagnostics(
+        plane_weight=problem.weights.plane * NOMINAL_SIGMA_M**2,
+        edge_weight=problem.weights.edge * NOMINAL_SIGMA_M**2,
+        fit_plane_rms_m=float(np.sqrt(np.mean(plane**2))),
+        fit_edge_rms_m=float(np.sqrt(np.mean(edge**2))),
+        edge_shift_echo_m=float(shifts_m[0]),
+        edge_shift_blended_m=float(shifts_m[1]),
+        edge_shift_blended_echo_m=float(shifts_m[2]),
+    )
     if problem.n_shift:
-        figures["edge_shift_m"] = float(solution.linear[0, 3])
-        figures["edge_shift_sigma_m"] = float(np.sqrt(covariances[0][6, 6] + covariances[1][6, 6]))
+        figures = replace(
+            figures,
+            edge_shift_m=float(solution.linear[0, 3]),
+            edge_shift_sigma_m=float(np.sqrt(covariances[0][6, 6] + covariances[1][6, 6])),
+        )
     if draws is not None:
-        offset = error_to_reference(draws.T_mean[draws.best], solution.T[0])
-        figures |= {
-            "best_subset_size": float(draws.sizes[draws.best]),
-            "n_solved": float(draws.n_solved),
-            "certified_share": draws.certified_share,
-            "draw_mean_offset_deg": offset[0],
-            "draw_mean_offset_m": offset[1],
-            "draw_spread_rotation_deg": float(np.degrees(draws.spread_rotation_rad[draws.best])),
-            "draw_spread_translation_m": float(draws.spread_translation_m[draws.best]),
-        }
-    return figures
+        offset_deg, offset_m = error_to_reference(draws.T_mean[draws.best], solution.T[0])
+        figures = replace(
+            figures,
+            best_subset_size=float(draws.sizes[draws.best]),
+            n_solved=float(draws.n_solved),
+            certified_share=draws.certified_share,
+            draw_mean_offset_deg=offset_deg,
+            draw_mean_offset_m=offset_m,
+            draw_spread_rotation_deg=float(np.degrees(draws.spread_rotation_rad[draws.best])),
+            draw_spread_translation_m=float(draws.spread_translation_m[draws.best]),
+        )
+    return with_parts(figures, *covariances)

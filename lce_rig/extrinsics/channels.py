@@ -79,7 +79,8 @@ def calibrate_channels(
     estimate = _widened(calibrate_observations(mover.observations(), board, options, progress), offsets)
     for consensus in agreed.values():
         estimate = with_consensus(estimate, consensus)
-    estimate = replace(estimate, refused={**conflicts, **estimate.refused})
+    same_scan = {scan.capture: scan.captures for scan in scans if len(scan.captures) > 1}
+    estimate = replace(estimate, refused={**conflicts, **estimate.refused}, same_scan=same_scan)
     alone = {name: _alone_moved(mover, name, board, options, offsets) for name in agreed}
     results = tuple(
         _channel_result(
@@ -162,8 +163,8 @@ def _offsets(
     """Estimate the channels' time offsets; None if the boards did not move."""
     unit = 1 / NOMINAL_SIGMA_M**2
     weights = Weights(
-        plane=start.diagnostics["plane_weight"] * unit,
-        edge=start.diagnostics["edge_weight"] * unit,
+        plane=start.diagnostics.plane_weight * unit,
+        edge=start.diagnostics.edge_weight * unit,
         shift_prior=options.parts.edge_shift_precision,
     )
     moving = np.flatnonzero(samples.tells_motion).tolist()
@@ -228,7 +229,7 @@ def depth_scatter_m(estimate: CalibrationEstimate) -> float:
 def _difference(
     mover: _Mover, results: Sequence[ChannelResult], board: Board, options: EstimateSettings
 ) -> tuple[Array | None, Array | None]:
-    """Hold two channels' extrinsics against each other: the tangent (6,) between them and its covariance.
+    """Compare two channels' extrinsics: the tangent (6,) between them and its covariance.
 
     If only the two channels together show how boards moved, each pose depends on both; then one channel's
     extrinsic from half of the scans is compared with the other's from the other half, and of several ways to

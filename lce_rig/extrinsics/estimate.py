@@ -1,10 +1,19 @@
 """The result of a calibration."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import CaptureResidual, Certificate, ChannelResult, Metrics, Observation, Refusal
+from lce_rig.core.results import (
+    CaptureResidual,
+    Certificate,
+    ChannelResult,
+    Metrics,
+    Observation,
+    Refusal,
+    WeakestMotion,
+)
 from lce_rig.residuals.quadratics import Quadratics
 
 
@@ -19,18 +28,19 @@ class CalibrationEstimate:
             of the intrinsics and of the board's size.
         certificate: of the final cost over all captures used; its gap is infinite if there is none.
         metrics: errors over all captures used, of the boards as measured.
-        used: names of the captures used, sorted.
+        used: names of the captures used, sorted; one stands for all that hold the same scan.
         refused: why each other capture is not used.
         observations: capture -> the boards that were paired, as measured, for each capture used.
         fitted: the same as used in the method's cost: Algorithm 1 moves ring ends by the background's shift.
         residuals: one per capture used, in the order of `used`.
         held_out_m: mean over captures of `CaptureResidual.held_out_m`.
-        weak_direction: the least determined motion in words, with its standard deviation.
-        diagnostics: further figures by name.
+        weakest: the least determined motion.
+        diagnostics: further figures.
         method: that found it, as `CalibrateOptions.method`.
         expansion: the method's own cost about its result, capture by capture, in the extrinsic (and those of
             cameras estimated with it) alone; None if the method has none.
         estimated_with: cameras whose extrinsics were estimated together with this one.
+        same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
         channels: the result of each channel of the camera alone; empty if they were not separated.
         channel_difference: (6,) tangent between the extrinsics of two channels; None with one channel.
         channel_difference_cov: (6, 6) of it.
@@ -46,11 +56,16 @@ class CalibrationEstimate:
     fitted: Mapping[str, Observation]
     residuals: tuple[CaptureResidual, ...]
     held_out_m: float
-    weak_direction: str
-    diagnostics: Mapping[str, float]
+    weakest: WeakestMotion
+    diagnostics: Diagnostics
     method: str = "paper"
     expansion: Quadratics | None = None
     estimated_with: tuple[str, ...] = ()
+    same_scan: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     channels: tuple[ChannelResult, ...] = ()
     channel_difference: Array | None = None
     channel_difference_cov: Array | None = None
+
+    def captures_of(self, names: Iterable[str]) -> set[str]:
+        """Name every capture that holds the scan of one of the captures named."""
+        return {each for name in names for each in self.same_scan.get(name, (name,))}

@@ -4,13 +4,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from lce_rig.core.board import Board
-from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.findings import Finding
 from lce_rig.core.results import Observation
 from lce_rig.extrinsics.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.extrinsics.consensus import Consensus, find_consensus
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.likelihood import calibrate_by_likelihood
 from lce_rig.extrinsics.options import CaptureCandidates, EstimateSettings, Estimator, Method
+from lce_rig.words import not_enough
 
 Progress = Callable[[int, int], None]
 
@@ -74,7 +75,7 @@ def with_consensus(estimate: CalibrationEstimate, consensus: Consensus) -> Calib
     return replace(
         estimate,
         refused=dict(sorted({**consensus.refused, **estimate.refused}.items())),
-        diagnostics={**estimate.diagnostics, "n_alternative_poses": float(consensus.n_alternative_poses)},
+        diagnostics=replace(estimate.diagnostics, n_alternative_poses=float(consensus.n_alternative_poses)),
     )
 
 
@@ -86,16 +87,11 @@ def agree(candidates: Sequence[CaptureCandidates], board: Board) -> Consensus:
     """
     needed = _MIN_CAPTURES
     if len(candidates) < needed:
-        raise NotEnoughDataError(
-            f"{len(candidates)} captures show the board in both sensors (minimum {needed})",
-            "Add captures: ten or more, with the board at different places and tilts.",
-        )
+        figures = {"n_captures": len(candidates), "n_needed": needed}
+        raise not_enough(Finding("shortage.few_captures", "warning", figures=figures))
     consensus = find_consensus(candidates, board)
     n_agreeing = 0 if consensus is None else len(consensus.observations)
     if consensus is None or n_agreeing < needed:
-        raise NotEnoughDataError(
-            f"only {n_agreeing} of {len(candidates)} captures agree with one set of extrinsics, {needed} "
-            "are needed",
-            "check the board's size, the intrinsics and the pairing of images with scans; add captures",
-        )
+        figures = {"n_agreeing": n_agreeing, "n_captures": len(candidates), "n_needed": needed}
+        raise not_enough(Finding("shortage.few_agree", "warning", figures=figures))
     return consensus

@@ -1,21 +1,22 @@
-"""Which motions of the extrinsics the captures determine, and which they do not, in words."""
+"""Which motions of the extrinsics the captures determine, and which they do not."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array
+from lce_rig.core.results import MOTIONS, Motion, WeakestMotion
 from lce_rig.residuals.features import CaptureFeatures
 from lce_rig.residuals.moments import Problem, Weights
 from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS
 from lce_rig.solvers.registration import vec_rotation, with_one
+from lce_rig.words import not_enough
 
 # Standard deviation of one capture's board plane between camera and LiDAR.
 PLANE_SIGMA_M = 0.005
 # A motion that moves the board by more than this without changing the planes counts as undetermined.
 MAX_WEAK_SIGMA_M = 0.1
-_AXES = ("x axis (right)", "y axis (down)", "z axis (line of sight)")
 
 
 def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_cam_lidar: Array) -> None:
@@ -43,13 +44,12 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
     weak = values < 1 / MAX_WEAK_SIGMA_M**2
     if not weak.any():
         return
-    names = list(dict.fromkeys(name_direction(vector) for vector in vectors[:, weak].T))
-    spread_deg = normal_spread_deg(features)
-    raise NotEnoughDataError(
-        f"{' and '.join(names)} cannot be told from {len(features)} captures: their boards are nearly "
-        f"parallel (normals spread by {spread_deg:.1f} deg)",
-        "Add captures with the board tilted by 20 deg or more, left and right as well as up and down.",
-    )
+    figures: dict[str, Figure] = {
+        "motions": tuple(dict.fromkeys(main_motion(vector) for vector in vectors[:, weak].T)),
+        "n_captures": len(features),
+        "spread_deg": normal_spread_deg(features),
+    }
+    raise not_enough(Finding("shortage.undetermined", "warning", figures=figures))
 
 
 def lever_arm(features: Sequence[CaptureFeatures]) -> float:
@@ -65,20 +65,16 @@ def normal_spread_deg(features: Sequence[CaptureFeatures]) -> float:
     return float(np.degrees(np.sqrt(max(values[1], 0.0))))
 
 
-def name_direction(direction: Array) -> str:
+def main_motion(direction: Array) -> Motion:
     """Name the main component of a motion (6,), translations and rotations in comparable units."""
-    main = int(np.argmax(np.abs(direction)))
-    kind = "translation along" if main < 3 else "rotation about"
-    return f"{kind} the camera's {_AXES[main % 3]}"
+    return MOTIONS[int(np.argmax(np.abs(direction)))]
 
 
-def describe_weakest(cov: Array, features: Sequence[CaptureFeatures]) -> str:
-    """Name the least determined motion and its standard deviation, from a covariance (6, 6)."""
+def find_weakest(cov: Array, features: Sequence[CaptureFeatures]) -> WeakestMotion:
+    """Find the least determined motion and its standard deviation, from a covariance (6, 6)."""
     lever_m = lever_arm(features)
     scale = np.r_[np.ones(3), np.full(3, lever_m)]
     _, vectors = np.linalg.eigh(cov * np.outer(scale, scale))
-    direction = vectors[:, -1]
-    main = int(np.argmax(np.abs(direction)))
-    sigma = float(np.sqrt(cov[main, main]))
-    figure = f"{1e3 * sigma:.1f} mm" if main < 3 else f"{np.degrees(sigma):.3f} deg"
-    return f"{name_direction(direction)}, sigma {figure}"
+    motion = main_motion(vectors[:, -1])
+    main = MOTIONS.index(motion)
+    return WeakestMotion(motion, float(np.sqrt(cov[main, main])))

@@ -1,15 +1,17 @@
 """Turn a solution of any method into an estimate with residuals and figures."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from lce_rig.core.board import Board
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.results import Certificate, Observation, Refusal
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.metrics import capture_residual, summarise
-from lce_rig.extrinsics.observability import describe_weakest
+from lce_rig.extrinsics.observability import find_weakest
 from lce_rig.residuals.features import CaptureFeatures
 from lce_rig.residuals.placements import group_placements
 
@@ -17,10 +19,16 @@ from lce_rig.residuals.placements import group_placements
 NO_CERTIFICATE = Certificate(is_optimal=False, gap=float("inf"))
 
 
-def name_sigmas(part: str, cov: Array) -> dict[str, float]:
-    """Return the sizes of a covariance part, "scatter" or "systematic", as diagnostics: (6 + k, 6 + k)."""
-    sigma_deg, sigma_m = sigma_sizes(cov)
-    return {f"sigma_{part}_rotation_deg": sigma_deg, f"sigma_{part}_translation_m": sigma_m}
+def with_parts(figures: Diagnostics, scatter: Array, systematic: Array) -> Diagnostics:
+    """Add the sizes of both parts of a covariance, each (6 + k, 6 + k)."""
+    (scatter_deg, scatter_m), (systematic_deg, systematic_m) = map(sigma_sizes, (scatter, systematic))
+    return replace(
+        figures,
+        sigma_scatter_rotation_deg=scatter_deg,
+        sigma_scatter_translation_m=scatter_m,
+        sigma_systematic_rotation_deg=systematic_deg,
+        sigma_systematic_translation_m=systematic_m,
+    )
 
 
 def report_estimate(
@@ -34,7 +42,7 @@ def report_estimate(
     certificate: Certificate = NO_CERTIFICATE,
     held_out_m: Array | None = None,
     refused: Mapping[str, Refusal],
-    diagnostics: Mapping[str, float],
+    diagnostics: Diagnostics,
 ) -> CalibrationEstimate:
     """Measure the residuals of extrinsics and assemble the estimate.
 
@@ -56,12 +64,13 @@ def report_estimate(
         for observation, error in zip(observations, held_out, strict=True)
     )
     metrics = summarise(residuals)
-    figures = {
+    figures = replace(
+        diagnostics,
         # The paper's code counts every ring end twice, which halves its mean.
-        "paper_mee_m": metrics.mee_m / 2,
-        "held_out_m": float(np.mean(held_out)),
-        "n_placements": float(group_placements(observations).max() + 1),
-    }
+        paper_mee_m=metrics.mee_m / 2,
+        held_out_m=float(np.mean(held_out)),
+        n_placements=float(group_placements(observations).max() + 1),
+    )
     return CalibrationEstimate(
         T_cam_lidar=T_cam_lidar,
         cov=cov,
@@ -73,6 +82,6 @@ def report_estimate(
         fitted={observation.capture: observation for observation in fitted or observations},
         residuals=residuals,
         held_out_m=float(np.mean(held_out)),
-        weak_direction=describe_weakest(cov, features),
-        diagnostics={**diagnostics, **figures},
+        weakest=find_weakest(cov, features),
+        diagnostics=figures,
     )

@@ -1,6 +1,6 @@
 """Images of all channels of one camera that share one scan."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -43,14 +43,19 @@ class SharedScan:
     """One scan of the board and its images.
 
     Attributes:
-        capture: its name; the names of captures with the same scan are joined by "+".
+        captures: names of those that hold it, sorted; its images may lie in several, with copies of it.
         images: the board by channel, at least one.
         lidar: the board in the scan.
     """
 
-    capture: str
+    captures: tuple[str, ...]
     images: Mapping[str, ImageBoard]
     lidar: LidarBoard
+
+    @property
+    def capture(self) -> str:
+        """The capture that stands for all of them."""
+        return self.captures[0]
 
     def observation(self) -> Observation:
         """Pair the scan with its first channel's image."""
@@ -91,18 +96,13 @@ def join_scans(
                 group[channel] = observation
     scans = [
         SharedScan(
-            "+".join(sorted({o.capture for o in group.values()})),
+            tuple(sorted({o.capture for o in group.values()})),
             {channel: o.image for channel, o in group.items()},
             next(iter(group.values())).lidar,
         )
         for group in groups.values()
     ]
     return sorted(scans, key=lambda scan: scan.capture), refused
-
-
-def take_apart(names: Iterable[str]) -> set[str]:
-    """Split names of captures that share a scan ("000003+000060")."""
-    return {single for name in names for single in name.split("+")}
 
 
 def sample_scans(scans: Sequence[SharedScan], clocks: Clocks, noise_px: Mapping[str, float]) -> PoseSamples:

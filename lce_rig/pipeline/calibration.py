@@ -10,9 +10,10 @@ from itertools import combinations
 
 import numpy as np
 
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
-from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.geometry import invert, sigma_sizes, tangent_sizes
 from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
@@ -28,7 +29,6 @@ from lce_rig.extrinsics.consensus import find_consensus
 from lce_rig.extrinsics.likelihood.calibrate_together import TogetherEstimate, calibrate_together
 from lce_rig.extrinsics.metrics import error_to_reference
 from lce_rig.extrinsics.relative_pose import relative_pose
-from lce_rig.extrinsics.shared_scans import take_apart
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.result_files import Result
@@ -38,7 +38,7 @@ from lce_rig.validation.camera_pairs import CameraPair, camera_findings, relate
 from lce_rig.validation.reach import point_uncertainties
 from lce_rig.validation.validate import Validation, validate
 from lce_rig.validation.verdict import judge
-from lce_rig.words import sentence
+from lce_rig.words import not_enough, sentence
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +64,28 @@ class _Sensors:
     @property
     def lidar(self) -> str:
         return self.pairs[0].lidar
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """The result of the captures of one camera and one LiDAR.
+
+    Attributes:
+        sensors: the two.
+        estimate: of the extrinsics.
+        validation: of the estimate on the camera's own captures and images.
+        together: the estimate of several cameras that it is part of; None where it stands alone.
+    """
+
+    sensors: _Sensors
+    estimate: CalibrationEstimate
+    validation: Validation
+    together: TogetherEstimate | None = None
+
+    @property
+    def is_still(self) -> bool:
+        """Whether boards stood still, so that images need no motion compensation."""
+        return all(channel.time_offset_s is None for channel in self.estimate.channels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +145,7 @@ def calibrate_detections(
     channels: Sequence[str] | None = None,
     reference: Reference | None = None,
     progress: Progress = silent,
-) -> tuple[list[Calibration], list[NotEnoughDataError]]:
+) -> tuple[list[Calibration], list[Finding]]:
     """Estimate and judge the extrinsics of every camera with every LiDAR from their detections.
 
     Channels of one camera share pixels and lens: together they give one set of extrinsics. Cameras that saw
@@ -142,43 +164,36 @@ def calibrate_detections(
             named.
         UsageError: no capture holds one of the channels.
     """
-    board = rig.board.to_board()
-    sensors, alone, shortages = [], [], []
+    alone: list[_Solved] = []
+    shortages: list[Finding] = []
     for pairs in _pairs_by_sensors(detections, cameras, channels):
         try:
-            own = _sensors(rig, detections, pairs, options or CalibrateOptions())
-            clocks = clocks_of(rig, own.camera, own.lidar)
-            alone.append(calibrate_channels(own.candidates, board, own.settings, clocks, progress))
-            sensors.append(own)
+            alone.append(_solve(rig, detections, pairs, options or CalibrateOptions(), progress))
         except NotEnoughDataError as error:
-            shortages.append(error)
-    if not sensors:
+            shortages.append(_shortage(pairs, error))
+    if not alone:
         raise _nothing_solved(shortages, cameras)
-    links = list(_links(rig, sensors, alone))
-    joint = _estimate_together(rig, sensors, alone, links)
-    final = [_from_all_cameras(rig, detections, k, sensors[k], alone[k], joint) for k in range(len(sensors))]
-    checked = [_examine(rig, detections, *each) for each in zip(sensors, final, strict=True)]
-    calibrations = []
-    for k, own in enumerate(sensors):
-        mine = [link for link in links if k in (link.first, link.second)]
-        contradictions = [finding for link in mine for finding in link.findings]
-        others = tuple(_other_camera(sensors, final, checked, k, link, joint) for link in mine)
-        calibration = _judged(rig, detections, own, final[k], checked[k], contradictions, others)
-        truth = reference.of(own.camera, own.lidar) if reference else None
-        calibrations.append(calibration if truth is None else _compared(calibration, truth))
-    return calibrations, shortages
+    links = list(_links(rig, alone))
+    solved = _solve_together(rig, detections, alone, links)
+    calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
+    return [_compared(calibration, reference) for calibration in calibrations], shortages
 
 
-def _nothing_solved(
-    troubles: Sequence[NotEnoughDataError], cameras: Sequence[str] | None
-) -> NotEnoughDataError:
+def _nothing_solved(shortages: Sequence[Finding], cameras: Sequence[str] | None) -> NotEnoughDataError:
     """State for every pair why it could not be calibrated."""
-    if not troubles:
+    if not shortages:
         of_cameras = f" of {' or '.join(cameras)}" if cameras else ""
         return NotEnoughDataError(
             f"the session has no capture with an image{of_cameras} and a scan", "Collect captures first."
         )
-    return join_shortages(troubles)
+    return join_shortages([not_enough(shortage) for shortage in shortages])
+
+
+def _shortage(pairs: Sequence[Pair], error: NotEnoughDataError) -> Finding:
+    """Name the sensors that lack captures, if the error does not."""
+    figures = {"text": error.what, "advice": error.hint}
+    found = error.finding or Finding("shortage.text", "warning", figures=figures)
+    return found if found.subject else replace(found, subject=f"{pairs[0].camera} and {pairs[0].lidar}")
 
 
 def _pairs_by_sensors(
@@ -202,6 +217,22 @@ def _pairs_by_sensors(
     return list(groups.values())
 
 
+def _solve(
+    rig: Rig, detections: Detections, pairs: Sequence[Pair], options: CalibrateOptions, progress: Progress
+) -> _Solved:
+    """Estimate the extrinsics of one camera and LiDAR from their own captures alone.
+
+    Raises:
+        NotEnoughDataError: there are too few, or a direction is undetermined.
+    """
+    sensors = _sensors(rig, detections, pairs, options)
+    clocks = clocks_of(rig, sensors.camera, sensors.lidar)
+    estimate = calibrate_channels(
+        sensors.candidates, rig.board.to_board(), sensors.settings, clocks, progress
+    )
+    return _Solved(sensors, estimate, _examine(rig, detections, sensors, estimate))
+
+
 def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: CalibrateOptions) -> _Sensors:
     """Collect the candidates of each channel with enough captures, and why other captures are unusable.
 
@@ -210,21 +241,16 @@ def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: C
     """
     candidates: dict[str, list[CaptureCandidates]] = {}
     refused: dict[str, Refusal] = {}
-    needed = rig.quality.min_captures
-    trouble: NotEnoughDataError | None = None
+    shortages: list[Finding] = []
     for pair in pairs:
         own, own_refused = _candidates(detections, pair)
         refused |= {name: why for name, why in own_refused.items() if name not in refused}
-        if len(own) >= needed:
+        if len(own) >= rig.quality.min_captures:
             candidates[pair.channel] = own
-        elif trouble is None:
-            trouble = NotEnoughDataError(
-                f"{pair}: the board was found by both sensors in {len(own)} of "
-                f"{len(own) + len(own_refused)} captures, at least {needed} are needed",
-                _commonest(own_refused) or "collect more captures",
-            )
-    if not candidates and trouble is not None:
-        raise trouble
+        else:
+            shortages.append(_few_detected(pair, len(own), own_refused, rig.quality.min_captures))
+    if not candidates:
+        raise not_enough(shortages[0])
     found = {item.capture for items in candidates.values() for item in items}
     refused = {name: why for name, why in refused.items() if name not in found}
     settings = EstimateSettings.of(options, rig.lidars[pairs[0].lidar])
@@ -244,42 +270,45 @@ def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandida
     return candidates, refused
 
 
-def _commonest(refused: dict[str, Refusal]) -> str:
-    """List the most frequent causes of refusal, one per line."""
-    counts = Counter(f"{why.stage}: {sentence(why)}" for why in refused.values())
-    return "\n".join(f"{n} x {text}" for text, n in counts.most_common(3))
+def _few_detected(pair: Pair, n_detected: int, refused: Mapping[str, Refusal], n_needed: int) -> Finding:
+    """State in how many captures both sensors found the board, and the most frequent causes of refusal."""
+    counts = Counter((why.code, f"{why.stage}: {sentence(why)}") for why in refused.values())
+    figures: dict[str, Figure] = {
+        "n_detected": n_detected,
+        "n_captures": n_detected + len(refused),
+        "n_needed": n_needed,
+        "causes": tuple((n, code, text) for (code, text), n in counts.most_common(3)),
+    }
+    return Finding("shortage.few_detected", "warning", str(pair), figures)
 
 
-def _links(rig: Rig, sensors: Sequence[_Sensors], alone: Sequence[CalibrationEstimate]) -> Iterator[_Link]:
+def _links(rig: Rig, solved: Sequence[_Solved]) -> Iterator[_Link]:
     """Compare cameras of one LiDAR that saw the same still boards."""
-    for i, j in combinations(range(len(sensors)), 2):
-        if sensors[i].lidar == sensors[j].lidar and _is_still(alone[i]) and _is_still(alone[j]):
+    for (i, one), (j, other) in combinations(enumerate(solved), 2):
+        if one.sensors.lidar == other.sensors.lidar and one.is_still and other.is_still:
             # Contradicting captures widen a method's covariance; that must not hide the contradiction.
-            pair = relate(alone[i], alone[j])
+            pair = relate(one.estimate, other.estimate)
             if pair is not None:
-                names = sensors[i].camera, sensors[j].camera
+                names = one.sensors.camera, other.sensors.camera
                 yield _Link(i, j, pair, tuple(camera_findings(pair, names, rig.calibration, rig.verdict)))
 
 
-def _is_still(estimate: CalibrationEstimate) -> bool:
-    """Return whether boards stood still, so that images need no motion compensation."""
-    return all(channel.time_offset_s is None for channel in estimate.channels)
-
-
-def _estimate_together(
-    rig: Rig, sensors: Sequence[_Sensors], alone: Sequence[CalibrationEstimate], links: Sequence[_Link]
-) -> dict[int, TogetherEstimate]:
-    """Estimate cameras that agree jointly with method "ml"; return the results by index.
+def _solve_together(
+    rig: Rig, detections: Detections, alone: Sequence[_Solved], links: Sequence[_Link]
+) -> list[_Solved]:
+    """Estimate cameras that agree jointly with method "ml"; leave the others unchanged.
 
     A camera that contradicts another is excluded, as it would corrupt the other's extrinsics.
     """
-    joint: dict[int, TogetherEstimate] = {}
-    for group in _groups(len(sensors), links):
-        settings = sensors[group[0]].settings
+    solved = list(alone)
+    for group in _groups(len(alone), links):
+        settings = alone[group[0]].sensors.settings
         if settings.method == "ml":
-            own = {sensors[k].camera: alone[k] for k in group}
-            joint |= dict.fromkeys(group, calibrate_together(own, rig.board.to_board(), settings))
-    return joint
+            own = {alone[k].sensors.camera: alone[k].estimate for k in group}
+            together = calibrate_together(own, rig.board.to_board(), settings)
+            for k in group:
+                solved[k] = _part_of(together, rig, detections, alone[k])
+    return solved
 
 
 def _groups(n: int, links: Sequence[_Link]) -> list[list[int]]:
@@ -296,50 +325,37 @@ def _groups(n: int, links: Sequence[_Link]) -> list[list[int]]:
     return [members for members in found if len(members) > 1]
 
 
-def _from_all_cameras(
-    rig: Rig,
-    detections: Detections,
-    k: int,
-    sensors: _Sensors,
-    alone: CalibrationEstimate,
-    joint: Mapping[int, TogetherEstimate],
-) -> CalibrationEstimate:
-    """Return the joint estimate if there is one, else the camera's own."""
-    if k not in joint:
-        return alone
-    estimate = joint[k].estimates[sensors.camera]
-    sigma_deg, sigma_m = sigma_sizes(_examine(rig, detections, sensors, alone).cov)
-    figures = {"alone_sigma_rotation_deg": sigma_deg, "alone_sigma_translation_m": sigma_m}
-    return replace(
+def _part_of(together: TogetherEstimate, rig: Rig, detections: Detections, alone: _Solved) -> _Solved:
+    """Replace a camera's own estimate by its part of a joint one."""
+    estimate = together.estimates[alone.sensors.camera]
+    sigma_deg, sigma_m = sigma_sizes(alone.validation.cov)
+    estimate = replace(
         estimate,
-        diagnostics={**estimate.diagnostics, **figures},
-        channels=alone.channels,
-        channel_difference=alone.channel_difference,
-        channel_difference_cov=alone.channel_difference_cov,
+        diagnostics=replace(
+            estimate.diagnostics, alone_sigma_rotation_deg=sigma_deg, alone_sigma_translation_m=sigma_m
+        ),
+        channels=alone.estimate.channels,
+        channel_difference=alone.estimate.channel_difference,
+        channel_difference_cov=alone.estimate.channel_difference_cov,
     )
+    return _Solved(alone.sensors, estimate, _examine(rig, detections, alone.sensors, estimate), together)
 
 
-def _other_camera(
-    sensors: Sequence[_Sensors],
-    estimates: Sequence[CalibrationEstimate],
-    checked: Sequence[Validation],
-    k: int,
-    link: _Link,
-    joint: Mapping[int, TogetherEstimate],
-) -> OtherCamera:
-    """State the pose of the other camera of a link relative to camera k."""
+def _other_camera(solved: Sequence[_Solved], link: _Link, k: int) -> OtherCamera:
+    """State the pose of the other camera of a link relative to the camera of index k."""
     pair, is_second = link.pair, k == link.second
-    other = link.first if is_second else link.second
-    T, J = relative_pose(estimates[k].T_cam_lidar, estimates[other].T_cam_lidar)
+    own, other = solved[k], solved[link.first if is_second else link.second]
+    T, J = relative_pose(own.estimate.T_cam_lidar, other.estimate.T_cam_lidar)
     cov = None
-    if k in joint and joint[k] is joint.get(other):
+    if own.together is not None and own.together is other.together:
         # Widened like both extrinsics.
-        J = J * np.repeat([checked[k].widened_by, checked[other].widened_by], 6)
-        cov = np.asarray(J @ joint[k].covariance_of(sensors[k].camera, sensors[other].camera) @ J.T)
+        J = J * np.repeat([own.validation.widened_by, other.validation.widened_by], 6)
+        both = own.together.covariance_of(own.sensors.camera, other.sensors.camera)
+        cov = np.asarray(J @ both @ J.T)
     seen = None if pair.pictures is None else pair.pictures.T_second_first
     apart_deg, apart_m = (None, None) if pair.apart is None else tangent_sizes(pair.apart)
     return OtherCamera(
-        camera=sensors[other].camera,
+        camera=other.sensors.camera,
         n_captures=len(pair.captures),
         T_cam_other=T,
         cov=cov,
@@ -354,7 +370,7 @@ def _examine(
     rig: Rig, detections: Detections, sensors: _Sensors, estimate: CalibrationEstimate
 ) -> Validation:
     """Check an estimate on its own captures and images."""
-    used = sorted(take_apart(estimate.used))
+    used = sorted(estimate.captures_of(estimate.used))
     channels = {channel.channel for channel in estimate.channels}
     views = []
     for name in used:
@@ -367,64 +383,69 @@ def _examine(
 
 
 def _judged(
-    rig: Rig,
-    detections: Detections,
-    sensors: _Sensors,
-    estimate: CalibrationEstimate,
-    examination: Validation,
-    between_cameras: Sequence[Finding],
-    others: tuple[OtherCamera, ...],
+    rig: Rig, detections: Detections, solved: Sequence[_Solved], links: Sequence[_Link], k: int
 ) -> Calibration:
+    """Judge the extrinsics of index k and assemble their result."""
+    sensors, estimate, validation = solved[k].sensors, solved[k].estimate, solved[k].validation
     camera, lidar = sensors.camera, sensors.lidar
+    mine = [link for link in links if k in (link.first, link.second)]
+    contradictions = [finding for link in mine for finding in link.findings]
     n_captures = len({name for pair in sensors.pairs for name in detections.captures(pair)})
-    verdict, findings = judge(estimate, examination, rig, camera, lidar, n_captures, between_cameras)
-    diagnostics = dict(estimate.diagnostics)
-    if examination.widened_by != 1:
-        diagnostics["sigma_widened"] = examination.widened_by
-    if estimate.channel_difference is not None:
-        rotation_deg, translation_m = tangent_sizes(estimate.channel_difference)
-        diagnostics |= {"channels_rotation_deg": rotation_deg, "channels_translation_m": translation_m}
+    verdict, findings = judge(estimate, validation, rig, camera, lidar, n_captures, contradictions)
     lens = rig.cameras[camera].to_intrinsics()
     return Calibration(
         camera=camera,
-        channel="+".join(channel.channel for channel in estimate.channels),
+        channels=tuple(channel.channel for channel in estimate.channels),
         lidar=lidar,
         T_cam_lidar=estimate.T_cam_lidar,
-        cov=examination.cov,
+        cov=validation.cov,
         certificate=estimate.certificate,
         metrics=estimate.metrics,
         n_captures=n_captures,
         n_detected=n_captures - len(sensors.refused),
-        captures_used=tuple(sorted(take_apart(estimate.used))),
+        captures_used=tuple(sorted(estimate.captures_of(estimate.used))),
         captures_refused=_still_refused(estimate, sensors.refused),
         verdict=verdict,
-        reasons=tuple(sentence(finding) for finding in findings),
         findings=findings,
-        diagnostics=diagnostics,
+        diagnostics=_diagnostics(estimate, validation),
         channel_results=estimate.channels,
         method=estimate.method,
-        uncertainty=point_uncertainties(estimate.T_cam_lidar, examination.cov, lens),
+        uncertainty=point_uncertainties(estimate.T_cam_lidar, validation.cov, lens),
         estimated_with=estimate.estimated_with,
-        other_cameras=others,
-        weak_direction=estimate.weak_direction,
+        other_cameras=tuple(_other_camera(solved, link, k) for link in mine),
+        weakest=estimate.weakest,
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,
         observations=estimate.observations,
     )
 
 
+def _diagnostics(estimate: CalibrationEstimate, validation: Validation) -> Diagnostics:
+    """Add what the validation and the comparison of channels found."""
+    figures = estimate.diagnostics
+    if validation.widened_by != 1:
+        figures = replace(figures, sigma_widened=validation.widened_by)
+    if estimate.channel_difference is None:
+        return figures
+    rotation_deg, translation_m = tangent_sizes(estimate.channel_difference)
+    return replace(figures, channels_rotation_deg=rotation_deg, channels_translation_m=translation_m)
+
+
 def _still_refused(estimate: CalibrationEstimate, refused: Mapping[str, Refusal]) -> dict[str, Refusal]:
     """List refusals by capture, except those for which another channel of the same scan is usable."""
-    used = take_apart(estimate.used)
+    used = estimate.captures_of(estimate.used)
     every = dict(refused)
     for name, why in estimate.refused.items():
-        every |= dict.fromkeys(take_apart([name]), why)
+        every |= dict.fromkeys(estimate.captures_of([name]), why)
     return {name: every[name] for name in sorted(every) if name not in used}
 
 
-def _compared(calibration: Calibration, reference: Array) -> Calibration:
-    """Report the error from a reference T_cam_lidar (4, 4)."""
-    rotation_deg, translation_m = error_to_reference(calibration.T_cam_lidar, reference)
+def _compared(calibration: Calibration, reference: Reference | None) -> Calibration:
+    """Report the error from a reference T_cam_lidar, if there is one."""
+    truth = reference.of(calibration.camera, calibration.lidar) if reference else None
+    if truth is None:
+        return calibration
+    rotation_deg, translation_m = error_to_reference(calibration.T_cam_lidar, truth)
     return replace(calibration, egt_rotation_deg=rotation_deg, egt_translation_m=translation_m)
 
 

@@ -18,6 +18,7 @@ from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_part
 from lce_rig.session import Session
 from lce_rig.session.identity import DifferingKey, differing_keys
 from lce_rig.validation.repeatability import Repeatability, compare_calibrations
+from lce_rig.words import describe, recommend
 
 # Inputs of the extrinsics besides the captures; another lens is another camera.
 _SAME_SENSORS = frozenset({"intrinsics", "resolution_px", "model"})
@@ -213,7 +214,17 @@ def _calibrate(name: str, session: Session) -> tuple[list[Calibration], list[Fin
     except NotEnoughDataError as error:
         raise NotEnoughDataError(f"{name}: {error.what}", error.hint) from None
     return list(result.pairs), [
-        Finding("repeat.not_calibrated", "warning", name, {"what": shortage.what, "hint": shortage.hint})
+        Finding(
+            "repeat.not_calibrated",
+            "warning",
+            name,
+            {
+                "sensors": shortage.subject,
+                "cause": shortage.code,
+                "what": describe(shortage),
+                "hint": recommend(shortage),
+            },
+        )
         for shortage in result.shortages
     ]
 

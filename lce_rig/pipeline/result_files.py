@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, UsageError
+from lce_rig.core.findings import Finding
 from lce_rig.core.limits import read_file
 from lce_rig.core.results import Calibration
 from lce_rig.session import Session
@@ -37,7 +38,7 @@ class Result:
 
     session: Session
     pairs: tuple[Calibration, ...]
-    shortages: tuple[NotEnoughDataError, ...] = ()
+    shortages: tuple[Finding, ...] = ()
 
     def of(self, camera: str, lidar: str | None = None) -> Calibration:
         """Return the extrinsics of a camera with a LiDAR, by default the first with a result.

@@ -1,1 +1,1 @@
-"""What boards say of extrinsics: plane and ring-end residuals, their derivatives, quadratics by capture."""
+"""Plane and ring-end residuals, their derivatives, and quadratic costs per capture."""

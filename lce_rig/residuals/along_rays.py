@@ -1,12 +1,12 @@
-"""Plane and ring ends along the LiDAR's rays, against boards at given poses: what the likelihood weighs.
+"""Residuals of planes and ring ends along the LiDAR's rays for boards at given poses, for the likelihood.
 
 Ranges. A ray u meets a board's plane n . p = h at r = h / (n . u) and reads, off by the offset o of its laser
 and displaced by f theta (the lens, below),
 
     rho = r - n . f theta / (n . u) + o + noise                                                          (1)
 
-A plane moves in three ways that its points can tell (`freedoms_of_plane`), so that all that an estimate needs
-of the returns of a ring in a capture are the sums of products of
+The points determine three parameters of a plane's motion (`freedoms_of_plane`), so that all that an estimate
+needs of the returns of a ring in a capture are the sums of products of
 
     v = [(1, x, y) / (n . u); 1; -n . f / (n . u); residual of (1)]
 
@@ -62,7 +62,7 @@ SHIFTS = ("d_0", "c", "d_1", "d_2", "d_3", "along azimuth", "upwards")
 N_SHIFTS = len(SHIFTS)
 # Columns of a ring end: by board pose, by lens, by shifts, residual.
 _OF_END = 6 + N_FIELDS + N_SHIFTS + 1
-# A ring end on an edge parallel to its ring has hardly a step; it says where the edge is, but not so well.
+# A ring end on an edge parallel to its ring has hardly a step, and determines the edge less accurately.
 _SHORTEST_STEP_M = 2e-4
 BLENDS_M = 0.35
 """Echoes from surfaces nearer to each other than this blend into one."""
@@ -108,7 +108,7 @@ class StackedScans:
 
 
 def interior(lidar: LidarBoard, board: Board) -> LidarBoard:
-    """Leave out returns near the border: there the beam meets what is behind as well, and reads too long."""
+    """Remove returns near the border, where the beam also hits the background and reads too long."""
     T = lidar.T_lidar_board
     xy = ((np.asarray(lidar.points, dtype=np.float64) - T[:3, 3]) @ T[:3, :3])[:, :2]
     keep = np.all(np.abs(xy) < np.array([board.width_m, board.height_m]) / 2 - _BORDER_M, axis=1)
@@ -164,13 +164,13 @@ def lens_fields(points: Array) -> Array:
 
 
 def is_blended(lidar: LidarBoard) -> NDArray[np.bool_]:
-    """Tell of each ring end (M,) whether something stands close behind the board, along the beam."""
+    """Return for each ring end (M,) whether an object is close behind the board along the beam."""
     cosine = np.abs(lidar.edge_points @ lidar.plane[:3]) / np.linalg.norm(lidar.edge_points, axis=1)
     return np.asarray(lidar.edge_behind_m < BLENDS_M * cosine)
 
 
 def describe_background(lidar: LidarBoard) -> Array:
-    """Tell what is behind each ring end (M, 3).
+    """Describe the background of each ring end (M, 3).
 
     Columns are the background's share of the power where it is far behind, whether it blends, and its share
     where it does.
@@ -193,7 +193,7 @@ class RangeSums:
 
 
 def sum_ranges(scans: StackedScans, T_lidar_board: Array, offset_m: Array, lens: Array) -> RangeSums:
-    """Sum what the returns say.
+    """Sum the returns' terms.
 
     Args:
         scans: rays.
@@ -226,7 +226,7 @@ def sum_ranges(scans: StackedScans, T_lidar_board: Array, offset_m: Array, lens:
 
 
 def weigh_ranges(ranges: RangeSums, sigma_m: float, sigma_ring_m: float) -> tuple[Array, Array]:
-    """Weigh the sums by the noise of single ranges and by errors that a ring's returns in a capture share.
+    """Weight the sums by the noise of single ranges and by errors common to a ring's returns in a capture.
 
     The returns of one ring in one capture have the covariance sigma^2 I + sigma_ring^2 1 1^T; its inverse is
 

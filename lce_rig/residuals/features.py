@@ -1,4 +1,4 @@
-"""From a pair of detected boards to the points, planes and lines that are fitted to each other."""
+"""Points, planes and lines of a pair of detected boards."""
 
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -14,7 +14,7 @@ _GRAZING_COSINE = 0.2
 
 @dataclass(frozen=True)
 class FeatureSettings:
-    """How what the LiDAR measured comes onto the board's plane; benchmarks compare the choices.
+    """How the LiDAR's points are projected onto the board's plane; benchmarks compare the choices.
 
     Attributes:
         point_projection: along the rays ("ray"), along the plane's normal ("normal"), or not at all ("none").
@@ -27,7 +27,7 @@ class FeatureSettings:
 
 AS_FITTED = FeatureSettings()
 AS_MEASURED = FeatureSettings(half_step=False)
-"""Ring ends where the LiDAR saw them, for residuals that are reported."""
+"""Ring ends as measured, for reported residuals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class CaptureFeatures:
 def extract_features(
     observation: Observation, board: Board, settings: FeatureSettings = AS_FITTED
 ) -> CaptureFeatures:
-    """Build what one capture contributes to the cost."""
+    """Build one capture's contribution to the cost."""
     lidar = observation.lidar
     edge_points, edge_steps_m = _ring_ends(lidar, settings)
     return CaptureFeatures(

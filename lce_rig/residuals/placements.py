@@ -1,4 +1,4 @@
-"""Captures of a board that was not moved in between repeat each other: they are no independent evidence."""
+"""Placements: captures of a board that was not moved in between are not independent."""
 
 from collections.abc import Mapping, Sequence
 
@@ -42,7 +42,7 @@ def group_shared_placements(
 ) -> NDArray[np.intp]:
     """Number the board placements of captures that several cameras share.
 
-    Captures that one camera sees in the same place stood in the same place, whatever the others see.
+    Captures in the same place for one camera are one placement, for any other cameras.
 
     Args:
         cameras: observations of each.

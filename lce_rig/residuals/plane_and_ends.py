@@ -1,4 +1,4 @@
-"""How far the LiDAR's points and ring ends lie from the camera's board: two residuals and their derivatives.
+"""Distances of the LiDAR's points and ring ends from the camera's board: residuals and their derivatives.
 
 With T_cam_lidar = (R, t), a point p and a ring end q of the LiDAR's leave
 
@@ -24,7 +24,7 @@ from lce_rig.core.geometry import Array, transform
 from lce_rig.residuals.features import CaptureFeatures
 
 PLANE_FREEDOMS = 3
-"""Two planes differ by an offset and two tilts, however many points the LiDAR's has."""
+"""Two planes differ by an offset and two tilts, for any number of points."""
 # Errors of a board's plane and of its ring ends are at least as large as this.
 _PLANE_FLOOR_M, _END_FLOOR_M = 0.001, 0.002
 
@@ -147,7 +147,7 @@ def freedoms_of_plane() -> Array:
 
 @dataclass(frozen=True)
 class FeatureSigmas:
-    """Errors by which planes and ring ends are weighed: how far they lie from the camera's.
+    """Standard deviations for the weights of planes and ring ends, from their distances.
 
     Attributes:
         plane_m: of a capture's plane, rms over the board.
@@ -159,7 +159,7 @@ class FeatureSigmas:
 
 
 def feature_sigmas(features: Sequence[CaptureFeatures], board: Board, T_cam_lidar: Array) -> FeatureSigmas:
-    """Take the typical errors of captures' planes and ring ends under extrinsics (4, 4)."""
+    """Return the typical errors of captures' planes and ring ends under extrinsics (4, 4)."""
     planes_m = [np.sqrt(np.mean(plane_residuals(f, T_cam_lidar) ** 2)) for f in features]
     inside_m = np.concatenate([end_residuals(f, T_cam_lidar, board)[0] for f in features])
     # Ring ends reach beyond the plate by the beam's width, which is no error.

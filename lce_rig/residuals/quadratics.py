@@ -1,13 +1,13 @@
-"""A cost to second order, capture by capture: what any share of the captures would have given.
+"""A cost to second order per capture, which gives the result of any subset of the captures.
 
-Half the gradient g_k and half the Hessian H_k of each capture's cost say for all shares w of the captures at
-once, with P the information of the priors and g_P half the gradient of theirs, where the optimum lies:
+With half the gradient g_k and half the Hessian H_k of each capture's cost, and P and g_P those of the priors,
+the optimum for weights w of the captures is
 
     x(w) = -(P + sum_k w_k H_k)^-1 (g_P + sum_k w_k g_k)                                                 (1)
 
-Whatever weighs residuals (Algorithm 1, the likelihood, the validation's independent check) ends here, and
-every covariance from the scatter between captures starts here. What errs independently are placements of the
-board, not captures that repeat one.
+All weightings of residuals (Algorithm 1, the likelihood, the validation) give this form, and all covariances
+from the scatter between captures follow from it. Errors are independent between placements of the board, not
+between captures that repeat one.
 """
 
 from dataclasses import dataclass, replace
@@ -68,12 +68,12 @@ class Quadratics:
         return self.solve(1 - self.groups)
 
     def moves(self) -> Array:
-        """Compute by how much an estimate at the optimum moves without each placement: (G, p).
+        """Compute the leave-one-out shifts of an estimate at the optimum for each placement: (G, p).
 
             m_k = (P + sum_j H_j - H_k)^-1 g_k
 
-        with sums over a placement's captures for g_k and H_k. No other gradient enters: an estimate that
-        stopped short of its optimum shows in the scatter.
+        with sums over a placement's captures for g_k and H_k. No other gradient enters, so that an estimate
+        short of its optimum increases the scatter.
         """
         H = np.tensordot(1 - self.groups, self.hessians, axes=1) + self.prior
         return np.asarray((symmetric_inverse(H) @ (self.groups @ self.gradients)[..., None])[..., 0])
@@ -83,10 +83,10 @@ class Quadratics:
         return symmetric_inverse(self.information)
 
     def jackknife_covariance(self) -> Array:
-        """Compute the covariance (p, p) of the optimum from what leaving placements out does to it.
+        """Compute the leave-one-out covariance (p, p) of the optimum over placements.
 
         No model of the noise enters, and errors within a placement may be correlated in any way; unlike
-        s^2 H^-1, which takes every residual for independent, it sees what a whole placement has in common.
+        s^2 H^-1, which assumes independent residuals, it includes errors common to a whole placement.
 
         The inverse of a covariance from few samples is too large: for normal errors in p unknowns it averages
         (G - 1) / (G - p - 2) times the true inverse. Multiplied by that factor, the scatter gives normalised
@@ -102,11 +102,11 @@ class Quadratics:
         return np.asarray(correction * jackknife_scatter(self.moves()))
 
     def hold(self, unknown: int) -> "Quadratics":
-        """Hold an unknown where it is: quadratics in the others."""
+        """Hold an unknown fixed: quadratics in the others."""
         return self.of(np.delete(np.arange(len(self.prior)), unknown))
 
     def of(self, unknowns: NDArray[np.intp]) -> "Quadratics":
-        """Hold all unknowns but these, by index, where they are."""
+        """Hold all unknowns but these, by index, fixed."""
         return replace(
             self,
             gradients=self.gradients[:, unknowns],
@@ -128,13 +128,13 @@ class Quadratics:
 
 
 def without_prior(gradients: Array, hessians: Array, placement: NDArray[np.intp]) -> Quadratics:
-    """Build quadratics of costs of which nothing is believed beforehand."""
+    """Build quadratics of costs without a prior."""
     none = np.zeros_like(hessians[0])
     return Quadratics(gradients, hessians, none, none[0], placement)
 
 
 def jackknife_scatter(moves: Array) -> Array:
-    """Estimate the covariance (p, p) of an estimate from how leaving out each of G placements moves it.
+    """Estimate the covariance (p, p) of an estimate from its leave-one-out shifts over G placements.
 
         cov = (G - 1) / G sum_k m_k m_k^T
 

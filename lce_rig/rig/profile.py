@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from lce_rig.core.findings import Finding
 from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.nominal import NominalExtrinsic
 from lce_rig.rig.sensors import CameraSettings, LidarSettings
@@ -96,29 +97,26 @@ class Rig(Settings):
         cameras = {name: camera.located(folder) for name, camera in self.cameras.items()}
         return self.model_copy(update={"cameras": cameras})
 
-    def warnings(self) -> list[str]:
-        """List valid but probably unintended settings, as sentences with their key."""
+    def warnings(self) -> tuple[Finding, ...]:
+        """List valid but probably unintended settings; the subject is the key."""
         (cols, rows), width_m, height_m = self.board.inner_corners, self.board.width_m, self.board.height_m
         found = []
         if (cols - rows) * (width_m - height_m) < 0:
-            found.append(
-                f"board: {cols}x{rows} inner corners run along the shorter side of the plate "
-                f"{width_m:g} x {height_m:g} m; check whether to swap width_m and height_m, or the "
-                "inner_corners"
-            )
+            figures = {"n_cols": cols, "n_rows": rows, "width_m": width_m, "height_m": height_m}
+            found.append(Finding("profile.swapped_sides", "warning", "board", figures))
         timestamps = [(f"lidars.{name}", lidar.timestamps) for name, lidar in self.lidars.items()]
         for camera, settings in self.cameras.items():
             timestamps += [
                 (f"cameras.{camera}.channels.{n}", c.timestamps) for n, c in settings.channels.items()
             ]
         found += [
-            f"{key}.timestamps: the sensor's own clock without sync drifts away from the others"
+            Finding("profile.drifting_clock", "warning", f"{key}.timestamps")
             for key, settings in timestamps
             if settings.clock == "device" and settings.sync == "none"
         ]
-        return found + self._shared()
+        return (*found, *self._shared())
 
-    def _shared(self) -> list[str]:
+    def _shared(self) -> Iterator[Finding]:
         """List settings that two sensors cannot share, usually left from a copied block."""
         owned = [(f"lidars.{n}.topic", "topic", lidar.topic) for n, lidar in self.lidars.items()]
         for name, camera in self.cameras.items():
@@ -129,11 +127,9 @@ class Rig(Settings):
                 (f"cameras.{name}.driver.device", "device", camera.driver.device if camera.driver else None)
             )
         first: dict[tuple[str, str], str] = {}
-        found = []
         for key, kind, value in owned:
             if value is not None and first.setdefault((kind, value), key) != key:
-                found.append(f"{key}: {value} equals {first[kind, value]}, but two sensors cannot share it")
-        return found
+                yield Finding("profile.shared", "warning", key, {"value": value, "other": first[kind, value]})
 
     def nominal(self, camera: str, lidar: str) -> NominalExtrinsic | None:
         """Find the CAD pose of a pair of sensors; None if the profile has none."""

@@ -10,7 +10,7 @@ _RELATIVE_FLOOR = 1e-12
 def systematic_covariances(
     sensitivities: Array, sigma_each: float, sigma_common: float
 ) -> tuple[Array, Array]:
-    """Propagate errors that every group shares, and that no scatter between groups can show.
+    """Propagate errors common to all groups, which the scatter between groups cannot show.
 
     Source r is off by e + e_r, with e the mean error of all L sources and e_r its own deviation from it, and
     moves the estimate by s_r for each unit. Independent deviations less their mean leave
@@ -19,7 +19,7 @@ def systematic_covariances(
 
     Args:
         sensitivities: (..., p, L) s_r in columns.
-        sigma_each: standard deviation of e_r, before their mean is taken off.
+        sigma_each: standard deviation of e_r, before their mean is subtracted.
         sigma_common: standard deviation of e.
 
     Returns:

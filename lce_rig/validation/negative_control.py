@@ -13,7 +13,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import Observation
-from lce_rig.extrinsics.observability import lever_arm, name_direction
+from lce_rig.extrinsics.observability import lever_arm, main_motion
 from lce_rig.residuals.features import extract_features
 from lce_rig.residuals.plane_and_ends import capture_costs, feature_sigmas
 from lce_rig.residuals.quadratics import Quadratics
@@ -97,7 +97,7 @@ def control_findings(control: NegativeControl) -> list[Finding]:
     figures: dict[str, Figure] = {
         "rotation_deg": float(np.degrees(np.linalg.norm(move[3:]))),
         "translation_m": float(np.linalg.norm(move[:3])),
-        "direction": name_direction(move),
+        "direction": main_motion(move),
     }
     is_fail = bool(control.worse[worst] < -_SURE * control.worse_sigma[worst])
     return [reason("verdict.control", figures, is_fail=is_fail)]

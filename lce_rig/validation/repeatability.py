@@ -1,6 +1,6 @@
 """Compare calibrations of one rig with their reported uncertainties."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -157,8 +157,8 @@ def compare_calibrations(
         chi2, dof = max(pair.distance for pair in differences) ** 2, 6
         p = min(1.0, len(pairs) * _tail(chi2, dof))
     first = calibrations[names[0]]
-    scatter_deg = _rms_figure(calibrations.values(), "sigma_scatter_rotation_deg")
-    scatter_m = _rms_figure(calibrations.values(), "sigma_scatter_translation_m")
+    scatter_deg = _rms([c.diagnostics.sigma_scatter_rotation_deg for c in calibrations.values()])
+    scatter_m = _rms([c.diagnostics.sigma_scatter_translation_m for c in calibrations.values()])
     spread = np.sum(deviations**2, axis=0) / (len(names) - 1)
     return Repeatability(
         names=names,
@@ -208,8 +208,8 @@ def _odd_one(names: Sequence[str], T: Array, cov: Array) -> str | None:
     return blamed[0] if len(blamed) == 1 else None
 
 
-def _rms_figure(calibrations: Iterable[Calibration], key: str) -> float | None:
-    values = np.array([calibration.diagnostics.get(key, np.nan) for calibration in calibrations])
+def _rms(values: Sequence[float]) -> float | None:
+    """Give None where one of them is unknown."""
     return float(np.sqrt(np.mean(np.square(values)))) if np.isfinite(values).all() else None
 
 

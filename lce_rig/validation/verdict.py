@@ -93,26 +93,26 @@ def _certificate(estimate: CalibrationEstimate) -> list[Finding]:
 
 
 def _precision(estimate: CalibrationEstimate, cov: Array, rig: Rig) -> list[Finding]:
+    sigmas, target, of_lidar = np.sqrt(np.diag(cov)), rig.calibration, estimate.diagnostics
+    turns_deg, shifts_m = np.degrees(sigmas[3:]), sigmas[:3]
+    rotation = ("verdict.rotation_uncertain", "deg", turns_deg, target.target_sigma_deg)
+    translation = ("verdict.translation_uncertain", "m", shifts_m, target.target_sigma_m)
     found = []
-    target = rig.calibration
-    sigmas = np.sqrt(np.diag(cov))
-    for axes, goal, what, code in (
-        (np.degrees(sigmas[3:]), target.target_sigma_deg, "rotation_deg", "verdict.rotation_uncertain"),
-        (sigmas[:3], target.target_sigma_m, "translation_m", "verdict.translation_uncertain"),
+    for (code, unit, axes, goal), of_lidar_alone in (
+        (rotation, of_lidar.sigma_systematic_rotation_deg),
+        (translation, of_lidar.sigma_systematic_translation_m),
     ):
         sigma = float(np.linalg.norm(axes))
         if sigma > goal:
-            # If the LiDAR's own errors alone exceed the target, no number of captures will reach it.
-            is_lidar = estimate.diagnostics.get(f"sigma_systematic_{what}", 0.0) > goal
-            unit = what.partition("_")[2]
             figures: dict[str, Figure] = {
                 f"sigma_{unit}": sigma,
                 f"target_{unit}": goal,
                 f"by_axis_{unit}": tuple(float(axis) for axis in axes),
-                "weakest": estimate.weak_direction,
+                **estimate.weakest.figures(),
             }
             is_fail = sigma > rig.verdict.fail_factor * goal
-            action = "measure_ranges" if is_lidar else ""
+            # If the LiDAR's own errors alone exceed the target, no number of captures will reach it.
+            action = "measure_ranges" if of_lidar_alone > goal else ""
             found.append(reason(code, figures, is_fail=is_fail, action=action))
     return found
 
@@ -139,8 +139,8 @@ def _residuals(estimate: CalibrationEstimate, rig: Rig) -> list[Finding]:
 
 
 def _motion(estimate: CalibrationEstimate, limit_m: float) -> list[Finding]:
-    rms_m = estimate.diagnostics.get("fit_plane_rms_m", 0.0)
-    if rms_m <= limit_m:
+    rms_m = estimate.diagnostics.fit_plane_rms_m
+    if not rms_m > limit_m:  # NaN where the method has no such residual
         return []
     is_compensated = any(channel.time_offset_s is not None for channel in estimate.channels)
     action = "compensated" if is_compensated else ""
@@ -173,8 +173,11 @@ def _refusals(estimate: CalibrationEstimate) -> list[Finding]:
     n = len(disagreeing) + len(estimate.used)
     if 4 * len(disagreeing) <= n:
         return []
-    shown = ", ".join(disagreeing[:4]) + (" ..." if len(disagreeing) > 4 else "")
-    figures: dict[str, Figure] = {"n_refused": len(disagreeing), "n_captures": n, "captures": shown}
+    figures: dict[str, Figure] = {
+        "n_refused": len(disagreeing),
+        "n_captures": n,
+        "captures": tuple(disagreeing),
+    }
     return [reason("verdict.sensors_disagree", figures, is_fail=2 * len(disagreeing) > n)]
 
 
@@ -186,7 +189,7 @@ def _detected(estimate: CalibrationEstimate, n_captures: int, min_fraction: floa
 
 
 def _placements(estimate: CalibrationEstimate, needed: int) -> list[Finding]:
-    n = int(estimate.diagnostics.get("n_placements", len(estimate.used)))
+    n = int(estimate.diagnostics.n_placements)
     if n >= needed:
         return []
     figures = {"n_used": len(estimate.used), "n_placements": n, "n_needed": needed}

@@ -99,7 +99,7 @@ def _join(
     for o in own:
         # This capture's own image, if several hold the same scan.
         images = {**by_scan[o.lidar.points.tobytes()], channel: o.image}
-        scans.append(SharedScan(o.capture, images, o.lidar))
+        scans.append(SharedScan((o.capture,), images, o.lidar))
     return scans, own
 
 

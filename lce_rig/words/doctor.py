@@ -1,4 +1,4 @@
-"""Phrases of the doctor: the computer, each sensor's stream, clock, pulses and images, the board."""
+"""Phrases of the doctor: computer, profile, each sensor's stream, clock, pulses and images, the board."""
 
 from collections.abc import Mapping
 from textwrap import shorten
@@ -262,4 +262,15 @@ _IMAGES: Mapping[str, Phrase] = {
     ),
     "board.in_events": Phrase("{distance_m:.2f} m away, detected in its events"),
 }
-PHRASES: Mapping[str, Phrase] = {**_COMPUTER, **_SENSORS, **_CLOCKS, **_IMAGES}
+_PROFILE: Mapping[str, Phrase] = {
+    "profile.swapped_sides": Phrase(
+        "{subject}: {n_cols}x{n_rows} inner corners run along the shorter side of the plate "
+        "{width_m:g} x {height_m:g} m",
+        "check whether to swap width_m and height_m, or the inner_corners",
+    ),
+    "profile.drifting_clock": Phrase(
+        "{subject}: the sensor's own clock without sync drifts away from the others",
+    ),
+    "profile.shared": Phrase("{subject}: {value} equals {other}, but two sensors cannot share it"),
+}
+PHRASES: Mapping[str, Phrase] = {**_COMPUTER, **_SENSORS, **_CLOCKS, **_IMAGES, **_PROFILE}

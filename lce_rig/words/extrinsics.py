@@ -1,8 +1,10 @@
 """Phrases for extrinsics: reasons and notes of a verdict, checks on other captures and sessions."""
 
 import math
+from collections.abc import Mapping
 
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.results import WeakestMotion
 from lce_rig.words.rendering import Phrase, Template
 
 _AXES = ("x right", "y down", "z forward")
@@ -17,6 +19,51 @@ _WAYS = {
     "halves": "random halves of the captures",
 }
 _APART = "{rotation_deg:deg}, {translation_m:mm}"
+_CAMERA_AXES = {"x": "x axis (right)", "y": "y axis (down)", "z": "z axis (line of sight)"}
+
+
+def motion_words(motion: str) -> str:
+    """Name a motion by its code, "translation_x" to "rotation_z"; other text is returned unchanged."""
+    kind, _, axis = motion.partition("_")
+    if axis not in _CAMERA_AXES:
+        return motion
+    return f"{kind} {'along' if kind == 'translation' else 'about'} the camera's {_CAMERA_AXES[axis]}"
+
+
+def weakest_words(weakest: WeakestMotion) -> str:
+    """Name the least determined motion with its standard deviation."""
+    return _weakest(weakest.figures())
+
+
+def _weakest(figures: Mapping[str, Figure]) -> str:
+    sigma, unit, digits = figures.get("weakest_sigma_deg"), "deg", 3
+    if sigma is None:
+        sigma, unit, digits = 1e3 * float(str(figures["weakest_sigma_m"])), "mm", 1
+    return f"{motion_words(str(figures['weakest']))}, sigma {sigma:.{digits}f} {unit}"
+
+
+def _least_determined(advice: str) -> Template:
+    def text(finding: Finding) -> str:
+        return f"{advice}; least determined: {_weakest(finding.figures)}"
+
+    text.__doc__ = f"{advice}; least determined: {{weakest}}, {{weakest_sigma_m}} or {{weakest_sigma_deg}}."
+    return text
+
+
+def _control(finding: Finding) -> str:
+    """Control failed: moved by {rotation_deg}, {translation_m} ({direction}), the others fit as well."""
+    apart = f"{finding.figure('rotation_deg'):.2f} deg, {1000 * finding.figure('translation_m'):.0f} mm"
+    direction = motion_words(str(finding.figures["direction"]))
+    return f"control failed: moved by {apart} ({direction}), the result fits held-out captures no worse"
+
+
+def _sensors_disagree(finding: Finding) -> str:
+    """The sensors disagree in {n_refused} of {n_captures} captures, {captures}."""
+    q = finding.figures
+    names = q["captures"]
+    assert isinstance(names, tuple)
+    shown = ", ".join(map(str, names[:4])) + (" ..." if len(names) > 4 else "")
+    return f"the sensors disagree in {q['n_refused']} of {q['n_captures']} captures ({shown})"
 
 
 def _sigma(unit: str, scale: float) -> Template:
@@ -95,6 +142,25 @@ def _plate(finding: Finding) -> str:
     )
 
 
+def _commonest(finding: Finding) -> str:
+    """The commonest of {causes} of refusal with their counts, or: collect more captures."""
+    causes = finding.figures["causes"]
+    assert isinstance(causes, tuple)
+    lines = [f"{cause[0]} x {cause[2]}" for cause in causes if isinstance(cause, tuple)]
+    return "\n".join(lines) or "collect more captures"
+
+
+def _undetermined(finding: Finding) -> str:
+    """{motions} undetermined by {n_captures} captures: boards nearly parallel, spread {spread_deg}."""
+    motions, n_captures = finding.figures["motions"], finding.figures["n_captures"]
+    assert isinstance(motions, tuple)
+    names = " and ".join(motion_words(str(motion)) for motion in motions)
+    return (
+        f"{names} cannot be determined from {n_captures} captures: their boards are nearly parallel "
+        f"(normals spread by {finding.figure('spread_deg'):.1f} deg)"
+    )
+
+
 def _agree(finding: Finding) -> str:
     """The {n_sessions} calibrations of {camera} and {lidar} agree: {rotation_deg}, {translation_m} apart.
 
@@ -110,7 +176,7 @@ def _agree(finding: Finding) -> str:
 
 
 PHRASES: dict[str, Phrase] = {
-    "verdict.text": Phrase("{text}"),
+    "verdict.text": Phrase("{text}", "{advice}"),
     "verdict.no_certificate": Phrase(
         "not certified: method {method} has no certificate", "use --method paper"
     ),
@@ -119,13 +185,13 @@ PHRASES: dict[str, Phrase] = {
     ),
     "verdict.rotation_uncertain": Phrase(
         _sigma("deg", 1.0),
-        "collect more captures; least determined: {weakest}",
-        {"measure_ranges": _RANGES + "; least determined: {weakest}"},
+        _least_determined("collect more captures"),
+        {"measure_ranges": _least_determined(_RANGES)},
     ),
     "verdict.translation_uncertain": Phrase(
         _sigma("mm", 1000.0),
-        "collect more captures; least determined: {weakest}",
-        {"measure_ranges": _RANGES + "; least determined: {weakest}"},
+        _least_determined("collect more captures"),
+        {"measure_ranges": _least_determined(_RANGES)},
     ),
     "verdict.plane_residual": Phrase(
         "LiDAR points {mean_m:mm} on average from the camera's board planes (limit {limit_m:mm})",
@@ -149,7 +215,7 @@ PHRASES: dict[str, Phrase] = {
         "calibrate each alone (--channels) and find the captures that contradict it",
     ),
     "verdict.sensors_disagree": Phrase(
-        "the sensors disagree in {n_refused} of {n_captures} captures ({captures})",
+        _sensors_disagree,
         "look for a moving board, a second board, or wrong matching",
     ),
     "verdict.few_used": Phrase(
@@ -184,7 +250,7 @@ PHRASES: dict[str, Phrase] = {
         {"near": "check the squares' size and the focal length, and that the board is flat"},
     ),
     "verdict.control": Phrase(
-        "control failed: moved by " + _APART + " ({direction}), the result fits held-out captures no worse",
+        _control,
         "collect more captures; if this persists, re-measure the board",
     ),
     "verdict.scale": Phrase(_scale, "measure the squares"),
@@ -246,7 +312,24 @@ PHRASES: dict[str, Phrase] = {
         "the calibration of {subject} ({camera} and {lidar}) failed",
         "run `lce-rig calibrate` for its reasons",
     ),
-    "repeat.not_calibrated": Phrase("{subject}: {what}", "{hint}"),
+    "shortage.few_detected": Phrase(
+        "both sensors found the board in {n_detected} of {n_captures} captures (minimum {n_needed})",
+        _commonest,
+    ),
+    "shortage.few_captures": Phrase(
+        "{n_captures} captures show the board in both sensors (minimum {n_needed})",
+        "add captures: ten or more, with the board at different places and tilts",
+    ),
+    "shortage.few_agree": Phrase(
+        "only {n_agreeing} of {n_captures} captures agree with one set of extrinsics (minimum {n_needed})",
+        "check the board's size, the intrinsics and the pairing of images with scans; add captures",
+    ),
+    "shortage.undetermined": Phrase(
+        _undetermined,
+        "add captures with the board tilted by 20 deg or more, left and right as well as up and down",
+    ),
+    "shortage.text": Phrase("{text}", "{advice}"),
+    "repeat.not_calibrated": Phrase("{subject}: {sensors}: {what}", "{hint}"),
     "repeat.only_one": Phrase("{camera} and {lidar} are calibrated in {subject} only"),
     "repeat.other_board": Phrase("{first} and {subject} were taken with different boards"),
 }

@@ -8,6 +8,7 @@ from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Figure, Finding
 
 if TYPE_CHECKING:
@@ -98,6 +99,16 @@ def as_line(text: str) -> str:
 def enumerated(finding: Finding, reasons: Iterable[Finding]) -> str:
     """Say what was found and the reasons, in one line."""
     return f"{describe(finding)}: {'; '.join(sentence(reason) for reason in reasons)}"
+
+
+def not_enough(finding: Finding) -> NotEnoughDataError:
+    """Make the error that says what data are lacking, of what."""
+    whose = f"{finding.subject}: " if finding.subject else ""
+    action = recommend(finding)
+    # Several causes, a line each, are no sentence.
+    return NotEnoughDataError(
+        whose + describe(finding), action if "\n" in action else as_line(action), finding
+    )
 
 
 def as_json(finding: Finding) -> dict[str, object]:

@@ -37,6 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
+from lce_rig.core.diagnostics import NO_DIAGNOSTICS
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.core.results import Observation
 from lce_rig.extrinsics import CalibrationEstimate, EstimateSettings
@@ -270,7 +271,7 @@ def calibrate_by_lines_and_planes(
         features,
         board,
         refused={},
-        diagnostics={"n_lines": float(sum(len(own) for own in lines))},
+        diagnostics=NO_DIAGNOSTICS,
     )
 
 
@@ -341,7 +342,6 @@ def calibrate_by_corners(
     T, paired = align_corners(corners_lidar, corners_cam, T_planes)
     rows = np.stack([point_rows(c, p) for c, p in zip(paired, corners_lidar, strict=True)])
     moments = np.swapaxes(rows, -1, -2) @ rows
-    distances_m = np.linalg.norm(paired - (corners_lidar @ T[:3, :3].T + T[:3, 3]), axis=-1)
     return report_estimate(
         T,
         placement_covariance(moments, T, observations),
@@ -349,7 +349,7 @@ def calibrate_by_corners(
         features,
         board,
         refused={},
-        diagnostics={"corner_rms_m": float(np.sqrt(np.mean(distances_m**2)))},
+        diagnostics=NO_DIAGNOSTICS,
     )
 
 

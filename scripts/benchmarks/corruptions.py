@@ -18,6 +18,7 @@ from lce_rig.extrinsics import CalibrateOptions
 from lce_rig.extrinsics.options import Method
 from lce_rig.rig import Rig
 from lce_rig.validation.weighing import Verdict
+from lce_rig.words import sentence
 
 METHODS: tuple[Method, ...] = ("paper", "ml")
 _SIMULATED = ("rlfs", "rles")
@@ -179,7 +180,7 @@ def _judge(
         method,
         kind.unobservable,
         calibration.verdict,
-        calibration.reasons[0] if calibration.reasons else "",
+        sentence(calibration.findings[0]) if calibration.findings else "",
         (error_deg, error_mm),
         (sigma_deg, sigma_mm),
         max(error_deg / sigma_deg, error_mm / sigma_mm),

@@ -15,6 +15,7 @@ from lce_rig import pipeline
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.extrinsics import CalibrateOptions
 from lce_rig.rig import Rig
+from lce_rig.words import sentence
 
 _RIG = "rlfs"
 _N_DRAWS = 20
@@ -81,4 +82,4 @@ def _calibrate(case: Case) -> Outcome:
         return Outcome("refused", float("inf"), (str(error),))
     rotation_deg, translation_mm = compare(calibration.T_cam_lidar, case.T_cam_lidar)
     error = rig.calibration.in_targets(rotation_deg, translation_mm / 1000)
-    return Outcome(calibration.verdict, error, calibration.reasons)
+    return Outcome(calibration.verdict, error, tuple(map(sentence, calibration.findings)))

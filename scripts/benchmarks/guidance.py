@@ -238,7 +238,7 @@ def judge_session(name: str, seed: int, visits: list[Visit], *, is_offset: bool)
     used = np.array([v.T_cam_board for n, v in zip(names, visits, strict=True) if n in result.captures_used])
     model = model_sensors(rig, camera, lidar)
     figures = result.diagnostics
-    errors = model.errors.learned(figures["fit_plane_rms_m"], figures["fit_edge_rms_m"], len(used))
+    errors = model.errors.learned(figures.fit_plane_rms_m, figures.fit_edge_rms_m, len(used))
     errors = errors if is_offset else replace(errors, range_offset_m=0.0)
     nominal = rig.nominal(camera, lidar)
     assert nominal is not None

@@ -20,7 +20,7 @@ from lce_rig.rig import Rig
 def bench_real(n_splits: int, only: str, method: str) -> None:
     """Tabulate every recorded set that is there, each channel alone and all together."""
     head = (
-        "set, captures, picture, LiDAR, used, EGT deg, EGT mm, split deg, split mm, MGE mm, reported deg / mm"
+        "set, captures, image, LiDAR, used, EGT deg, EGT mm, split deg, split mm, MGE mm, reported deg / mm"
     )
     print_head(*head.split(", "), "verdict")
     clocks: list[tuple[object, ...]] = []
@@ -36,7 +36,7 @@ def bench_real(n_splits: int, only: str, method: str) -> None:
                 clocks += _clock_rows(recorded, rig, detections)
     if clocks:
         print()
-        head = "set, channel, captures, corner noise px, clock ms from the cloud's stamp, depth scatter mm"
+        head = "set, channel, captures, corner noise px, time offset ms, depth scatter mm"
         print_head(*head.split(", "), "without compensation mm", "channels differ by deg / mm")
         for row in clocks:
             print_row(*row)
@@ -120,7 +120,7 @@ def _only(detections: Detections, names: set[str]) -> Detections:
 def _clock_rows(recorded: RecordedSet, rig: Rig, detections: Detections) -> Iterator[tuple[object, ...]]:
     (calibration, *_), _ = pipeline.calibrate_detections(rig, detections)
     figures = calibration.diagnostics
-    apart = f"{figures['channels_rotation_deg']:.2f} / {1000 * figures['channels_translation_m']:.1f}"
+    apart = f"{figures.channels_rotation_deg:.2f} / {1000 * figures.channels_translation_m:.1f}"
     for result in calibration.channel_results:
         clock = "-"
         if result.time_offset_s is not None and result.time_offset_sigma_s is not None:

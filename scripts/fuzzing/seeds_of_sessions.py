@@ -14,6 +14,7 @@ import yaml
 
 from fuzzing.samples import CAMERA, LIDAR, SIZE, Samples, small_rig
 from fuzzing.seeds_of_recordings import Files
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.results import Calibration, Certificate, ImageBoard, Metrics, PointUncertainty, Refusal
 from lce_rig.rig import find_profile
 from lce_rig.session import Session
@@ -114,7 +115,7 @@ def calibration() -> Calibration:
     figures = Metrics(0.009, 0.0085, 0.2)
     return Calibration(
         camera=CAMERA,
-        channel="frames",
+        channels=("frames",),
         lidar=LIDAR,
         T_cam_lidar=T,
         cov=np.diag([1e-6, 1e-6, 4e-6, 1e-8, 4e-8, 1e-8]),
@@ -125,8 +126,7 @@ def calibration() -> Calibration:
         captures_used=("000000", "000002"),
         captures_refused={"000003": Refusal("pair.no_candidate")},
         verdict="pass",
-        reasons=(),
-        diagnostics={"split_half_deg": 0.1, "b": 1 / 3},
+        diagnostics=Diagnostics(n_placements=4.0, fit_plane_rms_m=1 / 300),
         uncertainty=_uncertainty(),
     )
 

@@ -31,7 +31,7 @@ def moving(tmp_path_factory) -> Path:
             T_cam_lidar = invert(capture.T_world_sensor["davis"]) @ capture.T_world_sensor["lidar"]
     truth = Calibration(
         camera="davis",
-        channel="events+frames",
+        channels=("events", "frames"),
         lidar="lidar",
         T_cam_lidar=T_cam_lidar,
         cov=np.eye(6) * 1e-6,
@@ -42,7 +42,6 @@ def moving(tmp_path_factory) -> Path:
         captures_used=("000000",),
         captures_refused={},
         verdict="pass",
-        reasons=(),
     )
     (path / "calibration").mkdir()
     write_result(path / "calibration" / "result.json", rig.name, [truth])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.data import Image
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import perturb
 from lce_rig.core.results import Calibration, Certificate, Metrics
 from lce_rig.export.result import write_result
@@ -14,6 +15,7 @@ from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
 from lce_rig.session import Session
 
 RLES = find_profile("rles").read_text(encoding="utf-8")
+BENT = Finding("verdict.few_used", figures={"n_used": 3, "n_captures": 20})
 COV = np.diag([4e-6] * 3 + [1e-6] * 3)
 
 
@@ -30,7 +32,7 @@ def made(tmp_path):
         T = load_rig("rles").nominal_extrinsics[0].to_matrix()
         calibration = Calibration(
             camera="davis",
-            channel="frames",
+            channels=("frames",),
             lidar=lidar,
             T_cam_lidar=perturb(T, np.array(tangent, dtype=float)),
             cov=COV,
@@ -41,7 +43,7 @@ def made(tmp_path):
             captures_used=("000000",),
             captures_refused={},
             verdict=verdict,
-            reasons=() if verdict == "pass" else ("the board was bent",),
+            findings=() if verdict == "pass" else (BENT,),
         )
         write_result(tmp_path / name / "calibration" / "result.json", rig.name, [calibration])
         return tmp_path / name

@@ -64,8 +64,12 @@ def test_check_warns_of_what_is_rarely_meant(capsys: pytest.CaptureFixture[str],
     path = tmp_path / "mine.yaml"
     turned = ["--from", "sss", "--set", "board.inner_corners=[6, 8]"]
     assert run(["rigs", "new", "mine", *turned, "-o", str(path)]) == 0
+    capsys.readouterr()
+    assert run(["rigs", "check", str(path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [each["code"] for each in found["findings"]] == ["profile.swapped_sides"]
     assert run(["rigs", "check", str(path)]) == 0
-    assert "shorter side" in capsys.readouterr().err
+    assert found["warnings"][0] in " ".join(capsys.readouterr().err.split())
 
 
 def test_new_writes_a_profile_and_never_over_another(

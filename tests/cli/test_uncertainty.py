@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from lce_rig.cli.calibrate import uncertainty_lines
-from lce_rig.core.results import Calibration, Certificate, Metrics, PointUncertainty
+from lce_rig.core.results import Calibration, Certificate, Metrics, PointUncertainty, WeakestMotion
 
 WEAK = "translation along the camera's z axis (line of sight), sigma 104.9 mm"
 
@@ -15,7 +15,7 @@ def calibration() -> Calibration:
     cov = np.diag(np.square([0.003, 0.004, 0.012, *np.radians([0.05, 0.12, 0.01])]))
     return Calibration(
         camera="cam",
-        channel="frames",
+        channels=("frames",),
         lidar="lidar",
         T_cam_lidar=np.eye(4),
         cov=cov,
@@ -26,8 +26,7 @@ def calibration() -> Calibration:
         captures_used=(),
         captures_refused={},
         verdict="pass",
-        reasons=(),
-        weak_direction=WEAK,
+        weakest=WeakestMotion("translation_z", 0.1049),
         uncertainty=tuple(PointUncertainty(d, 123.4, 0.123 * d, 134.5, 0.234 * d) for d in (5.0, 10.0, 20.0)),
     )
 

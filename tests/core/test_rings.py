@@ -87,7 +87,7 @@ def test_an_empty_cloud_has_no_rings():
 def test_a_cloud_without_rings_is_named_as_such():
     rng = np.random.default_rng(0)
     points = rng.uniform(-3, 3, size=(20000, 3))
-    with pytest.raises(SourceError, match="no rings in the cloud"):
+    with pytest.raises(SourceError, match="no rings in the point cloud"):
         rings_from_elevation(points)
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.core.results import Calibration, Certificate, Metrics, Refusal
@@ -35,7 +36,13 @@ def three_sensor_rig() -> Rig:
     return Rig.model_validate(data)
 
 
-_UNCERTAIN = {"sigma_deg": 0.3, "target_deg": 0.2, "by_axis_deg": (0.1, 0.2, 0.2), "weakest": "about x"}
+_UNCERTAIN = {
+    "sigma_deg": 0.3,
+    "target_deg": 0.2,
+    "by_axis_deg": (0.1, 0.2, 0.2),
+    "weakest": "rotation_x",
+    "weakest_sigma_deg": 0.2,
+}
 
 
 def calibration(T_cam_lidar: Array | None = None, **changes: Any) -> Calibration:
@@ -44,7 +51,7 @@ def calibration(T_cam_lidar: Array | None = None, **changes: Any) -> Calibration
     mixing = np.eye(6) + 0.1 * np.ones((6, 6))
     fields: dict[str, Any] = {
         "camera": "davis",
-        "channel": "frames",
+        "channels": ("frames",),
         "lidar": "lidar",
         "T_cam_lidar": some_pose() if T_cam_lidar is None else T_cam_lidar,
         "cov": sides @ mixing @ sides,
@@ -63,14 +70,18 @@ def calibration(T_cam_lidar: Array | None = None, **changes: Any) -> Calibration
             ),
         },
         "verdict": "pass",
-        "reasons": (),
         "findings": (
             Finding("verdict.widened", "note", figures={"ratio": 1.5, "spread": "halves"}),
             Finding("verdict.rotation_uncertain", "warning", figures=_UNCERTAIN, action="measure_ranges"),
         ),
-        "diagnostics": {"split_half_deg": 0.1, "b": 1 / 3},
+        "diagnostics": Diagnostics(n_placements=4.0, fit_plane_rms_m=1 / 300),
     }
     return Calibration(**(fields | changes))
+
+
+def reason(text: str) -> Finding:
+    """A reason of a verdict that only its words tell from others."""
+    return Finding("verdict.text", figures={"text": text, "advice": ""})
 
 
 def some_pose(

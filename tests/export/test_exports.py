@@ -23,6 +23,7 @@ from lce_rig.export.frames import T_BODY_OPTICAL, build_trees, check_tree
 from lce_rig.export.probes import check_pose, probe_points
 from lce_rig.export.urdf import read_urdf
 from lce_rig.rig import Rig
+from tests.export.conftest import reason
 
 Make = Callable[..., Calibration]
 in_one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
@@ -190,7 +191,7 @@ def test_a_loop_of_calibrations_stays_a_tree(three_sensor_rig: Rig, make: Make, 
 
 
 def test_of_two_channels_the_better_verdict_and_then_the_surer_gives_the_place(rles: Rig, make: Make) -> None:
-    events = make(random_pose(1), channel="events")
+    events = make(random_pose(1), channels=("events",))
     surer = replace(make(), cov=events.cov / 4)
     for frames, wanted in ((surer, "frames"), (replace(surer, verdict="marginal"), "events")):
         (tree,) = build_trees([events, frames], rles)
@@ -221,7 +222,7 @@ def test_a_result_that_failed_is_not_exported_and_removes_what_an_earlier_run_le
 ) -> None:
     export([make()], rles, tmp_path)
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
-    failed = make(verdict="fail", reasons=("translation known to 80 mm only",))
+    failed = make(verdict="fail", findings=(reason("translation known to 80 mm only"),))
     with pytest.raises(ResultRefusedError, match="davis/frames and lidar failed") as caught:
         export([failed], rles, tmp_path)
     assert "80 mm" in caught.value.hint
@@ -232,7 +233,7 @@ def test_a_result_that_failed_is_not_exported_and_removes_what_an_earlier_run_le
 def test_a_forced_export_of_a_failed_result_says_so_in_every_file(
     rles: Rig, make: Make, tmp_path: Path
 ) -> None:
-    failed = make(verdict="fail", reasons=("sigma -- 80 mm\nand more",))
+    failed = make(verdict="fail", findings=(reason("sigma -- 80 mm\nand more"),))
     paths = export([failed], rles, tmp_path, is_forced=True)
     assert len(paths) == len(EXPORTS)
     for path in paths:
@@ -275,7 +276,7 @@ def test_digits_lost_on_the_way_to_the_file_are_noticed(
 
 
 def test_a_result_of_another_rig_is_refused(rles: Rig, make: Make, tmp_path: Path) -> None:
-    for change in ({"camera": "cam"}, {"lidar": "other"}, {"channel": "depth"}):
+    for change in ({"camera": "cam"}, {"lidar": "other"}, {"channels": ("depth",)}):
         with pytest.raises(LceRigError, match="which rig rles does not have"):
             export([make(**change)], rles, tmp_path)
     assert list(tmp_path.iterdir()) == []

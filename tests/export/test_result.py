@@ -16,9 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lce_rig.core.errors import ResultRefusedError, SessionError
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import exp_so3, pose
 from lce_rig.core.results import Calibration, Certificate, Metrics, PointUncertainty
-from lce_rig.export.result import read_result, result_text, to_json_dict, write_result
+from lce_rig.export.result import layout, read_result, result_text, to_json_dict, write_result
+from tests.export.conftest import reason
 
 Make = Callable[..., Calibration]
 
@@ -115,15 +117,14 @@ def test_what_is_read_equals_what_was_written_to_the_last_digit(
 ) -> None:
     T = pose(exp_so3(np.array(phi)), np.array(t)) + 0.0
     calibrations = [
-        make(T, cov=make().cov * scale, reasons=(cause,)),
-        make(channel="events", egt_rotation_deg=0.5, egt_translation_m=scale, verdict="marginal"),
+        make(T, cov=make().cov * scale, findings=(reason(cause),)),
+        make(channels=("events",), egt_rotation_deg=0.5, egt_translation_m=scale, verdict="marginal"),
     ]
     path = tmp_path / "result.json"
     write_result(path, "rles", calibrations)
     saved = read_result(path)
     assert saved.rig == "rles"
     written = [replace(c, captures_refused=dict(sorted(c.captures_refused.items()))) for c in calibrations]
-    written = [replace(c, diagnostics=dict(sorted(c.diagnostics.items()))) for c in written]
     assert all(same(a, b) for a, b in zip(saved.pairs, written, strict=True))
     assert path.read_text(encoding="utf-8") == result_text("rles", saved.pairs)
 
@@ -131,7 +132,6 @@ def test_what_is_read_equals_what_was_written_to_the_last_digit(
 def test_the_order_of_mappings_does_not_change_the_bytes(make: Make) -> None:
     turned = make(
         captures_refused=dict(reversed(make().captures_refused.items())),
-        diagnostics=dict(reversed(make().diagnostics.items())),
     )
     assert result_text("rles", [turned]) == result_text("rles", [make()])
 
@@ -167,7 +167,7 @@ def set_in(document: Any, path: str, value: Any) -> None:
 def test_a_tampered_result_is_refused_with_its_key(
     make: Make, tmp_path: Path, path: str, value: Any, says: str
 ) -> None:
-    document = to_json_dict("rles", [make(), make(channel="events")])
+    document = to_json_dict("rles", [make(), make(channels=("events",))])
     set_in(document, path, value)
     file = tmp_path / "result.json"
     file.write_text(json.dumps(document), encoding="utf-8")
@@ -260,3 +260,26 @@ def test_what_the_uncertainty_means_at_distances_is_read_back(make: Make, tmp_pa
     path.write_text(json.dumps(document))
     with pytest.raises(SessionError, match="corner_m"):
         read_result(path)
+
+
+def test_reasons_of_files_without_findings_are_read_as_findings(make: Make, tmp_path: Path) -> None:
+    document = to_json_dict("rles", [make(verdict="fail")])
+    del document["pairs"][0]["findings"]
+    document["pairs"][0]["reasons"] = ["the board was bent: use another"]
+    path = tmp_path / "result.json"
+    path.write_text(layout(document), encoding="utf-8")
+    (pair,) = read_result(path).pairs
+    assert pair.findings == (reason("the board was bent: use another"),)
+    assert to_json_dict("rles", [pair])["pairs"][0]["reasons"] == document["pairs"][0]["reasons"]
+
+
+def test_findings_of_earlier_versions_keep_severity_and_words(make: Make, tmp_path: Path) -> None:
+    document = to_json_dict("rles", [make()])
+    old = document["pairs"][0]["findings"][1]
+    old["figures"] = {"sigma_deg": 0.3, "weakest": "rotation about x, sigma 0.2 deg"}
+    old |= {"text": "too uncertain", "action": "collect more"}
+    path = tmp_path / "result.json"
+    path.write_text(layout(document), encoding="utf-8")
+    (pair,) = read_result(path).pairs
+    figures = {"text": "too uncertain", "advice": "collect more"}
+    assert pair.findings[1] == Finding("verdict.text", "warning", figures=figures)

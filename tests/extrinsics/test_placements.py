@@ -16,6 +16,6 @@ def test_the_same_placements_captured_again_claim_no_smaller_sigma():
         fit_extrinsic(once, BOARD, options),
         fit_extrinsic([*once, *again], BOARD, options),
     )
-    assert double.diagnostics["n_placements"] == single.diagnostics["n_placements"] == 14
+    assert double.diagnostics.n_placements == single.diagnostics.n_placements == 14
     ratio = np.sqrt(np.diag(double.cov) / np.diag(single.cov))
     assert np.all(ratio > 0.85)

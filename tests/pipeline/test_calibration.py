@@ -17,7 +17,7 @@ def systematic_sigma_m(*lines: str) -> float:
     scans = {item.capture: list(item.lidar) for item in captures}
     detections = Detections({("cam", "frames"): images}, {"lidar": scans})
     (calibration,), _ = pipeline.calibrate_detections(rig, detections, CalibrateOptions(n_draws=0))
-    return calibration.diagnostics["sigma_systematic_translation_m"]
+    return calibration.diagnostics.sigma_systematic_translation_m
 
 
 def test_the_lidars_range_errors_come_from_the_profile() -> None:

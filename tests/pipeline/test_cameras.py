@@ -66,10 +66,10 @@ def test_cameras_that_share_boards_are_estimated_together_and_say_so(together):
         assert own.estimated_with == (other,)
         error = difference(own.T_cam_lidar, TRUTH[name])
         assert error @ np.linalg.solve(own.cov, error) < 25  # 0.9997 of chi square with 6 degrees
-        assert own.sigma_rotation_deg < own.diagnostics["alone_sigma_rotation_deg"]
+        assert own.sigma_rotation_deg < own.diagnostics.alone_sigma_rotation_deg
         (line,) = together_lines(own)
         assert line.split()[0] == "together"
-        assert f"with {other};" in line and f"{own.diagnostics['alone_sigma_rotation_deg']:.3f} deg" in line
+        assert f"with {other};" in line and f"{own.diagnostics.alone_sigma_rotation_deg:.3f} deg" in line
 
 
 def test_where_one_camera_sits_to_the_other_is_told_from_both_sides(together):
@@ -126,7 +126,7 @@ def test_cameras_without_a_common_board_stay_by_themselves(session):
     found = calibrated(detections(session, left=range(6), right=range(6, 12)), ML)
     for own in found.values():
         assert own.estimated_with == own.other_cameras == ()
-        assert "alone_sigma_rotation_deg" not in own.diagnostics
+        assert np.isnan(own.diagnostics.alone_sigma_rotation_deg)
     left, right = found.values()
     assert camera_lines(left, [left, right]) == []
     (line,) = camera_lines(right, [left, right])

@@ -11,11 +11,11 @@ from lce_rig.export.result import read_result
 from lce_rig.pipeline.result_files import Result, is_usable, keep_earlier, result_content, write_results
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
-from tests.export.conftest import calibration, some_pose
+from tests.export.conftest import calibration, reason, some_pose
 
 GOOD = calibration(captures_used=())
 OTHER = calibration(some_pose((1.2, -1.3, 1.0)), captures_used=())
-FAILED = calibration(verdict="fail", reasons=("too few",), captures_used=())
+FAILED = calibration(verdict="fail", findings=(reason("too few"),), captures_used=())
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def test_the_earlier_result_becomes_the_previous_one_with_its_exports(session, f
 def test_no_number_of_failures_takes_the_last_usable_result_away(session, folder):
     write_results(session, [GOOD], force=False)
     for k in range(3):
-        failed = calibration(verdict="fail", reasons=(f"{k}",), captures_used=())
+        failed = calibration(verdict="fail", findings=(reason(f"{k}"),), captures_used=())
         written = write_results(session, [failed], force=False)
         assert written.has_usable_previous
         assert names(folder) == {"result.json", "previous"}
@@ -80,7 +80,7 @@ def test_no_number_of_runs_of_one_camera_takes_the_other_ones_result_away(tmp_pa
     left, right = replace(GOOD, camera="left"), replace(GOOD, camera="right")
     assert write_results(session, [left, right], force=False).only_previous == ()
     for k in range(3):
-        again = replace(OTHER, camera="left", reasons=(f"{k}",))
+        again = replace(OTHER, camera="left", findings=(reason(f"{k}"),))
         (only,) = write_results(session, [again], force=False).only_previous
         assert only.startswith("right ")
         kept = read_result(folder / "previous" / "result.json").pairs
@@ -93,13 +93,15 @@ def test_without_a_usable_result_the_last_failed_one_is_kept(session, folder):
     write_results(session, [FAILED], force=False)
     written = write_results(session, [calibration(verdict="fail", captures_used=())], force=True)
     assert written.previous is not None and not written.has_usable_previous
-    assert read_result(folder / "previous" / "result.json").pairs[0].reasons == ("too few",)
+    assert read_result(folder / "previous" / "result.json").pairs[0].findings == (reason("too few"),)
 
 
 def test_a_forced_failure_does_not_count_as_usable(session, folder):
     write_results(session, [GOOD], force=False)
     for k in range(2):
-        write_results(session, [calibration(verdict="fail", reasons=(f"{k}",), captures_used=())], force=True)
+        write_results(
+            session, [calibration(verdict="fail", findings=(reason(f"{k}"),), captures_used=())], force=True
+        )
     assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
 
 

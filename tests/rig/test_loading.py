@@ -20,7 +20,7 @@ def test_the_shipped_profiles_are_those_of_the_paper_and_named_as_their_files() 
 
 
 def test_no_shipped_profile_gives_a_warning() -> None:
-    assert [load_rig(name).warnings() for name in shipped_profiles()] == [[], [], []]
+    assert [load_rig(name).warnings() for name in shipped_profiles()] == [(), (), ()]
 
 
 @pytest.mark.parametrize("name", ["rlfs", "rles", "sss"])

@@ -171,7 +171,7 @@ def test_squares_counted_for_inner_corners_are_named() -> None:
 
 def test_board_that_fits_both_ways_round_gives_a_warning() -> None:
     turned = find_profile("sss").read_text(encoding="utf-8").replace("[8, 6]", "[6, 8]")
-    assert any("shorter side" in warning for warning in parse_rig(turned).warnings())
+    assert [warning.code for warning in parse_rig(turned).warnings()] == ["profile.swapped_sides"]
     assert not load_rig("sss").warnings()
 
 
@@ -278,4 +278,5 @@ def test_what_a_copied_camera_shares_with_the_first_is_a_warning() -> None:
         (topic, "channels.frames.topic", "/camera/image_raw"),
         (device, "driver.device", "/dev/video0"),
     ):
-        assert warning.startswith(f"cameras.right.{key}: {value} ") and f" cameras.cam.{key}" in warning
+        assert (warning.code, warning.subject) == ("profile.shared", f"cameras.right.{key}")
+        assert warning.figures == {"value": value, "other": f"cameras.cam.{key}"}

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import exp_so3, perturb, pose
 from lce_rig.core.results import Calibration, Certificate, Metrics
 from lce_rig.validation.repeatability import compare_calibrations
@@ -18,7 +19,7 @@ COV = ROOT @ ROOT.T
 def calibration(T, cov=COV, **diagnostics) -> Calibration:
     return Calibration(
         camera="cam",
-        channel="frames",
+        channels=("frames",),
         lidar="lidar",
         T_cam_lidar=T,
         cov=cov,
@@ -29,8 +30,7 @@ def calibration(T, cov=COV, **diagnostics) -> Calibration:
         captures_used=("000000",),
         captures_refused={},
         verdict="pass",
-        reasons=(),
-        diagnostics=diagnostics,
+        diagnostics=Diagnostics(**diagnostics),
     )
 
 

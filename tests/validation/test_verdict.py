@@ -34,8 +34,8 @@ def examined(estimate, lens=CAMERA):
 def verdict_of(estimate):
     """Judge a changed estimate by what the checks found on the sound one."""
 
-    def judged(changed, n_captures=20):
-        return judge(changed, replace(examined(estimate), cov=changed.cov), RIG, "cam", "lidar", n_captures)
+    def judged(changed, n_captures=20, rig=RIG):
+        return judge(changed, replace(examined(estimate), cov=changed.cov), rig, "cam", "lidar", n_captures)
 
     return judged
 
@@ -72,7 +72,7 @@ def test_a_deviation_above_the_target_is_marginal_and_far_above_fails(estimate, 
 def test_where_the_lidar_itself_misses_the_target_more_captures_are_not_advised(estimate, verdict_of):
     cov = np.diag([0.015**2 / 3] * 3 + [1e-8] * 3)
     by_scatter = replace(estimate, cov=cov)
-    figures = dict(estimate.diagnostics) | {"sigma_systematic_translation_m": 0.014}
+    figures = replace(estimate.diagnostics, sigma_systematic_translation_m=0.014)
     by_lidar = replace(by_scatter, diagnostics=figures)
     assert verdict_of(by_scatter)[1][0].action == ""
     assert verdict_of(by_lidar)[1][0].action == "measure_ranges"
@@ -80,7 +80,10 @@ def test_where_the_lidar_itself_misses_the_target_more_captures_are_not_advised(
 
 def test_a_result_far_from_the_nominal_extrinsic_fails_with_both_figures(estimate, verdict_of):
     moved = perturb(estimate.T_cam_lidar, np.array([0.3, 0, 0, 0, 0, np.radians(20)]))
-    verdict, reasons = verdict_of(replace(estimate, T_cam_lidar=moved))
+    cad = [pose.model_copy(update={"source": "cad"}) for pose in RIG.nominal_extrinsics]
+    drawn = RIG.model_copy(update={"nominal_extrinsics": cad})
+    assert verdict_of(replace(estimate, T_cam_lidar=moved))[0] == "pass"
+    verdict, reasons = verdict_of(replace(estimate, T_cam_lidar=moved), rig=drawn)
     assert verdict == "fail"
     assert reasons[0].code == "verdict.far_from_nominal"
     assert (reasons[0].figures["tolerance_deg"], reasons[0].figures["tolerance_m"]) == (5, 0.05)
@@ -96,7 +99,7 @@ def test_sensors_that_disagree_in_many_captures_are_a_doubt(estimate, verdict_of
 
 
 def test_boards_that_moved_between_picture_and_scan_are_a_doubt(estimate, verdict_of):
-    moving = dict(estimate.diagnostics) | {"fit_plane_rms_m": 0.025}
+    moving = replace(estimate.diagnostics, fit_plane_rms_m=0.025)
     verdict, reasons = verdict_of(replace(estimate, diagnostics=moving))
     assert verdict == "marginal"
     assert (reasons[0].code, reasons[0].figures) == ("verdict.planes_apart", {"rms_m": 0.025})

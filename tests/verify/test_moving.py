@@ -18,7 +18,7 @@ MOVING = Moving(speed_mps=0.3, tracked=("events",))
 def calibration_of(results: tuple[ChannelResult, ...]) -> Calibration:
     return Calibration(
         camera="cam",
-        channel="+".join(result.channel for result in results),
+        channels=tuple(result.channel for result in results),
         lidar="lidar",
         T_cam_lidar=T_FORWARD,
         cov=np.eye(6) * 1e-6,
@@ -29,7 +29,6 @@ def calibration_of(results: tuple[ChannelResult, ...]) -> Calibration:
         captures_used=(),
         captures_refused={},
         verdict="pass",
-        reasons=(),
         channel_results=results,
     )
 

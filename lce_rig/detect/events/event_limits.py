@@ -1,4 +1,4 @@
-"""The profile's limits on boards seen through events, and why none was seen, with what to do about it."""
+"""The profile's limits on boards in images from events, and refusals if none was detected."""
 
 import numpy as np
 
@@ -10,20 +10,20 @@ from lce_rig.detect.events.reconstruct.filters import hot_pixels
 from lce_rig.rig import QualitySettings
 
 _MAX_HOT_SHARE = 0.5
-# One event in a hundred pixels in a second is none.
+# One event per hundred pixels in 1 s counts as none.
 _MIN_EVENTS_PX = 0.01
 # Boards at 2 to 5 cm/s make 2 to 4 events a pixel in a second: with fewer one that is missing was too slow.
 _SLOW_EVENTS_PX = 4.0
 
 
 def gate_event_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:
-    """Hold a board seen through events against the profile's limits on events and motion.
+    """Compare a board in an image from events with the profile's limits on events and motion.
 
     A figure that could not be measured, and images that others reconstructed, are not judged; speeds count
-    from where two standard deviations leave no doubt.
+    if they exceed the limit by two standard deviations.
 
     Args:
-        found: with what its events show.
+        found: the board with figures of its events.
         limits: `quality` of the rig profile.
     """
     q = found.events
@@ -50,7 +50,7 @@ def too_fast(speed_mps: float, limits: QualitySettings) -> Refusal:
 
 
 def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: QualitySettings) -> Refusal:
-    """Say what about the events keeps the board from being found; what was seen where they are not to blame.
+    """Return the fault of the events that prevents a detection; `seen` if there is none.
 
     Args:
         events: about the image.

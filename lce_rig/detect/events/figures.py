@@ -1,4 +1,4 @@
-"""What events and a board followed through their images tell: event rate, speed, and smear in the LiDAR."""
+"""Figures from events and a board tracked through their images: event rate, speed, smear in the LiDAR."""
 
 import math
 from dataclasses import dataclass, replace
@@ -13,14 +13,14 @@ from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array, difference, transform
 from lce_rig.core.results import EventQuality, ImageBoard, LidarBoard
 
-#: What the network has seen longer ago no longer shows.
+#: Events older than this no longer show in the network's image.
 MEMORY_NS = 1_000_000_000
 _JUST_NS = 100_000_000
 _BLOCK_PX = 16
 # A board of 0.8 x 0.6 m takes up about this share of a DAVIS346's image at 3.5 m.
 _BUSY_SHARE = 0.05
 _SUBPIXEL_BITS = 4
-# From poses nearer in time than this no speed can be told.
+# Poses nearer in time than this do not determine a speed.
 _MIN_TRACK_S = 0.03
 _ALONG = np.linspace(0, 1, 24)[:, None]
 
@@ -89,7 +89,7 @@ def busiest_events(events: Events, stamp_ns: int) -> float:
 
 
 def board_motion(found: ImageBoard) -> BoardMotion | None:
-    """Fit a steady motion to the poses of a board that was followed; None if it was not."""
+    """Fit a constant velocity to the poses of a tracked board; None if it was not tracked."""
     track_ns, track, track_cov = found.track_ns, found.track_T_cam_board, found.track_cov
     if track_ns is None or track is None or track_cov is None or found.stamp_ns is None:
         return None
@@ -119,10 +119,10 @@ def sweep_time_s(lidar: LidarBoard, period_s: float) -> float:
 
 
 def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None) -> EventQuality:
-    """Add what the board's motion amounts to; nothing without a track.
+    """Add figures of the board's motion; none without a track.
 
     Args:
-        measured: what the board's events show.
+        measured: figures of the board's events.
         found: with its track.
         sweep_s: how long the LiDAR sees the board; None if it does not.
     """
@@ -146,8 +146,8 @@ def with_motion(measured: EventQuality, found: ImageBoard, sweep_s: float | None
 def _slope(time_s: Array, values: Array, cov: Array) -> tuple[Array, Array]:
     """Fit values (K, 3) = a + b t; return b (3,) and its covariance (3, 3).
 
-    All count alike: weighed by their covariances, in which depth and place go together, what a hand's way
-    deviates from the line sideways would pass for speed along the line of sight.
+    All have equal weights. With weights by covariance, in which depth and lateral position are correlated, a
+    hand's lateral deviation from the line would appear as speed along the line of sight.
     """
     since_s = time_s - time_s.mean()
     share = since_s / np.sum(since_s**2)

@@ -1,4 +1,4 @@
-"""The board in a stream of events: an image at the time asked for, and the board followed through others."""
+"""The board in a stream of events: detected in an image at the requested time, and tracked through others."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,11 +24,11 @@ from lce_rig.solvers.pnp import pose_covariance
 
 
 def align_corner_order(found: ImageBoard, reference: ImageBoard, board: Board) -> ImageBoard:
-    """Count the corners from the same end of the print as another image of about the same time does.
+    """Order the corners from the same end of the pattern as in another image of about the same time.
 
-    The pattern looks the same when it is turned by 180 deg, a square one by 90 deg, but for the colours of
+    The pattern looks the same when rotated by 180 deg, a square one by 90 deg, except for the colours of
     its squares, and a reconstruction can have those wrong. The turn that brings the two poses nearest to each
-    other is taken; the board may not have turned by half of that between the images.
+    other is taken; the board must not have rotated by half of that between the images.
 
     Args:
         found: the board whose corners are put in order.
@@ -36,7 +36,7 @@ def align_corner_order(found: ImageBoard, reference: ImageBoard, board: Board) -
         board: the board.
 
     Returns:
-        `found` as it is, or with corners, poses, covariances and track turned.
+        `found` unchanged, or with corners, poses, covariances and track rotated.
     """
     turns = (0, 1, 2, 3) if board.rows == board.cols else (0, 2)
     R_reference = reference.T_cam_board[:3, :3]
@@ -106,7 +106,7 @@ _MAX_TURN_RAD = np.radians(45)
 
 @dataclass(frozen=True, eq=False)
 class EventSighting:
-    """What a stream of events shows.
+    """The detection in a stream of events.
 
     Attributes:
         picture: at the time asked for, or why there is none.
@@ -120,12 +120,12 @@ class EventSighting:
 def reconstructor_for(
     settings: ReconstructionSettings | None, channel: str, method: EventImage | None = None
 ) -> Reconstructor:
-    """Set up a reconstructor as a profile says.
+    """Set up a reconstructor according to a profile.
 
     Args:
         settings: the channel's block; None for the shipped network and automatic windows.
-        channel: that the images are said to come from.
-        method: in place of the profile's.
+        channel: the channel of the images.
+        method: replaces the profile's.
 
     Raises:
         ProfileError: the network cannot be used.

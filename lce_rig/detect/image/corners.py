@@ -44,7 +44,7 @@ def find_grid(
         grey: (H, W).
         board: tells the number of inner corners.
         is_thorough: whether to go on after the quick attempts, which take a tenth of the time of all.
-        square_px: about how large its squares are, where that is known: only such are looked for.
+        square_px: approximate size of its squares, if known; only such are searched for.
 
     Returns:
         The crossings, `grid_px` in the order of `Board.corners()`; None if no attempt finds that many.
@@ -84,7 +84,7 @@ def seen_grid(grey: Grey, scale: float | None = None) -> Array | None:
         scale: of the image that is searched; None for what suits images of this width.
 
     Returns:
-        (rows, cols, 2) px; which of the two is called rows means nothing. None if nothing is found.
+        (rows, cols, 2) px; rows and cols may be exchanged. None if nothing is found.
     """
     width = grey.shape[1]
     if scale is None:
@@ -97,7 +97,7 @@ def seen_grid(grey: Grey, scale: float | None = None) -> Array | None:
 
 
 def order_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
-    """Sort a grid of corners as `Board.corners()` does, row by row from the print's top left.
+    """Sort a grid of corners as `Board.corners()` does, row by row from the pattern's top left.
 
     A finder may start at any of the grid's ends. A camera looks at the front of the print, so the order that
     turns from rows to columns clockwise in the image (v points down) is the one that is not mirrored. Where
@@ -124,7 +124,7 @@ def order_corners(grey: Grey, corners_px: Array, board: Board) -> Array:
 
 
 def black_top_left(grey: Grey, grid_px: Array) -> float:
-    """Tell by how many grey values the squares of the top left one's colour are darker than the others.
+    """Measure by how many grey values the squares of the top left one's colour are darker than the others.
 
     Args:
         grey: (H, W).

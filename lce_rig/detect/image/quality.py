@@ -1,4 +1,4 @@
-"""What an image shows of the board in numbers, and why where it shows too little."""
+"""Figures of the board in an image, and the refusals that follow from them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +79,7 @@ def _alternation(values: Array, signs: Array) -> float:
 
 
 def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool = False) -> Refusal:
-    """Say why the board was not found, from the grey values and from what checkerboard is there instead."""
+    """Return why the board was not found, from the grey values and from other checkerboards in the image."""
     low, dark, bright = (float(value) for value in np.percentile(grey, (1, 50, 99)))
     if bright < 50:
         return Refusal("image.too_dark", figures={"grey_99": bright})
@@ -124,7 +124,7 @@ def explain_other_grid(
 def quality_problem(
     quality: ImageQuality, min_contrast: float, min_sharpness: float, is_from_events: bool = False
 ) -> Refusal | None:
-    """Judge the figures of a grid that was found; None if they will do."""
+    """Judge the figures of a detected grid; None if they are sufficient."""
     action = _action(is_from_events)
     if quality.contrast < min_contrast:
         figures = {"contrast": quality.contrast, "min_contrast": min_contrast}
@@ -141,7 +141,7 @@ def quality_problem(
 
 
 def _action(is_from_events: bool) -> str:
-    """Name the kind of advice: events need motion where a camera wants stillness."""
+    """Name the kind of action: events need motion, a camera needs a still board."""
     return "events" if is_from_events else ""
 
 

@@ -35,11 +35,12 @@ _CUT_FRACTION = 0.02
 _CANVAS_FRACTION = 3.0
 # Corners that the finder misplaced, or that an artefact covers, at most.
 _MAX_MISPLACED = 0.08
-# A quarter of a full fit's time; corners are then known to 0.03 px, plenty for stillness and guidance.
+# A quarter of a full fit's time; the corners' standard deviation is then 0.03 px, sufficient for stillness
+# and guidance.
 _FOLLOWED_SAMPLES = 13
-# A board whose corners have moved by less is where it was.
+# A board whose corners have moved by less stands still.
 _RESTING_PX = 0.5
-# A grid of corners of which fewer can be measured is none.
+# A grid of corners with a smaller measurable fraction is rejected.
 _MIN_FITTED = 0.5
 # The outer squares of a line that is not on the board are all alike.
 _MIN_OUTER_CONTRAST = 0.35
@@ -74,7 +75,7 @@ def find_image_board(
         max_reprojection_px: refuse where the corners' rms distance from the board's image is larger.
         min_contrast: refuse where black and white differ by fewer grey values.
         min_sharpness: refuse where fewer edge widths fit into a square.
-        is_from_events: whether the image was made from events: what is to be done is another thing.
+        is_from_events: whether the image was reconstructed from events, which changes the action.
         is_thorough: whether a board that is not found at once is searched for at other scales, and its
             absence explained, which takes most of a second.
 
@@ -111,7 +112,7 @@ def find_image_board(
 
 
 def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality | None = None) -> ImageBoard:
-    """Put together what an image shows of the board, once its pose is solved for.
+    """Assemble an image's detection after its pose is solved.
 
     Args:
         corners_px: (rows * cols, 2) in the order of `Board.corners()`.
@@ -146,7 +147,7 @@ def region_around(found: ImageBoard, image: Image, margin: float = 0.5) -> Regio
 
 
 def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:
-    """Return the grey image at the size the intrinsics belong to.
+    """Return the grey image at the size of the intrinsics.
 
     Two harmless differences occur in recordings: a readout that ends a few lines early, and a canvas larger
     than the sensor, blank beyond it (images reconstructed from events).
@@ -165,7 +166,7 @@ def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8
         grey = image.grey
         if _is_blank_beyond(grey, wanted_width, wanted_height):
             return grey[:wanted_height, :wanted_width]
-    hint = "use the intrinsics of this mode, or record in the mode the intrinsics were calibrated in"
+    hint = "Use the intrinsics of this mode, or record in the mode of the intrinsics"
     if abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width:
         hint += f"; if the image is only scaled, multiply fx, fy, cx, cy by {width / wanted_width:.4g}"
     raise ProfileError(

@@ -1,4 +1,4 @@
-"""What the calibration needs from a registered board: plane, points, ring ends and measured size."""
+"""Measure a registered board for the calibration: plane, points, ring ends and size."""
 
 from dataclasses import dataclass, replace
 
@@ -20,7 +20,7 @@ from lce_rig.detect.lidar.template import (
     view_plane,
 )
 
-# Where the rings end on a board, whether that is the board's border, and the size they show.
+# Ring ends on a board, whether they are the board's border, and the size they imply.
 
 SIZE_PRIOR_M = 0.10
 SLACK_M = 0.05  # by how much a board's border may lie off the nominal one to be measured
@@ -147,7 +147,7 @@ def measure_size(
     common_m = median(step_m) / np.sqrt(12) if len(step_m) else 0.0
     size_sigma_m = np.hypot(2 * np.sqrt(np.diag(cov)[3:] * max(1.0, chi2)), common_m)
     if np.abs(x[:2]).max() > SLACK_M or np.abs(x[3:]).max() > SLACK_M:
-        # The ends contradict each other: they say nothing about the size.
+        # The ends contradict each other and do not determine the size.
         return placement, np.full(2, SIZE_PRIOR_M), target, step_m
     cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
     fitted = Placement(
@@ -302,7 +302,7 @@ def build_board(
     low_m, high_m = np.percentile(height, [2.5, 97.5])
     rms_m = float(np.sqrt(np.mean(height**2)))
     incidence = np.arccos(np.clip(view.plane[3] / distance_m, 0.0, 1.0))
-    # How much of the light spot counts is not known.
+    # The effective size of the light spot is unknown.
     size_m, sigma_m = 2 * np.asarray(fitted.half_m), np.hypot(size_sigma_m, beyond_m)
     quality = LidarQuality(
         width_m=float(size_m[0]),

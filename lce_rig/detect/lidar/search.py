@@ -13,7 +13,7 @@ from lce_rig.detect.lidar.plates import propose_plates, screen_plates
 from lce_rig.detect.lidar.segments import Indices, OrderedScan, cut_segments, order_scan
 from lce_rig.detect.lidar.template import Placement, PlaneView, beams_about, plane_axes, view_plane
 
-# Why no board was found in a scan: the nearest miss, with its figures.
+# Refusals of a scan: the nearest candidate, with its figures.
 
 # Share of returns beyond the outline, in the board's plane, from which something touches the board.
 TOUCHING_SHARE = 0.10
@@ -102,10 +102,10 @@ def no_plate(
 
     Args:
         scan: all returns.
-        board: what was looked for.
+        board: the board searched for.
         limit_m: largest error of an outline.
-        min_range_m: from where it was looked for.
-        max_range_m: up to where.
+        min_range_m: minimum distance of the search.
+        max_range_m: maximum distance of the search.
     """
     coarse = replace(scan, sigma_m=scan.sigma_m + SCATTER_M)
     plates, ends = propose_plates(coarse, cut_segments(coarse, max_range_m), board, is_any_size=True)
@@ -146,7 +146,7 @@ PATCH_SHARE = 0.20
 
 @dataclass(frozen=True)
 class Limits:
-    """What a plate must meet to be taken for the board.
+    """Limits for accepting a plate as the board.
 
     Attributes:
         template_m: largest mean distance of the outline from where the rings end.
@@ -285,7 +285,7 @@ def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
 
 
 def _penalty(found: LidarBoard, board: Board) -> float:
-    """Rate a candidate in m: misfit of outline and size, what no ring shows, what else is in its plane."""
+    """Rate a candidate in m: residual of outline and size, unobserved parts, other returns in its plane."""
     q = found.quality
     penalty = q.template_m + 0.03 / q.n_rings + 0.15 * (q.width_sigma_m + q.height_sigma_m)
     penalty += 0.05 * q.beyond_share
@@ -375,7 +375,7 @@ def _near(scan: Scan, board: Board, previous: LidarBoard, margin_m: float) -> In
 def _measure_again(
     nearby: Scan, board: Board, previous: LidarBoard, min_range_m: float, limits: Limits, beam: Beam | None
 ) -> LidarBoard | None:
-    """Start from the last pose, which a board held still hardly leaves; None unless it fits as well again."""
+    """Start from the last pose, valid for a still board; None unless it fits as well again."""
     T = previous.T_lidar_board
     half = np.array([board.width_m / 2, board.height_m / 2, 3.0 * previous.sigma_m])
     is_on = (np.abs((nearby.points - T[:3, 3]) @ T[:3, :3]) <= half).all(axis=1)

@@ -133,8 +133,8 @@ def _from_first_break(is_break: NDArray[np.bool_], starts: Indices) -> Indices:
 def _by_azimuth(order: Indices, ring: NDArray[np.int16], azimuth: Floats) -> Indices:
     """Sort the returns of each ring, given in order of firing, by azimuth; drop those of a second turn.
 
-    A scan of slightly more than one turn shows the same directions twice, 0.1 s apart: mixed, they would
-    tear what moves into two. Point point clouds that are not in order of firing lose nothing.
+    A scan of slightly more than one turn has the same directions twice, 0.1 s apart; mixed, they would split
+    moving objects in two. Point clouds that are not in order of firing lose nothing.
     """
     if len(order) == 0:
         return order

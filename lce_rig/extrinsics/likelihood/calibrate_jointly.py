@@ -1,12 +1,13 @@
 """The joint estimate as a method of calibration: Algorithm 1 gives the start, the likelihood the optimum."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
 from lce_rig.extrinsics.algorithm_1 import calibrate_by_algorithm_1
@@ -17,7 +18,7 @@ from lce_rig.extrinsics.likelihood.spread import inflate
 from lce_rig.extrinsics.likelihood.system import PER_CAMERA
 from lce_rig.extrinsics.metrics import error_to_reference
 from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M, EstimateSettings
-from lce_rig.extrinsics.report import name_sigmas, report_estimate
+from lce_rig.extrinsics.report import report_estimate, with_parts
 from lce_rig.residuals.along_rays import N_SHIFTS, SHIFTS
 from lce_rig.residuals.features import extract_features
 from lce_rig.residuals.placements import group_placements
@@ -54,12 +55,11 @@ def calibrate_by_likelihood(
     placement = group_placements(used)
     cov, inflation = inflate(joint, placement)
     offset_deg, offset_m = error_to_reference(joint.T_cam_lidar[0], start.T_cam_lidar)
-    figures = {
-        **figures_of(joint, 0),
-        "algorithm_1_offset_deg": offset_deg,
-        "algorithm_1_offset_m": offset_m,
-        "covariance_inflation": inflation,
-    }
+    figures = replace(
+        add_figures(start.diagnostics, joint, 0, inflation),
+        algorithm_1_offset_deg=offset_deg,
+        algorithm_1_offset_m=offset_m,
+    )
     estimate = describe(joint, 0, cov, start, used, board, options, figures)
     return replace(estimate, expansion=expand_joint(joint, 0, placement))
 
@@ -78,7 +78,7 @@ def describe(
     used: Sequence[Observation],
     board: Board,
     options: EstimateSettings,
-    figures: Mapping[str, float],
+    figures: Diagnostics,
 ) -> CalibrationEstimate:
     """Report one camera's extrinsics of a joint estimate.
 
@@ -90,7 +90,7 @@ def describe(
         used: the camera's observations, those that the start used.
         board: the board.
         options: switches of the features.
-        figures: diagnostics, which replace those of the start.
+        figures: diagnostics.
     """
     features = [extract_features(observation, board, options.parts.features) for observation in used]
     return report_estimate(
@@ -102,7 +102,7 @@ def describe(
         certificate=start.certificate,
         held_out_m=np.array([residual.held_out_m for residual in start.residuals]),
         refused=start.refused,
-        diagnostics={**start.diagnostics, **figures},
+        diagnostics=figures,
     )
 
 
@@ -124,41 +124,35 @@ def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp])
     return replace(joint.cost.of(mine), prior=prior, prior_gradient=np.zeros(len(mine)), placement=placement)
 
 
-def figures_of(joint: JointEstimate, camera: int) -> dict[str, float]:
-    """Name the constant errors and noise levels; they replace those of Algorithm 1."""
-    levels = joint.levels
-    shifts = dict(zip(SHIFTS, joint.shifts.tolist(), strict=True))
-    return {
-        **_sigmas(joint, camera),
-        "edge_shift_m": shifts["d_0"],
-        "edge_shift_sigma_m": float(joint.constants_sigma[-N_SHIFTS]),
-        "edge_shift_echo_m": shifts["d_1"],
-        "edge_shift_blended_m": shifts["d_2"],
-        "edge_shift_blended_echo_m": shifts["d_3"],
-        "range_offset_m": float(np.mean(joint.offset_m)),
-        "laser_spread_m": float(np.std(joint.offset_m)),
-        "lens_lateral_m": float(joint.lens_m[0]),
-        "lens_vertical_m_per_rad": float(joint.lens_m[1]),
-        "camera_scale": 1.0 - float(joint.scale[camera]),
-        "noise_range_m": levels.range_m,
-        "noise_ring_m": levels.ring_m,
-        "noise_ring_end_mrad": 1e3 * levels.edge_rad,
-        "ring_ends_lost": levels.lost_share,
-        "noise_tilt_deg": float(np.degrees(levels.tilt_rad)),
-        "noise_spin_deg": float(np.degrees(levels.spin_rad)),
-        "noise_depth_m": levels.depth_m,
-        "noise_across_m": levels.across_m,
-    }
+def add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation: float) -> Diagnostics:
+    """Replace the start's constant errors, noise levels and covariance parts by those of a joint estimate.
 
-
-def _sigmas(joint: JointEstimate, camera: int) -> dict[str, float]:
-    """Split a camera's covariance into the part that differs between sessions and that of constant errors.
-
-    With information H = sum_k H_k + P, the covariance H^-1 is H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1.
+    With information H = sum_k H_k + P, the covariance H^-1 is H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1: the part
+    that differs between sessions, and that of constant errors.
     """
-    cost = joint.cost
+    levels, cost = joint.levels, joint.cost
+    shifts = dict(zip(SHIFTS, joint.shifts.tolist(), strict=True))
+    figures = replace(
+        start,
+        covariance_inflation=inflation,
+        edge_shift_m=shifts["d_0"],
+        edge_shift_sigma_m=float(joint.constants_sigma[-N_SHIFTS]),
+        edge_shift_echo_m=shifts["d_1"],
+        edge_shift_blended_m=shifts["d_2"],
+        edge_shift_blended_echo_m=shifts["d_3"],
+        range_offset_m=float(np.mean(joint.offset_m)),
+        laser_spread_m=float(np.std(joint.offset_m)),
+        lens_lateral_m=float(joint.lens_m[0]),
+        lens_vertical_m_per_rad=float(joint.lens_m[1]),
+        camera_scale=1.0 - float(joint.scale[camera]),
+        noise_range_m=levels.range_m,
+        noise_ring_m=levels.ring_m,
+        noise_ring_end_mrad=1e3 * levels.edge_rad,
+        ring_ends_lost=levels.lost_share,
+        noise_tilt_deg=float(np.degrees(levels.tilt_rad)),
+        noise_spin_deg=float(np.degrees(levels.spin_rad)),
+        noise_depth_m=levels.depth_m,
+        noise_across_m=levels.across_m,
+    )
     J = joint.to_extrinsics[camera] @ cost.covariance()
-    figures: dict[str, float] = {}
-    for name, part in (("scatter", cost.hessians.sum(axis=0)), ("systematic", cost.prior)):
-        figures |= name_sigmas(name, J @ part @ J.T)
-    return figures
+    return with_parts(figures, J @ cost.hessians.sum(axis=0) @ J.T, J @ cost.prior @ J.T)

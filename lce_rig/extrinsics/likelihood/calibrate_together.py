@@ -9,23 +9,13 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation, Refusal
 from lce_rig.extrinsics.estimate import CalibrationEstimate
-from lce_rig.extrinsics.likelihood.calibrate_jointly import describe, expand_joint, figures_of, what_is_known
+from lce_rig.extrinsics.likelihood.calibrate_jointly import add_figures, describe, expand_joint, what_is_known
 from lce_rig.extrinsics.likelihood.levels import PoseLevels
 from lce_rig.extrinsics.likelihood.refine import refine
 from lce_rig.extrinsics.likelihood.spread import inflate
 from lce_rig.extrinsics.options import EstimateSettings
-from lce_rig.extrinsics.shared_scans import scan_key, take_apart
+from lce_rig.extrinsics.shared_scans import scan_key
 from lce_rig.residuals.placements import group_shared_placements
-
-# Diagnostics of a camera's pose errors beyond corner noise, by their level.
-_POSE_FIGURES = {
-    "tilt_rad": "noise_tilt_deg",
-    "spin_rad": "noise_spin_deg",
-    "depth_m": "noise_depth_m",
-    "across_m": "noise_across_m",
-}
-# Diagnostics of a camera's own estimate that do not apply to the joint one.
-_OF_ONE = ("algorithm_1_offset_deg", "algorithm_1_offset_m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +70,14 @@ def calibrate_together(
         n_seen = len(np.unique(placement[[order[o.capture] for o in labelled[k]]]))
         cov, inflation = inflate(joint, placement, k, n_seen)
         scales.append(np.full(6, np.sqrt(inflation)))
-        figures = {**figures_of(joint, k), "covariance_inflation": inflation}
+        figures = add_figures(start.diagnostics, joint, k, inflation)
         estimate = describe(joint, k, cov, start, used[k], board, options, figures)
         estimates[name] = replace(
             estimate,
             method=start.method,
             expansion=expand_joint(joint, k, placement),
             estimated_with=tuple(other for other in names if other != name),
+            same_scan=start.same_scan,
         )
     scale = np.concatenate(scales)
     cov = scale[:, None] * (J @ joint.cost.covariance() @ J.T) * scale
@@ -95,7 +86,7 @@ def calibrate_together(
 
 def _without(start: CalibrationEstimate, conflicts: Mapping[str, Refusal]) -> CalibrationEstimate:
     """Remove captures, and figures that apply to the camera alone."""
-    singles = [take_apart([name]) for name in start.used]
+    singles = [start.captures_of([name]) for name in start.used]
     kept = [k for k, names in enumerate(singles) if not names & conflicts.keys()]
     mine = {name: why for name, why in conflicts.items() if name in set().union(*singles)}
     return replace(
@@ -103,7 +94,7 @@ def _without(start: CalibrationEstimate, conflicts: Mapping[str, Refusal]) -> Ca
         used=tuple(start.used[k] for k in kept),
         residuals=tuple(start.residuals[k] for k in kept),
         refused={**start.refused, **mine},
-        diagnostics={name: value for name, value in start.diagnostics.items() if name not in _OF_ONE},
+        diagnostics=replace(start.diagnostics, algorithm_1_offset_deg=np.nan, algorithm_1_offset_m=np.nan),
     )
 
 
@@ -114,7 +105,7 @@ def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
     for camera, estimate in sorted(alone.items()):
         for observation in estimate.observations.values():
             key = scan_key(observation)
-            for capture in sorted(take_apart([observation.capture])):
+            for capture in sorted(estimate.captures_of([observation.capture])):
                 other, held = seen.setdefault(capture, (camera, key))
                 if held != key:
                     figures = {"first": other, "second": camera}
@@ -135,6 +126,7 @@ def _label_scans(used: Sequence[Sequence[Observation]]) -> list[list[Observation
 
 def _pose_ratios(starts: Sequence[CalibrationEstimate]) -> list[PoseLevels]:
     """Compare cameras' pose errors, as each alone estimates them, with their geometric mean."""
-    logs = np.log([[start.diagnostics[name] for name in _POSE_FIGURES.values()] for start in starts])
+    each = [start.diagnostics for start in starts]
+    logs = np.log([[d.noise_tilt_deg, d.noise_spin_deg, d.noise_depth_m, d.noise_across_m] for d in each])
     ratios = np.exp(logs - logs.mean(axis=0))
-    return [PoseLevels(**dict(zip(_POSE_FIGURES, own, strict=True))) for own in ratios.tolist()]
+    return [PoseLevels(*own) for own in ratios.tolist()]

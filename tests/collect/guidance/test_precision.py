@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.guidance import combine, predict_covariance, sigmas, weigh_placements
-from lce_rig.collect.guidance.precision import combine_with_each
+from lce_rig.collect.guidance.evidence import combine_with_each
 from lce_rig.collect.guidance.sensor_noise import ErrorModel
 from lce_rig.core.geometry import difference, invert
 from lce_rig.core.results import Observation
@@ -86,7 +86,7 @@ def test_predicted_scatter_is_that_of_many_sessions(poses):
     figures = [run.diagnostics for run in runs]
     learned = SURROGATE
     for key, name in (("plane_m", "fit_plane_rms_m"), ("edge_m", "fit_edge_rms_m")):
-        learned = replace(learned, **{key: float(np.mean([each[name] for each in figures]))})
+        learned = replace(learned, **{key: float(np.mean([getattr(each, name) for each in figures]))})
     predicted = combine(weigh_placements(model(learned), poses, T_FORWARD), learned)
     for actual, expected in zip(sigmas(np.cov(errors.T)), sigmas(predicted.cov), strict=True):
         assert 0.75 < expected / actual < 1.33

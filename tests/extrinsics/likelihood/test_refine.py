@@ -44,11 +44,11 @@ def test_errors_of_lasers_hardly_reach_the_extrinsic_and_the_claim_says_so(sessi
 def test_noise_and_constant_errors_come_out_as_simulated(sessions):
     for estimate in sessions:
         figures = estimate.diagnostics
-        assert abs(figures["edge_shift_m"] - 0.008) < 4 * figures["edge_shift_sigma_m"] + 3e-4
-        assert abs(figures["noise_range_m"] - 0.010) < 3e-4
-        assert figures["noise_tilt_deg"] < 0.1
-        assert 0.004 < figures["laser_spread_m"] < 0.014
-        assert abs(figures["camera_scale"] - 1) < 0.001
+        assert abs(figures.edge_shift_m - 0.008) < 4 * figures.edge_shift_sigma_m + 3e-4
+        assert abs(figures.noise_range_m - 0.010) < 3e-4
+        assert figures.noise_tilt_deg < 0.1
+        assert 0.004 < figures.laser_spread_m < 0.014
+        assert abs(figures.camera_scale - 1) < 0.001
         assert estimate.certificate.is_optimal
         assert estimate.method == "ml"
 
@@ -56,8 +56,8 @@ def test_noise_and_constant_errors_come_out_as_simulated(sessions):
 def test_the_claim_is_parted_in_what_differs_between_sessions_and_what_they_share(sessions):
     for estimate in sessions:
         figures = estimate.diagnostics
-        parts = [figures[f"sigma_{name}_translation_m"] ** 2 for name in ("scatter", "systematic")]
-        claimed = np.trace(estimate.cov[:3, :3]) / figures["covariance_inflation"]
+        parts = [getattr(figures, f"sigma_{name}_translation_m") ** 2 for name in ("scatter", "systematic")]
+        claimed = np.trace(estimate.cov[:3, :3]) / figures.covariance_inflation
         assert sum(parts) == pytest.approx(claimed, rel=1e-6)
         assert min(parts) > 0.01 * claimed
 
@@ -68,7 +68,7 @@ def test_an_offset_common_to_all_ranges_is_found_though_it_is_four_times_what_th
     angle_deg, distance_m = error_to_reference(estimate.T_cam_lidar, T_FORWARD)
     assert angle_deg < 0.05
     assert distance_m < 0.002
-    assert abs(estimate.diagnostics["range_offset_m"] - 0.02) < 0.003
+    assert abs(estimate.diagnostics.range_offset_m - 0.02) < 0.003
 
 
 def raised(capture, metres_per_rad):
@@ -87,7 +87,7 @@ def raised(capture, metres_per_rad):
 def test_the_height_of_the_lasers_is_found_where_the_driver_left_it_out():
     captures = [raised(capture, -0.043) for capture in simulate(30, 2, REAL)]
     estimate = fit_extrinsic(captures, BOARD, ML)
-    assert abs(estimate.diagnostics["lens_vertical_m_per_rad"] + 0.043) < 0.006
+    assert abs(estimate.diagnostics.lens_vertical_m_per_rad + 0.043) < 0.006
     error = difference(estimate.T_cam_lidar, T_FORWARD)
     assert error @ np.linalg.solve(estimate.cov, error) < 25  # 0.9997 of chi square with 6 degrees
     assert np.degrees(np.linalg.norm(error[3:])) < 0.08

@@ -1,4 +1,4 @@
-"""What no scene made: hot pixels and background activity."""
+"""Removal of hot pixels and background activity."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ _SUPPORT_NS = 10_000_000
 
 
 class NoiseFilter:
-    """Learns along the stream which pixels are hot, and leaves out their events and lone ones."""
+    """Learns along the stream which pixels are hot, and removes their events and isolated ones."""
 
     def __init__(self) -> None:
         self._n_events: NDArray[np.int64] | None = None
@@ -23,7 +23,7 @@ class NoiseFilter:
         self._is_hot: NDArray[np.bool_] | None = None
 
     def learn(self, events: Events) -> None:
-        """Count the next stretch of the stream; twice a second the hot pixels are found anew."""
+        """Count the next stretch of the stream; twice a second the hot pixels are determined again."""
         if not len(events):
             return
         shape = events.height_px, events.width_px
@@ -38,7 +38,7 @@ class NoiseFilter:
             self._since_ns = last_ns
 
     def clean(self, events: Events) -> Events:
-        """Leave out the events of hot pixels known so far and background activity."""
+        """Remove the events of hot pixels known so far and background activity."""
         if self._is_hot is not None:
             events = without_pixels(events, self._is_hot)
         return without_background_activity(events)
@@ -57,18 +57,18 @@ def hot_pixels(n_events: NDArray[np.uint16]) -> NDArray[np.bool_]:
 
 
 def without_pixels(events: Events, is_bad: NDArray[np.bool_]) -> Events:
-    """Leave out the events of marked pixels, (H, W)."""
+    """Remove the events of marked pixels, (H, W)."""
     if not is_bad.any():
         return events
     return _select(events, ~is_bad[events.y, events.x])
 
 
 def without_background_activity(events: Events, support_ns: int = _SUPPORT_NS) -> Events:
-    """Leave out events that no neighbour accompanies.
+    """Remove events without a neighbouring event.
 
     Time is cut into slices of `support_ns`; an event stays where its 3 x 3 neighbourhood holds another
     pixel's event in the same slice, the one before or the one after: the nearest-neighbour filter of [1] with
-    slices in place of a map of time timestamps.
+    slices in place of a map of timestamps.
 
     References:
         [1] Delbruck, Frame-free dynamic digital vision, ISSE 2008.

@@ -1,4 +1,4 @@
-"""The network file: what it must offer, and one step of it."""
+"""The network file: its required inputs and outputs, and one step of it."""
 
 import math
 import re
@@ -37,7 +37,7 @@ class ReconstructionModel:
     """A recurrent event-to-image network in ONNX, its state explicit.
 
     Args:
-        path: ONNX file; None takes the one shipped with the package.
+        path: ONNX file; None for the one shipped with the package.
         n_threads: threads of onnxruntime.
 
     Raises:
@@ -127,7 +127,7 @@ def model_bytes(path: Path | None) -> bytes:
     """
     if path is None:
         return (resources.files("lce_rig") / "models" / "reconstruction.onnx").read_bytes()
-    hint = "leave the key out for the shipped one"
+    hint = "Omit the key to use the shipped one."
     try:
         return read_file(path)
     except FileNotFoundError as error:
@@ -144,7 +144,7 @@ def _load(path: Path | None, name: str, n_threads: int) -> NetworkSession:
     try:
         return LocalSession(content, n_threads) if path is None else ProcessSession(content, n_threads)
     except ImportError as error:
-        raise SourceError("onnxruntime is not installed", "pip install onnxruntime") from error
+        raise SourceError("onnxruntime is not installed", "Run: pip install onnxruntime") from error
     except NetworkError as error:
         hint = error.hint or _EXPECTED
         raise ProfileError(f"reconstruction model {name}: cannot be loaded: {error}", hint) from error

@@ -27,7 +27,7 @@ LOAD_S = 60.0
 FIRST_STEP_S = 60.0
 STEP_S = 20.0
 """Limit of a step: 400 times what the shipped network takes on a desktop."""
-_HINT = "take a smaller network, or leave the key out for the shipped one"
+_HINT = "Use a smaller network, or omit the key to use the shipped one."
 _MAX_ANSWER_BYTES = 1 << 20
 _MAX_IDLE = 2
 
@@ -121,7 +121,7 @@ class _Worker:
             answer = self._exchange(json.dumps(request).encode() + b"\n" + content, limit_s)
             is_answered = True
         finally:
-            if not is_answered:  # What was interrupted would answer the next question.
+            if not is_answered:  # An interrupted request would answer the next one.
                 self.stop()
         if "missing" in answer:
             raise ImportError(f"{answer['missing']} is not installed")
@@ -181,7 +181,7 @@ def _stop_idle() -> None:
 
 
 def _explained(text: str) -> NetworkError:
-    """Put what onnxruntime says about memory and files that it could not have into words."""
+    """Translate onnxruntime's errors about memory and files."""
     if re.search("bad_?alloc|out of memory|failed to allocate|bad allocation", text, re.IGNORECASE):
         return NetworkError(f"it needs more than {MAX_BYTES / 1e9:.1f} GB of memory", _HINT)
     if re.search(f"external data|SystemError : {errno.EMFILE}$", text, re.IGNORECASE):

@@ -13,7 +13,7 @@ Shape = tuple[int | str | None, ...]
 
 
 class NetworkError(Exception):
-    """What onnxruntime, or the process it runs in, says is wrong.
+    """An error of onnxruntime or of its process.
 
     Args:
         what: one line.

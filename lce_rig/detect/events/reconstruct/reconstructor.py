@@ -1,4 +1,4 @@
-"""Images from an event stream, at any time asked for."""
+"""Images from an event stream at any requested time."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -46,7 +46,7 @@ _MIN_SPREAD = 0.05
 
 
 class GreyScale(Protocol):
-    """What maps the images of a stream to 8 bits."""
+    """Mapping of a stream's images to 8 bits."""
 
     def follow(self, picture: FloatArray) -> None:
         """Take the next image of the stream into account, (H, W)."""
@@ -61,7 +61,7 @@ class SignedScale:
     """Nothing is grey 128, sums of polarities brighter and darker alike, but for the largest twentieth."""
 
     def follow(self, picture: FloatArray) -> None:
-        """Every map stands for itself."""
+        """Do nothing, as every map is independent."""
 
     def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
         """Map (H, W) to uint8."""
@@ -106,7 +106,7 @@ def _bounds(picture: FloatArray) -> NDArray[np.float64]:
 
 
 class EventImager(Protocol):
-    """What turns windows of events into images, one step a window."""
+    """Turns windows of events into images, one step per window."""
 
     @property
     def n_warm_up(self) -> int:
@@ -195,7 +195,7 @@ class ReconstructionOptions:
         windows: how the stream is cut.
         n_warm_up: windows of the network before its images count.
         is_filtered: leave out hot pixels and background activity.
-        channel: the channel that images are said to come from.
+        channel: the channel of the images.
         n_threads: threads of onnxruntime.
     """
 
@@ -217,7 +217,7 @@ class _Window:
 
 
 class Reconstructor:
-    """Runs over one event stream; its recurrent state spans the whole stream.
+    """Runs over one event stream, with a recurrent state for the whole stream.
 
     Windows are cut by the events alone, so that neither the batches in which events arrive nor the timestamps
     asked for change what the network has seen: an image at a timestamp is a side step from the running state
@@ -288,7 +288,7 @@ class Reconstructor:
         Args:
             batches: the stream from its beginning, in time order, cut anywhere.
             stamps_ns: when images are wanted, never decreasing, the events' clock.
-            every_ns: in place of stamps: one image every so many ns from the first event on.
+            every_ns: instead of stamps_ns, one image per this period from the first event on.
 
         Raises:
             SourceError: the batches are of different sensors or go back in time.
@@ -355,12 +355,12 @@ class Reconstructor:
         if size != expected:
             raise SourceError(
                 f"{batch.sensor}: events of {size} px follow events of {expected} px",
-                "name one sensor's stream",
+                "Give one sensor's stream.",
             )
         if last_ns is not None and int(batch.t_ns[0]) < last_ns:
             back_s = (last_ns - int(batch.t_ns[0])) / 1e9
             raise SourceError(
-                f"{batch.sensor}: events go back in time by {back_s:.6f} s", "sort the recording"
+                f"{batch.sensor}: events go back in time by {back_s:.6f} s", "Sort the recording."
             )
         self._current = replace(self._current, events=join_events([pending, batch]))
 
@@ -423,8 +423,8 @@ class Reconstructor:
 
 def _check_request(stamps_ns: Sequence[int] | None, every_ns: int | None) -> None:
     if (stamps_ns is None) == (every_ns is None):
-        raise UsageError("either stamps_ns or every_ns says when images are wanted")
+        raise UsageError("give either stamps_ns or every_ns")
     if stamps_ns is not None and np.any(np.diff(np.asarray(stamps_ns, dtype=np.int64)) < 0):
-        raise UsageError("timestamps at which images are wanted must not decrease")
+        raise UsageError("stamps_ns must not decrease")
     if every_ns is not None and every_ns <= 0:
-        raise UsageError(f"an image every {every_ns} ns makes no sense")
+        raise UsageError(f"every_ns is {every_ns} (minimum 1)")
