@@ -34,7 +34,7 @@ class Board:
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether the pattern turned by 180 deg gives the same image (squares add up to an even number)."""
+        """Whether the pattern rotated by 180 deg gives the same image (squares add up to an even number)."""
         return (self.cols + self.rows) % 2 == 0
 
     def corners(self) -> Array:

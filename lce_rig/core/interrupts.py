@@ -88,7 +88,7 @@ def watch_for_interrupts() -> None:
 
 
 def interrupt_no_more() -> None:
-    """Let the program end as it is about to; the watch continues."""
+    """Let the program's own exit proceed; the watch continues."""
     if _watch is not None:
         _watch.is_raising = False
 

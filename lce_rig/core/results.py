@@ -328,7 +328,7 @@ class OtherCamera:
             extrinsics were not estimated together.
         T_cam_other_pictures: (4, 4) from the images of both alone; None if too few boards tell.
         apart_rotation_deg, apart_translation_m: how far that lies from what the extrinsics compose to, each
-            estimated by itself.
+            estimated separately.
         board_rms_m: how far apart those put the middle of the same board, rms.
     """
 

@@ -23,7 +23,7 @@ def read_table(
         start: where the rows begin in it.
         dtype: structured, of scalar fields: the columns.
         n_rows: how many to read.
-        n_skipped: rows in front of them, whatever they hold.
+        n_skipped: rows before them, with any content.
 
     Returns:
         Structured (n_rows,).
@@ -53,7 +53,7 @@ def read_table(
 
 
 class _BadRowsError(ValueError):
-    """Malformed lines, whatever figures they hold."""
+    """Malformed lines, with any figures."""
 
 
 class _Rows:

@@ -15,7 +15,7 @@ MAX_EVENT_RATIO = 100
 """The same for events. A hundredth of an event's usual 13 bytes is one bit, and its pixel alone is more;
 sensors' recordings shrink to a third or a tenth."""
 
-# What is unpacked in no time, whatever the ratio: short, black, or of one value all over.
+# Sizes that unpack quickly at any ratio: short, black, or of a single value.
 _FREE_BYTES = 1 << 24
 # Larger than most chunks, which then are not copied once more.
 _PIECE_BYTES = 1 << 23

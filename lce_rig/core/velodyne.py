@@ -47,7 +47,7 @@ DATA_PACKET = np.dtype(
 
 PPS_STATES = ("absent", "synchronising", "locked", "error")
 PPS_LOCKED = 2
-#: `nmea` is padded with zeros; fields between these are of no use here, and not filled by older firmware.
+#: `nmea` is padded with zeros; fields between these are not used here, and not filled by older firmware.
 POSITION_PACKET = np.dtype(
     {
         "names": ["us", "pps", "nmea"],

@@ -9,7 +9,7 @@ from lce_rig.rig import QualitySettings
 
 
 def gate_image_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:
-    """Hold a board found in an image against the profile's limits.
+    """Compare a board found in an image with the profile's limits.
 
     Args:
         found: one without quality is judged by its pose alone.

@@ -229,7 +229,7 @@ def depth_scatter_m(estimate: CalibrationEstimate) -> float:
 def _difference(
     mover: _Mover, results: Sequence[ChannelResult], board: Board, options: EstimateSettings
 ) -> tuple[Array | None, Array | None]:
-    """Hold two channels' extrinsics against each other: the tangent (6,) between them and its covariance.
+    """Compare two channels' extrinsics: the tangent (6,) between them and its covariance.
 
     If only the two channels together show how boards moved, each pose depends on both; then one channel's
     extrinsic from half of the scans is compared with the other's from the other half, and of several ways to

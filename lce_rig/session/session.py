@@ -255,11 +255,11 @@ class Session:
         self.journal("restored", capture=name)
 
     def _move(self, name: str, source: str, target: str) -> None:
-        """Move a capture's folder in one step, so that it is in one place whatever happens."""
+        """Move a capture's folder in one step, so that it is always in exactly one place."""
         self._require_lock()
         old, new = self.own(source, name), self.own(target, name)
         if new.exists():
-            raise SessionError(f"{new} is in the way of capture {name}", f"Move {new} out of the session.")
+            raise SessionError(f"{new} blocks capture {name}", f"Move {new} out of the session.")
         try:
             new.parent.mkdir(exist_ok=True)
             old.rename(new)
@@ -387,7 +387,7 @@ class Session:
     ) -> Iterator[Path]:
         """Yield an empty folder that replaces one of the session's when the block ends.
 
-        Readers find the earlier folder or the new one, whole, whatever happens in between.
+        Readers find the earlier folder or the new one, complete, at any time.
 
         Args:
             parts: of the folder's path in the session.

@@ -5,7 +5,7 @@ The cost over a rotation R, a translation t and further linear unknowns s (nuisa
     f(R, t, s) = sum_i w_i (n_i . (g_i - R p_i - t) + c_i . s)^2                                     (1)
 
 With x = [vec R; t; s; 1] every residual is a_i . x, hence f = x^T M x with one moment matrix
-M = sum w a a^T (2), whatever the number of points; sets of captures are sums of matrices. The linear unknowns
+M = sum w a a^T (2), for any number of points; sets of captures are sums of matrices. The linear unknowns
 minimise (1) in closed form for every R, which leaves f = z^T Q z over z = [vec R; 1] (3), minimised on SO(3)
 by Newton's method. vec stacks columns. Every function takes leading batch axes.
 """

@@ -23,7 +23,7 @@ _CAMERA_AXES = {"x": "x axis (right)", "y": "y axis (down)", "z": "z axis (line 
 
 
 def motion_words(motion: str) -> str:
-    """Name a motion by its code, "translation_x" to "rotation_z"; what is no code is taken as words."""
+    """Name a motion by its code, "translation_x" to "rotation_z"; other text is returned unchanged."""
     kind, _, axis = motion.partition("_")
     if axis not in _CAMERA_AXES:
         return motion
@@ -31,7 +31,7 @@ def motion_words(motion: str) -> str:
 
 
 def weakest_words(weakest: WeakestMotion) -> str:
-    """Name the least certain motion with its standard deviation."""
+    """Name the least determined motion with its standard deviation."""
     return _weakest(weakest.figures())
 
 
@@ -151,12 +151,12 @@ def _commonest(finding: Finding) -> str:
 
 
 def _undetermined(finding: Finding) -> str:
-    """{motions} open after {n_captures} captures: boards nearly parallel, normals spread by {spread_deg}."""
+    """{motions} undetermined by {n_captures} captures: boards nearly parallel, spread {spread_deg}."""
     motions, n_captures = finding.figures["motions"], finding.figures["n_captures"]
     assert isinstance(motions, tuple)
     names = " and ".join(motion_words(str(motion)) for motion in motions)
     return (
-        f"{names} cannot be told from {n_captures} captures: their boards are nearly parallel "
+        f"{names} cannot be determined from {n_captures} captures: their boards are nearly parallel "
         f"(normals spread by {finding.figure('spread_deg'):.1f} deg)"
     )
 
@@ -313,8 +313,7 @@ PHRASES: dict[str, Phrase] = {
         "run `lce-rig calibrate` for its reasons",
     ),
     "shortage.few_detected": Phrase(
-        "the board was found by both sensors in {n_detected} of {n_captures} captures, at least {n_needed} "
-        "are needed",
+        "both sensors found the board in {n_detected} of {n_captures} captures (minimum {n_needed})",
         _commonest,
     ),
     "shortage.few_captures": Phrase(
@@ -322,7 +321,7 @@ PHRASES: dict[str, Phrase] = {
         "add captures: ten or more, with the board at different places and tilts",
     ),
     "shortage.few_agree": Phrase(
-        "only {n_agreeing} of {n_captures} captures agree with one set of extrinsics, {n_needed} are needed",
+        "only {n_agreeing} of {n_captures} captures agree with one set of extrinsics (minimum {n_needed})",
         "check the board's size, the intrinsics and the pairing of images with scans; add captures",
     ),
     "shortage.undetermined": Phrase(

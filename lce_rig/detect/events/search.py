@@ -26,9 +26,9 @@ from lce_rig.solvers.pnp import pose_covariance
 def align_corner_order(found: ImageBoard, reference: ImageBoard, board: Board) -> ImageBoard:
     """Order the corners from the same end of the pattern as in another image of about the same time.
 
-    The pattern looks the same when it is turned by 180 deg, a square one by 90 deg, but for the colours of
+    The pattern looks the same when rotated by 180 deg, a square one by 90 deg, except for the colours of
     its squares, and a reconstruction can have those wrong. The turn that brings the two poses nearest to each
-    other is taken; the board may not have turned by half of that between the images.
+    other is taken; the board must not have rotated by half of that between the images.
 
     Args:
         found: the board whose corners are put in order.

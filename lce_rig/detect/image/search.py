@@ -35,7 +35,8 @@ _CUT_FRACTION = 0.02
 _CANVAS_FRACTION = 3.0
 # Corners that the finder misplaced, or that an artefact covers, at most.
 _MAX_MISPLACED = 0.08
-# A quarter of a full fit's time; corners are then known to 0.03 px, plenty for stillness and guidance.
+# A quarter of a full fit's time; the corners' standard deviation is then 0.03 px, sufficient for stillness
+# and guidance.
 _FOLLOWED_SAMPLES = 13
 # A board whose corners have moved by less stands still.
 _RESTING_PX = 0.5

@@ -1,6 +1,6 @@
 """The process in which a profile's own network runs: little memory, no files, and it ends with its parent.
 
-It is told what to do by lines of JSON on stdin and answers with lines on stdout; arrays lie in memory that
+It receives requests as lines of JSON on stdin and answers with lines on stdout; arrays lie in memory that
 both share. `model_process` is the other end.
 """
 
@@ -54,7 +54,7 @@ def main() -> None:
 
 
 def _listen(stdin: BinaryIO, requests: "queue.SimpleQueue[tuple[dict[str, Any], bytes]]") -> None:
-    """Take requests; the end of stdin is the end of the parent, whatever the network is doing."""
+    """Take requests; the end of stdin means the end of the parent, at any time."""
     while line := stdin.readline():
         request = json.loads(line)
         requests.put((request, stdin.read(request.get("n_bytes", 0))))
