@@ -16,9 +16,8 @@ from lce_rig.core.errors import LceRigError
 from lce_rig.screen.keys import Controls, controls
 
 if TYPE_CHECKING:
-    from lce_rig.collect.live.options import LiveReport
     from lce_rig.collect.live.simulated import SimulatedRig
-    from lce_rig.collect.live.state import LiveState
+    from lce_rig.collect.live.state import LiveReport, LiveState
     from lce_rig.devices.reading import LiveSource
     from lce_rig.page import Preview
     from lce_rig.rig import Rig
@@ -59,7 +58,7 @@ class LiveArguments:
 def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
     """Collect live into a session and report the outcome."""
     from lce_rig.collect.live.collection import collect_live
-    from lce_rig.collect.live.options import HOLD_S, LiveOptions
+    from lce_rig.collect.live.state import HOLD_S, LiveOptions
     from lce_rig.core.errors import UsageError
     from lce_rig.rig import load_rig
     from lce_rig.screen.live_view import open_view

@@ -1,4 +1,4 @@
-"""The board followed from frame to frame, in every picture and scan."""
+"""The board followed from frame to frame, in every image and scan."""
 
 from dataclasses import asdict, dataclass, field, replace
 
@@ -19,6 +19,8 @@ ImageKey = tuple[str, str]
 
 # A candidate is the camera's board where it lies as far from it as nominal extrinsics may be off, and a half.
 _NOMINAL_MARGIN = 1.5
+# Nominal extrinsics that fit a board so well at one distance fit boards at all distances.
+_PROVED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +82,9 @@ class TakenByHand:
 
 @dataclass(frozen=True, eq=False)
 class CaptureMoment:
-    """A sighting worth a capture, and how the board moved; both are kept."""
+    """A detection worth a capture, and how the board moved; both are kept."""
 
-    sighting: BoardDetection
+    detection: BoardDetection
     motion: HeldStill | MovedSlowly | TakenByHand
 
     @property
@@ -97,7 +99,7 @@ class BoardTracker:
 
     Attributes:
         rig: the profile.
-        search_interval_s: how often a whole picture is searched while no board is in sight.
+        search_interval_s: how often a whole image is searched while no board is in sight.
         refusals: frames in which it was not found, and boards that were found and cannot be used.
         thorough_interval_s: how often such a search is thorough, which takes most of a second; 0 for always.
         rescan_interval_s: how often a whole scan is searched while all candidates are followed; 0 for as
@@ -120,11 +122,11 @@ class BoardTracker:
         self.finder = BoardFinder(self.rig)
 
     def sight(self, frame: Frame) -> BoardDetection:
-        """Find the board in every picture and scan of a frame."""
+        """Find the board in every image and scan of a frame."""
         return self.sight_in_scans(self.sight_in_images(frame))
 
     def sight_in_images(self, frame: Frame) -> BoardDetection:
-        """Find the board in every picture of a frame; what follows from scans is empty."""
+        """Find the board in every image of a frame; what follows from scans is empty."""
         images: dict[ImageKey, ImageBoard] = {}
         unseen: dict[ImageKey, Refusal] = {}
         unfit: dict[ImageKey, Refusal] = {}
@@ -141,26 +143,26 @@ class BoardTracker:
                 unfit[key] = found.usable
         return BoardDetection(frame, images, {}, unseen, {}, unfit)
 
-    def sight_in_scans(self, sighting: BoardDetection) -> BoardDetection:
-        """Find the board in every scan too, where a picture shows it, and count what cannot be used."""
-        for refusal in sighting.unfit.values():
+    def sight_in_scans(self, detection: BoardDetection) -> BoardDetection:
+        """Find the board in every scan too, where an image shows it, and count what cannot be used."""
+        for refusal in detection.unfit.values():
             self.refusals.add(refusal)
         lidars: dict[str, list[LidarBoard]] = {}
         unscanned: dict[str, Refusal] = {}
         # Nothing is gained from scans while no camera sees the board.
-        for scan in sighting.frame.scans if sighting.images else ():
-            candidates = self._find_in_scan(scan, sighting.frame.time_ns)
+        for scan in detection.frame.scans if detection.images else ():
+            candidates = self._find_in_scan(scan, detection.frame.time_ns)
             if isinstance(candidates, Refusal):
                 unscanned[scan.sensor] = candidates
             else:
                 lidars[scan.sensor] = candidates
-        if not sighting.images:
+        if not detection.images:
             self._n_candidates.clear()  # A board that comes back is searched for at once.
-            if not sighting.is_moving:
+            if not detection.is_moving:
                 self.refusals.add(Refusal("image.none"))
         elif not lidars:
             self.refusals.add(Refusal("lidar.none"))
-        return replace(sighting, lidars=lidars, unscanned=unscanned)
+        return replace(detection, lidars=lidars, unscanned=unscanned)
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
         """Search the frame of a moment without a prior, as `check` does: what is captured can be used later.
@@ -168,14 +170,14 @@ class BoardTracker:
         Returns:
             The moment with what was found; or why it cannot be used.
         """
-        sighting = moment.sighting
-        keys = sighting.images.keys()
+        detection = moment.detection
+        keys = detection.images.keys()
         images = {
             (image.sensor, image.channel): self.finder.image(image)
-            for image in sighting.frame.images
+            for image in detection.frame.images
             if (image.sensor, image.channel) in keys
         }
-        scans = {scan.sensor: self.finder.scan(scan) for scan in sighting.frame.scans}
+        scans = {scan.sensor: self.finder.scan(scan) for scan in detection.frame.scans}
         usable = {key: board for key, board in images.items() if isinstance(board, ImageBoard)}
         lidars = {name: boards for name, boards in scans.items() if isinstance(boards, list)}
         for found, refused in ((usable, images), (lidars, scans)):
@@ -184,7 +186,7 @@ class BoardTracker:
         elsewhere = self._find_elsewhere(usable, lidars)
         if elsewhere is not None:
             return elsewhere
-        return replace(moment, sighting=BoardDetection(sighting.frame, usable, lidars))
+        return replace(moment, detection=BoardDetection(detection.frame, usable, lidars))
 
     def _find_elsewhere(
         self, images: dict[ImageKey, ImageBoard], lidars: dict[str, list[LidarBoard]]
@@ -199,12 +201,11 @@ class BoardTracker:
                 nominal = self.rig.nominal(camera, lidar)
                 if nominal is None:
                     return None
-                nearest = _compare(board, candidates, nominal)
-                if nearest is None:
+                misfit, elsewhere = _compare(board, candidates, nominal)
+                if misfit <= _PROVED:
                     self._are_proved.add((camera, lidar))
-                if nearest is None or (camera, lidar) not in self._are_proved:
+                if misfit <= 1 or (camera, lidar) not in self._are_proved:
                     return None
-                elsewhere = nearest
         return elsewhere
 
     def _find_in_image(self, image: Image, key: ImageKey, time_ns: int) -> ImageSearch | None:
@@ -240,7 +241,7 @@ class BoardTracker:
         return _is_due(self._searched_ns, key, time_ns, self.search_interval_s)
 
     def _is_thorough_due(self, key: ImageKey, time_ns: int, *, was_seen: bool) -> bool:
-        """Tell whether it is time for a thorough search; a board just lost is soon seen again without."""
+        """Check whether it is time for a thorough search; a board just lost is soon seen again without."""
         if was_seen and self.thorough_interval_s > 0:
             self._thorough_ns[key] = time_ns
             return False
@@ -248,7 +249,7 @@ class BoardTracker:
 
 
 def _is_due(last_ns: dict[ImageKey | str, int], key: ImageKey | str, time_ns: int, interval_s: float) -> bool:
-    """Tell whether an interval has gone by since something was done last, and note that it is done now."""
+    """Check whether an interval has gone by since something was done last, and note that it is done now."""
     before_ns = last_ns.get(key)
     if before_ns is not None and 0 <= time_ns - before_ns < interval_s * 1e9:
         return False
@@ -256,8 +257,14 @@ def _is_due(last_ns: dict[ImageKey | str, int], key: ImageKey | str, time_ns: in
     return True
 
 
-def _compare(board: ImageBoard, candidates: list[LidarBoard], nominal: NominalExtrinsic) -> Refusal | None:
-    """Compare candidates with where an image and nominal extrinsics have the board; None where one fits."""
+def _compare(
+    board: ImageBoard, candidates: list[LidarBoard], nominal: NominalExtrinsic
+) -> tuple[float, Refusal]:
+    """Compare candidates with where an image and nominal extrinsics have the board.
+
+    Returns:
+        The best one's misfit, 1 for the largest that is allowed, and the refusal if it is larger.
+    """
     T_lidar_cam = invert(nominal.to_matrix())
     poses = [pose for pose in (board.T_cam_board, board.T_cam_board_alternative) if pose is not None]
     distance, angle = np.array(
@@ -268,14 +275,12 @@ def _compare(board: ImageBoard, candidates: list[LidarBoard], nominal: NominalEx
     max_m = CENTRE_TOLERANCE_M + _NOMINAL_MARGIN * nominal.tolerance_m + range_m * turn_rad
     misfit = np.maximum(distance / max_m, angle / (NORMAL_TOLERANCE_RAD + turn_rad))
     best = int(np.argmin(misfit))
-    if misfit[best] <= 1:
-        return None
     figures = {
         "n_candidates": len(candidates),
         "distance_m": float(distance[best]),
         "rotation_deg": float(np.degrees(angle[best])),
     }
-    return Refusal("lidar.elsewhere", figures=figures)
+    return float(misfit[best]), Refusal("lidar.elsewhere", figures=figures)
 
 
 def _apart(T_1: Array, T_2: Array) -> tuple[float, float]:
@@ -284,6 +289,6 @@ def _apart(T_1: Array, T_2: Array) -> tuple[float, float]:
     return float(np.linalg.norm(T_1[:3, 3] - T_2[:3, 3])), float(np.arccos(cosine))
 
 
-def without_samples(sighting: BoardDetection) -> BoardDetection:
+def without_samples(detection: BoardDetection) -> BoardDetection:
     """Leave out the images and scans that were searched, which take long to send to another process."""
-    return replace(sighting, frame=replace(sighting.frame, images=(), scans=()))
+    return replace(detection, frame=replace(detection.frame, images=(), scans=()))

@@ -1,6 +1,6 @@
-"""Whether a sighting is worth a capture for an event camera.
+"""Whether a detection is worth a capture for an event camera.
 
-Events need motion, LiDAR wants stillness. A sighting will do where, in a camera that sends events, the board
+Events need motion, LiDAR wants stillness. A detection will do where, in a camera that sends events, the board
 
 - is not faster than `quality.max_board_speed_mps`,
 - made at least `quality.min_events_px` events a pixel of it in the second before,
@@ -23,7 +23,7 @@ from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.rig_time import rig_time_ns
 
-_LEAST_SIGHTINGS = 3
+_LEAST_DETECTIONS = 3
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class MotionOptions:
         best_speed_mps: neither too few events nor smear.
         plenty_events_px: events a pixel of the board in a second that are enough however slow it is.
         patience_s: how long a moment waits for a better one of the same place.
-        search_interval_s: how often a whole picture is searched while no board is in sight.
+        search_interval_s: how often a whole image is searched while no board is in sight.
     """
 
     window_s: float = 0.5
@@ -47,47 +47,47 @@ class MotionOptions:
     search_interval_s: float = 0.3
 
 
-def judge_sighting(
-    sighting: BoardDetection, around: Sequence[BoardDetection], rig: Rig, options: MotionOptions
+def judge_detection(
+    detection: BoardDetection, around: Sequence[BoardDetection], rig: Rig, options: MotionOptions
 ) -> CaptureMoment | Refusal | None:
-    """Say whether a sighting is worth a capture.
+    """Check whether a detection is worth a capture.
 
     Args:
-        sighting: what the sensors saw.
-        around: all sightings shortly before and after, itself among them.
+        detection: what the sensors saw.
+        around: all detections shortly before and after, itself among them.
         rig: the profile.
         options: how a moving board is judged.
 
     Returns:
-        The moment; why it is none; or None where the watcher has counted why.
+        The moment; why it is none; or None where the tracker has counted why.
     """
-    cuts = {cut.sensor: cut for cut in sighting.frame.events}
-    if sighting.images and not cuts:
+    cuts = {cut.sensor: cut for cut in detection.frame.events}
+    if detection.images and not cuts:
         return Refusal("read.no_events_at_scan")
-    watched = [key for key in sorted(sighting.images) if key[0] in cuts]
+    watched = [key for key in sorted(detection.images) if key[0] in cuts]
     if not watched:
-        return _explain_unseen(sighting, cuts, rig)
-    if not sighting.lidars:
+        return _explain_unseen(detection, cuts, rig)
+    if not detection.lidars:
         return None
-    judged = [_judge_camera(key, sighting, around, cuts[key[0]], rig, options) for key in watched]
+    judged = [_judge_camera(key, detection, around, cuts[key[0]], rig, options) for key in watched]
     return next((found for found in judged if isinstance(found, CaptureMoment)), judged[0])
 
 
 def _judge_camera(
     key: ImageKey,
-    sighting: BoardDetection,
+    detection: BoardDetection,
     around: Sequence[BoardDetection],
     cut: EventCut,
     rig: Rig,
     options: MotionOptions,
 ) -> CaptureMoment | Refusal | None:
-    if key in sighting.unfit:
-        return sighting.unfit[key]
+    if key in detection.unfit:
+        return detection.unfit[key]
     motion = _follow(key, around)
     if motion is None:
         return None
-    recent, stamp_ns = _events_before(key, sighting, cut, rig)
-    (speed_mps, unsteady_m), events_px = motion, _events_on_board(key, sighting, recent, stamp_ns, rig)
+    recent, stamp_ns = _events_before(key, detection, cut, rig)
+    (speed_mps, unsteady_m), events_px = motion, _events_on_board(key, detection, recent, stamp_ns, rig)
     limits = rig.quality
     made = {"events_px": events_px, "min_events_px": limits.min_events_px}
     if speed_mps > limits.max_board_speed_mps:
@@ -102,7 +102,7 @@ def _judge_camera(
         if lamps is not None:
             return lamps
     slow = MovedSlowly(round(speed_mps, 5), round(unsteady_m, 5), round(events_px, 5))
-    return CaptureMoment(sighting, slow)
+    return CaptureMoment(detection, slow)
 
 
 def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, float] | None:
@@ -111,7 +111,7 @@ def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, flo
     The middle is well known even where the tilt is not. None where the board was seen too seldom.
     """
     seen = [s for s in around if key in s.images]
-    if len(seen) < _LEAST_SIGHTINGS:
+    if len(seen) < _LEAST_DETECTIONS:
         return None
     time_s = 1e-9 * np.array([s.frame.time_ns - seen[0].frame.time_ns for s in seen])
     way: Array = np.stack([s.images[key].T_cam_board[:3, 3] for s in seen])
@@ -121,29 +121,29 @@ def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, flo
     return float(np.linalg.norm(velocity)), float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
 
 
-def _events_before(key: ImageKey, sighting: BoardDetection, cut: EventCut, rig: Rig) -> tuple[Events, int]:
-    """Cut out the second of events before the board's picture; also give its time on their clock."""
-    image = next(i for i in sighting.frame.images if (i.sensor, i.channel) == key)
+def _events_before(key: ImageKey, detection: BoardDetection, cut: EventCut, rig: Rig) -> tuple[Events, int]:
+    """Cut out the second of events before the board's image; also give its time on their clock."""
+    image = next(i for i in detection.frame.images if (i.sensor, i.channel) == key)
     # Frames and events of one camera may have clocks, or delays, of their own.
     time_ns = rig_time_ns(image, rig)
-    stamp_ns = (sighting.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
+    stamp_ns = (detection.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
     return cut.events.between(stamp_ns - MEMORY_NS, stamp_ns), stamp_ns
 
 
 def _events_on_board(
-    key: ImageKey, sighting: BoardDetection, recent: Events, stamp_ns: int, rig: Rig
+    key: ImageKey, detection: BoardDetection, recent: Events, stamp_ns: int, rig: Rig
 ) -> float:
-    """Count the events a pixel of the board in the second before its picture."""
-    camera, board = rig.cameras[key[0]], sighting.images[key]
+    """Count the events a pixel of the board in the second before its image."""
+    camera, board = rig.cameras[key[0]], detection.images[key]
     outline = outline_px(board.T_cam_board, rig.board.to_board(), camera.to_intrinsics())
     return event_quality(recent, stamp_ns, outline).events_px
 
 
-def _explain_unseen(sighting: BoardDetection, cuts: Mapping[str, EventCut], rig: Rig) -> Refusal | None:
-    """Say what keeps the board from being seen in pictures that were made of events."""
-    for (camera, channel), refusal in sorted(sighting.unseen.items()):
+def _explain_unseen(detection: BoardDetection, cuts: Mapping[str, EventCut], rig: Rig) -> Refusal | None:
+    """Say what keeps the board from being seen in images that were made of events."""
+    for (camera, channel), refusal in sorted(detection.unseen.items()):
         if rig.cameras[camera].channels[channel].kind == "events" and camera in cuts:
-            stamp_ns = sighting.frame.time_ns - cuts[camera].offset_ns
+            stamp_ns = detection.frame.time_ns - cuts[camera].offset_ns
             recent = cuts[camera].events.between(stamp_ns - MEMORY_NS, stamp_ns)
             return explain_missing_board(recent, stamp_ns, refusal, rig.quality)
     return None

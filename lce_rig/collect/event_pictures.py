@@ -1,4 +1,4 @@
-"""Pictures for cameras that send events only: reconstructed as the stream runs, one for every scan."""
+"""Images for cameras that send events only: reconstructed as the stream runs, one for every scan."""
 
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
@@ -18,16 +18,16 @@ _GONE_BY = Refusal("read.events_gone_by")
 def with_event_pictures(
     samples: Iterable[Sample], rig: Rig, cameras: Collection[str], tally: Losses, *, is_live: bool = False
 ) -> Iterator[Sample]:
-    """Pass samples on, and add a picture of each camera for the middle of every sweep.
+    """Pass samples on, and add an image of each camera for the middle of every scan.
 
-    The network's state runs through the whole stream. A picture follows the events it was made of.
+    The network's state runs through the whole stream. An image follows the events it was made of.
 
     Args:
         samples: scans and packets of events, the earliest first.
-        rig: says how pictures are made.
-        cameras: of whose events pictures are wanted.
+        rig: says how images are made.
+        cameras: of whose events images are wanted.
         tally: receives why a scan got none.
-        is_live: make each picture a step of the network instead of an extra run, which is quicker; pictures
+        is_live: make each image a step of the network instead of an extra run, which is quicker; images
             then depend on which scans came.
 
     Raises:
@@ -44,7 +44,7 @@ def with_event_pictures(
 
 
 class _Darkroom:
-    """Events of one camera that wait until it is known which pictures are wanted of them."""
+    """Events of one camera that wait until it is known which images are wanted of them."""
 
     def __init__(self, rig: Rig, camera: str, tally: Losses, is_live: bool) -> None:
         channel = event_channel(rig, camera) or ""
@@ -60,7 +60,7 @@ class _Darkroom:
         self._newest_ns = -(2**62)
 
     def take(self, sample: Sample) -> Iterator[Image]:
-        """Take the next sample and give the pictures that can be made by now."""
+        """Take the next sample and give the images that can be made by now."""
         if isinstance(sample, Events) and sample.sensor == self._camera:
             self._packets.append(sample)
         elif isinstance(sample, Scan):
@@ -101,7 +101,7 @@ class _Darkroom:
         return has_passed or self._newest_ns > time_ns + PATIENCE_NS
 
     def _feed(self, until_ns: int) -> None:
-        """Give the network all events before a stamp of their clock."""
+        """Give the network all events before a timestamp of their clock."""
         while self._packets and self._packets[0].t_ns[0] < until_ns:
             packet = self._packets.popleft()
             rest = packet.between(until_ns, int(packet.t_ns[-1]) + 1)

@@ -46,7 +46,7 @@ class Placements:
         return next((name for name in sorted(likes) if all(likes[name])), None)
 
     def are_alike(self, one: Mapping[ImageKey, ImageBoard], two: Mapping[ImageKey, ImageBoard]) -> bool:
-        """Tell whether every camera that saw both boards saw them at one place; False where none did."""
+        """Check whether every camera that saw both boards saw them at one place; False where none did."""
         shared = one.keys() & two.keys()
         likes = (self._is_like(one[key].T_cam_board, two[key].T_cam_board) for key in shared)
         return bool(shared) and all(likes)
@@ -54,7 +54,7 @@ class Placements:
     def _is_like(self, T_1: Array, T_2: Array) -> bool:
         if float(np.linalg.norm(T_1[:3, 3] - T_2[:3, 3])) >= self._min_move_m:
             return False
-        # The print may be read from either end.
+        # The pattern may be read from either end.
         turns = [rotation_angle(T_1[:3, :3] @ flip, T_2[:3, :3]) for flip in (np.eye(3), _HALF_TURN)]
         return float(min(turns)) < self._min_turn_rad
 
@@ -62,7 +62,7 @@ class Placements:
 def known_placements(session: Session, min_move_m: float, min_turn_deg: float) -> Placements:
     """Gather where the board was in a session's captures.
 
-    Captures made from folders carry no poses: their pictures are searched for the board once.
+    Captures made from folders carry no poses: their images are searched for the board once.
     """
     known = Placements(min_move_m, min_turn_deg)
     for capture in session.captures:

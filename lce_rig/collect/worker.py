@@ -57,7 +57,7 @@ class Worker:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the process, whatever it does."""
+        """End the process at once."""
         if self._process is not None:
             self._connection.close()
             self._process.terminate()
@@ -169,7 +169,7 @@ def _serve(
     arguments: tuple[object, ...],
 ) -> None:
     """Answer calls until the other end is gone."""
-    # Whoever started this ends it; a closed terminal must not.
+    # The parent ends this; a closed terminal must not.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     os.nice(nice)
     shared = memoryview(array).cast("B")
@@ -183,7 +183,7 @@ def _serve(
                 answer = getattr(subject, method)(*given)
             except LceRigError as error:
                 answer = error
-            except Exception as error:  # Whoever called is told, of bugs too.
+            except Exception as error:  # The caller learns of bugs as well.
                 answer = RuntimeError(f"{method}: {error!r}")
             connection.send(answer)
     except (EOFError, OSError, KeyboardInterrupt):

@@ -1,1 +1,1 @@
-"""Attached sensors: each a source of samples with one reader thread, a bounded queue and honest counts."""
+"""Attached sensors: each a source of samples with one reader thread, a bounded queue and counts of losses."""

@@ -1,4 +1,4 @@
-"""Pixel formats of cameras, by their four-character codes, as BGR or grey pictures.
+"""Pixel formats of cameras, by their four-character codes, as BGR or grey images.
 
 References:
     https://docs.kernel.org/userspace-api/media/v4l/pixfmt.html
@@ -17,7 +17,7 @@ Pixels = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class PixelFormat:
-    """How a picture lies in memory.
+    """How an image lies in memory.
 
     Attributes:
         n_channels: values per pixel in a row; 1 for the planes of 4:2:0.
@@ -33,7 +33,7 @@ class PixelFormat:
 
     @property
     def is_compressed(self) -> bool:
-        """Whether pictures are JPEG files of any length."""
+        """Whether images are JPEG files of any length."""
         return self.n_channels == 0
 
 
@@ -52,7 +52,7 @@ FORMATS = {
     "BGR3": PixelFormat(3),
     "RGB3": PixelFormat(3, 8, "COLOR_RGB2BGR"),
     "BGR4": PixelFormat(4, 8, "COLOR_BGRA2BGR"),
-    # OpenCV's newer names of the mosaics begin, like these codes, with the picture's first row.
+    # OpenCV's newer names of the mosaics begin, like these codes, with the image's first row.
     **{
         code: PixelFormat(1, bits, f"COLOR_Bayer{mosaic}2BGR")
         for mosaic, codes in {
@@ -90,7 +90,7 @@ def find_format(name: str) -> str | None:
 
 
 class PixelDecoder:
-    """Makes pictures from the bytes of one stream.
+    """Makes images from the bytes of one stream.
 
     Args:
         code: one of FORMATS.
@@ -99,7 +99,7 @@ class PixelDecoder:
     """
 
     def __init__(self, code: str, width: int, height: int, stride: int = 0) -> None:
-        import cv2  # takes a second: now, not when the first picture waits to be fetched
+        import cv2  # takes a second: now, not when the first image waits to be fetched
 
         self.code = code
         self._cv2 = cv2
@@ -113,7 +113,7 @@ class PixelDecoder:
 
     @property
     def n_bytes(self) -> int:
-        """Least number of bytes of a whole picture; 1 where it is compressed."""
+        """Least number of bytes of a whole image; 1 where it is compressed."""
         if self._form.is_compressed:
             return 1
         height = self._size[1]
@@ -122,7 +122,7 @@ class PixelDecoder:
         return self._stride * (height - 1) + self._row
 
     def decode(self, data: bytes | bytearray | memoryview) -> Pixels:
-        """Decode one picture.
+        """Decode one image.
 
         Returns:
             (H, W) grey or (H, W, 3) BGR.
@@ -132,7 +132,7 @@ class PixelDecoder:
         """
         width, height = self._size
         if len(data) < self.n_bytes:
-            raise ValueError(f"{len(data)} of the {self.n_bytes} bytes of a picture came")
+            raise ValueError(f"{len(data)} of the {self.n_bytes} bytes of an image came")
         if self._form.is_compressed:
             pixels = decode_image(bytes(data))
             if pixels.shape[:2] != (height, width):
@@ -161,7 +161,7 @@ class PixelDecoder:
         return np.concatenate((luma, chroma[:, :n_across].reshape(height // 2, width)))
 
     def _to_8_bit(self, values: NDArray[Any]) -> Pixels:
-        # Most drivers right-align, Xavier's VI left-aligns; once seen to be so, it stays so in dark pictures.
+        # Most drivers right-align, Xavier's VI left-aligns; once seen to be so, it stays so in dark images.
         if self._form.bits < 16 and not self._is_high_aligned:
             self._is_high_aligned = bool(values.max() >> self._form.bits)
         shift = 8 if self._is_high_aligned else self._form.bits - 8

@@ -34,8 +34,8 @@ class SourceStatus:
     Attributes:
         sensor: its name in the profile.
         n_samples: samples handed on since it was opened.
-        n_dropped: samples that nobody took in time.
-        n_lost: samples or packets that never arrived, by the device's own counters or stamps.
+        n_dropped: samples dropped because they were not taken in time.
+        n_lost: samples or packets that never arrived, by the device's own counters or timestamps.
         rate_hz: samples a second over the last seconds; 0 before two have come.
         clock: whose time the timestamps are; None before the first.
         problems: what is wrong now.

@@ -268,7 +268,7 @@ class LiveSource(ABC):
                 return
 
     def _read_on(self) -> SourceError | None:
-        """Read until told to stop, and give what else ended it."""
+        """Read until asked to stop, and give what else ended it."""
         heard_s, has_sent = time.monotonic(), False
         try:
             while not self._stopping.is_set():

@@ -9,8 +9,7 @@ from lce_rig.core.data import Image, Pulse
 from lce_rig.core.findings import Figure, Finding, Severity
 from lce_rig.devices.sync_board.lines import DIALECTS
 from lce_rig.doctor.line import Check, problems_of
-from lce_rig.doctor.observing import ObservedSensor
-from lce_rig.doctor.sensor_report import SensorReport
+from lce_rig.doctor.observing import ObservedSensor, SensorReport
 from lce_rig.doctor.sensor_sources import driver_of
 from lce_rig.rig.sync_settings import BOARD, PPS_LINE
 from lce_rig.timing.clock import ClockModel
@@ -138,7 +137,7 @@ _STREAMS = ("scans", "events", "frames")
 
 
 def check_clock(exam: SensorReport, sensor: str) -> Check | None:
-    """Say what a camera's or sync board's stamps are tied to."""
+    """Say what a camera's or sync board's timestamps are tied to."""
     status = exam.seen[sensor].status
     if status is None:
         return None
@@ -185,7 +184,7 @@ def check_offsets(exam: SensorReport) -> Check | None:
 
 
 def check_sync(exam: SensorReport) -> Check | None:
-    """Judge whether boards may move while they are captured; absent sensors are left out of it."""
+    """Judge whether boards may move while they are captured; absent sensors do not count."""
     rig, verdict = exam.rig, tie(exam).verdict()
     absent = [sensor for sensor, seen in exam.seen.items() if not seen.has_opened]
     if not verdict.requires_still_boards:
@@ -238,7 +237,7 @@ def _sees_edges(exam: SensorReport, sensor: str) -> bool:
 
 
 def _by_arrivals(exam: SensorReport, seen: ObservedSensor) -> ClockModel | None:
-    """Fit this computer's time on a sensor's clock; None of stamps that are arrivals themselves."""
+    """Fit this computer's time on a sensor's clock; None of timestamps that are arrivals themselves."""
     stream = next((name for name in _STREAMS if name in seen.stamps), None)
     if stream is None or seen.status is None or driver_of(exam.rig, seen.sensor) == "command":
         return None
@@ -252,9 +251,9 @@ def _by_arrivals(exam: SensorReport, seen: ObservedSensor) -> ClockModel | None:
 
 
 def _offset_ms(seen: ObservedSensor, model: ClockModel) -> float | None:
-    """Give by how much stamps are ahead of this computer's clock; what samples take to arrive is in it.
+    """Give by how much timestamps are ahead of this computer's clock; what samples take to arrive is in it.
 
-    A LiDAR's scan arrives a revolution after its stamp, which its driver has taken off; None for a board,
+    A LiDAR's scan arrives a revolution after its timestamp, which its driver subtracts; None for a board,
     whose clock counts from when it was switched on.
     """
     assert seen.status is not None

@@ -45,7 +45,7 @@ _OPEN3D_LIBRARIES = {
 _MIN_BUFFER_S = 0.25
 _PROBE_BYTES, _PROBE_BLOCK_BYTES, _PROBE_S = 48 << 20, 4 << 20, 0.5
 _MB = 1e6
-# A capture is a few MB; raw pictures of 1280x720 px at 30 Hz are 55 MB/s.
+# A capture is a few MB; raw images of 1280x720 px at 30 Hz are 55 MB/s.
 _MIN_FREE_MB, _SCARCE_MB = 500.0, 5000.0
 _MIN_WRITE_MBPS, _SLOW_WRITE_MBPS = 2.0, 20.0
 # struct timex is 26 longs on 64-bit Linux; its fourth is the largest error, us.

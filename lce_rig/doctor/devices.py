@@ -13,8 +13,7 @@ from lce_rig.detect.events.event_limits import events_problem
 from lce_rig.detect.image.quality import strongest_edge_px
 from lce_rig.devices.vlp16.web import VelodyneWeb, WebReport, find_problems
 from lce_rig.doctor.line import Check, problems_of
-from lce_rig.doctor.observing import ObservedSensor
-from lce_rig.doctor.sensor_report import SensorReport
+from lce_rig.doctor.observing import ObservedSensor, SensorReport
 from lce_rig.doctor.sensor_sources import driver_of
 from lce_rig.rig import Rig
 
@@ -57,7 +56,7 @@ def check_settings(exam: SensorReport, sensor: str) -> Check | None:
 
 
 def check_pulse(exam: SensorReport, sensor: str) -> Check | None:
-    """Say whether the sensor is locked to pulses and knows UTC, and whose time its scans are stamped with."""
+    """Check whether the sensor is locked to pulses and knows UTC, and which clock its scans carry."""
     seen, report, lidar = exam.seen[sensor], exam.web.get(sensor), exam.rig.lidars[sensor]
     if seen.status is None or seen.status.clock is None:
         return None
@@ -72,7 +71,7 @@ def check_pulse(exam: SensorReport, sensor: str) -> Check | None:
     return Check.of(sensor, "PPS", pulse, replace(clock.finding, severity=severity), way_out)
 
 
-# What a camera's pictures and events are like, and the board in them and in a LiDAR's scans.
+# What a camera's images and events are like, and the board in them and in a LiDAR's scans.
 
 _BLACK, _WHITE = 5, 250
 _MAX_WHITE, _MAX_BLACK = 0.2, 0.6
@@ -115,7 +114,7 @@ def check_events(exam: SensorReport, sensor: str) -> Check | None:
 
 
 def check_board(exam: SensorReport, sensor: str) -> Check | None:
-    """Say whether the sensor sees the board now."""
+    """Check whether the sensor sees the board now."""
     found = [board for (name, _), board in exam.boards.items() if name == sensor]
     if not found:
         return None
@@ -168,7 +167,7 @@ def check_stream(exam: SensorReport, sensor: str) -> Check | None:
 
 
 def wanted_rate_hz(rig: Rig, sensor: str) -> float | None:
-    """Give how many scans or pictures a second the profile wants; None where it does not say."""
+    """Give how many scans or images a second the profile wants; None where it does not say."""
     if sensor in rig.lidars:
         return rig.lidars[sensor].rate_hz
     driver = rig.cameras[sensor].driver

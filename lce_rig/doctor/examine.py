@@ -33,8 +33,7 @@ from lce_rig.doctor.devices import (
     check_stream,
     read_web,
 )
-from lce_rig.doctor.observing import ObservedSensor, observe
-from lce_rig.doctor.sensor_report import SensorReport
+from lce_rig.doctor.observing import ObservedSensor, SensorReport, observe
 from lce_rig.doctor.sensor_sources import driver_of, sensors, source_of
 from lce_rig.rig import Rig
 from lce_rig.rig.sync_settings import BOARD
@@ -119,7 +118,7 @@ def _applying(table: tuple[Callable[..., Check | None], ...], *arguments: object
 
 
 def look_for_boards(rig: Rig, seen: Mapping[str, ObservedSensor]) -> dict[tuple[str, str], Finding]:
-    """Look for the board in each sensor's last sample; in events only where a camera has no pictures."""
+    """Look for the board in each sensor's last sample; in events only where a camera has no images."""
     sights: dict[tuple[str, str], Finding] = {}
     for sensor, observation in seen.items():
         if observation.scan is not None:

@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import Events, Image, LiveSample, Pulse, Scan
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.devices.protocol import SourceStatus
 from lce_rig.devices.reading import LiveSource
 from lce_rig.devices.sync_board.driver import SyncBoard
+from lce_rig.devices.vlp16.web import WebReport
+from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 
-# A sync board that its port's opening resets takes some seconds to speak; nobody waits longer.
+# A sync board that its port's opening resets takes some seconds to speak; the wait ends then.
 PATIENCE_S = 3.0
 _POLL_S = 0.05
-# The network that makes pictures from events remembers about a second.
+# The network that makes images from events remembers about a second.
 _EVENTS_KEPT_NS = 1_500_000_000
 _NO_PIXELS = np.zeros((1, 1), dtype=np.uint8)
 
@@ -34,10 +37,10 @@ class ObservedSensor:
         failure: why it could not be opened, or ended early.
         watched_s: for how long it was open.
         ended_ns: when that ended, by the computer's time of day.
-        stamps: (stamp, arrival) ns of each scan, picture or batch of events, by "scans", "frames", "events".
-        frames: every picture, its pixels left out.
+        timestamps: (timestamp, arrival) ns of each scan, image or batch, by "scans", "frames", "events".
+        frames: every image, without its pixels.
         pulses: every pulse, of a board or seen by a camera.
-        scan, images, events: the last scan, the last picture of each channel, the last 1.5 s of events.
+        scan, images, events: the last scan, the last image of each channel, the last 1.5 s of events.
         n_events: how many events came in all.
         host_clock, utc_clock: a sync board's models of the computer's time and of UTC.
     """
@@ -63,7 +66,7 @@ class ObservedSensor:
         return self.status is not None
 
     def times(self, stream: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Give the stamps (N,) and arrivals (N,) of a stream, ns."""
+        """Give the timestamps (N,) and arrivals (N,) of a stream, ns."""
         pairs = np.array(self.stamps.get(stream, []), dtype=np.int64).reshape(-1, 2)
         return pairs[:, 0], pairs[:, 1]
 
@@ -194,3 +197,21 @@ class _Watch:
         self._seen.watched_s, self._seen.ended_ns = time.monotonic() - opened_s, time.time_ns()
         if isinstance(source, SyncBoard):
             self._seen.host_clock, self._seen.utc_clock = source.host_clock, source.utc_clock
+
+
+@dataclass(frozen=True, eq=False)
+class SensorReport:
+    """What is known of a rig's sensors.
+
+    Attributes:
+        rig: the profile.
+        seen: what was observed, by the sensor's name.
+        web: what the web page of each VLP-16 says, or why it says nothing, by name.
+        boards: the board as each sensor shows it, by (sensor, channel), a LiDAR's channel is "": a note with
+            its figures, or why it is not there.
+    """
+
+    rig: Rig
+    seen: Mapping[str, ObservedSensor]
+    web: Mapping[str, WebReport | SourceError]
+    boards: Mapping[tuple[str, str], Finding]

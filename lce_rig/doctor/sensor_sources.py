@@ -1,4 +1,4 @@
-"""The sensors of a rig one by one: which driver reads each, and its source, whatever ails the others."""
+"""The sensors of a rig one by one: the driver that reads each, and its source, even if others fail."""
 
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.opening import driver_type, open_live
@@ -6,7 +6,7 @@ from lce_rig.devices.reading import LiveSource
 from lce_rig.rig import DriverSettings, Rig
 from lce_rig.rig.sync_settings import BOARD
 
-# What to add for each driver that must be told where its sensor is.
+# What to add for each driver that needs the address of its sensor.
 _LINES = {
     "v4l2": "driver: {type: v4l2, device: /dev/video0}",
     "command": "driver: {type: command, command: [PROGRAM, ARGUMENT, ...]}",
@@ -19,7 +19,7 @@ def sensors(rig: Rig) -> list[str]:
 
 
 def driver_of(rig: Rig, sensor: str) -> str:
-    """Name the driver that reads a sensor; "" where none can be told."""
+    """Name the driver that reads a sensor; "" where none is known."""
     if sensor in rig.lidars:
         kind, model, driver = "lidar", rig.lidars[sensor].model, rig.lidars[sensor].driver
     elif sensor in rig.cameras:
@@ -33,7 +33,7 @@ def driver_of(rig: Rig, sensor: str) -> str:
 
 
 def uses_driver(rig: Rig, kind: str) -> bool:
-    """Tell whether a sensor of the rig is read by a driver."""
+    """Check whether a sensor of the rig is read by a driver."""
     return any(driver_of(rig, sensor) == kind for sensor in sensors(rig))
 
 

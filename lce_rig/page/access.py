@@ -82,7 +82,7 @@ class Gate:
             ipaddress.ip_address(name)
         except ValueError:
             name = name.lower()
-            # Networks append their own ending to a computer's name, which nobody here knows. A site could
+            # Networks append their own ending to a computer's name, unknown to this computer. A site could
             # take that name, but not the token.
             return name in self._names or (self._token is not None and name.partition(".")[0] == self._own)
         return True

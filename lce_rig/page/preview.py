@@ -1,4 +1,4 @@
-"""The page as the collection sees it: started, told the newest state, closed."""
+"""The page as the collection sees it: started, updated, closed."""
 
 import asyncio
 import contextlib
@@ -15,9 +15,8 @@ from aiohttp import WSMsgType, web
 from lce_rig.collect.live.state import LiveState
 from lce_rig.page.access import Gate, check_token, guarded, new_token
 from lce_rig.page.address import DEFAULT_PORT, LOOPBACK, is_loopback, links, listen
-from lce_rig.page.connections import REQUEST_S, Connections
+from lce_rig.page.connections import REQUEST_S, Connections, Troubles
 from lce_rig.page.state_message import Encoder, Pixels, beat, to_json
-from lce_rig.page.troubles import Troubles
 
 # The newest state, handed from the thread that collects to those who watch.
 
@@ -56,11 +55,11 @@ class Feed:
         return True
 
 
-# One open page: told the newest state as fast as it can follow, and no faster.
+# One open page: sent the newest state as fast as it can follow, and no faster.
 
 #: Between two updates.
 PERIOD_S = 0.1
-#: Without news the page is told so this often, and so knows that it is still connected.
+#: Without news the page gets a message this often, and so knows that it is still connected.
 BEAT_S = 1.0
 #: Updates under way to a page. Two hide the time of their way; more would only grow old in buffers.
 MAX_UNDER_WAY = 2
@@ -182,7 +181,7 @@ _TYPES = {
     "js": "text/javascript",
     "svg": "image/svg+xml",
 }
-# The page loads nothing from elsewhere, and nobody may frame it.
+# The page loads nothing from elsewhere, and may not be framed.
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -333,7 +332,7 @@ class Preview:
 
     @property
     def n_pictures(self) -> int:
-        """Images that were compressed, 0 while nobody watches."""
+        """Images that were compressed, 0 while the page is not open."""
         return 0 if self._server is None else self._server.encoder.n_encoded
 
     def notes(self) -> list[str]:
@@ -365,7 +364,7 @@ class Preview:
         with self._troubles, opened:
             try:
                 asyncio.run(self._serve(opened))
-            except Exception:  # Whatever ends the page, the collection continues.
+            except Exception:  # If the page ends, the collection continues.
                 self._troubles.log.exception("the page has ended, the collection goes on")
             finally:
                 self._is_ready.set()

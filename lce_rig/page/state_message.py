@@ -1,4 +1,4 @@
-"""What the page is told: a state in JSON, and its image as JPEG."""
+"""What the page receives: a state in JSON, and its image as JPEG."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""Keys and signals of a live collection: nobody has to press any, and none is waited for."""
+"""Keys and signals of a live collection: none has to be pressed."""
 
 import select
 import signal
@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
-from lce_rig.collect.live.options import Key
+from lce_rig.collect.live.state import Key
 from lce_rig.core.interrupts import patience
 
 _KEYS: dict[str, Key] = {"q": "stop", "\x03": "stop", " ": "capture", "n": "next"}
@@ -57,7 +57,7 @@ def controls() -> Iterator[Controls]:
     try:
         if is_interactive:
             tty.setcbreak(sys.stdin)
-        # The first request ends it in good order: captures that were decided on are written first.
+        # The first request ends it; captures that were decided on are written first.
         with patience(_ENDING_S):
             yield asked
     finally:

@@ -22,10 +22,10 @@ _STEPS = 400
 def draw_outlines(
     picture_px: tuple[int, int], solid_px: Array | None, dotted_px: Array | None, size: tuple[int, int]
 ) -> list[str]:
-    """Draw two closed polygons into a frame of the picture's shape.
+    """Draw two closed polygons into a frame of the image's shape.
 
     Args:
-        picture_px: (width, height) of the picture.
+        picture_px: (width, height) of the image.
         solid_px: (K, 2) polygon drawn as a line; None for none; NaN breaks it.
         dotted_px: (K, 2) polygon drawn dotted.
         size: (columns, rows) of characters, the frame's border included, at most.
@@ -71,6 +71,8 @@ _HEIGHT = 24
 _LOG_LINES, _NOTE_LINES, _DRAWING_SIZE = 3, 2, (40, 9)
 # Two lines of 80 characters, broken between words.
 _LONGEST_NOTE = 150
+# Written small in the headline, too: 8 M would be something else.
+_UNITS = ("m", "cm", "mm", "deg", "s", "cm/s")
 _PLAIN_EVERY_S = 3.0
 _BARS = ("left_right", "up_down", "near_far", "tilt", "roll")
 
@@ -141,7 +143,7 @@ class PlainView:
 
 
 class ScreenView:
-    """One screen, drawn anew with every state."""
+    """One screen, redrawn with every state."""
 
     def __init__(self, live: Any, console: Any, *, has_keys: bool, links: tuple[str, ...] = ()) -> None:
         self._live = live
@@ -181,7 +183,8 @@ def render(
         no_wrap=True,
         overflow="ellipsis",
     )
-    headline = state.headline.upper()
+    words = state.headline.split(" ")
+    headline = " ".join(word if word.strip(",") in _UNITS else word.upper() for word in words)
     if state.hold_s is not None:
         headline += f"   {state.hold_s:.1f} s"
     n_lacking = max(_HEIGHT - height, 0)
@@ -192,10 +195,10 @@ def render(
     drawing = _drawing(state, n_lacking)
     side = _progress(state)
     parts.append(Columns([side, drawing], padding=(0, 2)) if drawing is not None else side)
-    # A note that is alone may take the lines of all.
-    is_alone = len(state.notes) == 1 and not n_lacking
+    # A note that is alone may take the lines of all, and in a higher terminal each may take two.
+    may_wrap = (len(state.notes) == 1 and not n_lacking) or height >= _HEIGHT + _NOTE_LINES
     parts += [
-        Text(f"! {note}"[:_LONGEST_NOTE], style="yellow", no_wrap=not is_alone, overflow="ellipsis")
+        Text(f"! {note}"[:_LONGEST_NOTE], style="yellow", no_wrap=not may_wrap, overflow="ellipsis")
         for note in state.notes[:_NOTE_LINES]
     ]
     n_lines = max(_LOG_LINES - len(links[:1]) - n_lacking // 4, 1)
@@ -272,7 +275,7 @@ def _drawing(state: LiveState, n_lacking: int) -> Any:
     size = columns, max(lines - n_lacking, 7)
     rows = draw_outlines((width, height), drawing.wanted_px, drawing.present_px, size)
     if sum("." in stream.name for stream in state.streams) > 1:
-        # Guidance goes from camera to camera: whose picture this is stands in its border.
+        # Guidance goes from camera to camera: whose image this is stands in its border.
         name = f" {drawing.camera} "[: len(rows[0]) - 3]
         rows[0] = f"┌─{name}{rows[0][2 + len(name) :]}"
     return Text("\n".join(rows), style="green" if drawing.is_there else "", no_wrap=True)

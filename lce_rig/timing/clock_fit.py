@@ -219,7 +219,7 @@ class LineFit:
         y_ns: (N,) the reference's time minus the source's.
         excess_ns: (N,) e_i; 0 for edges.
         floor_ns: no reading is better than this.
-        origin_s: what was taken off x to centre it.
+        origin_s: what was subtracted from x to centre it.
     """
 
     x_s: Array

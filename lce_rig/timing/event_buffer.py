@@ -16,7 +16,7 @@ AFTER_NS = 150_000_000
 _LEAST_EVENTS = 1 << 16
 # Of what is held: more room costs memory, less of it copies more often.
 _ROOM = 1.5
-# A clock that is fitted anew while events come may move them back by microseconds.
+# A clock that is fitted again while events come may move them back by microseconds.
 _MAX_BACK_NS = 1_000_000
 
 
@@ -27,7 +27,7 @@ class EventCut:
     Attributes:
         events: every event with start_ns <= t < end_ns, at least one; they share the stream's memory.
         start_ns, end_ns: on the events' own clock.
-        offset_ns: what brings their stamps to the rig's time.
+        offset_ns: what brings their timestamps to the rig's time.
         missing_ns: how much of the stretch's beginning lies before the stream; 0 where it is whole.
     """
 
@@ -71,7 +71,7 @@ class EventBuffer:
         self._streams.clear()
 
     def has_passed(self, time_ns: int) -> bool:
-        """Tell whether every stream heard of so far has reached a time of the rig's clock."""
+        """Check whether every stream heard of so far has reached a time of the rig's clock."""
         return all(stream.last_ns + stream.offset_ns >= time_ns for stream in self._streams.values())
 
     def cut(self, start_ns: int, end_ns: int) -> tuple[EventCut, ...]:
@@ -93,7 +93,7 @@ class _Stream:
     event of a cut is ever moved or overwritten.
 
     Attributes:
-        offset_ns: what brings stamps to the rig's time.
+        offset_ns: what brings timestamps to the rig's time.
         first_ns: stamp of the first event of all.
         last_ns: of the last.
     """
@@ -105,7 +105,7 @@ class _Stream:
         self._start = self._end = 0
 
     def add(self, events: Events) -> None:
-        """Append a packet; a clock that was set back begins the stream anew."""
+        """Append a packet; a clock that was set back begins the stream again."""
         t_ns, first_ns = events.t_ns, int(events.t_ns[0])
         if first_ns < self.last_ns - _MAX_BACK_NS:
             self.first_ns, self._start = first_ns, self._end
@@ -118,7 +118,7 @@ class _Stream:
         self.last_ns = int(t_ns[-1])
 
     def forget_before(self, time_ns: int) -> None:
-        """Drop what comes before a stamp, but the last event."""
+        """Drop what comes before a timestamp, but the last event."""
         t_ns = self._block.t_ns[self._start : self._end]
         self._start += min(int(np.searchsorted(t_ns, time_ns)), len(t_ns) - 1)
 

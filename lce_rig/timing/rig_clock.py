@@ -1,7 +1,7 @@
-"""Every sensor's stamps on one clock, tied while collecting goes on.
+"""Every sensor's timestamps on one clock, tied while collecting goes on.
 
 With a sync board that is UTC as the board has it: the LiDAR's own where it is locked to the board's pulses,
-pictures by the pulses that made them, an event camera by the edges it saw, all else by the computer's clock
+images by the pulses that made them, an event camera by the edges it saw, all else by the computer's clock
 and the board's answers. Without one everything stays on the computer's clock.
 """
 
@@ -72,7 +72,7 @@ class EdgeClock:
         self._seen_ns.append(pulse.stamp_ns)
 
     def restart(self) -> None:
-        """Forget all edges: a clock was set, or the board began anew."""
+        """Forget all edges: a clock was set, or the board restarted."""
         self._sent_ns.clear()
         self._seen_ns.clear()
         self._model = None
@@ -112,7 +112,7 @@ def _recent(times_ns: deque[int]) -> Stamps:
     return np.asarray(times[times >= times[-1] - _WINDOW_NS])
 
 
-#: Pulses a second at which the first pictures are matched.
+#: Pulses a second at which the first images are matched.
 SLOW_TRIGGERS_HZ = 4.0
 # A DAVIS takes the computer's time when it is opened.
 _COARSE_EDGE_NS = 100_000_000.0
@@ -158,7 +158,7 @@ class RigClock:
 
     @property
     def needs_slow_triggers(self) -> bool:
-        """Whether pulses at the profile's rates are too quick to tell yet which made which picture."""
+        """Whether pulses at the profile's rates are too quick to tell yet which made which image."""
         return self._is_slow
 
     def take(self, source: str, sample: LiveSample) -> list[Sample]:
@@ -182,7 +182,7 @@ class RigClock:
 
         Args:
             host_clock, utc_clock: the computer's time and UTC on the board's clock; None where unknown.
-            locked: LiDARs whose stamps are UTC by the board's pulses.
+            locked: LiDARs whose timestamps are UTC by the board's pulses.
         """
         self._host, self._utc = host_clock, utc_clock
         host = self._rig_from_host()
@@ -236,9 +236,9 @@ class RigClock:
         return [self._at_pulse(each.image, each.stamp_ns) for each in matched] if was_matching else []
 
     def _at_pulse(self, image: Image, board_ns: int) -> Image:
-        """Stamp a picture by the pulse that made it."""
+        """Stamp an image by the pulse that made it."""
         clock = self._utc or self._host
-        assert clock is not None  # without it no picture was matched
+        assert clock is not None  # without it no image was matched
         return replace(image, stamp_ns=clock.convert(board_ns))
 
     def _place(self, sample: Sample) -> Sample:
@@ -260,7 +260,7 @@ class RigClock:
             self._is_slow = False
 
     def _rig_from_host(self) -> ClockModel | None:
-        """Give the model for stamps of the computer's time; None where it is the rig's clock itself."""
+        """Give the model for timestamps of the computer's time; None where it is the rig's clock itself."""
         if self._host is None or self._utc is None:
             return None
         return self._host.inverse().then(self._utc)

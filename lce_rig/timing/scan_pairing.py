@@ -23,8 +23,8 @@ class Frame:
     """What the rig saw at one time.
 
     Attributes:
-        time_ns: middle of the first LiDAR's sweep, rig time (stamps plus the profile's expected offsets).
-        images: the picture of each camera channel that has one within the tolerance.
+        time_ns: middle of the first LiDAR's scan, rig time (timestamps plus the profile's expected offsets).
+        images: the image of each camera channel that has one within the tolerance.
         scans: the scan of the first LiDAR, and of each other that has one within the tolerance.
         events: of each event camera, 1.2 s before the first scan's first firing to 0.15 s after its last.
     """
@@ -38,14 +38,14 @@ class Frame:
 def pair_by_time(
     samples: Iterable[Sample], rig: Rig, losses: Losses, events_wait_ns: int = IN_BAGS_NS
 ) -> Iterator[Frame]:
-    """Give each scan of the first LiDAR heard the nearest picture of each camera channel, and its events.
+    """Give each scan of the first LiDAR heard the nearest image of each camera channel, and its events.
 
     Samples come in order of receipt: a scan waits until every other sensor has passed its time, or a second
     has gone by. Where clocks are set back, what waits is given up.
 
     Args:
-        samples: pictures, scans and packets of events; each sensor's stamps rise.
-        rig: its timestamps say what to add to stamps, and how far pairs may lie apart.
+        samples: images, scans and packets of events; each sensor's timestamps rise.
+        rig: says what to add to timestamps, and how far pairs may lie apart.
         losses: receives the scans without an image within the tolerance, and how near the nearest was.
         events_wait_ns: how long events are kept for scans that wait or come late.
     """
@@ -68,7 +68,7 @@ class _Pairing:
         self._buffers: _Buffers = {}
         self._events = EventBuffer(rig)
         self._anchor: str | None = None
-        # How far pictures and scans have come, and all of them.
+        # How far images and scans have come, and all of them.
         self._newest_ns = self._position_ns = -(2**62)
 
     def take(self, sample: Sample) -> None:
@@ -79,7 +79,7 @@ class _Pairing:
         if isinstance(sample, Events):
             self._events.add(sample)
         else:
-            # Told once a scan: samples come hundreds of times as often.
+            # Computed once per scan: samples come hundreds of times as often.
             half_ns = _half_sweep_ns(sample, self._rig) if isinstance(sample, Scan) else 0
             time_ns += half_ns
             self._take_frame_part(sample, time_ns, half_ns)
@@ -150,7 +150,7 @@ class _Pairing:
 
 
 def middle_of_sweep_ns(scan: Scan, rig: Rig) -> int | None:
-    """Find the rig's time at the middle of a sweep; None where the scan carries no stamp."""
+    """Find the rig's time at the middle of a scan; None where the scan carries no timestamp."""
     time_ns = rig_time_ns(scan, rig)
     return None if time_ns is None else time_ns + _half_sweep_ns(scan, rig)
 

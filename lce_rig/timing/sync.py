@@ -20,8 +20,8 @@ class PairTime:
 
     Attributes:
         stream: the other part: "cam.frames", or a second LiDAR.
-        lidar: the LiDAR whose sweep it was paired with.
-        difference_ns: the other's time minus the middle of the sweep, on the rig's clock.
+        lidar: the LiDAR whose scan it was paired with.
+        difference_ns: the other's time minus the middle of the scan, on the rig's clock.
         sigma_ns: standard deviation of that, from the clock models; None where a clock is not tied.
         tolerance_ns: largest difference that the profile allows.
         clock: the models behind it, in words.
@@ -83,7 +83,7 @@ class CommonClock:
         self._models[sensor] = model
 
     def untie(self, sensor: str) -> None:
-        """Forget a sensor's model: its clock has jumped, or its board has begun anew."""
+        """Forget a sensor's model: its clock has jumped, or its board has restarted."""
         self._models.pop(sensor, None)
 
     def model(self, sensor: str) -> ClockModel | None:
@@ -91,7 +91,7 @@ class CommonClock:
         return self._models.get(sensor)
 
     def place(self, sample: LiveSample) -> LiveSample:
-        """Give a sample with its stamps on the rig's clock; as it is where its sensor is not tied."""
+        """Give a sample with its timestamps on the rig's clock; as it is where its sensor is not tied."""
         model = self._models.get(sample.sensor)
         if model is None:
             return sample
@@ -102,18 +102,18 @@ class CommonClock:
         return replace(sample, stamp_ns=model.convert(sample.stamp_ns))
 
     def sigma_ns(self, sensor: str, time_ns: int) -> float | None:
-        """Tell how well a sensor's stamps are known at a time of the rig's clock; None where not tied."""
+        """Give a timestamp's standard deviation at a time of the rig's clock; None where not tied."""
         model = self._models.get(sensor)
         return None if model is None else model.inverse().sigma_ns(time_ns)
 
 
 def pair_times(frame: Frame, rig: Rig, clock: CommonClock) -> list[PairTime]:
-    """Measure how far the pictures and further scans of a frame lie from its first scan.
+    """Measure how far the images and further scans of a frame lie from its first scan.
 
     Args:
-        frame: its samples' stamps are on the rig's clock.
-        rig: its timestamps say what to add to stamps, and how far pairs may lie apart.
-        clock: how the stamps came there.
+        frame: its samples' timestamps are on the rig's clock.
+        rig: says what to add to timestamps, and how far pairs may lie apart.
+        clock: how the timestamps came there.
     """
     anchor = frame.scans[0]
     parts: list[tuple[str, int | None, Image | Scan]] = [
@@ -170,7 +170,7 @@ def _pair_time(
         tolerance_s = rig.lidars[part.sensor].timestamps.tolerance_s
     tolerance_s = max(tolerance_s, rig.lidars[anchor.sensor].timestamps.tolerance_s)
     words = [
-        f"{sensor}: {clock.model(sensor) or 'its own stamps'}" for sensor in (part.sensor, anchor.sensor)
+        f"{sensor}: {clock.model(sensor) or 'its own timestamps'}" for sensor in (part.sensor, anchor.sensor)
     ]
     return PairTime(
         stream=name,

@@ -1,9 +1,9 @@
-"""Triggered pictures and the pulses that made them, matched by their running numbers.
+"""Triggered images and the pulses that made them, matched by their running numbers.
 
 A camera numbers its frames, a sync board its pulses. The two numbers differ by a constant, which a few
-pictures at the start tell by their time; from then on the numbers alone decide, and neither a busy computer
-nor a lost line can mix them up. The camera's stamps still watch over the constant: a pulse that the camera
-missed, or a frame that its driver did not number, shifts every later picture by whole pulses.
+images at the start tell by their time; from then on the numbers alone decide, and neither a busy computer
+nor a lost line can mix them up. The camera's timestamps still check the constant: a pulse that the camera
+missed, or a frame that its driver did not number, shifts every later image by whole pulses.
 """
 
 from bisect import bisect_left
@@ -22,9 +22,9 @@ N_AGREE = 4
 
 _N_WAITING = 64
 _N_DELAYS = 31
-# A camera that misses more pulses at once has been set up anew.
+# A camera that misses more pulses at once has been set up again.
 _MAX_SLIP = 8
-# Of the time between two pulses: nearer than this, a picture belongs to the pulse and to no other.
+# Of the time between two pulses: nearer than this, an image belongs to the pulse and to no other.
 _NEAR = 0.3
 _N_SLIPS_DOUBTFUL = 3
 _SLIP_WINDOW = 200
@@ -44,13 +44,13 @@ _LOSSES = {
 
 @dataclass(frozen=True, eq=False)
 class TriggeredImage:
-    """A picture and the pulse that made it.
+    """An image and the pulse that made it.
 
     Attributes:
         image: as the camera gave it.
         pulse: running number of the pulse.
         pulse_ns: its rising edge, board time.
-        stamp_ns: the moment the picture shows, board time: the pulse and the camera's usual delay.
+        stamp_ns: the moment the image shows, board time: the pulse and the camera's usual delay.
         is_interpolated: whether the pulse's line was lost, and its time is between its neighbours'.
     """
 
@@ -69,7 +69,7 @@ class _Waiting:
 
 
 class TriggerMatcher:
-    """Pulses and pictures of one camera in, matched pictures out, each stream in its own order.
+    """Pulses and images of one camera in, matched images out, each stream in its own order.
 
     Attributes:
         n_matched: images matched.
@@ -82,7 +82,7 @@ class TriggerMatcher:
 
         Args:
             camera: its name in the profile.
-            max_delay_ns: latest stamp of a picture after its pulse, on the board's clock.
+            max_delay_ns: latest timestamp of an image after its pulse, on the board's clock.
             min_delay_ns: earliest; below 0 where the two clocks are tied loosely.
         """
         self.n_matched = 0
@@ -106,7 +106,7 @@ class TriggerMatcher:
         self._clock = board_from_camera
 
     def take_pulse(self, pulse: Pulse) -> list[TriggeredImage]:
-        """Take a pulse, and give the pictures that waited for it."""
+        """Take a pulse, and give the images that waited for it."""
         if len(self._pulses) and pulse.count <= self._pulses.last_count:
             if pulse.stamp_ns <= self._pulses.last_ns and pulse.stamp_ns in self._pulses:
                 self._lose("n_repeated")
@@ -117,7 +117,7 @@ class TriggerMatcher:
         return list(self._proceed())
 
     def take_image(self, image: Image) -> list[TriggeredImage]:
-        """Take a picture, and give those whose pulses are now known."""
+        """Take an image, and give those whose pulses are now known."""
         if image.count is None or image.stamp_ns is None or self._clock is None:
             self._lose("n_unmatched")
             code = "pulses.images_not_numbered" if image.count is None else "pulses.clock_not_tied"
@@ -142,7 +142,7 @@ class TriggerMatcher:
         while self._waiting and len(self._pulses):
             frame = self._waiting[0]
             if self._constant is None:
-                # Only when the pulses have come past a picture's time are all that could be its own known.
+                # Only when the pulses have come past an image's time are all that could be its own known.
                 if self._pulses.last_ns <= frame.board_ns - self._window_ns[0]:
                     return
                 yield from self._seek(self._waiting.popleft())
@@ -152,7 +152,7 @@ class TriggerMatcher:
                 yield from self._follow(self._waiting.popleft())
 
     def _seek(self, frame: _Waiting) -> Iterator[TriggeredImage]:
-        """Look for the constant: the same for several pictures in a row, each with one possible pulse."""
+        """Look for the constant: the same for several images in a row, each with one possible pulse."""
         least_ns, most_ns = self._window_ns
         possible = self._pulses.within(frame.board_ns - most_ns, frame.board_ns - least_ns)
         # A pulse lost on the way is missing among the possible, and makes another look like the only one.
@@ -188,7 +188,7 @@ class TriggerMatcher:
             return
         shift = self._shift(frame)
         if shift == 0:
-            # What looked like a slip was a picture with a late stamp.
+            # What looked like a slip was an image with a late timestamp.
             doubtful, self._doubtful = self._doubtful, []
             for known in (*doubtful, frame):
                 yield from self._emit(known)
@@ -202,7 +202,7 @@ class TriggerMatcher:
             yield from self._settle(doubtful)
 
     def _settle(self, doubtful: list[_Waiting]) -> Iterator[TriggeredImage]:
-        """Decide on several pictures in a row that are at odds with their pulses' times."""
+        """Decide on several images in a row that are at odds with their pulses' times."""
         shifts = {self._shift(frame) for frame in doubtful}
         shift = shifts.pop()
         if shifts or shift is None or self._is_slipping(doubtful[-1].number):
@@ -222,7 +222,7 @@ class TriggerMatcher:
         return is_full and number - self._slipped_at[0] < _SLIP_WINDOW
 
     def _shift(self, frame: _Waiting) -> int | None:
-        """Tell by how many pulses a picture's time is off its number's; None where it is between pulses."""
+        """Tell by how many pulses an image's time is off its number's; None where it is between pulses."""
         assert self._constant is not None
         number = frame.number - self._constant
         made_ns = frame.board_ns - round(median(self._delays_ns))

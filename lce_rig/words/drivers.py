@@ -163,15 +163,15 @@ _STREAM: Mapping[str, Phrase] = {
     "buffer.small": Phrase("the receive buffer holds {buffer_s:0ms} (minimum 250 ms)", _RAISE_LIMIT),
 }
 _PACKETS: Mapping[str, Phrase] = {
-    "packet.wrong_length": Phrase("{n} {subject} packets of wrong length skipped"),
-    "packet.wrong_flag": Phrase("{n} {subject} packets with a wrong block flag skipped"),
-    "packet.time_beyond_hour": Phrase("{n} {subject} packets with a time beyond the hour skipped"),
-    "packet.azimuth_beyond_360": Phrase("{n} {subject} packets with an azimuth beyond 360 deg skipped"),
+    "packet.wrong_length": Phrase("{n} {of} packets of wrong length skipped"),
+    "packet.wrong_flag": Phrase("{n} {of} packets with a wrong block flag skipped"),
+    "packet.time_beyond_hour": Phrase("{n} {of} packets with a time beyond the hour skipped"),
+    "packet.azimuth_beyond_360": Phrase("{n} {of} packets with an azimuth beyond 360 deg skipped"),
     "packet.unknown_factory_bytes": Phrase(
-        "{n} {subject} packets with unknown factory bytes skipped (firmware before 3.0.29 sends none)"
+        "{n} {of} packets with unknown factory bytes skipped (firmware before 3.0.29 sends none)"
     ),
-    "packet.uneven_azimuths": Phrase("{n} {subject} packets with uneven azimuths skipped"),
-    "packet.unknown_pps": Phrase("{n} {subject} packets with an unknown PPS state skipped"),
+    "packet.uneven_azimuths": Phrase("{n} {of} packets with uneven azimuths skipped"),
+    "packet.unknown_pps": Phrase("{n} {of} packets with an unknown PPS state skipped"),
     "packet.lost": Phrase("{n} data packets lost"),
     "packet.late": Phrase("{n} data packets late or sent twice, skipped"),
     "packet.astray": Phrase("{n} data packets with a damaged time skipped"),
@@ -180,7 +180,7 @@ _PACKETS: Mapping[str, Phrase] = {
     "scan.thin": Phrase("{n} revolutions skipped: more than half of their packets are lost"),
     "scan.empty": Phrase("{n} revolutions without a return"),
     "scan.not_rising": Phrase("{n} scans skipped: their timestamps do not rise"),
-    "packet.other_model": Phrase("{n} {subject} packets of another LiDAR model skipped"),
+    "packet.other_model": Phrase("{n} {of} packets of another LiDAR model skipped"),
     "datagram.fragmented": Phrase("{n} datagrams sent in fragments skipped"),
     "datagram.cut_short": Phrase("{n} datagrams cut short by the recorder skipped"),
 }

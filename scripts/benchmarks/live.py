@@ -22,8 +22,7 @@ from wire.timing import LOOP_NS
 
 from benchmarks.tables import print_head, print_row
 from lce_rig.collect.live.collection import collect_live
-from lce_rig.collect.live.options import Key, LiveOptions, LiveReport
-from lce_rig.collect.live.state import LiveState
+from lce_rig.collect.live.state import Key, LiveOptions, LiveReport, LiveState
 from lce_rig.core.geometry import Array
 from lce_rig.devices.davis.driver import DavisSource
 from lce_rig.devices.davis.opened import OpenedCamera

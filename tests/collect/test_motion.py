@@ -27,18 +27,18 @@ def rig() -> Rig:
     return load_rig("rles")
 
 
-def choose(sightings: Iterable[BoardDetection], rig: Rig) -> tuple[list[CaptureMoment], dict[str, int]]:
+def choose(detections: Iterable[BoardDetection], rig: Rig) -> tuple[list[CaptureMoment], dict[str, int]]:
     tally = Losses()
-    moments = find_moving_moments(sightings, rig, MotionOptions(), Placements(0.15, 10.0), tally)
+    moments = find_moving_moments(detections, rig, MotionOptions(), Placements(0.15, 10.0), tally)
     return list(moments), tally.by_code()
 
 
 def times_s(moments: list[CaptureMoment]) -> list[float]:
-    return [round((m.sighting.frame.time_ns - T0_NS) / S, 2) for m in moments]
+    return [round((m.detection.frame.time_ns - T0_NS) / S, 2) for m in moments]
 
 
 def places_m(moments: list[CaptureMoment]) -> list[float]:
-    return [float(m.sighting.images["davis", "frames"].T_cam_board[0, 3]) for m in moments]
+    return [float(m.detection.images["davis", "frames"].T_cam_board[0, 3]) for m in moments]
 
 
 def test_a_board_that_passes_slowly_is_taken_once_a_place(rig: Rig) -> None:
@@ -109,10 +109,10 @@ def test_a_board_that_the_lidar_does_not_see_is_no_moment(rig: Rig) -> None:
 
 
 def test_a_board_seen_in_single_frames_only_has_no_speed_and_is_no_moment(rig: Rig) -> None:
-    sightings = watch(
+    detections = watch(
         rig, lambda t: (0.1 * t, 0.0), 2.0, SOME, is_seen=lambda t: round(10 * t - 0.5) % 4 == 0
     )
-    assert choose(sightings, rig) == ([], {})
+    assert choose(detections, rig) == ([], {})
 
 
 def test_a_board_that_comes_back_is_not_taken_twice(rig: Rig) -> None:
@@ -122,11 +122,11 @@ def test_a_board_that_comes_back_is_not_taken_twice(rig: Rig) -> None:
 
 
 def test_the_moments_are_the_same_however_often_they_are_sought(rig: Rig) -> None:
-    sightings = watch(rig, lambda t: (0.1 * t - 0.2, 0.05 * np.sin(4 * t)), 4.0, SOME)
-    first, again = (times_s(choose(sightings, rig)[0]) for _ in range(2))
+    detections = watch(rig, lambda t: (0.1 * t - 0.2, 0.05 * np.sin(4 * t)), 4.0, SOME)
+    first, again = (times_s(choose(detections, rig)[0]) for _ in range(2))
     assert first == again and first
     # Whoever stops early has had the first of them.
-    moments = find_moving_moments(sightings, rig, MotionOptions(), Placements(0.15, 10.0), Losses())
+    moments = find_moving_moments(detections, rig, MotionOptions(), Placements(0.15, 10.0), Losses())
     assert times_s([next(moments)]) == first[:1]
 
 
@@ -137,24 +137,26 @@ def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rig:
         (lit, "image.flicker"),
         (event_stream([(-1.3, 3.0, 0.3)]), "image.still_scene"),
     ]:
-        sightings = watch(rig, lambda _t: (0.0, 0.0), 1.0, stream, channel="events", is_seen=lambda _t: False)
-        told = [BoardDetection(s.frame, {}, {}, {("davis", "events"): unseen}) for s in sightings]
+        detections = watch(
+            rig, lambda _t: (0.0, 0.0), 1.0, stream, channel="events", is_seen=lambda _t: False
+        )
+        told = [BoardDetection(s.frame, {}, {}, {("davis", "events"): unseen}) for s in detections]
         moments, refused = choose(told, rig)
         assert moments == [] and list(refused) == [code]
 
 
 @given(steps=st.lists(st.integers(1, 400), min_size=1, max_size=40), set_back=st.integers(0, 40))
-def test_every_sighting_is_judged_once_with_all_that_lie_within_half_a_window(
+def test_every_detection_is_judged_once_with_all_that_lie_within_half_a_window(
     steps: list[int], set_back: int
 ) -> None:
     times_ms = np.cumsum(steps)
     times_ms[set_back:] -= 100_000
-    sightings = [BoardDetection(Frame(int(t) * 10**6, (), ()), {}, {}) for t in times_ms]
+    detections = [BoardDetection(Frame(int(t) * 10**6, (), ()), {}, {}) for t in times_ms]
     neighbours = _Neighbours(0.5)
-    found = [each for sighting in sightings for each in neighbours.take(sighting)]
+    found = [each for detection in detections for each in neighbours.take(detection)]
     found.extend(neighbours.finish())
-    assert [sighting for sighting, _ in found] == sightings
-    for k, (sighting, around) in enumerate(found):
-        same_clock = sightings[:set_back] if k < set_back else sightings[set_back:]
-        near = [s for s in same_clock if abs(s.frame.time_ns - sighting.frame.time_ns) <= 250_000_000]
+    assert [detection for detection, _ in found] == detections
+    for k, (detection, around) in enumerate(found):
+        same_clock = detections[:set_back] if k < set_back else detections[set_back:]
+        near = [s for s in same_clock if abs(s.frame.time_ns - detection.frame.time_ns) <= 250_000_000]
         assert around == near

@@ -22,14 +22,14 @@ def see(watcher: BoardTracker, k: int, time_s: float) -> BoardDetection:
     return watcher.sight(Frame(T0_NS + round(time_s * 1e9), capture.images[:1], capture.scans))
 
 
-def nearest_m(sighting: BoardDetection, k: int) -> float:
+def nearest_m(detection: BoardDetection, k: int) -> float:
     """Tell how far the nearest candidate lies from where the picture has the board."""
-    (image,) = sighting.images.values()
+    (image,) = detection.images.values()
     nominal = rig().nominal("davis", "lidar")
     assert nominal is not None
     seen = [
         transform(nominal.to_matrix(), each.T_lidar_board[:3, 3][None])[0]
-        for each in sighting.lidars["lidar"]
+        for each in detection.lidars["lidar"]
     ]
     return float(min(np.linalg.norm(each - image.T_cam_board[:3, 3]) for each in seen))
 
@@ -68,9 +68,9 @@ def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> 
 
 def test_candidates_beyond_the_profiles_limits_are_no_board_in_the_scan() -> None:
     watcher = BoardTracker(strict(min_points=100_000), 0.3)
-    sighting = see(watcher, 0, 0.0)
-    assert sighting.images and not sighting.lidars and not sighting.is_usable
-    assert sighting.unscanned["lidar"].figures["min_points"] == 100_000
+    detection = see(watcher, 0, 0.0)
+    assert detection.images and not detection.lidars and not detection.is_usable
+    assert detection.unscanned["lidar"].figures["min_points"] == 100_000
 
 
 def test_live_and_offline_take_the_same_boards() -> None:
@@ -78,25 +78,25 @@ def test_live_and_offline_take_the_same_boards() -> None:
         profile = strict(**limits)
         finder, watcher = BoardFinder(profile), BoardTracker(profile, 0.0)
         for k, capture in enumerate(placements()):
-            sighting = see(watcher, k, float(k))
+            detection = see(watcher, k, float(k))
             image, scan = finder.image(capture.images[0]), finder.scan(capture.scans[0])
             key = ("davis", "frames")
-            assert (key in sighting.images.keys() - sighting.unfit.keys()) != isinstance(image, Refusal)
-            if sighting.images:
-                assert ("lidar" in sighting.lidars) != isinstance(scan, Refusal)
+            assert (key in detection.images.keys() - detection.unfit.keys()) != isinstance(image, Refusal)
+            if detection.images:
+                assert ("lidar" in detection.lidars) != isinstance(scan, Refusal)
 
 
 def test_a_moment_is_confirmed_by_the_search_that_check_makes() -> None:
     watcher = BoardTracker(rig(), 0.3)
     for time_s in (0.0, 0.1, 0.2):
-        sighting = see(watcher, 0, time_s)
-    confirmed = watcher.confirm(CaptureMoment(sighting, HeldStill(0.001)))
+        detection = see(watcher, 0, time_s)
+    confirmed = watcher.confirm(CaptureMoment(detection, HeldStill(0.001)))
     assert isinstance(confirmed, CaptureMoment) and confirmed.figures == {"motion_m": 0.001}
     whole = watcher.finder.image(placements()[0].images[0])
     assert not isinstance(whole, Refusal)
-    assert np.array_equal(confirmed.sighting.images["davis", "frames"].corners_px, whole.corners_px)
-    blank = replace(sighting.frame.images[0], pixels=np.full_like(sighting.frame.images[0].pixels, 90))
-    gone = replace(sighting, frame=replace(sighting.frame, images=(blank,)))
+    assert np.array_equal(confirmed.detection.images["davis", "frames"].corners_px, whole.corners_px)
+    blank = replace(detection.frame.images[0], pixels=np.full_like(detection.frame.images[0].pixels, 90))
+    gone = replace(detection, frame=replace(detection.frame, images=(blank,)))
     refused = watcher.confirm(CaptureMoment(gone, HeldStill(0.001)))
     assert isinstance(refused, Refusal) and refused.stage == "image"
 

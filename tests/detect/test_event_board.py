@@ -42,7 +42,7 @@ def stream():
 
 
 @pytest.fixture(scope="module")
-def sighting(stream):
+def detection(stream):
     return find(stream, sweep_s=0.02)
 
 
@@ -71,10 +71,10 @@ def noise(rate_hz=0.5, duration_s=1.4, seed=1):
     )
 
 
-def test_the_board_is_found_and_followed_to_either_side_where_it_truly_is(sighting):
-    board = sighting.board
-    assert isinstance(sighting.picture, Image) and isinstance(board, ImageBoard)
-    assert sighting.picture.stamp_ns == board.stamp_ns == STAMP
+def test_the_board_is_found_and_followed_to_either_side_where_it_truly_is(detection):
+    board = detection.board
+    assert isinstance(detection.picture, Image) and isinstance(board, ImageBoard)
+    assert detection.picture.stamp_ns == board.stamp_ns == STAMP
     assert board.track_ns.tolist() == [STAMP + offset for offset in TRACK_NS]
     assert board.track_T_cam_board.shape == (4, 4, 4) and board.track_cov.shape == (4, 6, 6)
     for stamp_ns, T in zip(
@@ -85,21 +85,21 @@ def test_the_board_is_found_and_followed_to_either_side_where_it_truly_is(sighti
         assert np.arccos(np.clip(-T[2, 2], -1, 1)) < np.radians(8)
 
 
-def test_speed_and_smear_are_those_of_the_true_motion(sighting):
+def test_speed_and_smear_are_those_of_the_true_motion(detection):
     # The mean motion over the track: the board turns on its figure of eight meanwhile.
     stamps = STAMP + np.array([0, *TRACK_NS])
     places = np.array([truth_m(stamp) for stamp in stamps])
     seconds = (stamps - STAMP) * 1e-9
     velocity = np.polyfit(seconds, places, 1)[0]
-    quality = sighting.board.events
+    quality = detection.board.events
     assert quality.speed_mps == pytest.approx(np.linalg.norm(velocity), abs=0.02)
     assert quality.smear_m == pytest.approx(0.02 * quality.speed_mps)
     assert quality.smear_depth_m < 0.3 * quality.smear_m
     assert quality.turn_deg_s < 25
 
 
-def test_events_are_counted_on_the_board_only(stream, sighting):
-    quality = sighting.board.events
+def test_events_are_counted_on_the_board_only(stream, detection):
+    quality = detection.board.events
     on_board = (BOARD.width_m * BOARD.height_m) * (FOCAL_PX / DEPTH_M) ** 2
     recent = stream.between(STAMP - 100 * MS, STAMP)
     # Nothing but the board makes events here, less 0.3 noise events a second and pixel.
@@ -115,15 +115,15 @@ def test_the_track_ends_with_the_stream(stream):
 
 
 def test_a_stream_that_ends_before_the_stamp_is_told_by_how_much(stream):
-    sighting = find(stream, stamp_ns=3_000 * MS)
-    assert isinstance(sighting.picture, Refusal)
-    assert sighting.board.code == "read.after_events"
-    assert sighting.board.figure("gap_s") == pytest.approx(1.6, abs=1e-3)
+    detection = find(stream, stamp_ns=3_000 * MS)
+    assert isinstance(detection.picture, Refusal)
+    assert detection.board.code == "read.after_events"
+    assert detection.board.figure("gap_s") == pytest.approx(1.6, abs=1e-3)
 
 
 def test_a_capture_without_events_says_so(stream):
-    sighting = find(stream.between(0, 0))
-    assert sighting.board.code == "image.no_events"
+    detection = find(stream.between(0, 0))
+    assert detection.board.code == "image.no_events"
 
 
 def test_a_stream_too_short_to_settle_is_told(stream):
@@ -164,11 +164,11 @@ def test_hot_pixels_are_named_with_their_share_and_do_not_hide_a_moving_board(st
 
 
 def test_the_event_map_does_not_show_the_board_though_it_moves(stream):
-    sighting = find(stream, method="map")
-    assert isinstance(sighting.picture, Image)
-    assert isinstance(sighting.board, Refusal)
+    detection = find(stream, method="map")
+    assert isinstance(detection.picture, Image)
+    assert isinstance(detection.board, Refusal)
     # Nothing happened where the picture is grey; edges are brighter or darker than that.
-    values = sighting.picture.pixels
+    values = detection.picture.pixels
     assert np.median(values) == 128 and values.min() < 40 and values.max() > 215
 
 
@@ -182,16 +182,16 @@ def test_the_event_map_does_not_show_the_board_though_it_moves(stream):
         ({"min_event_contrast": 300.0}, "image.low_contrast", "min_contrast"),
     ],
 )
-def test_limits_of_the_profile_refuse_with_their_figures(sighting, limit, code, figure):
+def test_limits_of_the_profile_refuse_with_their_figures(detection, limit, code, figure):
     limits = LIMITS.model_copy(update=limit)
-    board = find_in_reconstruction(sighting.picture, BOARD, CAMERA, limits)
+    board = find_in_reconstruction(detection.picture, BOARD, CAMERA, limits)
     if isinstance(board, ImageBoard):
-        board = gate_event_board(sighting.board, limits)
+        board = gate_event_board(detection.board, limits)
     assert isinstance(board, Refusal)
     assert (board.code, board.figures[figure]) == (code, *limit.values())
 
 
-def test_speeds_that_could_be_noise_are_not_held_against_a_board(sighting):
+def test_speeds_that_could_be_noise_are_not_held_against_a_board(detection):
     for figures, code in (
         ({"speed_mps": 0.6, "speed_sigma_mps": 0.1}, ""),
         ({"speed_mps": 0.6, "speed_sigma_mps": 0.02}, "image.too_fast"),
@@ -199,13 +199,13 @@ def test_speeds_that_could_be_noise_are_not_held_against_a_board(sighting):
         ({"turn_deg_s": 90.0, "turn_sigma_deg_s": 5.0}, "image.turning"),
     ):
         board = gate_event_board(
-            replace(sighting.board, events=replace(sighting.board.events, **figures)), LIMITS
+            replace(detection.board, events=replace(detection.board.events, **figures)), LIMITS
         )
         assert (board.code if isinstance(board, Refusal) else "") == code
 
 
-def test_pictures_made_by_others_are_judged_without_figures_of_events(sighting):
-    bare = find_in_reconstruction(sighting.picture, BOARD, CAMERA, LIMITS)
+def test_pictures_made_by_others_are_judged_without_figures_of_events(detection):
+    bare = find_in_reconstruction(detection.picture, BOARD, CAMERA, LIMITS)
     assert gate_event_board(bare, LIMITS) is bare
 
 

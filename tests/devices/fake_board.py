@@ -8,7 +8,7 @@ import threading
 import time
 import tty
 
-from lce_rig.devices.sync_board.lines.sentence import split_sentence, write_sentence
+from lce_rig.devices.sync_board.lines.dialect import split_sentence, write_sentence
 
 HELLO = "LCEHI,1,1.0,fake,1000000"
 

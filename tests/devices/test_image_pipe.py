@@ -153,7 +153,7 @@ def test_y4m_that_is_not_read_is_explained(begin: bytes, says: str) -> None:
 
 def test_pnm_that_ends_in_something_else_is_explained() -> None:
     stream = PnmPictures()
-    with pytest.raises(ValueError, match="a PGM or PPM picture was expected"):
+    with pytest.raises(ValueError, match="a PGM or PPM image was expected"):
         list(stream.feed(pgm(grey_pictures(1)) + b"Segmentation fault"))
 
 
@@ -229,7 +229,7 @@ def test_a_program_that_dies_is_quoted_with_what_it_left(tmp_path: Path) -> None
     with ImagePipeSource("cam", camera(*command)) as source, pytest.raises(SourceError) as caught:
         take(source, 5)
     n_left = WIDTH * HEIGHT * 3 // 2 - 100
-    assert all(figure in caught.value.what for figure in ("code 3", "1 pictures", f"{n_left} bytes"))
+    assert all(figure in caught.value.what for figure in ("code 3", "1 images", f"{n_left} bytes"))
     assert "signal | bye" in caught.value.hint
 
 
@@ -237,7 +237,7 @@ def test_a_program_that_is_killed_is_said_to_be(tmp_path: Path) -> None:
     command = child(tmp_path, pgm(grey_pictures(1)), "import os; os.kill(os.getpid(), 9)")
     with (
         ImagePipeSource("cam", camera(*command)) as source,
-        pytest.raises(SourceError, match="was ended by SIGKILL after 1 pictures"),
+        pytest.raises(SourceError, match="was ended by SIGKILL after 1 images"),
     ):
         take(source, 5)
 
@@ -302,7 +302,7 @@ def test_a_program_that_ended_can_be_started_again(tmp_path: Path) -> None:
     source = ImagePipeSource("cam", camera(*child(tmp_path, pgm(grey_pictures(2)), "sys.exit(1)")))
     for _ in range(2):
         came = []
-        with source, pytest.raises(SourceError, match="after 2 pictures"):
+        with source, pytest.raises(SourceError, match="after 2 images"):
             came.extend(source.samples())
         assert [image.count for image in came if isinstance(image, Image)] == [0, 1]
 

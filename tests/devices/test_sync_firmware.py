@@ -16,6 +16,7 @@ import pytest
 
 from lce_rig.devices.sync_board.driver import SyncBoard
 from lce_rig.devices.sync_board.lines import DIALECTS, LineReader
+from lce_rig.devices.sync_board.lines.dialect import write_sentence
 from lce_rig.devices.sync_board.lines.lce1 import Lce1
 from lce_rig.devices.sync_board.lines.messages import (
     BoardError,
@@ -26,7 +27,6 @@ from lce_rig.devices.sync_board.lines.messages import (
     TriggerEdge,
     UtcTime,
 )
-from lce_rig.devices.sync_board.lines.sentence import write_sentence
 from lce_rig.rig.sync_settings import SyncSettings
 
 FIRMWARE = Path(__file__).parents[2] / "scripts" / "firmware"

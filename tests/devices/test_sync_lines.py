@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.devices.sync_board.lines import DIALECTS, LineReader
-from lce_rig.devices.sync_board.lines.dialect import MAX_LINE, LineSplitter
+from lce_rig.devices.sync_board.lines.dialect import MAX_LINE, LineSplitter, write_sentence
 from lce_rig.devices.sync_board.lines.lce1 import READERS, Lce1
 from lce_rig.devices.sync_board.lines.messages import (
     MAX_COUNT,
@@ -24,7 +24,6 @@ from lce_rig.devices.sync_board.lines.messages import (
     TriggerEdge,
     UtcTime,
 )
-from lce_rig.devices.sync_board.lines.sentence import write_sentence
 
 RMC = b"$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A"
 

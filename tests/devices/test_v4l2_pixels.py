@@ -115,7 +115,7 @@ def test_exactly_the_declared_bytes_make_a_picture(code: str, width: int, paddin
         pixels = decoder.decode(bytes(decoder.n_bytes))
         assert pixels.shape[:2] == (8, width)
         assert pixels.dtype == np.uint8
-    with pytest.raises(ValueError, match="bytes of a picture came"):
+    with pytest.raises(ValueError, match="bytes of an image came"):
         decoder.decode(bytes(decoder.n_bytes - 1))
 
 

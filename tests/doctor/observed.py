@@ -9,8 +9,7 @@ from lce_rig.core.data import Image, Pulse, Scan
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.doctor import Check
-from lce_rig.doctor.observing import ObservedSensor
-from lce_rig.doctor.sensor_report import SensorReport
+from lce_rig.doctor.observing import ObservedSensor, SensorReport
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 

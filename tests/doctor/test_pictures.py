@@ -8,7 +8,7 @@ from lce_rig.core.data import Events, Image
 from lce_rig.core.findings import Finding
 from lce_rig.core.results import Refusal
 from lce_rig.doctor.devices import check_board, check_events, check_picture
-from lce_rig.doctor.sensor_report import SensorReport
+from lce_rig.doctor.observing import SensorReport
 
 from .observed import START_NS, S, camera, codes, examination, make_rig
 

@@ -78,7 +78,7 @@ def test_a_pair_without_clock_models_says_so(rlfs):
     assert pair.sigma_ns is None and pair.difference_ns == 2 * MS
     assert pair.to_meta() == {
         "stream": "cam.frames", "lidar": "lidar", "difference_s": 0.002, "sigma_s": None, "tolerance_s": 0.05,
-        "clock": "cam: its own stamps; lidar: its own stamps",
+        "clock": "cam: its own timestamps; lidar: its own timestamps",
     }  # fmt: skip
 
 

@@ -1,22 +1,26 @@
 """Where to hold the board next, and how well the extrinsic is going to be known."""
 
 from lce_rig.collect.guidance.candidates import SensorPlace, is_reachable, spread_candidates
-from lce_rig.collect.guidance.coverage import Coverage, measure_coverage
-from lce_rig.collect.guidance.evidence import Evidence, weigh_placements
+from lce_rig.collect.guidance.evidence import (
+    Evidence,
+    Precision,
+    combine,
+    predict_covariance,
+    sigmas,
+    weigh_placements,
+)
 from lce_rig.collect.guidance.instructions import (
     HeldPose,
     Instruction,
+    Person,
     build_pose,
     describe_pose,
     instruct,
     is_there,
     say,
 )
-from lce_rig.collect.guidance.outline import outline_px
-from lce_rig.collect.guidance.person import Person
-from lce_rig.collect.guidance.planner import Guidance, Novelty, Planner
-from lce_rig.collect.guidance.precision import Precision, combine, predict_covariance, sigmas
-from lce_rig.collect.guidance.sensor_noise import ErrorModel, SensorModel, model_sensors
+from lce_rig.collect.guidance.planner import Coverage, Guidance, Novelty, Planner, measure_coverage
+from lce_rig.collect.guidance.sensor_noise import ErrorModel, SensorModel, model_sensors, outline_px
 
 __all__ = [
     "Coverage",

@@ -128,7 +128,7 @@ def is_reachable(view: SensorPlace, T_cam_board: Array) -> NDArray[np.bool_]:
     ok &= np.sum(normal * to_lidar, axis=1) > _GRAZING_COSINE * range_m
     height_m = -to_lidar @ view.up
     ok &= (height_m > REACH_M[0]) & (height_m < REACH_M[1])
-    # Nobody holds a board flat.
+    # People do not hold a board flat.
     return np.asarray(ok & (np.abs(normal @ view.up) < 0.7))
 
 

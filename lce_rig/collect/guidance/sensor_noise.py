@@ -7,7 +7,7 @@ import numpy as np
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ProfileError
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, transform
 from lce_rig.rig import QualitySettings, Rig
 from lce_rig.simulate.lidar import VLP16
 
@@ -132,3 +132,22 @@ def model_sensors(rig: Rig, camera: str, lidar: str) -> SensorModel:
             laser_bias_m=settings.laser_bias_sigma_m, range_offset_m=settings.range_offset_sigma_m
         ),
     )
+
+
+def outline_px(model: SensorModel, T_cam_board: Array, points_per_edge: int = 12) -> Array:
+    """Project the plate's border as a closed polygon; lenses bend its edges.
+
+    Args:
+        model: the camera and the board.
+        T_cam_board: (4, 4).
+        points_per_edge: of the polygon.
+
+    Returns:
+        (4 points_per_edge + 1, 2) px, the last point the first; NaN where a point is out of the lens's sight.
+    """
+    corners = model.board.outline()
+    share = np.arange(points_per_edge)[:, None] / points_per_edge
+    edges = [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    border = np.concatenate([*edges, corners[:1]])
+    pixels, _ = model.lens.project(transform(T_cam_board, border))
+    return pixels

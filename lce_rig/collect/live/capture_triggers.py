@@ -20,10 +20,10 @@ LIVE_PATIENCE_S = 0.7
 
 
 class LiveGate(Protocol):
-    """Decides on moments as sightings come."""
+    """Decides on moments as detections come."""
 
-    def take(self, sighting: BoardDetection) -> list[CaptureMoment]:
-        """Take the next sighting, and give the moments that are worth a capture by how the board moves."""
+    def take(self, detection: BoardDetection) -> list[CaptureMoment]:
+        """Take the next detection, and give the moments that are worth a capture by how the board moves."""
         ...
 
     def narrate(self, guide: Guide, present: Array) -> Narration:
@@ -47,9 +47,9 @@ class StillBoards:
         self._is_judged = self._is_decided = False
         self._refusal: Refusal | None = None
 
-    def take(self, sighting: BoardDetection) -> list[CaptureMoment]:
-        """Take the next sighting; a board that is moved on before its time is not captured."""
-        moment = self._gate.take(sighting)
+    def take(self, detection: BoardDetection) -> list[CaptureMoment]:
+        """Take the next detection; a board that is moved on before its time is not captured."""
+        moment = self._gate.take(detection)
         if self._gate.motion_m > self._max_motion_m:
             self._is_judged = self._is_decided = False
             return []
@@ -71,7 +71,7 @@ class StillBoards:
         return narrate_still(guide, present, held_s, self._hold_s, self._refusal)
 
     def events_of(self, moment: CaptureMoment) -> tuple[EventCut, ...]:
-        """Give none: a board that stands still makes no events of use."""
+        """Give none: a board that stands still makes too few events."""
         return ()
 
 
@@ -82,9 +82,9 @@ class SlowBoards:
         self._options = MotionOptions(patience_s=LIVE_PATIENCE_S)
         self._gate = MotionGate(rig, self._options, novelty, Losses())
 
-    def take(self, sighting: BoardDetection) -> list[CaptureMoment]:
-        """Take the next sighting."""
-        return self._gate.take(sighting)
+    def take(self, detection: BoardDetection) -> list[CaptureMoment]:
+        """Take the next detection."""
+        return self._gate.take(detection)
 
     def narrate(self, guide: Guide, present: Array) -> Narration:
         """Say what to do with a board that is seen at (4, 4)."""
@@ -92,4 +92,4 @@ class SlowBoards:
 
     def events_of(self, moment: CaptureMoment) -> tuple[EventCut, ...]:
         """Give all of them."""
-        return moment.sighting.frame.events
+        return moment.detection.frame.events

@@ -99,14 +99,14 @@ class CaptureWriter:
         return self._stored.notes()
 
     def _store(self, task: Task) -> None:
-        sighting = task.moment.sighting
-        meta = {**task.meta, **task.moment.figures, **board_figures(sighting.images)}
+        detection = task.moment.detection
+        meta = {**task.meta, **task.moment.figures, **board_figures(detection.images)}
         events = [cut.events for cut in task.events]
-        name = self._session.add_capture(task.images, sighting.frame.scans, meta, events)
-        self._kept.append(Kept(name, sighting.images, time.monotonic() - task.asked_s))
+        name = self._session.add_capture(task.images, detection.frame.scans, meta, events)
+        self._kept.append(Kept(name, detection.images, time.monotonic() - task.asked_s))
         # The capture is safe: what follows delays nothing.
         self._stored.note(task.events)
-        self._learning.show(name, sighting)
+        self._learning.show(name, detection)
 
 
 def record_streams(

@@ -26,8 +26,7 @@ from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
 from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.live.monitor import Monitor
 from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_unseen
-from lce_rig.collect.live.options import Ending, Key, LiveOptions, LiveReport
-from lce_rig.collect.live.state import LiveState
+from lce_rig.collect.live.state import Ending, Key, LiveOptions, LiveReport, LiveState
 from lce_rig.collect.placement_dedupe import Placements, capture_poses
 from lce_rig.collect.worker import Worker
 from lce_rig.core.errors import LceRigError
@@ -44,7 +43,7 @@ from lce_rig.words import describe, sentence
 
 # The board searched for in a process of its own, while this one reads sensors.
 
-#: How often a picture without a board is searched thoroughly, during which nothing is said.
+#: How often an image without a board is searched thoroughly, during which nothing is said.
 THOROUGH_S = 3.0
 #: How often a scan is searched for other things of the board's size while all that are known are followed.
 RESCAN_S = 1.0
@@ -60,22 +59,22 @@ class BoardSearch(Worker):
         super().__init__("search for the board", _Search, rig, search_interval_s)
 
     def sight(self, frame: Frame) -> BoardDetection:
-        """Find the board in every picture and scan of a frame.
+        """Find the board in every image and scan of a frame.
 
         Raises:
             LceRigError: the profile cannot be used.
         """
-        sighting: BoardDetection = self.call("sight", replace(frame, events=()))
-        return replace(sighting, frame=frame)
+        detection: BoardDetection = self.call("sight", replace(frame, events=()))
+        return replace(detection, frame=frame)
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
         """Search the frame of a moment as `check` does; see `BoardTracker.confirm`."""
-        frame = moment.sighting.frame
-        bare = replace(moment.sighting, frame=replace(frame, events=()))
-        found: CaptureMoment | Refusal = self.call("confirm", replace(moment, sighting=bare))
+        frame = moment.detection.frame
+        bare = replace(moment.detection, frame=replace(frame, events=()))
+        found: CaptureMoment | Refusal = self.call("confirm", replace(moment, detection=bare))
         if isinstance(found, Refusal):
             return found
-        return replace(found, sighting=replace(found.sighting, frame=frame))
+        return replace(found, detection=replace(found.detection, frame=frame))
 
 
 class _Search:
@@ -100,7 +99,7 @@ class _Search:
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
         found = self._tracker.confirm(moment)
         if isinstance(found, CaptureMoment):
-            return replace(found, sighting=without_samples(found.sighting))
+            return replace(found, detection=without_samples(found.detection))
         return found
 
 
@@ -123,7 +122,7 @@ def collect_live(
         session: open for writing; what it holds counts.
         sources: of every sensor, and the sync board's where there is one; not open yet.
         options: how it goes.
-        show: told the state after every frame, and twice a second without one; must not block.
+        show: receives the state after every frame, and twice a second without one; must not block.
         keys: asked what the user wants.
         record_to: a new folder for the raw streams; None where they are not recorded.
 
@@ -185,9 +184,9 @@ def _count_in(capture: Capture, session: Session, guides: Sequence[Guide]) -> No
             guide.add(capture.name, poses[guide.key])
 
 
-def _time_s(sighting: BoardDetection) -> float:
+def _time_s(detection: BoardDetection) -> float:
     """Tell the sensors' time: patience is measured by what they have seen, however slow this computer is."""
-    return sighting.frame.time_ns * 1e-9
+    return detection.frame.time_ns * 1e-9
 
 
 class _Loop:
@@ -226,11 +225,11 @@ class _Loop:
             frame = self._feed.take(_WAIT_S)
             self.take_kept()
             if frame is not None:
-                sighting = self._search.sight(frame)
+                detection = self._search.sight(frame)
                 if not self.report.n_frames:
                     self._captured_s = time.monotonic()  # The search had to start first.
                 self.report.n_frames += 1
-                self._see(sighting)
+                self._see(detection)
             key = keys()
             self._obey(key)
             ending = self._find_ending(key)
@@ -272,34 +271,34 @@ class _Loop:
         )
         return report
 
-    def _see(self, sighting: BoardDetection) -> None:
-        """Look for a moment in a sighting, and put into words what goes on."""
-        self._last = sighting
-        self._monitor.see(sighting)
+    def _see(self, detection: BoardDetection) -> None:
+        """Look for a moment in a detection, and put into words what goes on."""
+        self._last = detection
+        self._monitor.see(detection)
         gate = self._find_gate()
-        moments = gate.take(sighting)
-        guide = self._active_guide(sighting)
+        moments = gate.take(detection)
+        guide = self._active_guide(detection)
         for each in self._guides:
-            each.plan(each.locate(sighting), _time_s(sighting), is_asked=each is guide)
-        present = guide.locate(sighting)
-        if present is not None and guide.sees(sighting):
+            each.plan(each.locate(detection), _time_s(detection), is_asked=each is guide)
+        present = guide.locate(detection)
+        if present is not None and guide.sees(detection):
             narration = gate.narrate(guide, present)
         else:
-            narration = narrate_unseen(sighting, guide, self._monitor.reasons)
+            narration = narrate_unseen(detection, guide, self._monitor.reasons)
         for moment in moments:
             narration = self._decide(moment, narration)
         self._monitor.narrate(narration, guide, present)
 
     def _decide(self, moment: CaptureMoment, narration: Narration) -> Narration:
         """Capture a moment, unless it adds nothing."""
-        sighting = moment.sighting
-        guide = self._seeing_guide(sighting)
+        detection = moment.detection
+        guide = self._seeing_guide(detection)
         if guide is None:
             return narration
         n_wanted, n_waiting = self._options.n_wanted, self._n_asked - len(self.report.captured)
         if n_wanted is not None and self._n_captures + n_waiting >= n_wanted:
             return narration  # A slow disk still writes the last ones.
-        present = sighting.images[guide.key].T_cam_board
+        present = detection.images[guide.key].T_cam_board
         refusal = guide.adds_nothing(present)
         if refusal is None:
             confirmed = self._search.confirm(moment)
@@ -309,12 +308,12 @@ class _Loop:
             refusal = confirmed
         self._monitor.cue("refused", f"not captured: {describe(refusal)}")
         guide.note_refusal(present)
-        guide.plan(present, _time_s(sighting))
+        guide.plan(present, _time_s(detection))
         return narrate_refused(guide, present, refusal)
 
     def _capture(self, moment: CaptureMoment) -> None:
-        sighting, gate = moment.sighting, self._find_gate()
-        frame = sighting.frame
+        detection, gate = moment.detection, self._find_gate()
+        frame = detection.frame
         pairs = [pair.to_meta() for pair in pair_times(frame, self._rig, self._clock.common)]
         verdict = self._clock.verdict()
         meta: dict[str, object] = {
@@ -327,23 +326,23 @@ class _Loop:
         self._n_asked += 1
         self._captured_s = time.monotonic()
         for guide in self._guides:
-            if guide.sees(sighting):
-                guide.add(name, sighting.images[guide.key].T_cam_board)
+            if guide.sees(detection):
+                guide.add(name, detection.images[guide.key].T_cam_board)
 
     def _obey(self, key: Key | None) -> None:
         guide = None if self._last is None else self._active_guide(self._last)
         if key == "next" and guide is not None:
             guide.give_up()
-            self._monitor.log("another placement was asked for")
+            self._monitor.log("another placement requested")
         if key == "capture" and guide is not None and self._last is not None:
             self._capture_by_hand(self._last)
 
-    def _capture_by_hand(self, sighting: BoardDetection) -> None:
+    def _capture_by_hand(self, detection: BoardDetection) -> None:
         """Capture what is seen now, however it moves."""
-        if self._seeing_guide(sighting) is None:
+        if self._seeing_guide(detection) is None:
             self._monitor.cue("refused", "not captured: not every sensor sees the board")
             return
-        confirmed = self._search.confirm(CaptureMoment(sighting, TakenByHand()))
+        confirmed = self._search.confirm(CaptureMoment(detection, TakenByHand()))
         if isinstance(confirmed, CaptureMoment):
             self._capture(confirmed)
         else:
@@ -373,7 +372,7 @@ class _Loop:
         return all(guide.is_enough for guide in self._guides)
 
     def _is_exhausted(self) -> bool:
-        """Tell whether nobody is there to show anything new, or nothing new is left to be shown."""
+        """Check whether nothing new was shown for long, or nothing new is left to show."""
         idle_s = self._options.idle_s
         if idle_s is None:
             return False
@@ -386,20 +385,20 @@ class _Loop:
             is_enough, has_ended = self._is_enough(), ending is not None
             self._show(self._monitor.state(self._n_captures, is_enough=is_enough, has_ended=has_ended))
 
-    def _active_guide(self, sighting: BoardDetection) -> Guide:
+    def _active_guide(self, detection: BoardDetection) -> Guide:
         """Choose whose words are said: of the guides whose camera sees the board that of fewest captures.
 
         Where they all have enough, the board goes before a camera whose guide has not.
         """
-        seeing = [g for g in self._guides if g.key in sighting.images]
+        seeing = [g for g in self._guides if g.key in detection.images]
         if seeing and all(guide.is_enough for guide in seeing):
             seeing += [guide for guide in self._guides if not guide.is_enough]
             return min(seeing, key=lambda guide: (guide.is_enough, guide.n_held))
         return min(seeing or self._guides, key=lambda guide: guide.n_held)
 
-    def _seeing_guide(self, sighting: BoardDetection) -> Guide | None:
+    def _seeing_guide(self, detection: BoardDetection) -> Guide | None:
         """Choose who judges a placement: of the guides whose sensors see it that of fewest captures."""
-        return min((g for g in self._guides if g.sees(sighting)), key=lambda g: g.n_held, default=None)
+        return min((g for g in self._guides if g.sees(detection)), key=lambda g: g.n_held, default=None)
 
     def _find_gate(self) -> LiveGate:
         """Choose how boards are captured: moving where events come and clocks are tied, else still."""

@@ -48,7 +48,7 @@ class FrameFeed:
 
     Attributes:
         losses: scans without an image of their time, and without events to make one of.
-        n_skipped: frames that nobody took before the next one came.
+        n_skipped: frames skipped because the next one came first.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class FrameFeed:
         Args:
             rig: the profile.
             sensors: open.
-            clock: ties the stamps.
+            clock: ties the timestamps.
             board: the sync board; None where there is none.
             record: takes every sample too, as it came but for its time; must not block.
         """
@@ -93,7 +93,7 @@ class FrameFeed:
 
     @property
     def n_skipped(self) -> int:
-        """Frames that nobody took before the next one came."""
+        """Frames skipped because the next one came first."""
         return self._frames.n_dropped
 
     def take(self, timeout_s: float) -> Frame | None:
@@ -111,14 +111,14 @@ class FrameFeed:
         try:
             for frame in pair_by_time(self._with_pictures(), self._rig, self.losses, LIVE_NS):
                 self._frames.put(frame)
-        except BaseException as error:  # Whoever takes frames is told, of bugs too.
+        except BaseException as error:  # The taker of frames learns of bugs as well.
             self._failure = error
             self._frames.close(error if isinstance(error, SourceError) else None)
             if not isinstance(error, LceRigError):
                 raise
 
     def _with_pictures(self) -> Iterator[Sample]:
-        """Add pictures made of events for cameras that have nothing else to watch the board by."""
+        """Add images made of events for cameras that have nothing else to watch the board by."""
         cameras = {
             name
             for name, camera in self._rig.cameras.items()

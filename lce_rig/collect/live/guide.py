@@ -109,13 +109,13 @@ class Guide:
         """Where the board should go, T_cam_board (4, 4); None where nothing new can be reached."""
         return None if self.guidance is None else self.guidance.T_cam_board
 
-    def sees(self, sighting: BoardDetection) -> bool:
-        """Tell whether both of its sensors see the board in a sighting as the profile's limits want it."""
-        return self.key in sighting.images.keys() - sighting.unfit.keys() and self.lidar in sighting.lidars
+    def sees(self, detection: BoardDetection) -> bool:
+        """Check whether both of its sensors see the board in a detection as the profile's limits want it."""
+        return self.key in detection.images.keys() - detection.unfit.keys() and self.lidar in detection.lidars
 
-    def locate(self, sighting: BoardDetection) -> Array | None:
+    def locate(self, detection: BoardDetection) -> Array | None:
         """Give T_cam_board (4, 4) as its camera sees it; None where it does not."""
-        board = sighting.images.get(self.key)
+        board = detection.images.get(self.key)
         return None if board is None else board.T_cam_board
 
     def add(self, name: str, T_cam_board: Array) -> None:
@@ -186,13 +186,13 @@ class Guide:
         return instruct(self._planner.view, present, self.wanted)
 
     def is_there(self, present: Array) -> bool:
-        """Tell whether a board (4, 4) is where it should be."""
+        """Check whether a board (4, 4) is where it should be."""
         if self._planner is None or self.wanted is None:
             return False
         return is_there(self._planner.view, present, self.wanted)
 
     def outline_px(self, T_cam_board: Array) -> Array | None:
-        """Project a board (4, 4) into the picture as a closed polygon."""
+        """Project a board (4, 4) into the image as a closed polygon."""
         return None if self._model is None else outline_px(self._model, T_cam_board)
 
     def coverage(self) -> Coverage | None:

@@ -41,19 +41,19 @@ class Learning:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End, whatever is being calibrated."""
+        """End, without waiting for a calibration."""
         with self._changed:
             self._is_closing = True
             self._changed.notify()
         self._worker.__exit__(None, None, None)
         self._thread.join()
 
-    def show(self, name: str, sighting: BoardDetection) -> None:
+    def show(self, name: str, detection: BoardDetection) -> None:
         """Take what a capture shows; returns at once."""
         with self._changed:
             for k, guide in enumerate(self._guides):
-                if guide.sees(sighting):
-                    image, scans = sighting.images[guide.key], sighting.lidars[guide.lidar]
+                if guide.sees(detection):
+                    image, scans = detection.images[guide.key], detection.lidars[guide.lidar]
                     self._candidates[k].append(CaptureCandidates(name, image, scans))
                     if len(self._candidates[k]) >= self._min_captures and k not in self._due:
                         self._due.append(k)
@@ -81,7 +81,7 @@ class Learning:
                 candidates = list(self._candidates[k])
             try:
                 planner = self._worker.call("learn", k, candidates)
-            except Exception as error:  # Captures are safe whatever a calibration trips over.
+            except Exception as error:  # Captures are safe even if a calibration fails.
                 if self._is_closing:
                     return
                 self._problem = f"guidance does not learn from captures: {error}"

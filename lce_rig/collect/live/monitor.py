@@ -8,8 +8,7 @@ import numpy as np
 from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.narration import Narration, image_figures, scan_figures, stream_name
-from lce_rig.collect.live.options import LiveOptions
-from lce_rig.collect.live.state import Cue, Drawing, LiveState, Phase, Sound, StreamState
+from lce_rig.collect.live.state import Cue, Drawing, LiveOptions, LiveState, Phase, Sound, StreamState
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
 from lce_rig.devices.protocol import SourceStatus
@@ -53,32 +52,32 @@ class Monitor:
         self._narration = Narration("starting", _WAIT)
         self._guide: Guide | None = None
         self._drawing: Drawing | None = None
-        self._sighting: BoardDetection | None = None
+        self._detection: BoardDetection | None = None
         self._seen_s = 0.0
         self._ticks_left: int | None = None
         self._lost: frozenset[str] = frozenset()
         self._was_enough = False
 
-    def see(self, sighting: BoardDetection) -> None:
-        """Take a sighting, and remember why streams do not show the board."""
-        self._sighting, self._seen_s = sighting, time.monotonic()
-        for key, why in sighting.unseen.items():
+    def see(self, detection: BoardDetection) -> None:
+        """Take a detection, and remember why streams do not show the board."""
+        self._detection, self._seen_s = detection, time.monotonic()
+        for key, why in detection.unseen.items():
             self.reasons[stream_name(key)] = why
-        self.reasons.update(sighting.unscanned)
-        for key in sighting.images:
+        self.reasons.update(detection.unscanned)
+        for key in detection.images:
             self.reasons.pop(stream_name(key), None)
-        for key, why in sighting.unfit.items():
+        for key, why in detection.unfit.items():
             self.reasons[stream_name(key)] = why
-        for lidar in sighting.lidars:
+        for lidar in detection.lidars:
             self.reasons.pop(lidar, None)
 
     def narrate(self, narration: Narration, guide: Guide, present: Array | None) -> None:
-        """Take what is said of the last sighting."""
+        """Take what is said of the last detection."""
         self._narration, self._guide = narration, guide
         self._tick(narration)
-        assert self._sighting is not None
+        assert self._detection is not None
         picture = next(
-            (each for each in self._sighting.frame.images if (each.sensor, each.channel) == guide.key), None
+            (each for each in self._detection.frame.images if (each.sensor, each.channel) == guide.key), None
         )
         if picture is not None:
             self._drawing = Drawing(
@@ -110,7 +109,7 @@ class Monitor:
         return f"last said: {said.headline}" + (f" ({said.detail})" if said.detail else "")
 
     def is_due(self) -> bool:
-        """Tell whether views have not been told anything for long."""
+        """Check whether views have not been updated for long."""
         return time.monotonic() - self._told_s > _EVERY_S
 
     def state(self, n_captures: int, *, is_enough: bool, has_ended: bool) -> LiveState:
@@ -159,7 +158,7 @@ class Monitor:
             return "enough", _ENOUGH, said.headline
         if self._is_stale():
             waited_s = time.monotonic() - self._seen_s
-            return "searching", _WAIT, f"no picture with a scan of its time for {waited_s:.0f} s"
+            return "searching", _WAIT, f"no image with a scan of its time for {waited_s:.0f} s"
         return said.phase, said.headline, said.detail or (_MET if is_enough else "")
 
     def _what_now(self) -> str:
@@ -189,8 +188,8 @@ class Monitor:
         self._lost = frozenset(lost)
 
     def _is_stale(self) -> bool:
-        """Tell whether what was seen last is no longer what is there."""
-        return self._sighting is not None and time.monotonic() - self._seen_s > _STALE_S
+        """Check whether what was seen last is no longer what is there."""
+        return self._detection is not None and time.monotonic() - self._seen_s > _STALE_S
 
     def _streams(self) -> tuple[StreamState, ...]:
         """List every stream: channels of cameras, LiDARs, then what else there is."""
@@ -213,23 +212,23 @@ class Monitor:
     def _camera_stream(
         self, camera: str, channel: str, is_framed: bool, rate_hz: float, status: SourceStatus
     ) -> StreamState:
-        name, sighting = f"{camera}.{channel}", None if self._is_stale() else self._sighting
+        name, detection = f"{camera}.{channel}", None if self._is_stale() else self._detection
         n_lost = status.n_lost + status.n_dropped
-        pictures = {(i.sensor, i.channel) for i in sighting.frame.images} if sighting else set()
-        if sighting is None or (camera, channel) not in pictures:
+        pictures = {(i.sensor, i.channel) for i in detection.frame.images} if detection else set()
+        if detection is None or (camera, channel) not in pictures:
             return StreamState(name, rate_hz, n_lost, None, self._trouble(camera) if is_framed else "")
-        board = sighting.images.get((camera, channel))
-        if board is None or (camera, channel) in sighting.unfit:
+        board = detection.images.get((camera, channel))
+        if board is None or (camera, channel) in detection.unfit:
             why = self.reasons.get(name)
             reason = self._trouble(camera) or (sentence(why) if why else "no board")
             return StreamState(name, rate_hz, n_lost, False, reason)
         return StreamState(name, rate_hz, n_lost, True, self._trouble(camera), image_figures(board))
 
     def _lidar_stream(self, lidar: str, status: SourceStatus) -> StreamState:
-        sighting, n_lost = None if self._is_stale() else self._sighting, status.n_lost + status.n_dropped
-        if sighting is None or not sighting.images:
+        detection, n_lost = None if self._is_stale() else self._detection, status.n_lost + status.n_dropped
+        if detection is None or not detection.images:
             return StreamState(lidar, status.rate_hz, n_lost, None, self._trouble(lidar))
-        boards = sighting.lidars.get(lidar)
+        boards = detection.lidars.get(lidar)
         if not boards:
             why = self.reasons.get(lidar)
             reason = self._trouble(lidar) or (sentence(why) if why else "no board")

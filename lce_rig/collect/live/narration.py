@@ -30,22 +30,22 @@ class Narration:
     hold_s: float | None = None
 
 
-def narrate_unseen(sighting: BoardDetection, guide: Guide, reasons: dict[str, Refusal]) -> Narration:
+def narrate_unseen(detection: BoardDetection, guide: Guide, reasons: dict[str, Refusal]) -> Narration:
     """Say what keeps a board out of sight.
 
     Args:
-        sighting: in which the guide's camera or LiDAR does not see the board, or not well enough.
+        detection: in which the guide's camera or LiDAR does not see the board, or not well enough.
         guide: whose sensors they are.
         reasons: the last refusal of each stream, by its name.
     """
-    if guide.key not in sighting.images:
+    if guide.key not in detection.images:
         why = reasons.get(stream_name(guide.key))
-        # A picture without a board hardly tells why; one with half a board does.
-        headline = f"show the board to {guide.key[0]}" if sighting.images else _SHOW
+        # An image without a board hardly tells why; one with half a board does.
+        headline = f"show the board to {guide.key[0]}" if detection.images else _SHOW
         return Narration("searching", headline, sentence(why) if why else "")
-    if guide.key in sighting.unfit:
-        why = sighting.unfit[guide.key]
-        headline = _next(guide, sighting.images[guide.key].T_cam_board, recommend(why))
+    if guide.key in detection.unfit:
+        why = detection.unfit[guide.key]
+        headline = _next(guide, detection.images[guide.key].T_cam_board, recommend(why))
         return Narration("moving", headline, f"cannot be used here: {describe(why)}")
     why = reasons.get(guide.lidar)
     headline = recommend(why) if why else "the LiDAR does not see the board"
@@ -94,7 +94,7 @@ def stream_name(key: ImageKey) -> str:
 
 
 def image_figures(board: ImageBoard) -> str:
-    """Sum a board in a picture up in few words."""
+    """Sum a board in an image up in few words."""
     return f"{board.distance_m:.1f} m, {board.reprojection_px:.2f} px"
 
 

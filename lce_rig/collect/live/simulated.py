@@ -1,8 +1,8 @@
 """The simulated rig in real time: its sensors as live sources, and a person who follows the guidance.
 
 The simulation runs in a process of its own, as sensors do. While the board is held, its scene is rendered
-once and measured anew for each picture and scan; on its way it is rendered every time. Where the computer
-is too slow for that, all of it goes in slow motion: sensors, stamps and the person keep one simulated time.
+once and measured again for each image and scan; on its way it is rendered every time. Where the computer
+is too slow for that, all runs in slow motion: sensors, timestamps and person keep one simulated time.
 """
 
 import math
@@ -32,7 +32,7 @@ from lce_rig.simulate.trajectory import between
 
 # Whether this computer simulates as fast as sensors sense: where it does not, low rates are its doing.
 
-#: Longer than the board is on its way, when everything has to be rendered anew.
+#: Longer than the board is on its way, when everything has to be rendered again.
 WINDOW_S = 10.0
 #: Rendering a moving board takes longer than the sensors would: no slower than this is as it should be.
 USUAL = 2.0
@@ -296,7 +296,7 @@ def _simulate(
     try:
         connection.send(answer)
     except OSError:
-        return  # Whoever started this was ended meanwhile.
+        return  # The parent has ended.
     if isinstance(answer, LceRigError):
         return
     walker = Walker(scene, person, views)

@@ -1,4 +1,4 @@
-"""What a live collection knows at one moment: all that its views show."""
+"""How a live collection is to go, what it knows at one moment for its views, and how it went."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -7,7 +7,78 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.collect.guidance import Coverage
+from lce_rig.core.errors import SourceError
 from lce_rig.core.geometry import Array
+
+Ending = Literal["enough", "frames", "timeout", "exhausted", "stopped", "lost"]
+"""enough: the target is predicted to be met; frames: as many captures as wanted; timeout: the time is over;
+exhausted: nothing new was shown for `LiveOptions.idle_s`; stopped: by the user; lost: a sensor is gone."""
+
+Key = Literal["stop", "capture", "next"]
+"""stop: end; capture: take what is seen now; next: propose another placement."""
+
+#: How long a board stands still before it is captured, beyond the first half second.
+HOLD_S = 1.5
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """How a live collection goes.
+
+    Attributes:
+        n_wanted: captures that the session is to hold; None until the target is predicted to be met.
+        timeout_s: ends after so long; None never.
+        hold_s: how long a board stands still before it is captured, beyond the first half second.
+        lost_s: how long a lost sensor is waited for.
+        goes_on: whether to go on when the target is met, until asked to stop.
+        idle_s: ends after so long without a capture, for unattended runs; None never.
+        search_interval_s: how often a whole image is searched while no board is in sight.
+    """
+
+    n_wanted: int | None = None
+    timeout_s: float | None = None
+    hold_s: float = HOLD_S
+    lost_s: float = 60.0
+    goes_on: bool = False
+    idle_s: float | None = None
+    search_interval_s: float = 0.3
+
+    @property
+    def is_open(self) -> bool:
+        """Whether to go on when the target is predicted to be met."""
+        return self.goes_on or self.n_wanted is not None
+
+
+@dataclass
+class LiveReport:
+    """How a live collection went.
+
+    Attributes:
+        ending: why it ended.
+        is_enough: whether the session holds enough for the profile's target, as far as is known.
+        captured: names of the new captures, in order.
+        latencies_s: from each decision until its capture was safe on the disk.
+        n_frames: frames looked at.
+        n_skipped: frames that came while one before was looked at.
+        n_lost: samples lost or dropped, by sensor.
+        lost: sensors that were lost when it ended, and why, by name.
+        error: the sensor that is lost for good; None where none is.
+        notes: what else was odd.
+        n_recorded: samples of the raw streams on the disk; None where they were not recorded.
+    """
+
+    ending: Ending = "stopped"
+    is_enough: bool = False
+    captured: list[str] = field(default_factory=list)
+    latencies_s: list[float] = field(default_factory=list)
+    n_frames: int = 0
+    n_skipped: int = 0
+    n_lost: dict[str, int] = field(default_factory=dict)
+    lost: dict[str, SourceError] = field(default_factory=dict)
+    error: SourceError | None = None
+    notes: list[str] = field(default_factory=list)
+    n_recorded: int | None = None
+
 
 Phase = Literal["starting", "searching", "moving", "holding", "saving", "refused", "enough", "lost", "ended"]
 """starting: no sensor has sent yet; searching: not every sensor sees the board; moving: the board has to go
@@ -24,7 +95,7 @@ class StreamState:
     Attributes:
         name: "cam.frames", "lidar".
         rate_hz: samples a second.
-        n_lost: what never arrived or nobody took.
+        n_lost: samples lost or dropped.
         sees_board: None where it was not looked for.
         reason: why not, or what is wrong with the sensor, and what to do; "" while all is well.
         figures: in few words: "2 rings, 3.1 m", "0.05 px".
@@ -53,7 +124,7 @@ class Cue:
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """The camera's last picture, and where the board is and should be in it.
+    """The camera's last image, and where the board is and should be in it.
 
     Attributes:
         camera: the stream it comes from.
@@ -88,7 +159,7 @@ class LiveState:
         n_captures: in the session.
         n_wanted: how many are wanted; None where the target decides.
         streams: every stream.
-        drawing: the guiding camera's picture; None before one has come.
+        drawing: the guiding camera's image; None before one has come.
         coverage: how much of what is reachable has been shown; None without guidance.
         sigma_deg, sigma_mm: predicted 1-sigma of rotation and translation now; NaN where captures are few.
         target_deg, target_mm: the profile's.

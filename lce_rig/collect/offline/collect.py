@@ -91,12 +91,12 @@ class MomentSearch:
         is_long = self.n_samples >= _LONG_SAMPLES
         are_still = not self.has_events and stillness.max_motion_m <= _GLANCED_M
         ahead = sight_ahead(watcher, frames, is_still_wanted=are_still)
-        sightings = ahead if is_long else map(watcher.sight, frames)
+        detections = ahead if is_long else map(watcher.sight, frames)
         if self.has_events:
             taken = Placements(self.min_move_m, self.min_turn_deg)
-            moments = find_moving_moments(sightings, self.rig, self.motion, taken, self.losses)
+            moments = find_moving_moments(detections, self.rig, self.motion, taken, self.losses)
         else:
-            moments = find_still_moments(sightings, self.rig.board.to_board(), stillness)
+            moments = find_still_moments(detections, self.rig.board.to_board(), stillness)
         for moment in moments:
             confirmed = watcher.confirm(moment)
             if isinstance(confirmed, Refusal):
@@ -106,7 +106,7 @@ class MomentSearch:
 
     def kept_images(self, moment: CaptureMoment) -> list[Image]:
         """List the pictures of a moment that its capture keeps: all but those that its events give again."""
-        images = moment.sighting.frame.images
+        images = moment.detection.frame.images
         return [image for image in images if (image.sensor, image.channel) not in self.reconstructed]
 
 
@@ -314,7 +314,7 @@ class _Collector:
     def _take_moment(
         self, recording_key: str, moment: CaptureMoment, images: Sequence[Image], known: Placements
     ) -> None:
-        frame, boards = moment.sighting.frame, moment.sighting.images
+        frame, boards = moment.detection.frame, moment.detection.images
         stamps = [scan.stamp_ns for scan in frame.scans] + [image.stamp_ns for image in images]
         key = f"{recording_key}:{'/'.join(str(stamp) for stamp in stamps)}"
         label = f"at {stamps[0]} ns"

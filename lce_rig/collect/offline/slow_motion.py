@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, MovedSlowly
-from lce_rig.collect.event_moment import MotionOptions, judge_sighting
+from lce_rig.collect.event_moment import MotionOptions, judge_detection
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.losses import Losses
 from lce_rig.core.results import Refusal
@@ -22,7 +22,7 @@ _UNSTEADY_M = 0.01
 
 
 def find_moving_moments(
-    sightings: Iterable[BoardDetection],
+    detections: Iterable[BoardDetection],
     rig: Rig,
     options: MotionOptions,
     taken: Placements,
@@ -33,28 +33,28 @@ def find_moving_moments(
     Which they are depends on the recording alone, so that a second run finds the same.
 
     Args:
-        sightings: in order of time.
+        detections: in order of time.
         rig: the profile.
         options: how a moving board is judged.
         taken: no placements yet; it says how far apart they must be.
-        tally: receives why other sightings are no moments.
+        tally: receives why other detections are no moments.
     """
     gate = MotionGate(rig, options, taken, tally)
-    for sighting in sightings:
-        yield from gate.take(sighting)
+    for detection in detections:
+        yield from gate.take(detection)
     yield from gate.finish()
 
 
 class MotionGate:
-    """Takes sightings in order of time, and gives the best moment of every place that the board passes.
+    """Takes detections in order of time, and gives the best moment of every place that the board passes.
 
     Attributes:
-        judged: the last sighting that could be judged: a moment that will do, or why it does not; None where
+        judged: the last detection that could be judged: a moment that will do, or why it does not; None where
             no camera of events saw the board.
     """
 
     def __init__(self, rig: Rig, options: MotionOptions, taken: Placements, tally: Losses) -> None:
-        """Begin without sightings; for the arguments see `find_moving_moments`."""
+        """Begin without detections; for the arguments see `find_moving_moments`."""
         self.judged: CaptureMoment | Refusal | None = None
         self._rig = rig
         self._options = options
@@ -62,22 +62,24 @@ class MotionGate:
         self._neighbours = _Neighbours(options.window_s)
         self._chooser = _Chooser(options, taken)
 
-    def take(self, sighting: BoardDetection) -> list[CaptureMoment]:
-        """Take the next sighting, and give the moments that nothing better can follow."""
-        return self._judge(self._neighbours.take(sighting))
+    def take(self, detection: BoardDetection) -> list[CaptureMoment]:
+        """Take the next detection, and give the moments that nothing better can follow."""
+        return self._judge(self._neighbours.take(detection))
 
     def finish(self) -> list[CaptureMoment]:
         """Give what is left when nothing more comes."""
         return [*self._judge(self._neighbours.finish()), *self._chooser.finish()]
 
-    def _judge(self, sightings: Iterable[tuple[BoardDetection, list[BoardDetection]]]) -> list[CaptureMoment]:
+    def _judge(
+        self, detections: Iterable[tuple[BoardDetection, list[BoardDetection]]]
+    ) -> list[CaptureMoment]:
         moments: list[CaptureMoment] = []
-        for sighting, around in sightings:
-            self.judged = judge_sighting(sighting, around, self._rig, self._options)
+        for detection, around in detections:
+            self.judged = judge_detection(detection, around, self._rig, self._options)
             if isinstance(self.judged, Refusal):
                 self._tally.add(self.judged)
             moment = self.judged if isinstance(self.judged, CaptureMoment) else None
-            moments.extend(self._chooser.take(sighting.frame.time_ns, moment))
+            moments.extend(self._chooser.take(detection.frame.time_ns, moment))
         return moments
 
 
@@ -93,7 +95,7 @@ class _Chooser:
         """Take the moment at a time, where there is one, and yield those that nothing better came after."""
         while self._pending and not self._is_young(self._pending[0], now_ns):
             yield from self._decide_oldest()
-        if moment is not None and self._taken.find_like(moment.sighting.images) is None:
+        if moment is not None and self._taken.find_like(moment.detection.images) is None:
             self._pending.append(moment)
 
     def finish(self) -> Iterator[CaptureMoment]:
@@ -104,24 +106,24 @@ class _Chooser:
     def _decide_oldest(self) -> Iterator[CaptureMoment]:
         """Give up the oldest moment, unless it stands when the best of all are taken first, one a place."""
         oldest = self._pending.popleft()
-        if self._taken.find_like(oldest.sighting.images) is not None:
+        if self._taken.find_like(oldest.detection.images) is not None:
             return
         kept: list[CaptureMoment] = []
         for moment in sorted((oldest, *self._pending), key=self._badness):
-            boards = moment.sighting.images
-            if any(self._taken.are_alike(boards, other.sighting.images) for other in kept):
+            boards = moment.detection.images
+            if any(self._taken.are_alike(boards, other.detection.images) for other in kept):
                 continue
             if moment is oldest:
-                self._taken.add(str(oldest.sighting.frame.time_ns), boards)
+                self._taken.add(str(oldest.detection.frame.time_ns), boards)
                 yield oldest
                 return
             kept.append(moment)
 
     def _is_young(self, moment: CaptureMoment, now_ns: int) -> bool:
-        return 0 <= now_ns - moment.sighting.frame.time_ns < self._options.patience_s * 1e9
+        return 0 <= now_ns - moment.detection.frame.time_ns < self._options.patience_s * 1e9
 
     def _badness(self, moment: CaptureMoment) -> tuple[bool, float]:
-        is_short = any(cut.missing_ns > 0 for cut in moment.sighting.frame.events)
+        is_short = any(cut.missing_ns > 0 for cut in moment.detection.frame.events)
         motion = moment.motion
         assert isinstance(motion, MovedSlowly)
         speed_ratio = max(motion.speed_mps, 1e-3) / self._options.best_speed_mps
@@ -129,20 +131,20 @@ class _Chooser:
 
 
 class _Neighbours:
-    """Gives each sighting with all within half a window of it, itself among them, once they have come."""
+    """Gives each detection with all within half a window of it, itself among them, once they have come."""
 
     def __init__(self, window_s: float) -> None:
         self._half_ns = round(window_s * 0.5e9)
         self._near: deque[BoardDetection] = deque()
         self._n_waiting = 0
 
-    def take(self, sighting: BoardDetection) -> Iterator[tuple[BoardDetection, list[BoardDetection]]]:
-        """Take the next sighting, and give those whose neighbours are complete."""
-        near, now_ns = self._near, sighting.frame.time_ns
+    def take(self, detection: BoardDetection) -> Iterator[tuple[BoardDetection, list[BoardDetection]]]:
+        """Take the next detection, and give those whose neighbours are complete."""
+        near, now_ns = self._near, detection.frame.time_ns
         if near and now_ns <= near[-1].frame.time_ns:
             # The clocks were set back.
             yield from self.finish()
-        near.append(sighting)
+        near.append(detection)
         self._n_waiting += 1
         while now_ns - near[-self._n_waiting].frame.time_ns >= self._half_ns:
             oldest = near[-self._n_waiting]
@@ -158,6 +160,6 @@ class _Neighbours:
         self._near.clear()
         self._n_waiting = 0
 
-    def _around(self, sighting: BoardDetection) -> list[BoardDetection]:
-        time_ns = sighting.frame.time_ns
+    def _around(self, detection: BoardDetection) -> list[BoardDetection]:
+        time_ns = detection.frame.time_ns
         return [other for other in self._near if abs(other.frame.time_ns - time_ns) <= self._half_ns]

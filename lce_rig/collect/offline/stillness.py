@@ -30,12 +30,12 @@ class StillnessOptions:
 
 
 def find_still_moments(
-    sightings: Iterable[BoardDetection], board: Board, options: StillnessOptions
+    detections: Iterable[BoardDetection], board: Board, options: StillnessOptions
 ) -> Iterator[CaptureMoment]:
     """Yield the stillest moment of every stretch in which the board stands still."""
     gate = StillnessGate(board, options)
-    for sighting in sightings:
-        moment = gate.take(sighting)
+    for detection in detections:
+        moment = gate.take(detection)
         if moment is not None:
             yield moment
     moment = gate.finish()
@@ -44,7 +44,7 @@ def find_still_moments(
 
 
 class StillnessGate:
-    """Takes sightings in order of time, and gives the stillest moment of every stretch of stillness.
+    """Takes detections in order of time, and gives the stillest moment of every stretch of stillness.
 
     It is the middle of a window in which nothing moved more than its figure `motion_m`. A stretch ends when
     the board moves, is lost, or has stood for `dwell_s`; it is then reported once.
@@ -64,10 +64,10 @@ class StillnessGate:
         self._best_m = np.inf
         self._since_ns = 0
 
-    def take(self, sighting: BoardDetection) -> CaptureMoment | None:
-        """Take the next sighting, and give the moment of a stretch that has ended with it."""
-        options, now_ns = self._options, sighting.frame.time_ns
-        self.motion_m = self._measure(sighting)
+    def take(self, detection: BoardDetection) -> CaptureMoment | None:
+        """Take the next detection, and give the moment of a stretch that has ended with it."""
+        options, now_ns = self._options, detection.frame.time_ns
+        self.motion_m = self._measure(detection)
         is_still = self.motion_m <= options.max_motion_m
         if is_still:
             self._since_ns = now_ns if self._best is None else self._since_ns
@@ -85,22 +85,24 @@ class StillnessGate:
         best, self._best, self.held_s = self._best, None, None
         return best
 
-    def _measure(self, sighting: BoardDetection) -> float:
-        """Put a sighting into the window and measure how far the board moved in it."""
+    def _measure(self, detection: BoardDetection) -> float:
+        """Put a detection into the window and measure how far the board moved in it."""
         window, options = self._window, self._options
-        is_seen = sighting.is_usable
-        if not is_seen or _is_gap(window, sighting, options):
+        is_seen = detection.is_usable
+        if not is_seen or _is_gap(window, detection, options):
             window.clear()
         if is_seen:
-            window.append(sighting)
+            window.append(detection)
         while len(window) > 2 and _span_s(window) - _step_s(window) >= options.window_s:
             window.popleft()
         is_full = len(window) > 2 and _span_s(window) >= options.window_s * 0.999
         return _motion_m(window, self._board, options.max_motion_m) if is_full else np.inf
 
 
-def _is_gap(window: deque[BoardDetection], sighting: BoardDetection, options: StillnessOptions) -> bool:
-    return bool(window) and not 0 < sighting.frame.time_ns - window[-1].frame.time_ns < options.window_s * 1e9
+def _is_gap(window: deque[BoardDetection], detection: BoardDetection, options: StillnessOptions) -> bool:
+    return (
+        bool(window) and not 0 < detection.frame.time_ns - window[-1].frame.time_ns < options.window_s * 1e9
+    )
 
 
 def _span_s(window: deque[BoardDetection]) -> float:
@@ -122,7 +124,7 @@ def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) 
         others = [s.images[key].corners_px for s in window if key in s.images]
         motions.append(max(_corner_motion_m(corners, reference.corners_px, board) for corners in others))
     lidar_motions = [
-        max(_plane_motion_m(candidate, sighting.lidars.get(lidar, []), max_motion_m) for sighting in window)
+        max(_plane_motion_m(candidate, detection.lidars.get(lidar, []), max_motion_m) for detection in window)
         for lidar, candidates in middle.lidars.items()
         for candidate in candidates
     ]

@@ -37,8 +37,8 @@ class DavisSamples:
 
     Attributes:
         n_events, n_frames, n_pulses: how many came.
-        n_frames_lost: frames missing by their stamps, where the profile sets controls.frame_interval_us.
-        n_resets: how often the camera's clock began anew.
+        n_frames_lost: frames missing by their timestamps, where the profile sets controls.frame_interval_us.
+        n_resets: how often the camera's clock restarted.
     """
 
     def __init__(self, sensor: str, settings: CameraSettings) -> None:
@@ -235,7 +235,7 @@ class DavisSource(LiveSource):
         return pulses
 
     def _next_imu(self, host_ns: int) -> list[LiveSample]:
-        """Take IMU data off their queue, lest it grow; nobody wants them yet."""
+        """Take IMU data off their queue, lest it grow; they are not used yet."""
         batch = self._input.getNextImuBatch()
         self._n_imu += 0 if batch is None else len(batch)
         return []

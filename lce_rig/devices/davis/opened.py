@@ -126,7 +126,7 @@ def _set_up_new(camera: Any, sensor: str, controls: Mapping[str, Value]) -> list
     for name, bias in biases.items():
         if name in controls:
             camera.setDavis346BiasCoarseFine(bias, *bias_of(sensor, name, controls[name]))
-    # The trigger input is off until told otherwise.
+    # The trigger input is off by default.
     camera.setDetectorRisingEdges(True)
     camera.setDetectorFallingEdges(False)
     camera.setDetectorRunning(True)

@@ -1,4 +1,4 @@
-"""Pictures from a command's standard output: GStreamer, ffmpeg or any program that writes them."""
+"""Images from a command's standard output: GStreamer, ffmpeg or any program that writes them."""
 
 import os
 import re
@@ -25,7 +25,7 @@ _WAIT_S = 0.25
 _PATIENCE_S = 2.0
 _PIPE_BYTES = 1 << 20
 _N_BEGIN = 16
-# What no raw picture begins with: a whole header of PGM or PPM, or that of Y4M.
+# What no raw image begins with: a whole header of PGM or PPM, or that of Y4M.
 _HEADER = re.compile(rb"P[56]\s\d+\s\d+\s|YUV4MPEG2 ")
 _TAIL_BYTES = 2000
 _EXAMPLE = (
@@ -36,18 +36,18 @@ _EXAMPLE = (
 class ImagePipeSource(LiveSource):
     """A camera read by a command of the profile; see `LiveSource`.
 
-    The command writes Y4M, PGM, PPM or JPEG pictures, one behind the other, or raw ones of a pixel_format.
-    Such a stream carries no usable stamps: those given are the arrival of a picture's last byte, with nothing
-    taken off, and the status says so.
+    The command writes Y4M, PGM, PPM or JPEG images, one behind the other, or raw ones of a pixel_format.
+    Such a stream carries no usable timestamps: those given are the arrival of an image's last byte
+    as it is, and the status says so.
 
     Args:
         sensor: the camera's name in the profile.
         settings: its block of the profile.
-        silence_s: so long without a picture is an error.
+        silence_s: so long without an image is an error.
     """
 
     def __init__(self, sensor: str, settings: CameraSettings, silence_s: float = 10.0) -> None:
-        hint = f"Run its command in a shell: does it write pictures? {' '.join(settings.driver.command)}"
+        hint = f"Run its command in a shell: does it write images? {' '.join(settings.driver.command)}"
         super().__init__(sensor, f"camera {sensor!r}", _N_SLOTS, silence_s, hint)
         self._settings = settings
         self._channel = settings.first_channel("frames") or "frames"
@@ -117,7 +117,7 @@ class ImagePipeSource(LiveSource):
         )
 
     def _raw_stream(self) -> PictureStream | None:
-        """Prepare for raw pictures where the profile names their format."""
+        """Prepare for raw images where the profile names their format."""
         wanted = self._settings.driver.pixel_format
         if wanted is None:
             return None
@@ -136,20 +136,20 @@ class ImagePipeSource(LiveSource):
         """Find out by its first bytes what the command writes, and whether it is what the profile says.
 
         Raises:
-            SourceError: it is nothing that is read, or no raw pictures though the profile says so.
+            SourceError: it is nothing that is read, or no raw images though the profile says so.
         """
         if self._stream is None:
             self._stream = find_stream(self._begin)
             if self._stream is None:
                 begin = self._begin[:16]
                 what = f"{self._who}: its command writes no Y4M, PGM, PPM or JPEG; it begins {begin!r}"
-                raise SourceError(what, f"For raw pictures set driver.pixel_format. An example: {_EXAMPLE}")
+                raise SourceError(what, f"For raw images set driver.pixel_format. An example: {_EXAMPLE}")
         elif isinstance(self._stream, RawPictures) and _HEADER.match(self._begin):
             wanted = self._settings.driver.pixel_format
             raise SourceError(
-                f"{self._who}: driver.pixel_format says raw {wanted}, but its command writes pictures with a "
+                f"{self._who}: driver.pixel_format says raw {wanted}, but its command writes images with a "
                 f"header: {self._begin[:16]!r}",
-                "Leave pixel_format out: such pictures name their form themselves.",
+                "Leave pixel_format out: such images name their form themselves.",
             )
 
     def _pipes(self) -> tuple[IO[bytes], IO[bytes]]:
@@ -216,8 +216,8 @@ class ImagePipeSource(LiveSource):
         if code is not None and code < 0:
             how = f"was ended by {signal.Signals(-code).name}"
         n_left = self._stream.n_left if self._stream else len(self._begin)
-        torn = f"; {n_left} bytes of an unfinished picture were left out" if n_left else ""
-        what = f"{self._who}: its command {how} after {self._n_pictures} pictures{torn}"
+        torn = f"; {n_left} bytes of an unfinished image were skipped" if n_left else ""
+        what = f"{self._who}: its command {how} after {self._n_pictures} images{torn}"
         raise SourceError(what, self._said())
 
     def _said(self) -> str:

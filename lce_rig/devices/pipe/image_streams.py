@@ -1,4 +1,4 @@
-"""Pictures in a stream of bytes, one behind the other: Y4M, PNM (PGM and PPM), JPEG, or raw.
+"""Images in a stream of bytes, one behind the other: Y4M, PNM (PGM and PPM), JPEG, or raw.
 
 References:
     https://wiki.multimedia.cx/index.php/YUV4MPEG2
@@ -24,10 +24,10 @@ _SOI, _EOI, _SOS = b"\xff\xd8", b"\xff\xd9", 0xDA
 
 
 class PictureStream(ABC):
-    """Bytes in as they come, pictures out.
+    """Bytes in as they come, images out.
 
     Attributes:
-        n_damaged: pictures that were there and could not be decoded.
+        n_damaged: images that were there and could not be decoded.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class PictureStream(ABC):
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Pixels]:
-        """Take bytes and yield the pictures that they complete, (H, W) grey or (H, W, 3) BGR.
+        """Take bytes and yield the images that they complete, (H, W) grey or (H, W, 3) BGR.
 
         Raises:
             ValueError: the stream is not what it began as.
@@ -51,16 +51,16 @@ class PictureStream(ABC):
 
     @property
     def n_left(self) -> int:
-        """Bytes of a picture that is not complete yet."""
+        """Bytes of an image that is not complete yet."""
         return len(self._rest)
 
     @abstractmethod
     def _cut(self) -> bytes | None:
-        """Take the next picture's bytes off the rest; None where they have not all come."""
+        """Take the next image's bytes off the rest; None where they have not all come."""
 
     @abstractmethod
     def _decode(self, payload: bytes) -> Pixels:
-        """Decode one picture; ValueError where it is damaged."""
+        """Decode one image; ValueError where it is damaged."""
 
     def _take(self, n_bytes: int) -> bytes:
         taken = bytes(self._rest[:n_bytes])
@@ -77,7 +77,7 @@ class PictureStream(ABC):
 
 
 class RawPictures(PictureStream):
-    """Pictures of one pixel format and size, with nothing between them and no padding of rows.
+    """Images of one pixel format and size, with nothing between them and no padding of rows.
 
     Attributes:
         row_bytes: length of a row.
@@ -168,7 +168,7 @@ class PnmPictures(PictureStream):
         match = _PNM_HEADER.match(self._rest, 0, _MAX_HEADER)
         if match is None:
             if len(self._rest) >= _MAX_HEADER or bytes(self._rest[:2]) not in (b"", b"P", b"P5", b"P6"):
-                raise ValueError(f"a PGM or PPM picture was expected, {bytes(self._rest[:20])!r} came")
+                raise ValueError(f"a PGM or PPM image was expected, {bytes(self._rest[:20])!r} came")
             return None
         width, height, most = (int(text) for text in match.groups()[1:])
         n_channels = 3 if match.group(1) == b"P6" else 1
@@ -180,7 +180,7 @@ class PnmPictures(PictureStream):
         assert match is not None  # it was cut by this
         width, height, most = (int(text) for text in match.groups()[1:])
         if not 0 < most < 65536 or width * height == 0:
-            raise ValueError(f"{width}x{height} px with values up to {most} is no picture")
+            raise ValueError(f"{width}x{height} px with values up to {most} is no image")
         shape = (height, width, 3) if match.group(1) == b"P6" else (height, width)
         values = np.frombuffer(payload, ">u2" if most > 255 else "u1", offset=match.end()).reshape(shape)
         if most != 255:
@@ -206,13 +206,13 @@ class JpegPictures(PictureStream):
         end = self._find_end()
         if end is None:
             if len(self._rest) > _MAX_JPEG:
-                raise ValueError(f"a JPEG picture does not end within {_MAX_JPEG >> 20} MiB")
+                raise ValueError(f"a JPEG image does not end within {_MAX_JPEG >> 20} MiB")
             return None
         self._searched = 0
         return self._take(end)
 
     def _find_end(self) -> int | None:
-        """Walk the segments, which may hold small pictures, to the data, which ends at the first EOI."""
+        """Walk the segments, which may hold small images, to the data, which ends at the first EOI."""
         at = 2
         while at + 4 <= len(self._rest) and self._rest[at] == 0xFF:
             kind, n_bytes = self._rest[at + 1], int.from_bytes(self._rest[at + 2 : at + 4], "big")
@@ -221,7 +221,7 @@ class JpegPictures(PictureStream):
                 found = self._rest.find(_EOI, max(at, self._searched - 1))
                 self._searched = len(self._rest)
                 return None if found < 0 else found + 2
-        if at + 4 <= len(self._rest):  # damaged: go on at the next picture
+        if at + 4 <= len(self._rest):  # damaged: go on at the next image
             following = self._rest.find(_SOI + b"\xff", 2)
             return following if following > 0 else None
         return None

@@ -45,7 +45,7 @@ class BoardView:
 
 
 def clock_state(view: BoardView) -> ClockState:
-    """Say whose clock the stamps are on, and how it is tied to others."""
+    """Say whose clock the timestamps are on, and how it is tied to others."""
     if not view.reader.dialect.has_triggers:
         return ClockState(Finding("clock.receiver", "note"))
     found: dict[str, Figure] = {}

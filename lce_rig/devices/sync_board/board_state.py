@@ -24,10 +24,10 @@ from lce_rig.timing.clock import NS_PER_S, ClockModel
 from lce_rig.timing.clock_fit import fit_arrivals
 from lce_rig.timing.clock_tracker import ClockTracker
 
-# Which times and running numbers of a sync board can be, and which tell that it began anew.
+# Which times and running numbers of a sync board can be, and which tell that it restarted.
 #
-# A line may be damaged and keep its sum. One odd value is left out; two in a row that agree with each other
-# are believed: the board, or one of its counters, began anew.
+# A line may be damaged and keep its sum. One odd value is skipped; two in a row that agree with each other
+# are believed: the board, or one of its counters, restarted.
 
 # A line is written within milliseconds of what it tells, and read whenever the computer gets to it.
 ROOM_NS = 2 * NS_PER_S
@@ -45,7 +45,7 @@ class Verdict(Enum):
 
 
 class BoardTime:
-    """The board's clock against one of the computer's that nobody sets."""
+    """The board's clock against one of the computer's that is never set."""
 
     def __init__(self) -> None:
         self._latest_ns: int | None = None
@@ -135,7 +135,7 @@ class Arrival:
 
     Attributes:
         host_ns: the computer's time of day, which may be set at any moment.
-        steady_ns: a clock of the computer that nobody sets.
+        steady_ns: a clock of the computer that is never set.
     """
 
     host_ns: int
@@ -149,9 +149,9 @@ class BoardCounts:
     Attributes:
         n_pulses: pulses handed on, by line.
         n_lost: pulses whose lines never came, by line; gaps in the running numbers tell.
-        n_resets: how often the board began anew.
-        n_implausible: messages left out because their times or numbers cannot be.
-        reset_steady_ns: when it last began anew.
+        n_resets: how often the board restarted.
+        n_implausible: messages skipped because their times or numbers cannot be.
+        reset_steady_ns: when it last restarted.
     """
 
     n_pulses: dict[str, int] = field(default_factory=dict)
@@ -178,7 +178,7 @@ class BoardState:
         """Begin with a board that has said nothing yet.
 
         Args:
-            lines: name of the camera on each channel; pulses on others are left out.
+            lines: name of the camera on each channel; pulses on others are skipped.
             has_own_counts: whether each channel counts its own pulses.
         """
         self.counts = BoardCounts()
@@ -276,7 +276,7 @@ class BoardState:
         sent_ns, turn_ns = self._asked[1], 1000 * (reply.tx_us - reply.rx_us)
         self._asked = None
         self.round_trip_ns = arrival.host_ns - sent_ns - turn_ns
-        # A clock that is set between question and answer makes nonsense of both.
+        # A clock that is set between question and answer spoils both.
         if 0 <= self.round_trip_ns <= ROOM_NS:
             middle_ns = sent_ns + (arrival.host_ns - sent_ns) // 2
             board_ns = 500 * (reply.rx_us + reply.tx_us)

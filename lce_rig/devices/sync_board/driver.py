@@ -159,7 +159,7 @@ _N_HEARD_BYTES = 2048
 class SyncBoard(LiveSource):
     """An attached sync board; a `LiveSource` of pulses.
 
-    A reader thread always drains the port: some boards block, and hold their pulse high, when nobody does.
+    A reader thread always drains the port: some boards block, and hold their pulse high, if it is not.
     """
 
     def __init__(
@@ -224,7 +224,7 @@ class SyncBoard(LiveSource):
     def read(self) -> list[Pulse]:
         """Give the pulses that came, and say to the board what is due.
 
-        Their `sensor` is the camera, or "pps"; stamps are the board's own time.
+        Their `sensor` is the camera, or "pps"; timestamps are the board's own time.
 
         Raises:
             SourceError: the board was unplugged, or fell silent for good.
@@ -268,7 +268,7 @@ class SyncBoard(LiveSource):
         """Let the pulses of the cameras begin; running numbers go on.
 
         Args:
-            rate_hz: of all lines in place of the profile's: slow pulses tell which picture is of which.
+            rate_hz: of all lines in place of the profile's: slow pulses tell which image is of which.
         """
         with self._lock:
             self._are_triggers_on, self._rate_hz = True, rate_hz

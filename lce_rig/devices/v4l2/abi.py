@@ -72,7 +72,7 @@ class FormatDescription(Structure):
 
 
 class FrameSize(Structure):
-    """One picture size that a device offers: width and height, or least, most and step of both."""
+    """One image size that a device offers: width and height, or least, most and step of both."""
 
     _fields_ = (
         ("index", c_uint32),
@@ -84,7 +84,7 @@ class FrameSize(Structure):
 
 
 class PixFormat(Structure):
-    """Size and layout of pictures."""
+    """Size and layout of images."""
 
     _fields_ = (
         ("width", c_uint32),
@@ -108,13 +108,13 @@ class _FormatUnion(Union):
 
 
 class Format(Structure):
-    """Size and layout of pictures, by type of stream."""
+    """Size and layout of images, by type of stream."""
 
     _fields_ = (("type", c_uint32), ("fmt", _FormatUnion))
 
 
 class CaptureParameters(Structure):
-    """Rate of pictures, as the time of one in numerator / denominator seconds."""
+    """Rate of images, as the time of one in numerator / denominator seconds."""
 
     _fields_ = (
         ("type", c_uint32),
@@ -150,7 +150,7 @@ class _Memory(Union):
 
 
 class Buffer(Structure):
-    """One buffer: where it lies, and what the kernel says about the picture in it."""
+    """One buffer: where it lies, and what the kernel says about the image in it."""
 
     _fields_ = (
         ("index", c_uint32),

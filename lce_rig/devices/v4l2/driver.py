@@ -1,4 +1,4 @@
-"""A camera of the kernel's video interface: pictures with the kernel's stamps, counted, in UTC."""
+"""A camera of the kernel's video interface: images with the kernel's timestamps, counted, in UTC."""
 
 import time
 from contextlib import ExitStack
@@ -14,7 +14,7 @@ from lce_rig.devices.v4l2.kernel_clock import FrameTiming, Mark, StampClock, fra
 from lce_rig.devices.v4l2.video_device import RawFrame, VideoDevice, video_devices
 from lce_rig.rig import CameraSettings
 
-# Two buffers drop pictures as soon as the computer stalls for one; eight ride out a quarter of a second.
+# Two buffers drop images as soon as the computer stalls for one; eight ride out a quarter of a second.
 N_BUFFERS = 8
 _N_SLOTS = 16
 _WAIT_S = 0.25
@@ -27,13 +27,13 @@ _SILENT_HINT = (
 class V4l2Source(LiveSource):
     """A camera at /dev/video*; see `LiveSource`.
 
-    Stamps are mid exposure in the computer's UTC: the driver's stamp, moved by the rules of `v4l2_timing` and
-    read by the clock that it fits (`v4l2_clock`). Where none fits it is the arrival, and the status says so.
+    Timestamps are mid exposure in the computer's UTC: the driver's, moved by the rules of `kernel_clock`
+    and read by the clock that they fit. Where none fits it is the arrival, and the status says so.
 
     Args:
         sensor: the camera's name in the profile.
         settings: its block of the profile.
-        silence_s: so long without a picture is an error.
+        silence_s: so long without an image is an error.
     """
 
     def __init__(self, sensor: str, settings: CameraSettings, silence_s: float = 5.0) -> None:
@@ -53,7 +53,7 @@ class V4l2Source(LiveSource):
 
     @property
     def timing(self) -> FrameTiming:
-        """How the rows are exposed; `to_mid_ns("trigger")` is what a pulse's stamp lacks to mid exposure."""
+        """How the rows are exposed; `to_mid_ns("trigger")` is the time from a pulse to mid exposure."""
         return self._timing
 
     def open(self) -> None:
@@ -117,7 +117,7 @@ class V4l2Source(LiveSource):
             self._notes.append(Finding("stream.few_buffers", "warning", figures=buffers))
 
     def _set_up_pictures(self) -> PixelDecoder:
-        """Agree on the form of the pictures.
+        """Agree on the form of the images.
 
         Raises:
             SourceError: another size than the intrinsics', or no pixel format that is read here.
@@ -139,7 +139,7 @@ class V4l2Source(LiveSource):
             raise SourceError(
                 f"{where} sends {layout.width}x{layout.height} px in {code.strip()}, "
                 f"the intrinsics belong to {width}x{height} px",
-                f"Is it another camera? Its sizes: {sizes}. Choose another, or measure intrinsics anew.",
+                f"Is it another camera? Its sizes: {sizes}. Choose another, or measure the intrinsics again.",
             )
         if layout.code != code:
             raise SourceError(

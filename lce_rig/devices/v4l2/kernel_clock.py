@@ -1,8 +1,7 @@
-"""Which of the computer's clocks stamps a camera's pictures, and what UTC time such a stamp is.
+"""Which of the computer's clocks timestamps a camera's images, and what UTC time such a timestamp is.
 
-Drivers say CLOCK_MONOTONIC. Jetson's do too, and stamp with a counter that is seconds away from it. So every
-clock is tried on the stamps themselves: a picture is younger than 0.2 s when it arrives, and never comes from
-the future.
+Drivers say CLOCK_MONOTONIC. Jetson's do too, and use a counter that is seconds away from it. So every clock
+is tried on the timestamps: an image is younger than 0.2 s when it arrives, and never of the future.
 
 References:
     https://docs.kernel.org/userspace-api/media/v4l/buffer.html (V4L2_BUF_FLAG_TIMESTAMP_*)
@@ -19,7 +18,7 @@ from lce_rig.core.findings import Figure, Finding
 from lce_rig.devices.v4l2 import abi
 from lce_rig.rig import DriverSettings
 
-# From the moment a driver stamps to the middle of the exposure, for the middle row of a picture.
+# From the moment a driver timestamps to the middle of the exposure, for the middle row of an image.
 #
 # A row of a rolling shutter is exposed and then read; the next one follows a line time later. With rows 0
 # to
@@ -37,16 +36,16 @@ from lce_rig.rig import DriverSettings
 # A global shutter has l = 0.
 
 Mark = Literal["start_of_exposure", "start_of_frame", "end_of_frame", "trigger"]
-# Their flags say end of frame; the stamp is what the video input saw of the first row (devices' forums).
+# Their flags say end of frame; the timestamp is what the video input saw of the first row (devices' forums).
 _JETSON_DRIVERS = ("tegra", "nv_", "vi5", "vi6")
 
 
 @dataclass(frozen=True)
 class FrameTiming:
-    """How the rows of a picture are exposed and read.
+    """How the rows of an image are exposed and read.
 
     Attributes:
-        n_rows: of the picture.
+        n_rows: of the image.
         exposure_ns: of a row; None where unknown.
         line_time_ns: from row to row; 0 for a global shutter.
         trigger_delay_ns: from the trigger's edge to the start of the first row's exposure.
@@ -58,7 +57,7 @@ class FrameTiming:
     trigger_delay_ns: float = 0.0
 
     def to_mid_ns(self, mark: Mark) -> int:
-        """Give what to add to a stamp of a kind to come to the middle of the exposure, (1) to (4).
+        """Give what to add to a timestamp of a kind to come to the middle of the exposure, (1) to (4).
 
         An unknown exposure counts as none.
         """
@@ -86,7 +85,7 @@ def frame_timing(settings: DriverSettings, n_rows: int, exposure_us: float | Non
 
 
 def stamped_moment(settings: DriverSettings, flags: int, driver: str) -> Mark:
-    """Find which moment a stamp marks: as the profile says, else as a buffer's flags do.
+    """Find which moment a timestamp marks: as the profile says, else as a buffer's flags do.
 
     Args:
         settings: the camera's.
@@ -102,7 +101,7 @@ def stamped_moment(settings: DriverSettings, flags: int, driver: str) -> Mark:
 
 
 MAX_DELAY_NS = 200_000_000
-# A computer that stalls takes pictures late from the queue: no reason to doubt a clock once it is known.
+# A computer that stalls takes images late from the queue: no reason to doubt a clock once it is known.
 _MAX_STALL_NS = 2_000_000_000
 # Two clocks that agree as well as this may stand for each other.
 HARMLESS_NS = 2_000_000
@@ -120,11 +119,11 @@ CLOCKS = ("monotonic", "monotonic_raw", "tsc", "tsc_minus", "boottime", "realtim
 
 @dataclass(frozen=True)
 class ClockChoice:
-    """The clock that a stamp was made with.
+    """The clock that a timestamp was made with.
 
     Attributes:
         clock: its name; None where no clock fits.
-        delays_ns: by clock, how old the stamp would be.
+        delays_ns: by clock, how old the timestamp would be.
         spread_ns: by how much the fitting clocks disagree; 0 where one fits.
     """
 
@@ -138,7 +137,7 @@ class ClockChoice:
         return self.spread_ns > HARMLESS_NS
 
     def delays_ms(self) -> tuple[Figure, ...]:
-        """List how old the stamp would be by each clock, (clock, ms)."""
+        """List how old the timestamp would be by each clock, (clock, ms)."""
         return tuple((name, delay_ns * 1e-6) for name, delay_ns in self.delays_ns.items())
 
 
@@ -157,7 +156,7 @@ def choose_clock(stamp_ns: int, now_ns: Mapping[str, int]) -> ClockChoice:
     """Choose the clock with 0 <= now - stamp <= 0.2 s.
 
     Args:
-        stamp_ns: of a picture.
+        stamp_ns: of an image.
         now_ns: readings of the candidates when it arrived.
     """
     delays = {name: now_ns[name] - stamp_ns for name in CLOCKS if name in now_ns}
@@ -169,13 +168,13 @@ def choose_clock(stamp_ns: int, now_ns: Mapping[str, int]) -> ClockChoice:
 
 
 class StampClock:
-    """Turns a driver's stamps into UTC, by the clock they fit.
+    """Turns a driver's timestamps into UTC, by the clock they fit.
 
     The computer's UTC clock may be stepped while we run; its distance from the driver's clock is measured
-    anew for every picture.
+    again for every image.
 
     Args:
-        clock: name of the driver's clock; "auto" tries the candidates on the stamps.
+        clock: name of the driver's clock; "auto" tries the candidates on the timestamps.
     """
 
     def __init__(self, clock: str = "auto") -> None:
@@ -187,7 +186,7 @@ class StampClock:
         self._is_missing = False
 
     def to_utc_ns(self, stamp_ns: int) -> int | None:
-        """Convert the stamp of a picture that has just arrived; None where no clock fits."""
+        """Convert the timestamp of an image that has just arrived; None where no clock fits."""
         now_ns, utc_ns = _read_with_utc()
         delay_ns = now_ns[self.clock] - stamp_ns if self.clock in now_ns else -1
         if not self._is_fixed and not 0 <= delay_ns <= _MAX_STALL_NS:
@@ -202,11 +201,11 @@ class StampClock:
 
     @property
     def used(self) -> str | None:
-        """Name of the clock behind the last stamp; None where arrival had to be taken."""
+        """Name of the clock behind the last timestamp; None where arrival had to be taken."""
         return None if self._is_missing else self.clock
 
     def problems(self) -> list[Finding]:
-        """Find what is doubtful about the stamps."""
+        """Find what is doubtful about the timestamps."""
         if self._is_missing:
             return [Finding("clock.missing", "warning", figures={"clock": self.clock})]
         if self._is_fixed:

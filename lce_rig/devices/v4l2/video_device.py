@@ -1,4 +1,4 @@
-"""One video device of the kernel: what it is, the form of its pictures, and its memory-mapped buffers."""
+"""One video device of the kernel: what it is, the form of its images, and its memory-mapped buffers."""
 
 import errno
 import os
@@ -19,12 +19,12 @@ _S_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Layout:
-    """How a device lays its pictures out.
+    """How a device lays its images out.
 
     Attributes:
         code: four characters of the pixel format.
         width, height: px.
-        stride: bytes from row to row; 0 for compressed pictures.
+        stride: bytes from row to row; 0 for compressed images.
     """
 
     code: str
@@ -35,12 +35,12 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class RawFrame:
-    """One picture as the kernel hands it over.
+    """One image as the kernel hands it over.
 
     Attributes:
         data: its bytes.
         stamp_ns: on the driver's clock.
-        sequence: running number; gaps are lost pictures.
+        sequence: running number; gaps are lost images.
         flags: the kernel's, see `v4l2_abi`.
     """
 
@@ -110,7 +110,7 @@ class VideoDevice:
         return codes
 
     def sizes(self, code: str) -> list[str]:
-        """List the picture sizes it offers in a pixel format, in words: "1280x720"."""
+        """List the image sizes it offers in a pixel format, in words: "1280x720"."""
         found = []
         ask = abi.FrameSize(pixel_format=code.encode())
         while self.grants(abi.ENUMERATE_SIZES, ask):
@@ -121,7 +121,7 @@ class VideoDevice:
         return found
 
     def set_layout(self, code: str, width: int, height: int) -> Layout:
-        """Ask for a form of pictures; gives what the device will deliver instead if it must.
+        """Ask for a form of images; gives what the device will deliver instead if it must.
 
         Raises:
             SourceError: another program streams from it.
@@ -132,13 +132,13 @@ class VideoDevice:
         try:
             self.ioctl(abi.SET_FORMAT, ask)
         except OSError as error:
-            raise self._explain(error, "does not take a picture format") from None
+            raise self._explain(error, "does not take an image format") from None
         pix = ask.fmt.pix
         given = pix.pixelformat.decode("ascii", "replace").ljust(4)
         return Layout(given, pix.width, pix.height, pix.bytesperline)
 
     def set_rate(self, rate_hz: float) -> float | None:
-        """Ask for pictures a second; gives what they will be, None where the device does not say."""
+        """Ask for images a second; gives what they will be, None where the device does not say."""
         ask = abi.CaptureParameters(type=abi.VIDEO_CAPTURE, numerator=1000, denominator=round(1000 * rate_hz))
         if not self.grants(abi.SET_PARAMETERS, ask) or not ask.numerator:
             return None
@@ -175,7 +175,7 @@ class VideoDevice:
         self.grants(abi.REQUEST_BUFFERS, request)
 
     def read(self, timeout_s: float) -> RawFrame | None:
-        """Wait for a picture; None where none came in time.
+        """Wait for an image; None where none came in time.
 
         Raises:
             SourceError: the device is gone.
@@ -228,9 +228,9 @@ class VideoDevice:
         where = f"camera {self._sensor!r}: {self.path} ({self.card})"
         if able & abi.CAP_VIDEO_CAPTURE_MPLANE and not able & abi.CAP_VIDEO_CAPTURE:
             hint = "Read it through a pipe: driver.type command, with gst-launch-1.0 v4l2src ... ! fdsink."
-            raise SourceError(f"{where} delivers pictures in several planes, which is not read here", hint)
+            raise SourceError(f"{where} delivers images in several planes, which is not read here", hint)
         if not able & abi.CAP_VIDEO_CAPTURE or not able & abi.CAP_STREAMING:
-            raise SourceError(f"{where} delivers no pictures; it is another end of some device", _attached())
+            raise SourceError(f"{where} delivers no images; it is another end of some device", _attached())
 
     def _explain(self, error: OSError, what: str) -> SourceError:
         """Say what a failure of the device means and what to check."""
@@ -241,7 +241,7 @@ class VideoDevice:
                 return SourceError(f"{where} is gone", hint)
             return SourceError(f"{where} is not there", _attached())
         if error.errno in (errno.EACCES, errno.EPERM):
-            hint = "Add yourself to the group of the device: sudo usermod -aG video $USER, then log in anew."
+            hint = "Add yourself to the group of the device: sudo usermod -aG video $USER, then log in again."
             return SourceError(f"{where} may not be opened by you", hint)
         if error.errno == errno.EBUSY:
             return SourceError(

@@ -122,7 +122,7 @@ def _find_problems(settings: LidarSettings, stream: Vlp16Stream, reception: Rece
     return problems
 
 
-# Why no packets of a VLP-16 come: what can be told from here, and what is left to check.
+# Why no packets of a VLP-16 come: what can be found from here, and what is left to check.
 
 _WEB_TIMEOUT_S = 1.0
 _EVERYBODY = "255.255.255.255"

@@ -1,4 +1,4 @@
-"""A UDP port of the host, with the kernel's own arrival stamps and its count of what it had to drop."""
+"""A UDP port of the host, with the kernel's own arrival timestamps and its count of what it had to drop."""
 
 import contextlib
 import ctypes
@@ -138,7 +138,7 @@ class UdpPort:
     Attributes:
         port: its number.
         granted_bytes: receive buffer that the kernel granted.
-        n_overflowed: datagrams that the kernel dropped because nobody took them in time.
+        n_overflowed: datagrams that the kernel dropped because they were not taken in time.
     """
 
     def __init__(self, port: int, what: str) -> None:
@@ -159,8 +159,8 @@ class UdpPort:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WANTED_BUFFER_BYTES)
             for option in (_SO_TIMESTAMPNS, _SO_RXQ_OVFL):
-                # Without the one arrivals are stamped a little later, without the other drops are not told
-                # from losses on the way.
+                # Without the one arrivals are stamped a little later; without the other, drops look like
+                # losses in the network.
                 with contextlib.suppress(OSError):
                     self._socket.setsockopt(socket.SOL_SOCKET, option, 1)
             self._socket.setblocking(False)

@@ -357,8 +357,9 @@ def _push(stream: Vlp16Stream, datagram: Datagram) -> Scan | None:
 
 def _account(stream: Vlp16Stream) -> list[str]:
     """Say what was lost or skipped, in words."""
-    return [describe(each) for each in stream.losses.findings()]
+    lost = [each for each in stream.losses.findings() if not each.subject]
+    return [describe(each) for each in lost + stream.flaws()]
 
 
 def _flaw(code: str, n: int) -> Finding:
-    return Finding(code, "warning", subject="data", figures={"n": n})
+    return Finding(code, "warning", figures={"n": n, "of": "data"})

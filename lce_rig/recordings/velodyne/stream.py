@@ -214,7 +214,11 @@ class Vlp16Stream:
 
     def flaws(self) -> list[Finding]:
         """List what was wrong with single packets of either kind."""
-        return [each for each in self.losses.findings() if each.subject]
+        return [
+            Finding(each.code, each.severity, figures={**each.figures, "of": each.subject})
+            for each in self.losses.findings()
+            if each.subject
+        ]
 
     def push_position(self, payload: bytes | memoryview, host_ns: int) -> None:
         """Take a position packet; a bad one is counted."""

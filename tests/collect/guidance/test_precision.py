@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.guidance import combine, predict_covariance, sigmas, weigh_placements
-from lce_rig.collect.guidance.precision import combine_with_each
+from lce_rig.collect.guidance.evidence import combine_with_each
 from lce_rig.collect.guidance.sensor_noise import ErrorModel
 from lce_rig.core.geometry import difference, invert
 from lce_rig.core.results import Observation

@@ -10,8 +10,7 @@ import pytest
 
 from lce_rig.collect.live.collection import collect_live
 from lce_rig.collect.live.guide import make_guides
-from lce_rig.collect.live.options import Key, LiveOptions
-from lce_rig.collect.live.state import LiveState
+from lce_rig.collect.live.state import Key, LiveOptions, LiveState
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.session import Session
 from tests.collect.live.replay import Show, placements, rig

@@ -1,4 +1,4 @@
-"""When live boards are captured, by sightings that come one by one."""
+"""When live boards are captured, by detections that come one by one."""
 
 from dataclasses import replace
 from functools import cache
@@ -26,7 +26,7 @@ def boards(k: int = 0) -> tuple[ImageBoard, list[LidarBoard]]:
     return image, scan
 
 
-def sighting(step: int, shift_px: float = 0.0, k: int = 0) -> BoardDetection:
+def detection(step: int, shift_px: float = 0.0, k: int = 0) -> BoardDetection:
     """Show a placement at a time, its corners shifted."""
     image, scan = boards(k)
     moved = replace(image, corners_px=image.corners_px + shift_px)
@@ -39,7 +39,7 @@ def present() -> Array:
 
 def test_a_board_is_captured_once_when_it_was_held_long_enough() -> None:
     gate = StillBoards(rig(), HOLD_S)
-    taken = [step for step in range(40) if gate.take(sighting(step))]
+    taken = [step for step in range(40) if gate.take(detection(step))]
     # Half a second tells that it stands still, the hold comes after that.
     assert taken == [12]
 
@@ -47,7 +47,7 @@ def test_a_board_is_captured_once_when_it_was_held_long_enough() -> None:
 def test_a_board_that_is_moved_on_before_its_time_is_not_captured() -> None:
     gate = StillBoards(rig(), HOLD_S)
     shifts = [0.0] * 9 + [30.0 * k for k in range(1, 6)] + [180.0] * 14
-    taken = [step for step, shift in enumerate(shifts) if gate.take(sighting(step, shift))]
+    taken = [step for step, shift in enumerate(shifts) if gate.take(detection(step, shift))]
     assert taken == [14 + 12]
 
 
@@ -57,7 +57,7 @@ def test_what_is_said_counts_the_hold_down_and_then_goes_on() -> None:
     gate = StillBoards(rig(), HOLD_S)
     said = []
     for step in range(20):
-        moments = gate.take(sighting(step))
+        moments = gate.take(detection(step))
         if moments:
             guide.add("000000", present())
             guide.plan(None, 0.0)
@@ -77,7 +77,7 @@ def test_a_place_that_adds_nothing_is_refused_while_the_board_stands_there() -> 
     guide.plan(None, 0.0)
     gate = StillBoards(rig(), HOLD_S)
     for step in range(8):
-        gate.take(sighting(step))
+        gate.take(detection(step))
         said = gate.narrate(guide, present())
     assert said.phase == "refused" and said.hold_s is None
     assert "capture 000007" in said.detail

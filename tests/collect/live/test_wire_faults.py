@@ -13,8 +13,7 @@ from wire.reel import Reel
 from wire.rig import WireRig
 
 from lce_rig.collect.live.collection import collect_live
-from lce_rig.collect.live.options import LiveOptions
-from lce_rig.collect.live.state import LiveState
+from lce_rig.collect.live.state import LiveOptions, LiveState
 from lce_rig.devices.opening import open_live
 from lce_rig.session import Session
 from tests.collect.live.sent import check_sent, check_stamps, check_whole, errors, journal_of, read_sent

@@ -1,7 +1,10 @@
 """What all dialects have in common, and a reader that turns bytes into messages with one of them."""
 
+import re
 from abc import ABC, abstractmethod
 from collections import Counter
+from functools import reduce
+from operator import xor
 from typing import TypeAlias
 
 from lce_rig.devices.sync_board.lines.messages import LineFault, Message
@@ -15,7 +18,7 @@ class LineSplitter:
     """Bytes in as they come, whole lines out.
 
     Attributes:
-        n_too_long: lines longer than 512 bytes, which are left out.
+        n_too_long: lines longer than 512 bytes, which are skipped.
     """
 
     def __init__(self) -> None:
@@ -24,7 +27,7 @@ class LineSplitter:
         self._is_cut = False
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Take bytes and give the lines that they complete, without their ends; empty ones are left out."""
+        """Take bytes and give the lines that they complete, without their ends; empty ones are skipped."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if lines and self._is_cut:
             del lines[0]
@@ -79,7 +82,7 @@ class Dialect(ABC):
         return b""
 
     def set_utc(self, t_us: int, utc_s: int) -> bytes:
-        """Tell the board which UTC second begins at a moment of its clock; empty where it cannot be told."""
+        """Tell the board which UTC second begins at a moment of its clock; empty where it takes none."""
         return b""
 
     def start(self) -> bytes:
@@ -119,3 +122,42 @@ class LineReader:
             self.faults[LineFault.TOO_LONG] = self._splitter.n_too_long
         self.n_messages += len(messages)
         return messages
+
+
+# Sentences as NMEA 0183 has them: `$`, name and fields, `*`, and the exclusive or of what lies between.
+#
+# The sum is weak: two characters that trade places leave it unchanged. What passes is still compared with a
+# strict grammar, and with what the board has said before (`BoardState`).
+#
+# References:
+#     NMEA 0183 sentence format; checksums of one digit instead of two are written by boards in the field.
+
+_SENTENCE = re.compile(rb"([!-#%-)+-~ ]+)\*([0-9A-Fa-f]{1,2})\Z")
+
+
+def checksum(body: bytes) -> int:
+    """Compute the exclusive or of all bytes between `$` and `*`."""
+    return reduce(xor, body, 0)
+
+
+def write_sentence(body: str) -> bytes:
+    """Frame the name and fields of a sentence."""
+    data = body.encode("ascii")
+    return b"$%s*%02X\r\n" % (data, checksum(data))
+
+
+def split_sentence(line: bytes) -> list[bytes] | LineFault:
+    """Take a sentence apart into its name and fields.
+
+    What stands before the last `$` is skipped: a board that restarts breaks off in the middle of a line.
+
+    Args:
+        line: without its end.
+    """
+    start = line.rfind(b"$")
+    found = _SENTENCE.match(line, start + 1) if start >= 0 else None
+    if found is None:
+        return LineFault.MALFORMED if start >= 0 else LineFault.UNKNOWN
+    if checksum(found[1]) != int(found[2], 16):
+        return LineFault.CHECKSUM
+    return found[1].split(b",")

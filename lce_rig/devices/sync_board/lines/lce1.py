@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable
 
-from lce_rig.devices.sync_board.lines.dialect import Dialect, Reading
+from lce_rig.devices.sync_board.lines.dialect import Dialect, Reading, split_sentence, write_sentence
 from lce_rig.devices.sync_board.lines.messages import (
     MAX_COUNT,
     MAX_US,
@@ -19,7 +19,6 @@ from lce_rig.devices.sync_board.lines.messages import (
     TriggerEdge,
 )
 from lce_rig.devices.sync_board.lines.nmea import read_rmc
-from lce_rig.devices.sync_board.lines.sentence import split_sentence, write_sentence
 
 VERSION = 1
 

@@ -1,4 +1,4 @@
-"""What a sync board may say, whatever its dialect."""
+"""What a sync board may say, in any dialect."""
 
 from dataclasses import dataclass
 from enum import Enum

@@ -3,9 +3,8 @@
 import re
 from datetime import datetime, timezone
 
-from lce_rig.devices.sync_board.lines.dialect import Dialect, Reading
+from lce_rig.devices.sync_board.lines.dialect import Dialect, Reading, split_sentence
 from lce_rig.devices.sync_board.lines.messages import LineFault, UtcTime
-from lce_rig.devices.sync_board.lines.sentence import split_sentence
 
 _TIME = re.compile(rb"([01][0-9]|2[0-3])([0-5][0-9])([0-5][0-9])(?:\.([0-9]{1,9}))?\Z")
 _DATE = re.compile(rb"([0-9]{2})([0-9]{2})([0-9]{2})\Z")

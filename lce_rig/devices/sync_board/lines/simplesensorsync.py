@@ -1,7 +1,7 @@
 """SimpleSensorSync's JSON lines: `{"f":"t","s":mask,"t":us,"c":count}` for triggers, an exchange for time.
 
 A request `{"f":"a","a":n}` is answered by two lines: `{"f":"a","a":n,"b":received}` and `{"f":"b","a":sent}`.
-The board would set its own clock by a further line from the host. None is sent: a clock that nobody touches
+The board would set its own clock by a further line from the host. None is sent: a clock that is never set
 is easier to model. There is no checksum; a line is taken only if its values are whole numbers in range.
 
 References:
