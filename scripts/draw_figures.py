@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Draw the pictures of docs/images/ that show a rig, with lce-rig itself, on the simulated rig rlfs.
+"""Draw the pictures of docs/images/ that show a rig, with lce-rig itself, on simulated rigs.
 
 draw_figures.py [NAME...]   only these; the two screens need Chromium and `pip install '.[docs]'`
 """
@@ -42,12 +42,22 @@ def _good_and_bad() -> None:
 
 
 def _debug() -> None:
+    _save_debug_picture("rlfs", ["--captures", "4", "--seed", "1"], "000003.png", "debug.jpg")
+
+
+def _events() -> None:
+    options = ["--captures", "2", "--seed", "2", "--motion", "moving"]
+    _save_debug_picture("rles", options, "davis.events.lidar/000001.png", "events.jpg")
+
+
+def _save_debug_picture(rig: str, options: list[str], picture: str, name: str) -> None:
+    """Simulate a session, and keep one of the pictures that `check --debug-images` draws of it."""
     with tempfile.TemporaryDirectory() as folder:
         session = str(Path(folder, "session"))
-        assert run(["simulate", session, "--rig", "rlfs", "--captures", "4", "--seed", "1"]) == 0
+        assert run(["simulate", session, "--rig", rig, *options]) == 0
         assert run(["check", session, "--debug-images"]) == 0
-        picture = cv2.imread(str(Path(session, "debug", "000003.png")))
-    cv2.imwrite(str(FOLDER / "debug.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 82])
+        drawn = cv2.imread(str(Path(session, "debug", picture)))
+    cv2.imwrite(str(FOLDER / name), drawn, [cv2.IMWRITE_JPEG_QUALITY, 82])
 
 
 def _frames() -> None:
@@ -70,6 +80,7 @@ FIGURES: dict[str, Callable[[], None]] = {
     "refused": _refused,
     "good_and_bad": _good_and_bad,
     "debug": _debug,
+    "events": _events,
     "frames": _frames,
     "screens": _screens,
 }

@@ -19,6 +19,8 @@ ImageKey = tuple[str, str]
 
 # A candidate is the camera's board where it lies as far from it as nominal extrinsics may be off, and a half.
 _NOMINAL_MARGIN = 1.5
+# Nominal extrinsics that fit a board so well at one distance fit boards at all distances.
+_PROVED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,12 +201,11 @@ class BoardTracker:
                 nominal = self.rig.nominal(camera, lidar)
                 if nominal is None:
                     return None
-                nearest = _compare(board, candidates, nominal)
-                if nearest is None:
+                misfit, elsewhere = _compare(board, candidates, nominal)
+                if misfit <= _PROVED:
                     self._are_proved.add((camera, lidar))
-                if nearest is None or (camera, lidar) not in self._are_proved:
+                if misfit <= 1 or (camera, lidar) not in self._are_proved:
                     return None
-                elsewhere = nearest
         return elsewhere
 
     def _find_in_image(self, image: Image, key: ImageKey, time_ns: int) -> ImageSearch | None:
@@ -256,8 +257,14 @@ def _is_due(last_ns: dict[ImageKey | str, int], key: ImageKey | str, time_ns: in
     return True
 
 
-def _compare(board: ImageBoard, candidates: list[LidarBoard], nominal: NominalExtrinsic) -> Refusal | None:
-    """Compare candidates with where an image and nominal extrinsics have the board; None where one fits."""
+def _compare(
+    board: ImageBoard, candidates: list[LidarBoard], nominal: NominalExtrinsic
+) -> tuple[float, Refusal]:
+    """Compare candidates with where an image and nominal extrinsics have the board.
+
+    Returns:
+        The best one's misfit, 1 for the largest that is allowed, and the refusal if it is larger.
+    """
     T_lidar_cam = invert(nominal.to_matrix())
     poses = [pose for pose in (board.T_cam_board, board.T_cam_board_alternative) if pose is not None]
     distance, angle = np.array(
@@ -268,14 +275,12 @@ def _compare(board: ImageBoard, candidates: list[LidarBoard], nominal: NominalEx
     max_m = CENTRE_TOLERANCE_M + _NOMINAL_MARGIN * nominal.tolerance_m + range_m * turn_rad
     misfit = np.maximum(distance / max_m, angle / (NORMAL_TOLERANCE_RAD + turn_rad))
     best = int(np.argmin(misfit))
-    if misfit[best] <= 1:
-        return None
     figures = {
         "n_candidates": len(candidates),
         "distance_m": float(distance[best]),
         "rotation_deg": float(np.degrees(angle[best])),
     }
-    return Refusal("lidar.elsewhere", figures=figures)
+    return float(misfit[best]), Refusal("lidar.elsewhere", figures=figures)
 
 
 def _apart(T_1: Array, T_2: Array) -> tuple[float, float]:

@@ -17,9 +17,17 @@ def test_equal_names_are_paired_whatever_their_order():
 
 
 def test_a_few_without_partner_are_left_out_and_said():
-    pairing = pair_names(COUNTERS * 2 + ["x"], [*(COUNTERS * 2)[:-1], "y"])
-    assert has_note([pairing.explanation], "equal file", "1 images", "6 point clouds")
-    assert 12 in pairing.lone_images and 11 in pairing.lone_clouds
+    pairing = pair_names([*COUNTERS, "x"], [*COUNTERS[:-1], "y"])
+    assert has_note([pairing.explanation], "5 pairs", "equal file", "2 images", "1 point clouds")
+    assert (pairing.lone_images, pairing.lone_clouds) == ((5, 6), (5,))
+
+
+def test_of_files_with_one_name_each_has_a_partner_of_its_own_as_far_as_they_go():
+    pairing = pair_names(["00000", "00000", "00001"], ["00000", "00001", "00001"], "stem")
+    assert pairing.pairs == ((0, 0), (1, 0), (2, 1))
+    assert (pairing.lone_images, pairing.lone_clouds) == ((), (2,))
+    twice = pair_names(sorted(COUNTERS * 2), sorted(COUNTERS * 2))
+    assert twice.pairs == tuple((k, k) for k in range(12)) and not twice.lone_clouds
 
 
 def test_names_that_are_times_within_the_tolerance_are_paired_by_time():

@@ -114,8 +114,15 @@ def _choose(
 
 
 def _by_stem(images: Sequence[str], clouds: Sequence[str]) -> Pairing:
-    position = {name: j for j, name in enumerate(clouds)}
-    pairs = [(i, position[name]) for i, name in enumerate(images) if name in position]
+    places: dict[str, list[int]] = {}
+    for j in reversed(range(len(clouds))):
+        places.setdefault(clouds[j], []).append(j)
+    pairs = []
+    for i, name in enumerate(images):
+        if name in places:
+            # Files may differ in their suffix only: the first goes with the first, the rest with the last.
+            left = places[name]
+            pairs.append((i, left.pop() if len(left) > 1 else left[0]))
     return _pairing("stem", pairs, len(images), len(clouds), "paired by equal file names")
 
 

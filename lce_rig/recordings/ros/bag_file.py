@@ -57,11 +57,6 @@ class BagFile:
         """What is wrong with the bag, as far as it was read; "" where nothing is."""
         return str(self._damages)
 
-    @property
-    def n_messages(self) -> int:
-        """Number of messages of all topics."""
-        return sum(count for _, count in self.topics.values())
-
     def fingerprint(self) -> str:
         """Hash names, sizes and both ends of the files: enough to know a recording again."""
         return fingerprint(self._readable)
