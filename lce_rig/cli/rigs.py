@@ -198,37 +198,149 @@ def _print_warnings(rig: "Rig") -> None:
 @rigs.command("new")
 @click.argument("name")
 @click.option(
-    "--from", "origin", default="rlfs", show_default=True, help="Derive from this profile, a name or a file."
+    "--from",
+    "origin",
+    metavar="RIG|BAG",
+    help="Profile to derive from, or a bag of the rig [default: rlfs, unless a sensor is given].",
+)
+@click.option("--lidar", metavar="MODEL", help="Model of the LiDAR, such as OS1-64.")
+@click.option("--camera", "cameras", multiple=True, metavar="NAME", help="Name of a camera; may be repeated.")
+@click.option(
+    "--intrinsics",
+    multiple=True,
+    metavar="FILE|NUMBERS",
+    help="Of each camera in turn: a camera_info file of ROS, or MODEL,WIDTHxHEIGHT,FX,FY,CX,CY,K1,...",
+)
+@click.option(
+    "--board",
+    metavar="COLSxROWS,SQUARE,WIDTHxHEIGHT[,RIGHT,UP]",
+    help="Inner corners, square and plate in m, and how far the pattern is off the plate's centre.",
 )
 @click.option(
     "--set",
     "settings",
     multiple=True,
     metavar="KEY=VALUE",
-    help="Set a key, such as board.square_m=0.08; repeatable.",
+    help="Set a key, as board.square_m=0.08; may be repeated.",
 )
-@click.option("-o", "--output", help="Write to this file, - for stdout  [default: NAME.yaml]")
-def new_profile(name: str, origin: str, settings: tuple[str, ...], output: str | None) -> None:
-    """Derive the profile NAME from another, with its comments."""
-    from lce_rig.core.errors import UsageError
-    from lce_rig.rig import derive_text, find_profile, load_rig, read_profile
+@click.option(
+    "--unset", "removed", multiple=True, metavar="KEY", help="Remove a key or a block; may be repeated."
+)
+@click.option("-o", "--output", help="File to write, - for stdout [default: NAME.yaml].")
+def new_profile(
+    name: str,
+    origin: str | None,
+    lidar: str | None,
+    cameras: tuple[str, ...],
+    intrinsics: tuple[str, ...],
+    board: str | None,
+    settings: tuple[str, ...],
+    removed: tuple[str, ...],
+    output: str | None,
+) -> None:
+    """Write a profile NAME: for sensors of your own, from a bag of them, or derived from another profile.
 
-    pairs = [setting.partition("=") for setting in settings]
-    for key, equals, value in pairs:
-        if not (key and equals and value):
-            raise UsageError(f"--set {key}{equals}{value}: expected KEY=VALUE, such as board.square_m=0.08")
-    parent = load_rig(origin)
+    \b
+      lce-rig rigs new truck --lidar OS1-64 --camera front --intrinsics camera_info.yaml \\
+                             --board 8x6,0.07,0.767x0.626
+      lce-rig rigs new truck --from drive.bag --lidar OS1-64 --board 8x6,0.07,0.767x0.626
+      lce-rig rigs new mine --from rlfs --set board.square_m=0.08 --unset sync
+    """
+    from lce_rig.core.errors import UsageError
+    from lce_rig.rig import edit_text, load_rig
+
+    values = [_setting(text) for text in settings]
     path = Path(output or f"{name}.yaml")
-    original = read_profile(find_profile(origin))
-    values = [(key.strip(), value.strip()) for key, _, value in pairs]
-    target = name if output == "-" else str(path)
-    text = derive_text(original, name, values, f"{target} (not written)", parent.name)
+    target = f"{name if output == '-' else path} (not written)"
+    has_sensors = bool(lidar or cameras or intrinsics)
+    bag = None if origin is None or not _is_bag(Path(origin)) else Path(origin)
+    if bag is not None or (origin is None and has_sensors):
+        text = _from_sensors(name, bag, lidar, cameras, intrinsics, board, target)
+        text = edit_text(text, values, removed, target)
+    elif has_sensors:
+        raise UsageError(
+            f"--lidar, --camera and --intrinsics do not go with the profile --from {origin}",
+            "Change its sensors with --set, or leave --from away for a profile of your own sensors.",
+        )
+    else:
+        text = _derived(name, origin or "rlfs", [*_board_settings(board), *values], removed, target)
     if output == "-":
         click.echo(text, nl=False)
         return
     _write_new(path, text)
-    screen.note(f"wrote {path}; measure your board and edit it, then: lce-rig rigs check {path}")
+    screen.note(f"wrote {path}; compare it with your rig, then: lce-rig rigs check {path}")
     _print_warnings(load_rig(path))
+
+
+def _setting(text: str) -> tuple[str, str]:
+    from lce_rig.core.errors import UsageError
+
+    key, equals, value = text.partition("=")
+    if not (key and equals and value):
+        raise UsageError(f"--set {text}: KEY=VALUE is expected, such as board.square_m=0.08")
+    return key.strip(), value.strip()
+
+
+def _is_bag(path: Path) -> bool:
+    """Tell a bag from a profile, by its suffix or what lies in the folder."""
+    from lce_rig.recordings.ros.bag_file import SUFFIXES
+
+    return path.suffix in SUFFIXES or (
+        path.is_dir() and any(entry.suffix in SUFFIXES for entry in path.iterdir())
+    )
+
+
+def _from_sensors(
+    name: str,
+    bag: Path | None,
+    lidar: str | None,
+    cameras: tuple[str, ...],
+    intrinsics: tuple[str, ...],
+    board: str | None,
+    target: str,
+) -> str:
+    """Write a profile's text from its parts; say what was found in a bag."""
+    from lce_rig.core.errors import UsageError
+    from lce_rig.pipeline.new_profile import BOARD_FORM, new_profile, parse_board, parse_intrinsics
+
+    if board is None:
+        raise UsageError("the board is missing", f"Measure it, and add --board {BOARD_FORM}")
+    text, found = new_profile(
+        name,
+        parse_board(board),
+        recording=bag,
+        lidar_model=lidar,
+        cameras=cameras,
+        intrinsics=[parse_intrinsics(each) for each in intrinsics],
+        source=target,
+    )
+    for line in found:
+        screen.note(line)
+    return text
+
+
+def _derived(
+    name: str, origin: str, values: list[tuple[str, str]], removed: tuple[str, ...], target: str
+) -> str:
+    from lce_rig.rig import derive_text, find_profile, load_rig, read_profile
+
+    parent = load_rig(origin)
+    return derive_text(read_profile(find_profile(origin)), name, values, target, parent.name, removed)
+
+
+def _board_settings(text: str | None) -> list[tuple[str, str]]:
+    from lce_rig.pipeline.new_profile import parse_board
+
+    if text is None:
+        return []
+    board = parse_board(text)
+    return [
+        ("board.inner_corners", f"[{board.cols}, {board.rows}]"),
+        ("board.square_m", f"{board.square_m:g}"),
+        ("board.width_m", f"{board.width_m:g}"),
+        ("board.height_m", f"{board.height_m:g}"),
+        ("board.pattern_offset_m", f"[{board.pattern_offset_m[0]:g}, {board.pattern_offset_m[1]:g}]"),
+    ]
 
 
 def _write_new(path: Path, text: str) -> None:

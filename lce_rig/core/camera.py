@@ -31,6 +31,37 @@ class Intrinsics:
     model: Literal["radtan", "equidistant"] = "radtan"
     distortion: tuple[float, ...] = ()
 
+    @classmethod
+    def from_ros(
+        cls, model: str, K: Array, distortion: tuple[float, ...], size_px: tuple[int, int]
+    ) -> "Intrinsics":
+        """Take the fields of sensor_msgs/CameraInfo.
+
+        Args:
+            model: plumb_bob, rational_polynomial, equidistant or fisheye; "" where nothing is distorted.
+            K: (3, 3) or (9,).
+            distortion: its coefficients.
+            size_px: (width, height).
+
+        Raises:
+            ValueError: a model that cannot be used, another number of coefficients, or no camera matrix.
+        """
+        names: dict[str, tuple[Literal["radtan", "equidistant"], tuple[int, ...]]] = {
+            "": ("radtan", (0,)),
+            "plumb_bob": ("radtan", (0, 4, 5)),
+            "rational_polynomial": ("radtan", (8,)),
+            "equidistant": ("equidistant", (4,)),
+            "fisheye": ("equidistant", (4,)),
+        }
+        if model not in names or len(distortion) not in names[model][1]:
+            known = ", ".join(f"{name} {n[-1]}" for name, (_, n) in names.items() if name)
+            raise ValueError(f"{model!r} with {len(distortion)} coefficients cannot be used ({known} can)")
+        fx, _, cx, _, fy, cy, *_ = (float(value) for value in np.asarray(K, dtype=np.float64).ravel())
+        if not (np.isfinite([fx, fy, cx, cy, *distortion]).all() and fx > 0 and fy > 0):
+            raise ValueError(f"its camera matrix is not measured (fx {fx:g}, fy {fy:g})")
+        coefficients = tuple(float(value) for value in distortion)
+        return cls(fx, fy, cx, cy, *size_px, model=names[model][0], distortion=coefficients)
+
     @cached_property
     def matrix(self) -> Array:
         """The camera matrix K (3, 3)."""

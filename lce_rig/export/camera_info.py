@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.errors import LceRigError
+from lce_rig.core.errors import LceRigError, ProfileError
+from lce_rig.core.limits import MAX_DOCUMENT_BYTES, describe, read_file
 from lce_rig.core.results import Calibration
 from lce_rig.export.files import header, numbers, quoted, reads_back
 from lce_rig.export.frames import choose_channels
@@ -78,17 +79,33 @@ def read_camera_info(path: Path) -> Intrinsics:
     import yaml
 
     data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    models: dict[str, tuple[Literal["radtan", "equidistant"], int]] = {
-        "plumb_bob": ("radtan", 5),
-        "rational_polynomial": ("radtan", 8),
-        "equidistant": ("equidistant", 4),
-    }
-    name, coefficients = data["distortion_model"], tuple(data["distortion_coefficients"]["data"])
     K, P = np.array(data["camera_matrix"]["data"]), np.array(data["projection_matrix"]["data"])
-    if name not in models or len(coefficients) != models[name][1]:
-        raise LceRigError(f"{path}: {name} with {len(coefficients)} coefficients is not a model of ROS")
     if not np.array_equal(P.reshape(3, 4), np.hstack([K.reshape(3, 3), np.zeros((3, 1))])):
-        raise LceRigError(f"{path}: projection_matrix contradicts camera_matrix")
-    fx, _, cx, _, fy, cy, *_ = (float(value) for value in K)
-    size = data["image_width"], data["image_height"]
-    return Intrinsics(fx, fy, cx, cy, *size, model=models[name][0], distortion=coefficients)
+        raise LceRigError(f"{path}: projection_matrix does not belong to camera_matrix")
+    return _intrinsics(data)
+
+
+def load_camera_info(path: Path) -> Intrinsics:
+    """Read a camera_info file of any maker; its projection_matrix, of a rectified image, is not used.
+
+    Raises:
+        ProfileError: it cannot be read, or is none, or of a camera that was not calibrated.
+    """
+    import yaml
+
+    try:
+        data = yaml.safe_load(read_file(path, MAX_DOCUMENT_BYTES))
+        return _intrinsics(data)
+    except OSError as error:
+        raise ProfileError(f"{path}: cannot be read: {error.strerror}") from None
+    except (KeyError, TypeError) as error:
+        raise ProfileError(f"{path}: not a camera_info file of ROS: {describe(str(error))}") from None
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        raise ProfileError(f"{path}: not a usable camera_info file: {' '.join(str(error).split())}") from None
+
+
+def _intrinsics(data: Any) -> Intrinsics:
+    coefficients = tuple(float(value) for value in data["distortion_coefficients"]["data"])
+    size = int(data["image_width"]), int(data["image_height"])
+    K = np.array(data["camera_matrix"]["data"], dtype=np.float64)
+    return Intrinsics.from_ros(str(data["distortion_model"]), K, coefficients, size)

@@ -10,7 +10,14 @@ from lce_rig.rig.document import BAD_SCALARS, read_document
 from lce_rig.rig.loading import rig_from_document
 
 
-def derive_text(text: str, name: str, settings: Sequence[tuple[str, str]], source: str, origin: str) -> str:
+def derive_text(
+    text: str,
+    name: str,
+    settings: Sequence[tuple[str, str]],
+    source: str,
+    origin: str,
+    removed: Sequence[str] = (),
+) -> str:
     """Derive a profile's text from another's.
 
     Args:
@@ -19,6 +26,7 @@ def derive_text(text: str, name: str, settings: Sequence[tuple[str, str]], sourc
         settings: (key path, YAML value) to set, such as ("board.square_m", "0.08").
         source: name of the new text in errors, usually its file.
         origin: name of the other profile.
+        removed: key paths to remove, such as "nominal_extrinsics".
 
     Returns:
         The new profile, which is valid.
@@ -28,8 +36,19 @@ def derive_text(text: str, name: str, settings: Sequence[tuple[str, str]], sourc
         UsageError: a value that is not YAML, or a path into something that has no keys.
     """
     head = f"# {name}: made from {origin} by `lce-rig rigs new`; the comments below are from {origin}.\n"
-    # A name such as 346 is text only in quotes.
-    text = head + set_value(text, "name", name if _is_plain(name) else json.dumps(name))
+    # What the other profile says of itself above its first key does not hold for this one.
+    text = text[_begin(text) :]
+    # A name such as 346 is a text only in quotes.
+    text = head + set_value(text, "name", name if is_plain(name) else json.dumps(name))
+    if "description" not in [key for key, _ in settings]:
+        text = remove_key(text, "description", must_exist=False)
+    return edit_text(text, settings, removed, source)
+
+
+def edit_text(text: str, settings: Sequence[tuple[str, str]], removed: Sequence[str], source: str) -> str:
+    """Remove and set keys of a profile's text; arguments, result and errors as of `derive_text`."""
+    for path in removed:
+        text = remove_key(text, path)
     for path, value in settings:
         text = set_value(text, path, value)
     rig_from_document(read_document(text, source))
@@ -64,8 +83,63 @@ def set_value(text: str, path: str, value: str) -> str:
     return new
 
 
-def _is_plain(name: str) -> bool:
-    """Return whether YAML reads a text back unchanged without quotes."""
+def remove_key(text: str, path: str, *, must_exist: bool = True) -> str:
+    """Remove one key with its value and the comments directly above it.
+
+    Args:
+        text: valid YAML.
+        path: keys and places in lists joined by dots: "nominal_extrinsics", "cameras.cam.driver".
+        must_exist: whether a key that is missing is an error.
+
+    Raises:
+        UsageError: there is no such key, or it cannot be removed.
+    """
+    keys = path.split(".")
+    root = yaml.compose(text, Loader=yaml.SafeLoader)
+    node, depth = (root, 0) if root is None else _descend(root, keys[:-1])
+    entry = None
+    if depth == len(keys) - 1 and isinstance(node, yaml.MappingNode):
+        entry = next(((key, value) for key, value in node.value if key.value == keys[-1]), None)
+    if entry is None or not isinstance(node, yaml.MappingNode):
+        if must_exist:
+            raise UsageError(f"--unset {path}: the profile has no such key")
+        return text
+    key, value = entry
+    if node.flow_style:
+        raise UsageError(f"--unset {path}: remove it with --set {'.'.join(keys[:-1])}=VALUE")
+    begin = text.rfind("\n", 0, key.start_mark.index) + 1
+    indent = key.start_mark.column
+    while begin > 0:
+        above = text.rfind("\n", 0, begin - 1) + 1
+        line = text[above : begin - 1]
+        if not (line.lstrip().startswith("#") and len(line) - len(line.lstrip()) == indent):
+            break
+        begin = above
+    end = text.find("\n", _end(value))
+    new = text[:begin] + ("" if end < 0 else text[end + 1 :])
+    if _holds_key(new, keys):
+        raise UsageError(f"--unset {path}: it cannot be removed there")
+    return new
+
+
+def _begin(text: str) -> int:
+    """Find where the first key stands, behind the comments above it."""
+    root = yaml.compose(text, Loader=yaml.SafeLoader)
+    return 0 if root is None else int(root.start_mark.index)
+
+
+def _holds_key(text: str, keys: Sequence[str]) -> bool:
+    try:
+        data = yaml.safe_load(text)
+        for key in keys:
+            data = data[int(key)] if isinstance(data, list) else data[key]
+    except (yaml.YAMLError, RecursionError, *BAD_SCALARS):
+        return False
+    return True
+
+
+def is_plain(name: str) -> bool:
+    """Return whether a text is read as that text without quotes."""
     try:
         return bool(yaml.safe_load(name) == name)
     except (yaml.YAMLError, RecursionError, *BAD_SCALARS):

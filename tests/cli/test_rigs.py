@@ -118,3 +118,30 @@ def test_new_writes_nothing_where_something_is_wrong(
     assert run(["rigs", "new", "mine", *arguments]) == code
     assert says in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_profile_of_ones_own_sensors_takes_one_command(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "os1.yaml"
+    lens = "equidistant,1920x1208,959.554,960.194,940.789,670.737,-0.097824,0.141429,-0.148385,0.055918"
+    words = ["rigs", "new", "os1", "--lidar", "OS1-64", "--intrinsics", lens, "-o", str(path)]
+    assert run(words) == 2  # without the board
+    assert not path.exists()
+    assert run([*words, "--board", "5x7,0.095,0.61x0.85", "--set", "lidars.lidar.rate_hz=20"]) == 0
+    assert run(["rigs", "check", str(path)]) == 0
+    rig = load_rig(path)
+    assert (rig.lidars["lidar"].model, rig.lidars["lidar"].rate_hz) == ("OS1-64", 20)
+    assert run(["rigs", "new", "x", "--from", "rlfs", "--lidar", "OS1-64"]) == 2
+
+
+def test_a_derived_profile_keeps_no_block_that_was_removed(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    removed = ["--unset", "nominal_extrinsics", "--unset", "cameras.cam.driver"]
+    assert run(["rigs", "new", "mine", *removed, "-o", str(path)]) == 0
+    rig = load_rig(path)
+    assert not rig.nominal_extrinsics and rig.cameras["cam"].driver.type is None
+    assert rig.description == "" and "RLFS" not in path.read_text()
+    assert run(["rigs", "new", "mine", "--unset", "cameras.cam.nothing", "-o", str(tmp_path / "b.yaml")]) == 2
+    assert run(["rigs", "new", "mine", "--unset", "board", "-o", str(tmp_path / "b.yaml")]) == 3
+    assert not (tmp_path / "b.yaml").exists()

@@ -48,6 +48,10 @@ def _build(store: Any, msgtype: str, fields: dict[str, Any]) -> Any:
     names = header_type.__dataclass_fields__
     stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     header = header_type(**({"seq": 0} if "seq" in names else {}), stamp=stamp, frame_id="sensor")
+    if "K" in fields and "K" not in types["sensor_msgs/msg/CameraInfo"].__dataclass_fields__:
+        fields = {name.lower() if len(name) == 1 else name: value for name, value in fields.items()}
+    if "roi" in fields:
+        fields["roi"] = types["sensor_msgs/msg/RegionOfInterest"](**fields["roi"])
     if "fields" in fields:
         point_field = types["sensor_msgs/msg/PointField"]
         fields["fields"] = [

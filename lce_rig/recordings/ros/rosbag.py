@@ -313,7 +313,7 @@ class BagRecording:
             for message in islice(self._bag.messages(self._targets.keys()), _N_PROBED):
                 if message.topic not in found:
                     with suppress(ValueError):
-                        stamp_ns = _header_stamp_ns(_deserialize(message)) or message.log_ns
+                        stamp_ns = _header_stamp_ns(deserialize(message)) or message.log_ns
                         found[message.topic] = stamp_ns, message.log_ns
                 if len(found) == len(self._targets):
                     break
@@ -324,7 +324,7 @@ class BagRecording:
     def _decode(self, message: RawMessage, stream: _BagStream) -> Image | Scan | None:
         target = self._targets[message.topic]
         try:
-            content = _deserialize(message)
+            content = deserialize(message)
             stamp_ns = _header_stamp_ns(content)
             if stamp_ns == 0:
                 stream.notes.add("headers have no timestamps; the time of receipt is used")
@@ -364,7 +364,7 @@ def _header_stamp_ns(content: Any) -> int:
     return int(content.header.stamp.sec * 10**9 + content.header.stamp.nanosec)
 
 
-def _deserialize(message: RawMessage) -> Any:
+def deserialize(message: RawMessage) -> Any:
     """Deserialise by ROS's own definitions; those in a bag may be missing, or beyond what rosbags parses."""
     is_ros1 = message.encoding == "ros1"
     if message.msgtype in CLOUD_TYPES:

@@ -1,0 +1,190 @@
+"""A profile for a rig of one's own: from its data sheets, or from a bag that it recorded."""
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.errors import UsageError
+from lce_rig.export.camera_info import load_camera_info
+from lce_rig.recordings.ros.survey import SensorTopic, survey_bag
+from lce_rig.rig.draft import CameraDraft, ChannelDraft, LidarDraft, draft_profile
+
+_UNKNOWN_MODEL = "other"
+_BOARD = re.compile(r"(\d+)x(\d+),([^,x]+),([^,x]+)x([^,x]+)(?:,([^,x]+),([^,x]+))?")
+_SIZE = re.compile(r"(\d{1,5})x(\d{1,5})")
+BOARD_FORM = "COLSxROWS,SQUARE,WIDTHxHEIGHT[,RIGHT,UP], lengths in m, such as 8x6,0.07,0.767x0.626"
+_LENS_FORM = (
+    "MODEL,WIDTHxHEIGHT,FX,FY,CX,CY,K1,..., such as radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23"
+)
+
+
+def new_profile(
+    name: str,
+    board: Board,
+    *,
+    recording: Path | None = None,
+    lidar_model: str | None = None,
+    cameras: Sequence[str] = (),
+    intrinsics: Sequence[Intrinsics] = (),
+    source: str = "profile",
+) -> tuple[str, list[str]]:
+    """Write the text of a profile.
+
+    Args:
+        name: of the rig.
+        board: as it was measured.
+        recording: a bag; its topics name the sensors, frames, rates and, by camera_info, the lenses.
+        lidar_model: maker's name of the LiDAR's model; None where it is not known.
+        cameras: names of the cameras, in the order of their topics where there is a bag.
+        intrinsics: of the cameras, in the same order; those of a bag where it is empty.
+        source: what to call the text in errors.
+
+    Returns:
+        The text; and what was found and chosen, a line each.
+
+    Raises:
+        UsageError: a camera without intrinsics, or names or intrinsics of cameras that are not there.
+        SourceError: the bag cannot be read, or holds no camera or no LiDAR.
+        ProfileError: the parts do not make a valid profile.
+    """
+    topics = [] if recording is None else survey_bag(recording)
+    lidars = list(_lidars([t for t in topics if t.kind == "scans"], lidar_model))
+    groups = _by_camera([t for t in topics if t.kind != "scans"])
+    if recording is not None:
+        _require_both(recording, topics)
+        _require_count(len(cameras), len(groups), "names (--camera)", recording)
+        _require_count(len(intrinsics), len(groups), "--intrinsics", recording)
+    else:
+        groups = [[] for _ in cameras or ("cam",)]
+        if len(intrinsics) != len(groups):
+            raise UsageError(
+                f"{len(groups)} cameras and intrinsics of {len(intrinsics)}",
+                f"Give --intrinsics once for each --camera: a camera_info file, or {_LENS_FORM}.",
+            )
+    names = list(cameras) or _names(groups)
+    used = {lidar.frame for lidar in lidars}
+    drafts = []
+    for index, (camera, group) in enumerate(zip(names, groups, strict=True)):
+        lens = intrinsics[index] if intrinsics else _lens(camera, group)
+        frame = next((t.frame for t in group if t.frame and t.frame not in used), None)
+        used.add(frame)
+        channels = tuple(ChannelDraft("events" if t.kind == "events" else "frames", t.topic) for t in group)
+        drafts.append(CameraDraft(camera, lens, frame, channels or (ChannelDraft(),)))
+    return draft_profile(name, lidars, drafts, board, source), [_line(topic) for topic in topics]
+
+
+def parse_board(text: str) -> Board:
+    """Read a board as "8x6,0.07,0.767x0.626": inner corners, square, plate and, if given, the offset.
+
+    Raises:
+        UsageError: it is not written like this.
+    """
+    match = _BOARD.fullmatch(text.replace(" ", ""))
+    try:
+        if match is None:
+            raise ValueError
+        cols, rows, *lengths = match.groups()
+        square, width, height, right, up = (float(value or 0) for value in lengths)
+    except ValueError:
+        raise UsageError(f"--board {text}: give {BOARD_FORM}") from None
+    return Board(int(cols), int(rows), square, width, height, (right, up))
+
+
+def parse_intrinsics(text: str) -> Intrinsics:
+    """Read a camera_info file, or intrinsics as "radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23".
+
+    Raises:
+        UsageError: it is neither.
+        ProfileError: the file cannot be used.
+    """
+    model, *values = text.replace(" ", "").split(",")
+    if len(values) < 5 or model not in ("radtan", "equidistant"):
+        if not Path(text).exists() and values:
+            raise UsageError(f"--intrinsics {text}: give a camera_info file, or {_LENS_FORM}")
+        return load_camera_info(Path(text))
+    size = _SIZE.fullmatch(values[0])
+    try:
+        if size is None:
+            raise ValueError
+        fx, fy, cx, cy, *distortion = map(float, values[1:])
+    except ValueError:
+        raise UsageError(f"--intrinsics {text}: give a camera_info file, or {_LENS_FORM}") from None
+    width, height = map(int, size.groups())
+    family: Literal["radtan", "equidistant"] = "radtan" if model == "radtan" else "equidistant"
+    return Intrinsics(fx, fy, cx, cy, width, height, family, tuple(distortion))
+
+
+def _lidars(topics: Sequence[SensorTopic], model: str | None) -> Iterator[LidarDraft]:
+    for index, topic in enumerate(topics):
+        name = "lidar" if len(topics) == 1 else f"lidar_{index + 1}"
+        sees = "" if topic.n_rings is None else f"{topic.n_rings} rings in the recording"
+        rate_hz = None if topic.rate_hz is None else round(topic.rate_hz, 1) or None
+        yield LidarDraft(name, model or _UNKNOWN_MODEL, topic.frame or None, topic.topic, rate_hz, sees)
+    if not topics:
+        yield LidarDraft(model=model or _UNKNOWN_MODEL)
+
+
+def _by_camera(topics: Sequence[SensorTopic]) -> list[list[SensorTopic]]:
+    """Group topics by camera: frames and events in one namespace share a lens; two of a kind do not."""
+    groups: list[list[SensorTopic]] = []
+    for topic in topics:
+        for group in groups:
+            if group[0].namespace == topic.namespace and topic.kind not in [each.kind for each in group]:
+                group.append(topic)
+                break
+        else:
+            groups.append([topic])
+    return [sorted(group, key=lambda topic: topic.kind == "events") for group in groups]
+
+
+def _names(groups: Sequence[Sequence[SensorTopic]]) -> list[str]:
+    """Name cameras by the last part of their topics' namespaces."""
+    if len(groups) == 1:
+        return ["cam"]
+    names: list[str] = []
+    for group in groups:
+        word = group[0].namespace.rpartition("/")[2] if group else ""
+        word = re.sub(r"[^a-z0-9_]", "_", word.lower()).lstrip("0123456789_")
+        names.append(word if word and word not in [*names, "lidar"] else f"cam_{len(names) + 1}")
+    return names
+
+
+def _lens(camera: str, group: Sequence[SensorTopic]) -> Intrinsics:
+    for topic in group:
+        if topic.intrinsics is not None:
+            return topic.intrinsics
+    topic = group[0]
+    why = next((each.note for each in group if each.note), f"no camera_info beside {topic.topic}")
+    raise UsageError(
+        f"no intrinsics of camera {camera} ({topic.topic}): {why}",
+        f"Give --intrinsics for every camera: a camera_info file, or {_LENS_FORM}.",
+    )
+
+
+def _require_both(recording: Path, topics: Sequence[SensorTopic]) -> None:
+    from lce_rig.core.errors import SourceError
+
+    for kinds, what in ((("scans",), "point clouds"), (("frames", "events"), "images or events")):
+        if not any(topic.kind in kinds for topic in topics):
+            found = "; ".join(map(_line, topics))
+            raise SourceError(f"{recording}: no {what}, so that it is no recording of a rig", found)
+
+
+def _require_count(n_given: int, n_there: int, what: str, recording: Path) -> None:
+    if n_given not in (0, n_there):
+        raise UsageError(
+            f"{recording} holds {n_there} cameras, {n_given} {what} given",
+            "Give one for each camera, in the order of their topics, or none.",
+        )
+
+
+def _line(topic: SensorTopic) -> str:
+    facts = [topic.kind, f"{topic.n_messages} messages"]
+    facts += [f"{topic.rate_hz:.1f} Hz"] if topic.rate_hz else []
+    facts += [f"{topic.size_px[0]}x{topic.size_px[1]}"] if topic.size_px else []
+    facts += [f"{topic.n_rings} rings"] if topic.n_rings else []
+    facts += ["intrinsics in camera_info"] if topic.intrinsics else []
+    return f"{topic.topic}: {', '.join(facts)}"

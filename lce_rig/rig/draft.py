@@ -1,0 +1,149 @@
+"""The text of a new profile from its parts: sensors, lenses, board; nothing of another rig."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.rig.document import read_document
+from lce_rig.rig.editing import is_plain
+from lce_rig.rig.loading import rig_from_document
+
+
+@dataclass(frozen=True)
+class LidarDraft:
+    """A LiDAR of the new profile.
+
+    Attributes:
+        name: in the profile.
+        model: maker's name of the model.
+        frame: of its points; None for the usual one.
+        topic: in bags.
+        rate_hz: scans per second; None for the default.
+        sees: what is known of it beside, as a comment, such as "64 rings in the recording".
+    """
+
+    name: str = "lidar"
+    model: str = "VLP-16"
+    frame: str | None = None
+    topic: str | None = None
+    rate_hz: float | None = None
+    sees: str = ""
+
+
+@dataclass(frozen=True)
+class ChannelDraft:
+    """A stream of a camera of the new profile.
+
+    Attributes:
+        kind: "frames" or "events".
+        topic: in bags.
+    """
+
+    kind: Literal["frames", "events"] = "frames"
+    topic: str | None = None
+
+
+@dataclass(frozen=True)
+class CameraDraft:
+    """A camera of the new profile.
+
+    Attributes:
+        name: in the profile.
+        intrinsics: of its images.
+        optical_frame: None for the usual one.
+        channels: at least one.
+    """
+
+    name: str
+    intrinsics: Intrinsics
+    optical_frame: str | None = None
+    channels: Sequence[ChannelDraft] = field(default_factory=lambda: (ChannelDraft(),))
+
+
+def draft_profile(
+    name: str, lidars: Sequence[LidarDraft], cameras: Sequence[CameraDraft], board: Board, source: str
+) -> str:
+    """Write the text of a profile.
+
+    Args:
+        name: of the rig.
+        lidars: at least one.
+        cameras: at least one.
+        board: as it was measured.
+        source: what to call the text in errors.
+
+    Raises:
+        ProfileError: the parts do not make a valid profile.
+    """
+    lines = [
+        f"# {name}: written by `lce-rig rigs new`; `lce-rig rigs show FILE` shows every setting.",
+        "format_version: 1",
+        f"name: {_text(name)}",
+        "",
+        "board:                            # measure it; do not rely on the CAD model",
+        f"  inner_corners: [{board.cols}, {board.rows}]           "
+        "# where four squares meet: [along the width, along the height]",
+        f"  square_m: {board.square_m:g}",
+        f"  width_m: {board.width_m:g}",
+        f"  height_m: {board.height_m:g}",
+        f"  pattern_offset_m: [{board.pattern_offset_m[0]:g}, {board.pattern_offset_m[1]:g}]"
+        "    # pattern's centre from the plate's centre: [right, up]",
+        "",
+        "lidars:",
+    ]
+    for lidar in lidars:
+        lines += _lidar(lidar)
+    lines += ["", "cameras:"]
+    for camera in cameras:
+        lines += _camera(camera)
+    text = "\n".join(lines) + "\n"
+    rig_from_document(read_document(text, source))
+    return text
+
+
+def _lidar(lidar: LidarDraft) -> list[str]:
+    model = f"    model: {_text(lidar.model)}"
+    return [
+        f"  {lidar.name}:",
+        f"{model:<34}# {lidar.sees}" if lidar.sees else model,
+        f"    frame: {lidar.frame or f'{lidar.name}_link'}",
+        *([f"    topic: {lidar.topic}"] if lidar.topic else []),
+        *([f"    rate_hz: {lidar.rate_hz:g}"] if lidar.rate_hz else []),
+        "    timestamps:",
+        "      clock: host                 # device, host or utc",
+        "      reference: first_firing     # or last_firing, as some drivers timestamp",
+        "      sync: none                  # hardware (shared pulse), ptp or none",
+    ]
+
+
+def _camera(camera: CameraDraft) -> list[str]:
+    lens = camera.intrinsics
+    lines = [
+        f"  {camera.name}:",
+        f"    frame: {camera.name}_link",
+        f"    optical_frame: {camera.optical_frame or f'{camera.name}_optical_frame'}",
+        f"    resolution_px: [{lens.width_px}, {lens.height_px}]",
+        "    intrinsics:",
+        f"      model: {lens.model}",
+        *(f"      {key}: {getattr(lens, key):.10g}" for key in ("fx_px", "fy_px", "cx_px", "cy_px")),
+        f"      distortion: [{', '.join(f'{value:.10g}' for value in lens.distortion)}]",
+        "    channels:",
+    ]
+    for channel in camera.channels:
+        lines += [
+            f"      {channel.kind}:",
+            f"        kind: {channel.kind}",
+            *([f"        topic: {channel.topic}"] if channel.topic else []),
+            "        timestamps:",
+            "          clock: host",
+            "          reference: mid_exposure # or start",
+            "          sync: none",
+        ]
+    return lines
+
+
+def _text(value: str) -> str:
+    return value if is_plain(value) else json.dumps(value, ensure_ascii=False)

@@ -1,0 +1,58 @@
+"""A profile of one's own rig, from numbers or from a bag, holds what was given and nothing of another rig."""
+
+import pytest
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.errors import ProfileError, UsageError
+from lce_rig.export.camera_info import camera_info_text
+from lce_rig.pipeline.new_profile import new_profile, parse_board, parse_intrinsics
+from lce_rig.rig import parse_rig
+
+BOARD = "5x7,0.095,0.61x0.85,0.002,0"
+LENS = "equidistant,1920x1208,959.554,960.194,940.789,670.737,-0.097824,0.141429,-0.148385,0.055918"
+
+
+def test_numbers_alone_make_a_profile():
+    text, _ = new_profile(
+        "os1", parse_board(BOARD), lidar_model="OS1-64", intrinsics=[parse_intrinsics(LENS)]
+    )
+    rig = parse_rig(text)
+    assert (rig.lidars["lidar"].model, rig.board.inner_corners) == ("OS1-64", (5, 7))
+    lens = rig.cameras["cam"].to_intrinsics()
+    assert lens == parse_intrinsics(LENS)
+    assert lens.distortion == (-0.097824, 0.141429, -0.148385, 0.055918)
+    assert (rig.board.square_m, rig.board.width_m, rig.board.pattern_offset_m) == (0.095, 0.61, (0.002, 0.0))
+    assert not rig.nominal_extrinsics and rig.lidars["lidar"].driver.type is None
+
+
+def test_a_camera_info_file_of_any_maker_is_taken(tmp_path):
+    lens = Intrinsics(897.5, 896.8, 635.4, 375.3, 1280, 720, "radtan", (-0.44, 0.233, -0.001, 0.0002, -0.073))
+    path = tmp_path / "camera_info.yaml"
+    # A calibrated camera's projection matrix is of the rectified image.
+    head, _ = camera_info_text("cam", lens, []).split("projection_matrix:")
+    path.write_text(
+        head + "projection_matrix: {rows: 3, cols: 4, data: [8, 0, 6, 0, 0, 8, 3, 0, 0, 0, 1, 0]}"
+    )
+    assert parse_intrinsics(str(path)) == lens
+    rig = parse_rig(new_profile("a", parse_board(BOARD), cameras=["front"], intrinsics=[lens])[0])
+    assert rig.cameras["front"].to_intrinsics() == lens
+
+
+@pytest.mark.parametrize("text", ["", "8x6", "8x6,0.07", "8x6,0.07,0.7", "8x6,a,0.7x0.6", "8,6,0.07,0.7x0.6"])
+def test_a_board_written_otherwise_is_a_usage_error(text):
+    with pytest.raises(UsageError):
+        parse_board(text)
+
+
+@pytest.mark.parametrize("text", ["radtan,640x480,1,2", "radtan,640,1,2,3,4", "pinhole,640x480,1,2,3,4"])
+def test_intrinsics_written_otherwise_are_a_usage_error(text):
+    with pytest.raises(UsageError):
+        parse_intrinsics(text)
+
+
+@pytest.mark.parametrize("content", ["", "[1, 2]", "a: 1", "camera_matrix: {data: [1]}", "\x00", "a: [b"])
+def test_a_file_that_is_no_camera_info_is_named(tmp_path, content):
+    path = tmp_path / "info.yaml"
+    path.write_text(content)
+    with pytest.raises(ProfileError, match=r"info\.yaml"):
+        parse_intrinsics(str(path))
