@@ -8,7 +8,7 @@ import socket
 import sys
 import tempfile
 import time
-from importlib import metadata
+from importlib import metadata, resources
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -42,6 +42,10 @@ _OPEN3D_LIBRARIES = {
     "libEGL.so.1": "libegl1",
     "libX11.so.6": "libx11-6",
 }
+# Where udev looks for rules, and what in them names a device: its USB vendor.
+_UDEV = Path("/run/udev")
+_UDEV_RULES = (Path("/etc/udev/rules.d"), Path("/run/udev/rules.d"), Path("/usr/lib/udev/rules.d"))
+_DAVIS_VENDOR, _TEENSY_VENDOR = "152a", "16c0"
 _MIN_BUFFER_S = 0.25
 _PROBE_BYTES, _PROBE_BLOCK_BYTES, _PROBE_S = 48 << 20, 4 << 20, 0.5
 _MB = 1e6
@@ -131,6 +135,26 @@ def check_socket_buffer(rig: Rig, folder: Path) -> Check | None:
     return Check.of(_GROUP, "buffer", Finding("computer.buffer", "note", figures=figures), wrong)
 
 
+def check_udev_rules(rig: Rig, folder: Path) -> Check | None:
+    """Look for udev rules of a DAVIS and of a sync board, which a user could not open without."""
+    wanted = {_DAVIS_VENDOR: "DAVIS"} if uses_driver(rig, "davis") else {}
+    if rig.sync is not None and rig.sync.type == "lce1":
+        wanted[_TEENSY_VENDOR] = "sync board"
+    if not wanted or not _UDEV.is_dir():  # in a container the host's rules count
+        return None
+    files = [path for place in _UDEV_RULES if place.is_dir() for path in place.glob("*.rules")]
+    rules = "".join(path.read_text(encoding="utf-8", errors="replace") for path in files)
+    devices = tuple(device for vendor, device in wanted.items() if f'"{vendor}"' not in rules)
+    if devices:
+        shipped = str(resources.files("lce_rig") / "devices" / "60-lce-rig.rules")
+        absent: dict[str, Figure] = {"devices": devices, "rules": shipped}
+        return Check.of(
+            _GROUP, "udev rules", Finding("computer.udev_rules_missing", "warning", figures=absent)
+        )
+    figures: dict[str, Figure] = {"devices": tuple(wanted.values())}
+    return Check.of(_GROUP, "udev rules", Finding("computer.udev_rules", "note", figures=figures))
+
+
 def check_clock(rig: Rig, folder: Path) -> Check:
     """Ask the kernel whether something keeps the computer's clock right; a VLP-16's hour is taken from it."""
     timex = (ctypes.c_long * _TIMEX_LONGS)()
@@ -147,6 +171,7 @@ COMPUTER_CHECKS = (
     check_libraries,
     check_disk,
     check_socket_buffer,
+    check_udev_rules,
     check_clock,
 )
 """Every check of the computer: each takes the rig and the folder of sessions; None where there is no need."""

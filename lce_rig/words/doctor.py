@@ -51,6 +51,16 @@ def _install_libraries(finding: Finding) -> str:
     return f"run: sudo apt install {_listed(finding.figures['packages'], ' ')}"
 
 
+def _udev_rules(finding: Finding) -> str:
+    """Rules for {devices} are installed."""
+    return f"installed for {_listed(finding.figures['devices'])}"
+
+
+def _udev_rules_missing(finding: Finding) -> str:
+    """No rule for {devices}: only root may open it."""
+    return f"none for {_listed(finding.figures['devices'])}: only root may open it"
+
+
 def _answers(finding: Finding) -> str:
     """The {driver} reads {device}, firmware {firmware}, serial number {serial}, at {temperature_c}."""
     figures = finding.figures
@@ -172,6 +182,12 @@ _COMPUTER: Mapping[str, Phrase] = {
         "too small (minimum 0.25 s)",
         "run: sudo sysctl -w net.core.rmem_max={wanted_bytes}\n"
         "to keep it: echo net.core.rmem_max={wanted_bytes} | sudo tee /etc/sysctl.d/60-lidar.conf",
+    ),
+    "computer.udev_rules": Phrase(_udev_rules),
+    "computer.udev_rules_missing": Phrase(
+        _udev_rules_missing,
+        "run: sudo cp {rules} /etc/udev/rules.d/ && sudo udevadm control --reload\n"
+        "then unplug the device and plug it in again",
     ),
     "computer.clock": Phrase("synchronised, error at most {max_error_ms:.0f} ms"),
     "computer.clock_not_synchronised": Phrase(

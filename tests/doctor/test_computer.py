@@ -1,5 +1,6 @@
 """The computer's lines say what the kernel and the disk do."""
 
+import shutil
 import socket
 from importlib.util import find_spec
 from pathlib import Path
@@ -68,6 +69,36 @@ def test_the_receive_buffer_is_what_the_kernel_grants() -> None:
 def test_a_rig_without_a_vlp16_needs_no_buffer() -> None:
     rig = make_rig(lidars={"lidar": {"model": "another"}})
     assert computer.check_socket_buffer(rig, Path()) is None
+
+
+@pytest.fixture
+def udev(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of udev rules, the only one."""
+    monkeypatch.setattr(computer, "_UDEV", tmp_path)
+    monkeypatch.setattr(computer, "_UDEV_RULES", (tmp_path,))
+    return tmp_path
+
+
+def test_a_davis_wants_udev_rules_and_the_shipped_ones_do(udev: Path) -> None:
+    rig = load_rig("rles")
+    line = computer.check_udev_rules(rig, Path())
+    assert line is not None and codes(line) == ["computer.udev_rules_missing"]
+    assert line.severity == "warning" and line.figures["devices"] == ("DAVIS",)
+    shutil.copy(str(line.figures["rules"]), udev)
+    line = computer.check_udev_rules(rig, Path())
+    assert line is not None and codes(line) == ["computer.udev_rules"]
+
+
+def test_the_shipped_rules_hold_for_a_sync_board_too(udev: Path) -> None:
+    rig = make_rig(sync={"device": "/dev/ttyACM0"})
+    line = computer.check_udev_rules(rig, Path())
+    assert line is not None and line.figures["devices"] == ("sync board",)
+    shutil.copy(str(line.figures["rules"]), udev)
+    assert codes(computer.check_udev_rules(rig, Path())) == ["computer.udev_rules"]
+
+
+def test_a_rig_without_such_devices_needs_no_udev_rules(udev: Path) -> None:
+    assert computer.check_udev_rules(load_rig("rlfs"), Path()) is None
 
 
 def test_the_clock_is_judged_by_the_kernel() -> None:

@@ -101,11 +101,11 @@ def test_what_was_seen_before_the_sensors_fell_silent_is_not_shown_as_seen_now(t
             show.pause()
 
     def key() -> Key | None:
-        return "stop" if states and "no picture" in states[-1].detail else None
+        return "stop" if states and "no image" in states[-1].detail else None
 
     with show.running(), Session.create(tmp_path / "session", rig()) as session:
         collect_live(session, show.sources, replace(QUICK, hold_s=20.0), watch, key)
-    told = next(state for state in states if "no picture" in state.detail)
+    told = next(state for state in states if "no image" in state.detail)
     assert told.phase == "searching" and "waiting" in told.headline
     assert any(stream.sees_board for state in states for stream in state.streams)
     assert [stream.sees_board for stream in told.streams] == [None] * len(told.streams)
