@@ -33,7 +33,7 @@ def test_show_gives_the_figures_and_marks_what_is_not_default(
     out = capsys.readouterr().out
     assert all(text in out for text in ("davis/events", "9 x 6", "68 mm", "346x260"))
     row = next(line for line in out.splitlines() if "quality.min_rings" in line)
-    assert row.split()[1:] == ["7", "4"]
+    assert row.split()[1:3] == ["7", "4"]
 
 
 def test_show_prints_a_profile_that_loads_again(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
