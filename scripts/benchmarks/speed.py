@@ -47,6 +47,10 @@ def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
         "board in a 1280x720 picture, median",
         milliseconds(lambda k: BoardFinder(rig).image(pictures[k])),
     )
+    finder = BoardFinder(rig)
+    seen = [finder.search_image(picture).board for picture in pictures]
+    lasts = [board if isinstance(board, ImageBoard) else None for board in seen]
+    yield "tracked, median", milliseconds(lambda k: finder.search_image(pictures[k], lasts[k]))
     detections = pipeline.detect(session)
     pair = detections.pairs[0]
     both = ((name, *detections.of(pair, name)) for name in detections.captures(pair))
