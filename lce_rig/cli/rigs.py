@@ -144,15 +144,29 @@ def _board_table(rig: "Rig") -> Any:
 
 
 def _limit_table(rig: "Rig") -> Any:
-
-    table = screen.plain_table("", "threshold", "value", "default")
+    table = screen.plain_table("", "threshold", "value", "default", "meaning")
     for block in ("quality", "calibration", "verdict"):
         settings = getattr(rig, block)
+        meanings = _attributes(type(settings))
         for key, field in type(settings).model_fields.items():
             value = getattr(settings, key)
             default = "" if value == field.default else f"{field.default:g}"
-            table.add_row(f"{block}.{key}", f"{value:g}", default)
+            table.add_row(f"{block}.{key}", f"{value:g}", default, meanings.get(key, ""))
     return table
+
+
+def _attributes(documented: type) -> dict[str, str]:
+    """Read what a class's docstring says of each attribute."""
+    import inspect
+    import re
+
+    _, _, text = (inspect.getdoc(documented) or "").partition("Attributes:\n")
+    entries = re.findall(r"^ {4}(\w[\w, ]*): (.*(?:\n {8}.*)*)", text, flags=re.MULTILINE)
+    return {
+        name.strip(): " ".join(meaning.split()).rstrip(".")
+        for names, meaning in entries
+        for name in names.split(",")
+    }
 
 
 @rigs.command("check")

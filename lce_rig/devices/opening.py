@@ -6,6 +6,7 @@ from typing import Any
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.reading import LiveSource
 from lce_rig.rig import DriverSettings, Rig
+from lce_rig.rig.sensors import CAMERA_DRIVERS, LIDAR_DRIVERS, VLP16_MODELS
 
 LIVE = {
     "vlp16": "lce_rig.devices.vlp16.driver:Vlp16Source",
@@ -16,8 +17,7 @@ LIVE = {
 }
 """Source by type of driver."""
 
-LIDAR_TYPES, CAMERA_TYPES = ("vlp16",), ("v4l2", "command", "davis")
-_TYPE_BY_MODEL = {"VLP-16": "vlp16", "PUCK": "vlp16", "DAVIS": "davis"}
+_TYPE_BY_MODEL = {**dict.fromkeys(VLP16_MODELS, "vlp16"), "DAVIS": "davis"}
 
 
 def open_live(rig: Rig) -> list[LiveSource]:
@@ -54,7 +54,7 @@ def driver_type(kind: str, name: str, model: str, driver: DriverSettings) -> str
     Raises:
         SourceError: there is none.
     """
-    known = LIDAR_TYPES if kind == "lidar" else CAMERA_TYPES
+    known = LIDAR_DRIVERS if kind == "lidar" else CAMERA_DRIVERS
     wanted = driver.type or _by_model(model)
     if wanted is None and kind == "camera":
         wanted = "command" if driver.command else "v4l2"

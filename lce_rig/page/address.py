@@ -11,7 +11,10 @@ from lce_rig.core.errors import UsageError
 LOOPBACK = "127.0.0.1"
 DEFAULT_PORT = 8765
 
-_HINT = "Write HOST:PORT, HOST or PORT: 0.0.0.0:8765, [::1]:8765, 8080."
+_HINT = (
+    "--preview takes HOST:PORT, HOST or PORT, such as 0.0.0.0:8765, [::1]:8765 or 8080. "
+    "Give the session before it: lce-rig collect --rig R session/ --preview"
+)
 # linux/sockios.h; Python names neither.
 _SIOCGIFADDR = 0x8915
 _INTERFACE = struct.Struct("16s20s")

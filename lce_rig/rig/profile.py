@@ -9,7 +9,13 @@ from pydantic import Field, model_validator
 from lce_rig.core.findings import Finding
 from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.nominal import NominalExtrinsic
-from lce_rig.rig.sensors import CameraSettings, LidarSettings
+from lce_rig.rig.sensors import (
+    CAMERA_DRIVERS,
+    LIDAR_DRIVERS,
+    VLP16_MODELS,
+    CameraSettings,
+    LidarSettings,
+)
 from lce_rig.rig.settings import FrameName, Name, RigName, Settings, Text, problem
 from lce_rig.rig.sync_settings import SyncSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
@@ -114,7 +120,22 @@ class Rig(Settings):
             for key, settings in timestamps
             if settings.clock == "device" and settings.sync == "none"
         ]
-        return (*found, *self._shared())
+        return (*found, *self._shared(), *self._unknown())
+
+    def _unknown(self) -> Iterator[Finding]:
+        """List drivers that do not exist, and models for which nothing but recordings works."""
+        for name, lidar in self.lidars.items():
+            is_vlp16 = lidar.model.upper().startswith(VLP16_MODELS)
+            if not is_vlp16:
+                yield Finding(
+                    "profile.unknown_model", "warning", f"lidars.{name}.model", {"value": lidar.model}
+                )
+            if lidar.driver.type == "vlp16" and not is_vlp16:
+                figures = {"value": lidar.driver.type, "model": lidar.model}
+                yield Finding("profile.other_driver", "warning", f"lidars.{name}.driver.type", figures)
+            yield from _unknown_driver(f"lidars.{name}.driver.type", lidar.driver.type, LIDAR_DRIVERS)
+        for name, camera in self.cameras.items():
+            yield from _unknown_driver(f"cameras.{name}.driver.type", camera.driver.type, CAMERA_DRIVERS)
 
     def _shared(self) -> Iterator[Finding]:
         """List settings that two sensors cannot share, usually left from a copied block."""
@@ -137,3 +158,8 @@ class Rig(Settings):
             entry for entry in self.nominal_extrinsics if (entry.camera, entry.lidar) == (camera, lidar)
         )
         return next(matches, None)
+
+
+def _unknown_driver(key: str, value: str | None, known: tuple[str, ...]) -> Iterator[Finding]:
+    if value is not None and value not in known:
+        yield Finding("profile.unknown_driver", "warning", key, {"value": value, "known": ", ".join(known)})

@@ -21,6 +21,10 @@ from lce_rig.rig.settings import (
     problem,
 )
 
+LIDAR_DRIVERS, CAMERA_DRIVERS = ("vlp16",), ("v4l2", "command", "davis")
+"""Values of `driver.type`."""
+VLP16_MODELS = ("VLP-16", "VLP16", "PUCK")
+"""How the names of the models begin whose beams and packets are known."""
 # Beyond this the figure is in millimetres, or the sensor is broken.
 RangeError = Annotated[float, Field(ge=0, le=0.2)]
 Coefficient = Annotated[float, Field(ge=-1000, le=1000)]

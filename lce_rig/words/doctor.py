@@ -287,6 +287,15 @@ _PROFILE: Mapping[str, Phrase] = {
     "profile.drifting_clock": Phrase(
         "{subject}: the sensor's own clock without sync drifts away from the others",
     ),
+    "profile.unknown_model": Phrase(
+        "{subject}: the beams of {value} are not known: recordings can be calibrated, live guidance and "
+        "simulation need a VLP-16"
+    ),
+    "profile.other_driver": Phrase(
+        "{subject}: {value} reads a VLP-16, and the model is {model}",
+        "remove the driver block, or correct the model",
+    ),
+    "profile.unknown_driver": Phrase("{subject}: there is no driver {value}", "choose one of: {known}"),
     "profile.shared": Phrase("{subject}: {value} equals {other}, but two sensors cannot share it"),
 }
 PHRASES: Mapping[str, Phrase] = {**_COMPUTER, **_SENSORS, **_CLOCKS, **_IMAGES, **_PROFILE}

@@ -33,7 +33,7 @@ def test_show_gives_the_figures_and_marks_what_is_not_default(
     out = capsys.readouterr().out
     assert all(text in out for text in ("davis/events", "9 x 6", "68 mm", "346x260"))
     row = next(line for line in out.splitlines() if "quality.min_rings" in line)
-    assert row.split()[1:] == ["7", "4"]
+    assert row.split()[1:3] == ["7", "4"]
 
 
 def test_show_prints_a_profile_that_loads_again(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -145,3 +145,14 @@ def test_a_derived_profile_keeps_no_block_that_was_removed(tmp_path: Path) -> No
     assert run(["rigs", "new", "mine", "--unset", "cameras.cam.nothing", "-o", str(tmp_path / "b.yaml")]) == 2
     assert run(["rigs", "new", "mine", "--unset", "board", "-o", str(tmp_path / "b.yaml")]) == 3
     assert not (tmp_path / "b.yaml").exists()
+
+
+def test_every_threshold_is_shown_with_its_meaning(capsys: pytest.CaptureFixture[str]) -> None:
+    from lce_rig.cli.rigs import _attributes
+    from lce_rig.rig import CalibrationSettings, QualitySettings, VerdictSettings
+
+    for settings in (QualitySettings, CalibrationSettings, VerdictSettings):
+        assert set(settings.model_fields) <= set(_attributes(settings))
+    assert run(["rigs", "show", "rlfs"]) == 0
+    row = next(line for line in capsys.readouterr().out.splitlines() if "quality.min_rings" in line)
+    assert _attributes(QualitySettings)["min_rings"] in row

@@ -6,8 +6,9 @@ from typing import Any
 import pytest
 
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.opening import CAMERA_TYPES, LIDAR_TYPES, LIVE, driver_type, open_live
+from lce_rig.devices.opening import LIVE, driver_type, open_live
 from lce_rig.rig import DriverSettings, Rig, load_rig
+from lce_rig.rig.sensors import CAMERA_DRIVERS, LIDAR_DRIVERS
 
 
 def with_driver(rig: Rig, camera: str, **driver: Any) -> Rig:
@@ -62,4 +63,4 @@ def test_a_lidar_of_an_unknown_model_is_not_guessed() -> None:
 
 
 def test_the_types_of_both_kinds_are_in_the_table() -> None:
-    assert {*LIDAR_TYPES, *CAMERA_TYPES, "sync_board"} == set(LIVE)
+    assert {*LIDAR_DRIVERS, *CAMERA_DRIVERS, "sync_board"} == set(LIVE)
