@@ -144,6 +144,7 @@ class Monitor:
             log=tuple(self._log),
             notes=self._notes(),
             n_logged=self._n_logged,
+            requires_still_boards=self._clock.verdict().requires_still_boards,
         )
 
     def _phase(self, *, is_enough: bool, has_ended: bool) -> tuple[Phase, str, str]:

@@ -165,7 +165,8 @@ class LiveState:
         target_deg, target_mm: the profile's.
         cues: the latest few, oldest first.
         log: the latest messages, oldest first.
-        notes: what holds all the time: "boards must stand still: ...".
+        notes: what holds all the time, in words.
+        requires_still_boards: whether boards must stand still, as `SyncVerdict` says.
         n_logged: messages since the beginning, of which `log` holds the latest.
     """
 
@@ -189,3 +190,4 @@ class LiveState:
     log: tuple[str, ...] = ()
     notes: tuple[str, ...] = field(default=())
     n_logged: int = 0
+    requires_still_boards: bool = True
