@@ -78,7 +78,7 @@ def set_value(text: str, path: str, value: str) -> str:
         new = _insert(text, node, keys[depth:], value)
     else:
         raise UsageError(f"--set {path}: {'.'.join(keys[:depth])} has no key {keys[depth]}")
-    if not _holds(new, keys, wanted):
+    if _value_at(new, keys) != wanted:
         raise UsageError(f"--set {path}: {value!r} is not allowed there", "quote a text that holds : or #")
     return new
 
@@ -117,7 +117,7 @@ def remove_key(text: str, path: str, *, must_exist: bool = True) -> str:
         begin = above
     end = text.find("\n", _end(value))
     new = text[:begin] + ("" if end < 0 else text[end + 1 :])
-    if _holds_key(new, keys):
+    if _value_at(new, keys) is not _ABSENT:
         raise UsageError(f"--unset {path}: it cannot be removed there")
     return new
 
@@ -128,14 +128,18 @@ def _begin(text: str) -> int:
     return 0 if root is None else int(root.start_mark.index)
 
 
-def _holds_key(text: str, keys: Sequence[str]) -> bool:
+_ABSENT = object()
+
+
+def _value_at(text: str, keys: Sequence[str]) -> object:
+    """Read the value of a key; `_ABSENT` if there is none, or the text is not YAML."""
     try:
         data = yaml.safe_load(text)
         for key in keys:
             data = data[int(key)] if isinstance(data, list) else data[key]
     except (yaml.YAMLError, RecursionError, *BAD_SCALARS):
-        return False
-    return True
+        return _ABSENT
+    return data
 
 
 def is_plain(name: str) -> bool:
@@ -195,13 +199,3 @@ def _insert(text: str, block: yaml.MappingNode, keys: Sequence[str], value: str)
     at = len(text) if at < 0 else at
     indent = " " * block.start_mark.column
     return f"{text[:at]}\n{indent}{entry}{text[at:]}"
-
-
-def _holds(text: str, keys: Sequence[str], wanted: object) -> bool:
-    try:
-        data = yaml.safe_load(text)
-        for key in keys:
-            data = data[int(key)] if isinstance(data, list) else data[key]
-    except (yaml.YAMLError, RecursionError, *BAD_SCALARS):
-        return False
-    return bool(data == wanted)

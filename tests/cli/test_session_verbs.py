@@ -232,7 +232,7 @@ def test_too_few_captures_exit_with_6_and_say_how_many_are_needed(lce_rig, sessi
         shutil.rmtree(session / "captures" / f"{k:06d}")
     outcome = lce_rig("calibrate", session)
     assert outcome.code == 6
-    assert "4 of 4 captures" in outcome.err and "at least 6" in outcome.err
+    assert "4 of 4 captures" in outcome.err and "minimum 6" in outcome.err
 
 
 def test_a_damaged_capture_is_named_and_the_others_still_count(lce_rig, session):

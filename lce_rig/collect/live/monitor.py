@@ -147,6 +147,7 @@ class Monitor:
             notes=self._notes(),
             n_logged=self._n_logged,
             last_capture=last_capture,
+            requires_still_boards=self._clock.verdict().requires_still_boards,
         )
 
     def _phase(self, *, is_enough: bool, has_ended: bool) -> tuple[Phase, str, str]:

@@ -180,7 +180,8 @@ class LiveState:
         target_deg, target_mm: the profile's.
         cues: the latest few, oldest first.
         log: the latest messages, oldest first.
-        notes: what holds all the time: "boards must stand still: ...".
+        notes: what holds all the time, in words.
+        requires_still_boards: whether boards must stand still, as `SyncVerdict` says.
         n_logged: messages since the beginning, of which `log` holds the latest.
     """
 
@@ -205,3 +206,4 @@ class LiveState:
     notes: tuple[str, ...] = field(default=())
     n_logged: int = 0
     last_capture: str = ""
+    requires_still_boards: bool = True

@@ -13,14 +13,13 @@ from lce_rig.collect.guidance import (
     is_there,
     model_sensors,
     outline_px,
-    predict_covariance,
     sigmas,
 )
 from lce_rig.collect.guidance.planner import SPACINGS
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import perturb
 from lce_rig.rig import load_rig
-from tests.collect.guidance.boards import model, placements, view
+from tests.collect.guidance.boards import model, placements, predict_covariance, view
 from tests.extrinsics.boards import T_FORWARD
 
 NONE = np.zeros((0, 4, 4))
