@@ -352,7 +352,7 @@ def _other_camera(solved: Sequence[_Solved], link: _Link, k: int) -> OtherCamera
         J = J * np.repeat([own.validation.widened_by, other.validation.widened_by], 6)
         both = own.together.covariance_of(own.sensors.camera, other.sensors.camera)
         cov = np.asarray(J @ both @ J.T)
-    seen = None if pair.pictures is None else pair.pictures.T_second_first
+    seen = None if pair.from_images is None else pair.from_images.T_second_first
     apart_deg, apart_m = (None, None) if pair.apart is None else tangent_sizes(pair.apart)
     return OtherCamera(
         camera=other.sensors.camera,

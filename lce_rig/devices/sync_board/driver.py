@@ -13,7 +13,13 @@ from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.protocol import SourceStatus
 from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.sync_board.board_report import BoardView, clock_state, device_words, figures, problems
+from lce_rig.devices.sync_board.board_report import (
+    BoardSnapshot,
+    clock_state,
+    device_words,
+    figures,
+    problems,
+)
 from lce_rig.devices.sync_board.board_state import Arrival, BoardState
 from lce_rig.devices.sync_board.lines import DIALECTS, LineReader
 from lce_rig.devices.sync_board.lines.lce1 import VERSION
@@ -189,7 +195,7 @@ class SyncBoard(LiveSource):
         self._heard = deque[int](maxlen=_N_HEARD_BYTES)
         self._outbox: deque[bytes] = deque()
         self._rate_hz: float | None = None
-        self._n_resets_seen = 0
+        self._reset_seen_ns: int | None = None
         self._cookie = 0
         self._opened_ns = self._line_ns = self._asked_ns = self._told_utc_ns = self._greeted_ns = 0
         self._busy_until_ns = 0
@@ -243,12 +249,12 @@ class SyncBoard(LiveSource):
             view = self._view()
             return SourceStatus(
                 self.sensor,
-                n_lost=sum(self._state.counts.n_lost.values()),
+                n_lost=sum(self._state.n_lost_by_line().values()),
                 clock=clock_state(view),
                 problems=problems(view),
                 figures=figures(view),
                 device=device_words(view),
-                n_lost_by_line=dict(self._state.counts.n_lost),
+                n_lost_by_line=self._state.n_lost_by_line(),
             )
 
     @property
@@ -289,8 +295,8 @@ class SyncBoard(LiveSource):
         if not self._is_heard and self._is_introduced(bool(messages)):
             self._configure()
             self._is_heard = True
-        if self._state.counts.n_resets != self._n_resets_seen:
-            self._n_resets_seen = self._state.counts.n_resets
+        if self._state.reset_steady_ns != self._reset_seen_ns:
+            self._reset_seen_ns = self._state.reset_steady_ns
             self._busy_until_ns = arrival.steady_ns + _ASK_OFTEN_NS
             self._told_utc_ns = 0
             self._configure()
@@ -348,8 +354,8 @@ class SyncBoard(LiveSource):
         if data:
             port.write(data)
 
-    def _view(self) -> BoardView:
-        return BoardView(
+    def _view(self) -> BoardSnapshot:
+        return BoardSnapshot(
             self._state,
             self._reader,
             time.monotonic_ns(),
