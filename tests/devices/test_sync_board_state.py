@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.devices.sync_board.board_report import BoardView, clock_state, figures, problems
+from lce_rig.devices.sync_board.board_report import BoardSnapshot, clock_state, figures, problems
 from lce_rig.devices.sync_board.board_state import (
     IMPLAUSIBLE,
     RESTARTED,
@@ -48,7 +48,7 @@ def pulses(state, numbers, start_s=0.0, board_s=100.0, period_s=0.05):
 
 def view(state, now_s=10.0, opened_s=0.0, line_s=10.0, dialect=None, wants=("cam",), n_unwritten=0):
     reader = LineReader(dialect or Lce1())
-    return BoardView(
+    return BoardSnapshot(
         state, reader, round(now_s * S), round(opened_s * S), round(line_s * S), wants, n_unwritten
     )
 

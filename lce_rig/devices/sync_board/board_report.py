@@ -19,7 +19,7 @@ _NO_CLOCK_S = 5.0
 
 
 @dataclass(frozen=True)
-class BoardView:
+class BoardSnapshot:
     """A board at one moment.
 
     Attributes:
@@ -44,7 +44,7 @@ class BoardView:
         return (self.now_ns - then_ns) / NS_PER_S
 
 
-def clock_state(view: BoardView) -> ClockState:
+def clock_state(view: BoardSnapshot) -> ClockState:
     """Say whose clock the timestamps are on, and how it is tied to others."""
     if not view.reader.dialect.has_triggers:
         return ClockState(Finding("clock.receiver", "note"))
@@ -61,7 +61,7 @@ def clock_state(view: BoardView) -> ClockState:
     return ClockState(Finding("clock.board", "note", figures=found))
 
 
-def device_words(view: BoardView) -> str:
+def device_words(view: BoardSnapshot) -> str:
     """Name the board as it names itself."""
     hello = view.state.hello
     if hello is None or not hello.version:
@@ -69,7 +69,7 @@ def device_words(view: BoardView) -> str:
     return f"{hello.board}, firmware {hello.firmware}, LCE{hello.version}"
 
 
-def figures(view: BoardView) -> dict[str, float]:
+def figures(view: BoardSnapshot) -> dict[str, float]:
     """Give the board's figures by name."""
     state, faults = view.state, view.reader.faults
     found: dict[str, float] = {
@@ -93,7 +93,7 @@ def figures(view: BoardView) -> dict[str, float]:
     return found
 
 
-def problems(view: BoardView) -> tuple[Finding, ...]:
+def problems(view: BoardSnapshot) -> tuple[Finding, ...]:
     """Find what is wrong now."""
     silent_s = view.age_s(view.line_ns)
     if silent_s > STALLED_S:
@@ -105,7 +105,7 @@ def _warn(code: str, **figures: Figure) -> Finding:
     return Finding(code, "warning", figures=figures)
 
 
-def _line_problems(view: BoardView) -> list[Finding]:
+def _line_problems(view: BoardSnapshot) -> list[Finding]:
     faults = view.reader.faults
     n_damaged = sum(faults.values()) - faults[LineFault.UNKNOWN] + view.state.losses.n(IMPLAUSIBLE)
     n_lines = n_damaged + view.reader.n_messages
@@ -117,7 +117,7 @@ def _line_problems(view: BoardView) -> list[Finding]:
     return found
 
 
-def _board_problems(view: BoardView) -> list[Finding]:
+def _board_problems(view: BoardSnapshot) -> list[Finding]:
     state = view.state
     found = []
     if state.reset_steady_ns is not None:
@@ -137,7 +137,7 @@ def _board_problems(view: BoardView) -> list[Finding]:
     return found
 
 
-def _clock_problems(view: BoardView) -> list[Finding]:
+def _clock_problems(view: BoardSnapshot) -> list[Finding]:
     state = view.state
     found = []
     if view.reader.dialect.has_triggers and state.host_clock is None:
@@ -152,7 +152,7 @@ def _clock_problems(view: BoardView) -> list[Finding]:
     return found
 
 
-def _utc_problems(view: BoardView) -> list[Finding]:
+def _utc_problems(view: BoardSnapshot) -> list[Finding]:
     state = view.state
     if not view.reader.dialect.has_triggers:
         if state.utc is None or state.utc.utc_ns is None:

@@ -13,7 +13,13 @@ from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.protocol import SourceStatus
 from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.sync_board.board_report import BoardView, clock_state, device_words, figures, problems
+from lce_rig.devices.sync_board.board_report import (
+    BoardSnapshot,
+    clock_state,
+    device_words,
+    figures,
+    problems,
+)
 from lce_rig.devices.sync_board.board_state import Arrival, BoardState
 from lce_rig.devices.sync_board.lines import DIALECTS, LineReader
 from lce_rig.devices.sync_board.lines.lce1 import VERSION
@@ -348,8 +354,8 @@ class SyncBoard(LiveSource):
         if data:
             port.write(data)
 
-    def _view(self) -> BoardView:
-        return BoardView(
+    def _view(self) -> BoardSnapshot:
+        return BoardSnapshot(
             self._state,
             self._reader,
             time.monotonic_ns(),
