@@ -21,11 +21,11 @@ from lce_rig.extrinsics.board_motion import fit_motions
 from lce_rig.extrinsics.metrics import capture_residual, summarise
 from lce_rig.extrinsics.options import CaptureCandidates
 from lce_rig.extrinsics.shared_scans import SharedScan, sample_scans
-from lce_rig.extrinsics.time_offsets import at_sweep_time, deskew_points
+from lce_rig.extrinsics.time_offsets import at_scan_time, deskew_points
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.validation.verdict import residuals_beyond
-from lce_rig.verify.event_picture import CameraView
+from lce_rig.verify.event_picture import ImageWithEvents
 from lce_rig.verify.overlay import camera_part, draw_overlay, range_limits
 from lce_rig.verify.overlay_files import Overlay, SheetHead, write_overlays
 from lce_rig.words import as_json, sentence
@@ -39,18 +39,18 @@ class Meeting:
 
     Attributes:
         measured: as each sensor saw it, at its own time.
-        at_sweep: both at the time at which the LiDAR saw the board, for residuals.
-        in_picture: the LiDAR's at the time of the image, for drawing.
+        at_scan_time: both at the time at which the LiDAR saw the board, for residuals.
+        lidar_at_image_time: the LiDAR's at the time of the image, for drawing.
     """
 
     measured: Observation
-    at_sweep: Observation
-    in_picture: LidarBoard
+    at_scan_time: Observation
+    lidar_at_image_time: LidarBoard
 
     @property
     def way_m(self) -> float:
         """Distance that the board's middle moved between scan and image."""
-        before, after = self.measured.lidar.T_lidar_board, self.in_picture.T_lidar_board
+        before, after = self.measured.lidar.T_lidar_board, self.lidar_at_image_time.T_lidar_board
         return float(np.linalg.norm(after[:3, 3] - before[:3, 3]))
 
 
@@ -79,9 +79,9 @@ def bring_together(
     offset_s = np.array([results[name].time_offset_s for name in samples.channels], dtype=np.float64)
     only = channel if len(samples.channels) > 1 else None
     motions = fit_motions(samples, offset_s, only)
-    swept = deskew_points(at_sweep_time(own, motions, clocks.sweep_s), motions, calibration.T_cam_lidar)
+    swept = deskew_points(at_scan_time(own, motions, clocks.sweep_s), motions, calibration.T_cam_lidar)
     return {
-        o.capture: Meeting(o, moved, _in_picture(moved, o.image, calibration.T_cam_lidar))
+        o.capture: Meeting(o, moved, _at_image_time(moved, o.image, calibration.T_cam_lidar))
         for o, moved in zip(own, swept, strict=True)
     }
 
@@ -103,7 +103,7 @@ def _join(
     return scans, own
 
 
-def _in_picture(swept: Observation, image: ImageBoard, T_cam_lidar: Array) -> LidarBoard:
+def _at_image_time(swept: Observation, image: ImageBoard, T_cam_lidar: Array) -> LidarBoard:
     """Move the LiDAR's board from the time of the scan to that of the image."""
     moved = invert(T_cam_lidar) @ image.T_cam_board @ invert(swept.image.T_cam_board) @ T_cam_lidar
     lidar = swept.lidar
@@ -162,7 +162,7 @@ class SessionCheck:
     Attributes:
         pair: the sensors.
         calibration: the calibration to check.
-        doubts: why these captures contradict it; empty if they agree.
+        findings: why these captures contradict it; empty if they agree.
         residuals: of each capture in which both sensors see the board.
         metrics: their summary; None without any.
         meetings: by capture, the boards of the residuals.
@@ -172,7 +172,7 @@ class SessionCheck:
 
     pair: Pair
     calibration: Calibration
-    doubts: tuple[Finding, ...]
+    findings: tuple[Finding, ...]
     residuals: tuple[CaptureResidual, ...]
     metrics: Metrics | None
     meetings: Mapping[str, Meeting]
@@ -195,7 +195,7 @@ class SessionCheck:
             "channel": self.pair.channel,
             "lidar": self.pair.lidar,
             "verdict": self.calibration.verdict,
-            "doubts": [as_json(doubt) for doubt in self.doubts],
+            "doubts": [as_json(doubt) for doubt in self.findings],
             "metrics": None
             if self.metrics is None
             else {**asdict(self.metrics), "mge_m": self.metrics.mge_m},
@@ -228,12 +228,13 @@ def check_session(
     board = rig.board.to_board()
     meetings = _meetings(rig, detections, channel, calibration, clocks)
     residuals = [
-        capture_residual(calibration.T_cam_lidar, meeting.at_sweep, board) for meeting in meetings.values()
+        capture_residual(calibration.T_cam_lidar, meeting.at_scan_time, board)
+        for meeting in meetings.values()
     ]
     metrics = summarise(residuals) if residuals else None
     n_seen = sum(_sees_board(detections, pair, name) for name in detections.captures(pair))
-    doubts = contradictions(metrics, rig, n_seen - len(residuals), n_seen)
-    return SessionCheck(pair, calibration, doubts, tuple(residuals), metrics, meetings)
+    findings = contradictions(metrics, rig, n_seen - len(residuals), n_seen)
+    return SessionCheck(pair, calibration, findings, tuple(residuals), metrics, meetings)
 
 
 def draw_check(
@@ -242,7 +243,7 @@ def draw_check(
     check: SessionCheck,
     folder: Path,
     *,
-    view_of: Callable[[Capture], CameraView | None],
+    view_of: Callable[[Capture], ImageWithEvents | None],
     progress: Progress,
 ) -> SessionCheck:
     """Project the point cloud of every capture into its image, and return the images' paths.
@@ -303,7 +304,7 @@ def _head_lines(check: SessionCheck, n_captures: int) -> list[str]:
             else f"; mean over captures: {_residual_words(m.mpe_m, m.mee_m, m.reprojection_px)}"
         )
     ]
-    return lines + [sentence(finding) for finding in (*c.findings, *check.doubts)]
+    return lines + [sentence(finding) for finding in (*c.findings, *check.findings)]
 
 
 def _residual_words(plane_m: float, edge_m: float, corner_px: float) -> str:
@@ -320,13 +321,13 @@ def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: 
             be a board that the LiDAR missed among objects of its size; many are a contradiction.
         n_seen: captures with detections of both sensors.
     """
-    doubts = [] if metrics is None else residuals_beyond(metrics, rig.quality)
+    found = [] if metrics is None else residuals_beyond(metrics, rig.quality)
     if 4 * n_elsewhere > n_seen:
         figures = {"n_elsewhere": n_elsewhere, "n_captures": n_seen}
-        doubts.append(Finding("verify.elsewhere", "error", figures=figures))
+        found.append(Finding("verify.elsewhere", "error", figures=figures))
     if n_seen == 0:
-        doubts.append(Finding("verify.unseen", "error"))
-    return tuple(doubts)
+        found.append(Finding("verify.unseen", "error"))
+    return tuple(found)
 
 
 def _sees_board(detections: Detections, pair: Pair, name: str) -> bool:
@@ -366,7 +367,7 @@ def _draw(
     capture: Capture,
     rig: Rig,
     check: SessionCheck,
-    view: CameraView,
+    view: ImageWithEvents,
     seen: ImageBoard | None,
     residual: CaptureResidual | None,
     limits_m: tuple[float, float],
@@ -383,7 +384,7 @@ def _draw(
         scan if meeting is None else _without(scan, meeting.measured.lidar),
         rig.cameras[calibration.camera].to_intrinsics(),
         calibration.T_cam_lidar,
-        lidar_board=None if meeting is None else meeting.in_picture,
+        lidar_board=None if meeting is None else meeting.lidar_at_image_time,
         image_board=seen if meeting is None else meeting.measured.image,
         board=rig.board.to_board(),
         residuals=_legend(name, residual, meeting, calibration),
