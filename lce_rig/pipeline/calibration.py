@@ -452,8 +452,11 @@ def _compared(calibration: Calibration, reference: Reference | None) -> Calibrat
 def refusals_of(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refusal]:
     """State why captures of a pair are unusable: a sensor found no board, or both sensors disagree."""
     candidates, refused = _candidates(detections, pair)
-    consensus = find_consensus(candidates, rig.board.to_board()) if len(candidates) >= 3 else None
-    return dict(sorted({**refused, **(consensus.refused if consensus else {})}.items()))
+    if len(candidates) >= 3:
+        consensus = find_consensus(candidates, rig.board.to_board())
+        nowhere = Refusal("pair.no_agreement", figures={"n_captures": len(candidates)})
+        refused |= consensus.refused if consensus else {item.capture: nowhere for item in candidates}
+    return dict(sorted(refused.items()))
 
 
 def clocks_of(rig: Rig, camera: str, lidar: str) -> Clocks:
