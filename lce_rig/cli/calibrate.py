@@ -200,8 +200,9 @@ def calibrate(
     import lce_rig as lce
     from lce_rig.core.errors import UsageError
     from lce_rig.export.reference import read_reference
-    from lce_rig.pipeline.result_files import OVERLAYS
+    from lce_rig.pipeline.result_files import OVERLAYS, new_result_parts
 
+    new_result_parts(name)
     opened = lce.Session.open(session)
     rig = opened.rig
     require_sensors("camera", cameras, rig.cameras)

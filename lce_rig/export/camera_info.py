@@ -98,8 +98,10 @@ def load_camera_info(path: Path) -> Intrinsics:
         return _intrinsics(data)
     except OSError as error:
         raise ProfileError(f"{path}: cannot be read: {error.strerror}") from None
-    except (KeyError, TypeError) as error:
-        raise ProfileError(f"{path}: not a camera_info file of ROS: {describe(str(error))}") from None
+    except KeyError as error:
+        raise ProfileError(f"{path}: not a camera_info file of ROS: it has no key {error.args[0]}") from None
+    except TypeError:
+        raise ProfileError(f"{path}: not a camera_info file of ROS: a block of it has no keys") from None
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise ProfileError(f"{path}: not a usable camera_info file: {' '.join(str(error).split())}") from None
 

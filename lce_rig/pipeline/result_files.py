@@ -129,6 +129,13 @@ def result_parts(name: str | None) -> tuple[str, ...]:
     return (RESULTS, name)
 
 
+def new_result_parts(name: str | None) -> tuple[str, ...]:
+    """Give the path in a session of a result that is to be written; raises as `result_parts`."""
+    if name in (CURRENT, PREVIOUS):
+        raise UsageError(f"no result can be named {name!r}", "That is a name of what is in calibration/.")
+    return result_parts(name)
+
+
 def write_results(
     session: Session, calibrations: Sequence[Calibration], *, force: bool, name: str | None = None
 ) -> WrittenResults:
@@ -151,9 +158,7 @@ def write_results(
             unchanged.
         ResultRefusedError: a pose or covariance is not finite; the same.
     """
-    parts = result_parts(name)
-    if name in (CURRENT, PREVIOUS):
-        raise UsageError(f"no result can be named {name!r}", "That is a name of what is in calibration/.")
+    parts = new_result_parts(name)
     folder = session.path.joinpath(*parts)
     is_same = had_overlays = False
 

@@ -141,6 +141,9 @@ def _extrinsics(
 ) -> tuple[Sequence[Calibration], bytes | None]:
     """Return the extrinsics to check, and the content of the session's result.json if it holds them."""
     content = result_content(session, name)
+    if result is None and content is None and name is not None:
+        names = ", ".join(each.name for each in stored_results(session)) or "none"
+        raise SessionError(f"{session.path} has no result {name!r}", f"Its results: {names}.")
     if isinstance(result, Result):
         rig, calibrations = result.session.rig.name, result.pairs
         is_own = result.session.path.resolve() == session.path.resolve()
