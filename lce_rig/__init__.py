@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from lce_rig.export.result import SavedResult, read_result
     from lce_rig.extrinsics import CalibrateOptions
     from lce_rig.pipeline.calibration import calibrate
-    from lce_rig.pipeline.collection import collect_from
+    from lce_rig.pipeline.collect_recordings import collect_from
     from lce_rig.pipeline.comparison import Repeat, repeat
     from lce_rig.pipeline.detect_session import detect
     from lce_rig.pipeline.result_files import Result
@@ -105,7 +105,7 @@ _HOMES = {
     "lce_rig.export.reference": ("Reference", "read_reference"),
     "lce_rig.export.result": ("SavedResult", "read_result"),
     "lce_rig.pipeline.calibration": ("calibrate",),
-    "lce_rig.pipeline.collection": ("collect_from",),
+    "lce_rig.pipeline.collect_recordings": ("collect_from",),
     "lce_rig.pipeline.detect_session": ("detect",),
     "lce_rig.pipeline.comparison": ("Repeat", "repeat"),
     "lce_rig.pipeline.result_files": ("Result",),

@@ -12,6 +12,8 @@ from lce_rig.cli import show
 from lce_rig.cli.options import event_image_option, json_option, session_argument
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
+from lce_rig.detect.lidar.search import plane_limit_m
+from lce_rig.rig import Rig
 from lce_rig.words import describe, recommend, refusal_as_json
 
 
@@ -48,11 +50,12 @@ def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) ->
     else:
         for pair, refused in refusals.items():
             show.print_table(_table(detections, pair, refused))
-            _summarise(len(detections.captures(pair)), refused)
+            _summarise(opened.rig, detections, pair, refused)
     if all(len(refused) == len(detections.captures(pair)) for pair, refused in refusals.items()):
         raise NotEnoughDataError(
             f"{session}: no capture is usable",
-            "Follow the actions above, or draw the detections with --debug-images.",
+            "Follow the actions above"
+            + ("." if debug_images else ", or draw the detections with --debug-images."),
         )
 
 
@@ -142,15 +145,32 @@ def _cell(figures: Mapping[str, float | None] | None, key: str, scale: float, di
     return "-" if value is None or sigma_m > _SIDE_SIGMA_MAX_M else f"{scale * value:.{digits}f}"
 
 
-def _summarise(n_captures: int, refused: Mapping[str, Refusal]) -> None:
-    """Print each cause once, with its captures."""
-    show.say(f"{n_captures - len(refused)} of {n_captures} captures are usable")
+def _summarise(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> None:
+    """Print how many captures are usable, and each cause of refusal once, with its captures."""
+    captures = detections.captures(pair)
+    usable = [name for name in captures if name not in refused]
+    n_detected = len(usable) + sum(why.stage == "pair" for why in refused.values())
+    needed = rig.quality.min_captures
+    limits_mm = [
+        1000 * plane_limit_m(rig.quality.max_thickness_m, lidar[0].quality.range_noise_m)
+        for lidar in (detections.of(pair, name)[1] for name in usable)
+        if isinstance(lidar, list)
+    ]
+    if limits_mm:
+        low, high = f"{min(limits_mm):.0f}", f"{max(limits_mm):.0f}"
+        noise = f"max_thickness_m {1000 * rig.quality.max_thickness_m:g} mm and the scan's noise"
+        show.say(f"plane: limit {low if low == high else f'{low} to {high}'} mm ({noise})")
+    show.say(
+        f"{len(usable)} of {len(captures)} captures are usable"
+        + (f"; both sensors found the board in {n_detected}" if n_detected > len(usable) else "")
+        + (f" (minimum {needed} for `lce-rig calibrate`)" if len(usable) < needed else "")
+    )
     names: dict[str, list[str]] = {}
     for name, refusal in sorted(refused.items()):
         text = f"{refusal.stage}: {describe(refusal)}\n    -> {recommend(refusal)}"
         names.setdefault(text, []).append(name)
-    for text, captures in names.items():
-        show.say(f"  {', '.join(captures)}: {text}")
+    for text, own in names.items():
+        show.say(f"  {', '.join(own)}: {text}")
     by_stage = Counter(refusal.stage for refusal in refused.values())
     if len(by_stage) > 1:
         show.say("  refused by stage: " + ", ".join(f"{stage} {n}" for stage, n in sorted(by_stage.items())))

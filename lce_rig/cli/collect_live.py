@@ -17,7 +17,7 @@ from lce_rig.screen.keys import Controls, controls
 
 if TYPE_CHECKING:
     from lce_rig.collect.live.simulated import SimulatedRig
-    from lce_rig.collect.live.state import LiveReport, LiveState
+    from lce_rig.collect.live.state import LiveReport, LiveState, TakeBack
     from lce_rig.devices.reading import LiveSource
     from lce_rig.page import Preview
     from lce_rig.rig import Rig
@@ -70,7 +70,7 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
     hold_s = HOLD_S if given.hold is None else given.hold
     with ExitStack() as stack:
         # The page first: an address that cannot be served fails before anything is created or started.
-        listeners, links = _open_preview(stack, given)
+        listeners, links, page_asked = _open_preview(stack, given)
         session = stack.enter_context(_session(path, rig))
         n_before = len(session.captures)
         sources, simulated = _open_rig(stack, rig, path, given)
@@ -88,7 +88,9 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
                     listener(state)
 
             try:
-                report = collect_live(session, sources, options, tell, asked, given.record)
+                report = collect_live(
+                    session, sources, options, tell, lambda: asked() or page_asked(), given.record
+                )
             finally:
                 n_captures = len(session.captures)
                 if n_captures or is_begun.is_set():
@@ -153,10 +155,10 @@ def _open_rig(
 
 def _open_preview(
     stack: ExitStack, given: LiveArguments
-) -> "tuple[list[Callable[[LiveState], None]], tuple[str, ...]]":
-    """Serve the preview page if requested; return its listeners and links."""
+) -> "tuple[list[Callable[[LiveState], None]], tuple[str, ...], Callable[[], TakeBack | None]]":
+    """Serve the preview page if requested; return its listeners, links and what its viewers ask for."""
     if given.preview is None:
-        return [], ()
+        return [], (), lambda: None
     from lce_rig.page import Preview, parse_address
 
     host, port = parse_address(given.preview)
@@ -165,7 +167,7 @@ def _open_preview(
     stack.enter_context(preview)
     for url in preview.urls:
         show.note(f"preview: {url}")
-    return [preview.publish], preview.urls
+    return [preview.publish], preview.urls, preview.asked
 
 
 def _tell_troubles(preview: "Preview") -> None:

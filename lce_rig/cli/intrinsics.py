@@ -7,7 +7,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import cameras_option, require_sensors, session_argument, split_names
-from lce_rig.words import sentence
+from lce_rig.words import describe, sentence
 
 if TYPE_CHECKING:
     from lce_rig.pipeline.lens import MeasuredIntrinsics
@@ -33,8 +33,9 @@ _MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")
     "--save-profile",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Write the session's profile with the estimated intrinsics to a new file.",
+    help="Write the session's profile to a new file, with the intrinsics that the session determines better.",
 )
+@click.option("--force", is_flag=True, help="With --save-profile: write all estimated intrinsics.")
 @click.option("--json", "as_json", is_flag=True, help="Print intrinsics.json on stdout.")
 def intrinsics(
     session: Path,
@@ -42,13 +43,15 @@ def intrinsics(
     channels: list[str] | None,
     model: str | None,
     save_profile: Path | None,
+    force: bool,
     as_json: bool,
 ) -> None:
     """Estimate each camera's intrinsics from the boards in the images of SESSION (default: session/).
 
     Reports the standard deviation of every parameter, what the captures do not determine, and whether the
     profile's intrinsics still fit. Writes SESSION/intrinsics/: a block for the profile, camera_info and a
-    page of plots per camera. The profile is not changed. Exits with 6 if the captures are insufficient.
+    page of plots per camera. The profile is not changed. Exits with 6 if the captures are insufficient, with
+    7 if --save-profile has nothing to write, as the session determines no intrinsics better than the profile.
     """
     from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
     from lce_rig.pipeline.intrinsics_files import document, write_intrinsics
@@ -81,8 +84,12 @@ def intrinsics(
             show.print_lines(_findings(one))
     show.note("written: " + ", ".join(path.name for path in files) + f" in {files[0].parent}")
     if save_profile is not None:
-        write_profile(opened, measured, save_profile)
-        show.note(f"written: {save_profile}")
+        replaced = write_profile(opened, measured, save_profile, is_forced=force)
+        show.note(f"written: {save_profile}, with new intrinsics of {', '.join(replaced)}")
+        for one in measured:
+            if one.judgement.code != "intrinsics.better":
+                how = "new intrinsics forced" if one.camera in replaced else "intrinsics kept"
+                show.note(f"{one.camera}: {how}: {describe(one.judgement)}")
     if troubles:
         raise join_shortages(troubles)
 
@@ -138,7 +145,7 @@ def _table(measured: "MeasuredIntrinsics") -> Any:
 
 
 def _findings(measured: "MeasuredIntrinsics") -> list[str]:
-    from lce_rig.validation.intrinsics_check import describe, explain
+    from lce_rig.validation.intrinsics_check import describe as figures_of
 
     lines = []
     if measured.check is None:
@@ -146,10 +153,11 @@ def _findings(measured: "MeasuredIntrinsics") -> list[str]:
         size = f"{given.width_px}x{given.height_px}"
         lines.append(f"  [red]the profile's intrinsics are for {size} px, the images have another size[/]")
     else:
-        verdict = measured.check.verdict()
-        lines.append(f"  {describe(measured.check)}")
-        if verdict != "pass":
-            lines.append(f"  [{show.COLOURS[verdict]}]{show.escape(sentence(explain(measured.check)))}[/]")
+        lines.append(f"  {figures_of(measured.check)}")
+    if measured.misfit is not None:
+        colour = "red" if measured.misfit.severity == "error" else "yellow"
+        lines.append(f"  [{colour}]{show.escape(describe(measured.misfit))}[/]")
+    lines.append(f"  {show.escape(sentence(measured.judgement))}")
     lines += [f"  [yellow]{show.escape(text)}[/]" for text in measured.weaknesses]
     for name, why in measured.refused.items():
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {sentence(why)}')}[/]")

@@ -102,7 +102,7 @@ def _summary(comparison: "Repeatability") -> list[str]:
         *("  " + "  ".join(f"{value: .6f}" for value in row) for row in c.T_cam_lidar[:3]),
         f"spread   {c.spread_rotation_deg:.3f} deg, {1000 * c.spread_translation_m:.1f} mm "
         "(1 sigma of one session)",
-        f"reported {c.claimed_rotation_deg:.3f} deg, {1000 * c.claimed_translation_m:.1f} mm{_scatter(c)}",
+        f"reported {c.reported_rotation_deg:.3f} deg, {1000 * c.reported_translation_m:.1f} mm{_scatter(c)}",
         f"chi2     {c.chi2:.1f} with {c.dof} degrees of freedom, chance {c.p:.2g}"
         + ("" if c.are_independent else " (at least: the results share captures)"),
     ]
@@ -150,8 +150,8 @@ def _pair(comparison: "Repeatability") -> dict[str, Any]:
         "deviations": c.deviations.tolist(),
         "spread_rotation_deg": c.spread_rotation_deg,
         "spread_translation_m": c.spread_translation_m,
-        "claimed_rotation_deg": c.claimed_rotation_deg,
-        "claimed_translation_m": c.claimed_translation_m,
+        "claimed_rotation_deg": c.reported_rotation_deg,
+        "claimed_translation_m": c.reported_translation_m,
         "scatter_rotation_deg": c.scatter_rotation_deg,
         "scatter_translation_m": c.scatter_translation_m,
         "chi2": c.chi2,

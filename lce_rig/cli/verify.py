@@ -38,7 +38,7 @@ def verify(
 ) -> None:
     """Project the point clouds of SESSION (default: session/) into the images and print residuals.
 
-    Images and a contact sheet replace those in SESSION/calibration/overlays/, with --result FILE those in
+    Images and contact sheets replace those in SESSION/calibration/overlays/, with --result FILE those in
     SESSION/overlays/, with --name NAME those beside that result. Exits with 7 if the verdict is fail or these
     captures contradict the extrinsics.
     """
@@ -66,13 +66,13 @@ def verify(
     for c in verification.unchecked:
         show.warn(f"{session} holds no captures of {Pair.of(c)}: not checked")
     exit_by_verdict(verification.calibrations)
-    contradicted = [checked for checked in checks if checked.doubts]
+    contradicted = [checked for checked in checks if checked.findings]
     if contradicted:
         raise ResultRefusedError(
             f"the captures of {session} contradict the extrinsics of "
             + " and that of ".join(str(checked.pair) for checked in contradicted),
             "\n".join(
-                f"{checked.pair}: {describe(doubt)}" for checked in contradicted for doubt in checked.doubts
+                f"{checked.pair}: {describe(doubt)}" for checked in contradicted for doubt in checked.findings
             ),
         )
 
@@ -99,7 +99,9 @@ def _summary(checked: Any) -> list[str]:
             f"together {1000 * m.mge_m:.1f} mm; corners {m.reprojection_px:.2f} px"
         )
     lines.append(f"verdict of the calibration: {checked.calibration.verdict}")
-    lines.append(f"these captures: {'; '.join(map(describe, checked.doubts)) or 'agree'}")
-    if checked.contact_sheet is not None:
-        lines.append(f"images: {show.escape(str(checked.contact_sheet))}")
+    lines.append(f"these captures: {'; '.join(map(describe, checked.findings)) or 'agree'}")
+    if checked.contact_sheets:
+        first, *others = checked.contact_sheets
+        last = f" to {others[-1].name}" if others else ""
+        lines.append(f"images: {show.escape(str(first))}{last}")
     return lines

@@ -37,6 +37,10 @@ class Placements:
         """Remember poses T_cam_board (4, 4) of a capture."""
         self._poses.extend((name, key, T_cam_board) for key, T_cam_board in poses.items())
 
+    def remove(self, name: str) -> None:
+        """Forget a capture: where it was made is new again."""
+        self._poses = [each for each in self._poses if each[0] != name]
+
     def find_like(self, boards: Mapping[ImageKey, ImageBoard]) -> str | None:
         """Name a capture in which every camera saw the board where it is now; None where it is new."""
         likes: dict[str, list[bool]] = {}

@@ -1,7 +1,7 @@
 """Facts about a sensor, a capture or a result; `words` renders them."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 Severity = Literal["note", "warning", "error"]
@@ -43,11 +43,6 @@ class Finding:
         if not isinstance(value, float | int):
             raise TypeError(f"{self.code}: {name} is {value!r}")
         return float(value)
-
-
-def about(subject: str, findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return findings with the subject that whoever found them did not know."""
-    return tuple(replace(finding, subject=subject) for finding in findings)
 
 
 def worst(findings: Iterable[Finding]) -> Severity:

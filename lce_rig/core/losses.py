@@ -33,6 +33,12 @@ class Losses:
         for finding, n in other.counts():
             self.add(finding, n)
 
+    def keep_more(self, other: "Losses") -> None:
+        """Take over the larger numbers of what a more complete pass over the same data found."""
+        for kind, n in other._counts.items():
+            if n >= self._counts[kind]:
+                self._counts[kind], self._examples[kind] = n, other._examples[kind]
+
     def counts(self) -> list[tuple[Finding, int]]:
         """List an example of each kind with how many there were, most frequent first."""
         return [(self._examples[kind], n) for kind, n in self._counts.most_common()]

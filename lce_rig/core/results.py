@@ -98,8 +98,7 @@ class LidarQuality:
         n_rings, n_points: on the plate.
         n_ring_ends: at its outline.
         n_ring_ends_dropped: that do not fit the outline.
-        thickness_m: range of the points' heights over the plane without the outer 5 %.
-        plane_rms_m: of those heights.
+        plane_rms_m: rms of the points' distances from the plane.
         edge_rms_m: of the ring ends' distances from the outline; NaN without ring ends.
         template_m: error of the nominal outline.
         beyond_share: returns in the plane beyond the outline over those on the plate.
@@ -117,7 +116,6 @@ class LidarQuality:
     n_points: int
     n_ring_ends: int
     n_ring_ends_dropped: int
-    thickness_m: float
     plane_rms_m: float
     edge_rms_m: float
     template_m: float

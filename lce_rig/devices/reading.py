@@ -130,7 +130,6 @@ class LiveSource(ABC):
         self._rate = RateMeter()
         self._heard_s = 0.0
         self._lost: tuple[SourceError, float] | None = None
-        self._n_reopened = 0
         self._thread: threading.Thread | None = None
 
     @abstractmethod
@@ -238,11 +237,6 @@ class LiveSource(ABC):
         """Why the sensor is lost now, and since when by time.monotonic(); None while it is not."""
         return self._lost
 
-    @property
-    def n_reopened(self) -> int:
-        """How often it came back after it was lost."""
-        return self._n_reopened
-
     def note_heard(self) -> None:
         """Call the device alive, though no sample is complete yet."""
         self._heard_s = time.monotonic()
@@ -291,9 +285,7 @@ class LiveSource(ABC):
 
     def _note_back(self) -> None:
         """Call a sensor back when it sends: a program that can be started may still find no camera."""
-        if self._lost is not None:
-            self._lost = None
-            self._n_reopened += 1
+        self._lost = None
 
     def _reopen(self, failure: SourceError) -> bool:
         """Open the device again; False where reading is to end before that."""

@@ -80,7 +80,7 @@ _DARK_GREY, _FLAT_GREY = 50.0, 3.0
 _MAX_EDGE_PX = 6.0
 
 
-def check_picture(exam: SensorReport, sensor: str) -> Check | None:
+def check_image(exam: SensorReport, sensor: str) -> Check | None:
     """Judge the exposure and sharpness of the last image."""
     images = exam.seen[sensor].images
     if not images:

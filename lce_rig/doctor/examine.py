@@ -27,7 +27,7 @@ from lce_rig.doctor.devices import (
     check_board,
     check_device,
     check_events,
-    check_picture,
+    check_image,
     check_pulse,
     check_settings,
     check_stream,
@@ -47,7 +47,7 @@ CAMERA_CHECKS: tuple[SensorCheck, ...] = (
     check_clock,
     check_frames_of_pulses,
     check_edges,
-    check_picture,
+    check_image,
     check_events,
     check_board,
 )
@@ -124,7 +124,7 @@ def look_for_boards(rig: Rig, seen: Mapping[str, ObservedSensor]) -> dict[tuple[
         if observation.scan is not None:
             sights[sensor, ""] = _sight_in_scan(rig, observation)
         for channel, image in observation.images.items():
-            sights[sensor, channel] = _sight_in_picture(rig, image)
+            sights[sensor, channel] = _sight_in_image(rig, image)
         if observation.events and not observation.images:
             sights[sensor, "events"] = _sight_in_events(rig, observation)
     return sights
@@ -140,7 +140,7 @@ def _sight_in_scan(rig: Rig, seen: ObservedSensor) -> Finding:
     return Finding("board.in_scan", "note", figures={**figures, "n_candidates": len(found)})
 
 
-def _sight_in_picture(rig: Rig, image: Image) -> Finding:
+def _sight_in_image(rig: Rig, image: Image) -> Finding:
     try:
         found = BoardFinder(rig).image(image)
     except LceRigError as error:

@@ -29,7 +29,7 @@ from lce_rig.extrinsics.shared_scans import (
     sample_scans,
     time_sigmas_s,
 )
-from lce_rig.extrinsics.time_offsets import TimeOffsets, at_sweep_time, deskew_points, estimate_time_offsets
+from lce_rig.extrinsics.time_offsets import TimeOffsets, at_scan_time, deskew_points, estimate_time_offsets
 from lce_rig.residuals.moments import Weights
 from lce_rig.residuals.plane_and_ends import along_normals
 
@@ -109,7 +109,7 @@ class _Mover:
             return [_still_observation(scan, only) for scan in scans]
         motions = fit_motions(self.samples.select(kept), self.offsets.offset_s, only)
         still = [_still_observation(scan, only) for scan in scans]
-        return deskew_points(at_sweep_time(still, motions, self.sweep_s), motions, self.T_cam_lidar)
+        return deskew_points(at_scan_time(still, motions, self.sweep_s), motions, self.T_cam_lidar)
 
     @property
     def is_motion_own(self) -> bool:

@@ -52,7 +52,7 @@ class TimeOffsets:
     sensitivity: Array
 
 
-def at_sweep_time(
+def at_scan_time(
     observations: Sequence[Observation], motions: BoardMotions, sweep_s: float
 ) -> list[Observation]:
     """Replace the board's pose of every capture by that at the LiDAR's time.

@@ -3,16 +3,18 @@
 import asyncio
 import contextlib
 import json
+import re
 import socket
 import threading
 import time
+from collections import deque
 from contextlib import suppress
 from importlib import resources
 from types import TracebackType
 
 from aiohttp import WSMsgType, web
 
-from lce_rig.collect.live.state import LiveState
+from lce_rig.collect.live.state import LiveState, TakeBack
 from lce_rig.page.access import Gate, check_token, guarded, new_token
 from lce_rig.page.address import DEFAULT_PORT, LOOPBACK, is_loopback, links, listen
 from lce_rig.page.connections import REQUEST_S, Connections, Troubles
@@ -20,20 +22,31 @@ from lce_rig.page.state_message import Encoder, Pixels, beat, to_json
 
 # The newest state, handed from the thread that collects to those who watch.
 
+# Requests that wait; somebody who taps faster than the collection listens means one thing.
+_MOST_ASKED = 8
 # Waking the other thread would cost the collection a system call, and the interpreter's lock with it.
 _LOOK_S = 0.03
 
 
 class Feed:
-    """Holds one state, the newest; whoever is slow misses those between."""
+    """Holds one state, the newest; whoever is slow misses those between. Requests go the other way."""
 
     def __init__(self) -> None:
         self._newest: tuple[int, float, LiveState] | None = None
+        self._asked: deque[TakeBack] = deque(maxlen=_MOST_ASKED)
 
     def publish(self, state: LiveState) -> None:
         """Put a state in; from one thread at a time. It is a single assignment, so it never blocks."""
         number = 1 if self._newest is None else self._newest[0] + 1
         self._newest = (number, time.monotonic(), state)
+
+    def ask(self, asked: TakeBack) -> None:
+        """Put a request of a page in, for the thread that collects; the oldest make way."""
+        self._asked.append(asked)
+
+    def asked(self) -> TakeBack | None:
+        """Take the oldest request; None where nothing is asked for."""
+        return self._asked.popleft() if self._asked else None
 
     def newest(self) -> tuple[int, LiveState] | None:
         """Give the newest state and its running number, from 1; None before one has come."""
@@ -72,7 +85,8 @@ class Viewer:
     """Feeds one connection.
 
     The page answers each update with its number once it is on the screen, and images are sent to pages that
-    are looked at. Nothing else is read from it.
+    are looked at. It may ask for the capture that it shows as the last to be taken back. Nothing else is read
+    from it.
     """
 
     def __init__(self, socket: web.WebSocketResponse, feed: Feed, encoder: Encoder) -> None:
@@ -108,7 +122,7 @@ class Viewer:
     async def _read(self) -> None:
         async for received in self._socket:
             if received.type is not WSMsgType.TEXT or not self._take(received.data):
-                await self._socket.close(code=1008, message=b"only answers to updates are read")
+                await self._socket.close(code=1008, message=b"only answers and requests are read")
                 return
 
     async def _write(self) -> None:
@@ -145,9 +159,11 @@ class Viewer:
             await self._socket.send_bytes(jpeg)
 
     def _take(self, text: str) -> bool:
-        """Take an answer: {"shown": update, "visible": bool}; False where it is none."""
+        """Take {"shown": update, "visible": bool} or {"take_back": name}; False where it is neither."""
         try:
             answer = json.loads(text)
+            if "take_back" in answer:
+                return self._ask(answer["take_back"])
             shown, is_looked_at = answer["shown"], answer["visible"]
         except (ValueError, TypeError, KeyError, RecursionError):
             return False
@@ -164,6 +180,13 @@ class Viewer:
         self._is_looked_at = is_looked_at
         if self._n_sent - self._n_shown < MAX_UNDER_WAY:
             self._has_room.set()
+        return True
+
+    def _ask(self, name: object) -> bool:
+        """Ask for a capture to be taken back; False where that is not the name of one."""
+        if not isinstance(name, str) or not re.fullmatch(r"[0-9]{6,20}", name):
+            return False
+        self._feed.ask(TakeBack(name))
         return True
 
 
@@ -281,7 +304,7 @@ _LINGERING_S = 1.0
 
 
 class Preview:
-    """Serves a page that shows a live collection; read only.
+    """Serves a page that shows a live collection, and may ask for its last capture to be taken back.
 
     On this computer alone it needs no token. Bound to any other address it does, and only the link with the
     token opens it; the connection is not encrypted.
@@ -329,6 +352,10 @@ class Preview:
     def publish(self, state: LiveState) -> None:
         """Show a state; never blocks, and the newest wins. Call it from one thread."""
         self._feed.publish(state)
+
+    def asked(self) -> TakeBack | None:
+        """Take the oldest request of a page; None where nothing is asked for."""
+        return self._feed.asked()
 
     @property
     def n_pictures(self) -> int:

@@ -352,7 +352,7 @@ def _other_camera(solved: Sequence[_Solved], link: _Link, k: int) -> OtherCamera
         J = J * np.repeat([own.validation.widened_by, other.validation.widened_by], 6)
         both = own.together.covariance_of(own.sensors.camera, other.sensors.camera)
         cov = np.asarray(J @ both @ J.T)
-    seen = None if pair.pictures is None else pair.pictures.T_second_first
+    seen = None if pair.from_images is None else pair.from_images.T_second_first
     apart_deg, apart_m = (None, None) if pair.apart is None else tangent_sizes(pair.apart)
     return OtherCamera(
         camera=other.sensors.camera,
@@ -452,8 +452,11 @@ def _compared(calibration: Calibration, reference: Reference | None) -> Calibrat
 def refusals_of(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refusal]:
     """State why captures of a pair are unusable: a sensor found no board, or both sensors disagree."""
     candidates, refused = _candidates(detections, pair)
-    consensus = find_consensus(candidates, rig.board.to_board()) if len(candidates) >= 3 else None
-    return dict(sorted({**refused, **(consensus.refused if consensus else {})}.items()))
+    if len(candidates) >= 3:
+        consensus = find_consensus(candidates, rig.board.to_board())
+        nowhere = Refusal("pair.no_agreement", figures={"n_captures": len(candidates)})
+        refused |= consensus.refused if consensus else {item.capture: nowhere for item in candidates}
+    return dict(sorted(refused.items()))
 
 
 def clocks_of(rig: Rig, camera: str, lidar: str) -> Clocks:

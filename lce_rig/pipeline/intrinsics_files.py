@@ -10,7 +10,7 @@ import numpy as np
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.documents import read_json
-from lce_rig.core.errors import LceRigError, UsageError
+from lce_rig.core.errors import LceRigError, ResultRefusedError, UsageError
 from lce_rig.core.results import Refusal
 from lce_rig.export.camera_info import camera_info_text, read_camera_info, ros_distortion
 from lce_rig.export.files import MADE_BY, number, numbers
@@ -30,10 +30,12 @@ from lce_rig.session import Session
 from lce_rig.session.durable import write_atomically
 from lce_rig.session.replacing import copy_over
 from lce_rig.session.session import INTRINSICS
-from lce_rig.words import refusal_as_json
+from lce_rig.validation.weighing import verdict_of
+from lce_rig.words import as_json, as_line, describe, recommend, refusal_as_json
 
 DOCUMENT = "intrinsics.json"
 FORMAT_VERSION = 1
+_FORCE = "To write them nevertheless, add --force."
 _PIXEL_DIGITS, _COEFFICIENT_DIGITS = 4, 8
 
 
@@ -129,17 +131,35 @@ def profile_block(rig: Rig, measured: MeasuredIntrinsics) -> str:
     return "\n".join(lines) + "\n"
 
 
-def save_profile(session: Session, measured: Sequence[MeasuredIntrinsics], path: Path) -> None:
-    """Write the session's profile with the measured intrinsics, keeping its comments.
+def save_profile(
+    session: Session, measured: Sequence[MeasuredIntrinsics], path: Path, *, is_forced: bool = False
+) -> tuple[str, ...]:
+    """Write the session's profile with the intrinsics that the session determines better, and its comments.
+
+    Args:
+        session: whose profile.
+        measured: intrinsics from its boards.
+        path: of the new profile.
+        is_forced: write all of them.
+
+    Returns:
+        The cameras whose intrinsics were replaced.
 
     Raises:
         UsageError: the file exists already.
+        ResultRefusedError: the session determines none better than its profile; nothing is written.
         ProfileError: the intrinsics make no valid profile.
     """
     if path.exists():
         raise UsageError(
             f"{path} exists already", "Choose another file; an existing profile is never overwritten."
         )
+    refused = [one for one in measured if one.judgement.code != "intrinsics.better" and not is_forced]
+    measured = [one for one in measured if one not in refused]
+    if not measured:
+        why = "; ".join(f"{one.camera}: {describe(one.judgement)}" for one in refused)
+        actions = dict.fromkeys(as_line(recommend(one.judgement)) for one in refused)
+        raise ResultRefusedError(f"{path} not written. {why}", " ".join([*actions, _FORCE]))
     text = _profile_text(session.rig)
     for one in measured:
         lens, block = final(one), f"cameras.{one.camera}"
@@ -152,6 +172,7 @@ def save_profile(session: Session, measured: Sequence[MeasuredIntrinsics], path:
     head = "".join(f"# {line}\n" for one in measured for line in _head(session.rig, one))
     parse_rig(head + text, str(path))
     write_atomically(path, head + text)
+    return tuple(one.camera for one in measured)
 
 
 def _profile_text(rig: Rig) -> str:
@@ -221,6 +242,7 @@ def _camera(measured: MeasuredIntrinsics) -> dict[str, Any]:
         "covered": float(measured.certainty.is_covered.mean()),
         "models": None if choice is None else [asdict(score) for score in choice.scores],
         "reason": None if choice is None else choice.reason,
+        "judgement": as_json(measured.judgement),
         "weaknesses": list(measured.weaknesses),
         "views_used": [view.name for view in estimate.views],
         "views_refused": _refusals(measured.refused),
@@ -252,5 +274,5 @@ def _comparison(measured: MeasuredIntrinsics) -> dict[str, Any] | None:
         **{name: _figure(value) for name, value in asdict(check).items()},
         "displacement_max_px": _figure(difference.max_px),
         "turn_rad": np.asarray(difference.turn_rad).tolist(),
-        "verdict": check.verdict(),
+        "verdict": verdict_of([] if measured.misfit is None else [measured.misfit]),
     }

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError, UsageError
+from lce_rig.core.findings import Finding
 from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.detect.detection import ImageDetection
 from lce_rig.detect.finder import BoardFinder
@@ -20,7 +21,7 @@ from lce_rig.lens.models import MODELS, model_of
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
-from lce_rig.validation.intrinsics_check import IntrinsicsCheck, compare_with_given
+from lce_rig.validation.intrinsics_check import IntrinsicsCheck, compare_with_given, explain, judge_lens
 from lce_rig.words import describe
 
 AUTO = "auto"
@@ -44,6 +45,8 @@ class MeasuredIntrinsics:
         check: the profile's intrinsics compared with the estimate; None if they are for another resolution.
         difference: per pixel; None likewise.
         certainty: of the estimate, per pixel.
+        judgement: whether the captures determine the intrinsics better than the profile, as `judge_lens`.
+        misfit: how the profile's do not fit; None if they do, or are for another resolution.
         weaknesses: what the captures do not determine, and what to do.
         refused: name of an image -> why the estimate does not use it.
     """
@@ -56,6 +59,8 @@ class MeasuredIntrinsics:
     check: IntrinsicsCheck | None
     difference: LensDifference | None
     certainty: LensCertainty
+    judgement: Finding
+    misfit: Finding | None
     weaknesses: tuple[str, ...]
     refused: Mapping[str, Refusal]
 
@@ -275,6 +280,8 @@ def _measured(
     check, difference = None, None
     if (given.width_px, given.height_px) == (lens.width_px, lens.height_px):
         check, difference = compare_with_given(estimate, given, rig.board.to_board())
+    target_deg = rig.calibration.target_sigma_deg
+    fits = check is None or check.verdict(target_deg) == "pass"
     refused = {f"{name}.{channel}": why for (name, channel), why in found.items() if isinstance(why, Refusal)}
     return MeasuredIntrinsics(
         camera=camera,
@@ -285,6 +292,8 @@ def _measured(
         check=check,
         difference=difference,
         certainty=certainty,
+        judgement=judge_lens(certainty.covered, certainty.image_sigma_px, check, target_deg),
+        misfit=None if check is None or fits else explain(check, target_deg),
         weaknesses=find_weaknesses(estimate, certainty),
         refused=dict(sorted({**refused, **estimate.refused}.items())),
     )

@@ -16,7 +16,7 @@ from lce_rig.pipeline.result_files import OVERLAYS, RESULT, Result, keep_foreign
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.session.session import DEBUG
-from lce_rig.verify.event_picture import CameraView
+from lce_rig.verify.event_picture import ImageWithEvents
 from lce_rig.verify.overlay_files import is_overlay
 from lce_rig.verify.session_check import SessionCheck, check_session, draw_check
 
@@ -225,12 +225,14 @@ def write_debug_images(
 
 def _view(
     session: Session, camera: str, channel: str, event_image: EventImage | None, capture: Capture
-) -> CameraView | None:
+) -> ImageWithEvents | None:
     """Return a camera's image; None if it is damaged or events gave none; its detection says why."""
     try:
         if (camera, channel) not in event_channels(session.rig, capture, event_image):
-            return CameraView(capture.image(camera, channel))
+            return ImageWithEvents(capture.image(camera, channel))
         picture = event_picture(session, capture, camera, channel, event_image)
-        return None if isinstance(picture, Refusal) else CameraView.of_events(picture, capture.events(camera))
+        if isinstance(picture, Refusal):
+            return None
+        return ImageWithEvents.of_events(picture, capture.events(camera))
     except SessionError:
         return None

@@ -38,7 +38,6 @@ class CaptureFeatures:
         capture: its name.
         plane_points: (N, 3) frame lidar, m.
         edge_points: (M, 3) ring ends, frame lidar, m.
-        edge_steps_m: (M,) spacing of the ring's points on the board at each end.
         lidar_normal: (3,) of the board, towards the LiDAR, frame lidar.
         normal: (3,) of the board, towards the camera, frame camera.
         centre: (3,) of the plate, frame camera, m.
@@ -51,7 +50,6 @@ class CaptureFeatures:
     capture: str
     plane_points: Array
     edge_points: Array
-    edge_steps_m: Array
     lidar_normal: Array
     normal: Array
     centre: Array
@@ -66,12 +64,10 @@ def extract_features(
 ) -> CaptureFeatures:
     """Build one capture's contribution to the cost."""
     lidar = observation.lidar
-    edge_points, edge_steps_m = _ring_ends(lidar, settings)
     return CaptureFeatures(
         capture=observation.capture,
         plane_points=_onto_plane(lidar.points, lidar.plane, settings),
-        edge_points=edge_points,
-        edge_steps_m=edge_steps_m,
+        edge_points=_ring_ends(lidar, settings),
         lidar_normal=lidar.plane[:3],
         **_seen_at(observation.image.T_cam_board, observation.image.cov, board),
     )
@@ -142,8 +138,8 @@ def _meet_plane(points: Array, plane: Array) -> Array:
     return np.asarray(np.where(is_grazing[:, None], straight, points * scale[:, None]))
 
 
-def _ring_ends(lidar: LidarBoard, settings: FeatureSettings) -> tuple[Array, Array]:
-    """Place the ring ends (M, 3) on the plane, and measure the spacing (M,) of their rings there.
+def _ring_ends(lidar: LidarBoard, settings: FeatureSettings) -> Array:
+    """Place the ring ends (M, 3) on the plane.
 
     The edge lies between the last ray that met the board and the next one, which did not: on average half a
     step beyond the end, along the ring.
@@ -160,5 +156,4 @@ def _ring_ends(lidar: LidarBoard, settings: FeatureSettings) -> tuple[Array, Arr
     )
     half_steps = _meet_plane(turned, lidar.plane) - _meet_plane(ends, lidar.plane)
     placed = _onto_plane(ends, lidar.plane, settings)
-    steps_m = 2 * np.linalg.norm(half_steps, axis=1)
-    return (placed + half_steps if settings.half_step else placed), steps_m
+    return placed + half_steps if settings.half_step else placed

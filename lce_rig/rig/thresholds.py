@@ -19,7 +19,7 @@ class QualitySettings(Settings):
         max_reprojection_px: largest rms corner residual.
         min_rings: least number of LiDAR rings on the board.
         min_points: least number of LiDAR points on the board.
-        max_thickness_m: largest rms distance of the board's points from their plane, beyond the scan's noise.
+        max_thickness_m: largest rms of the board's points about their plane, without the scan's noise.
         max_size_error: largest deviation of the board's size in the LiDAR from the profile, as a fraction.
         max_edge_rms_m: largest rms distance of ring ends from the board's edges.
         min_distance_m: nearest board.

@@ -10,12 +10,18 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
-from lce_rig.collect.live.state import Key
+from lce_rig.collect.live.state import Key, TakeBack
 from lce_rig.core.interrupts import patience
 
-_KEYS: dict[str, Key] = {"q": "stop", "\x03": "stop", " ": "capture", "n": "next"}
+_KEYS: dict[str, Key | TakeBack] = {
+    "q": "stop",
+    "\x03": "stop",
+    " ": "capture",
+    "n": "next",
+    "u": TakeBack(),
+}
 _ENDING_S = 10.0
-HELP = "q stop   space capture now   n another place"
+HELP = "q stop   space capture now   u take back   n another place"
 
 
 @dataclass
@@ -30,7 +36,7 @@ class Controls:
     is_interactive: bool
     signal: int | None = None
 
-    def __call__(self) -> Key | None:
+    def __call__(self) -> Key | TakeBack | None:
         """Give the next thing that is asked for; None where nothing is."""
         if self.signal is not None:
             return "stop"

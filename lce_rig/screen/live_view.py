@@ -66,7 +66,7 @@ _STYLES: dict[Phase, str] = {
     "lost": "white on red",
     "ended": "white on grey30",
 }
-_BELLS = {"captured": 1, "refused": 2, "enough": 3, "lost": 3, "tick": 0}
+_BELLS = {"captured": 1, "taken_back": 1, "refused": 2, "enough": 3, "lost": 3, "tick": 0}
 _HEIGHT = 24
 _LOG_LINES, _NOTE_LINES, _DRAWING_SIZE = 3, 2, (40, 9)
 # Two lines of 80 characters, broken between words.

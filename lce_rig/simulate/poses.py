@@ -66,7 +66,7 @@ def place_board(
         wander = min(1.0, attempt / 60)
         where = np.mod(even + wander * rng.uniform(-0.5, 0.5, 3), 1.0)
         T_world_board = _candidate(view, options, where, rng)
-        if T_world_board is None or not _is_in_picture(view, board, T_world_board):
+        if T_world_board is None or not _is_in_image(view, board, T_world_board):
             continue
         if seen_share(view, board, T_world_board) < _WANTED_SHARE:
             continue
@@ -109,7 +109,7 @@ def _candidate(
     return pose(facing @ turns[0] @ turns[1], centre)
 
 
-def _is_in_picture(view: CameraView, board: Board, T_world_board: Array) -> bool:
+def _is_in_image(view: CameraView, board: Board, T_world_board: Array) -> bool:
     pattern = board.corners()
     middle = pattern.mean(axis=0)
     # The outer squares reach one square beyond the inner corners.
@@ -125,7 +125,7 @@ def _is_in_picture(view: CameraView, board: Board, T_world_board: Array) -> bool
 
 def can_be_held(view: CameraView, board: Board, room: Room, T_world_board: Array) -> bool:
     """Return whether a person can hold the board there, and the camera and the LiDAR see all of it."""
-    return _is_in_picture(view, board, T_world_board) and _stands_free(view, board, room, T_world_board)
+    return _is_in_image(view, board, T_world_board) and _stands_free(view, board, room, T_world_board)
 
 
 def _stands_free(view: CameraView, board: Board, room: Room, T_world_board: Array) -> bool:

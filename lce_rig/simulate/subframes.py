@@ -15,9 +15,9 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.backdrop import Backdrop, pixel_rays
 from lce_rig.simulate.event_camera import EventCamera
+from lce_rig.simulate.image_rendering import sensor_gain
 from lce_rig.simulate.light import irradiance, reached
 from lce_rig.simulate.options import CameraNoise
-from lce_rig.simulate.rendering import sensor_gain
 from lce_rig.simulate.scene import PLATE, PLATE_BACK, PRINT_ALBEDO, Hits, Raycaster, Scene
 from lce_rig.simulate.trajectory import Trajectory
 

@@ -10,8 +10,8 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array
 from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.event_camera import EventCamera
+from lce_rig.simulate.image_rendering import expose, render_radiance
 from lce_rig.simulate.lidar import sweep_scene
-from lce_rig.simulate.rendering import expose, render_radiance
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import EVENTS, IMAGE, SCAN, Stage
 from lce_rig.simulate.subframes import MovingView, speed_px_s

@@ -45,30 +45,6 @@ class TimePairs:
         """Take edges (N,) that both clocks timestamped."""
         return TimePairs(source_ns, reference_ns, np.zeros(len(source_ns)))
 
-    @staticmethod
-    def from_exchanges(
-        sent_ns: Stamps, received_ns: Stamps, device_rx_ns: Stamps, device_tx_ns: Stamps
-    ) -> "TimePairs":
-        """Take time requests (N,) that a device answered; the device's clock is the source.
-
-        The middle between sending and receiving is the middle between the device's own two timestamps, to
-        within half of what the round trip took beyond the device's own delay, whatever the two ways had of
-        it.
-
-        Args:
-            sent_ns, received_ns: when the host sent the request and had the answer.
-            device_rx_ns, device_tx_ns: when the device had the request and sent the answer.
-
-        References:
-            RFC 5905, "Network Time Protocol Version 4", section 8.
-        """
-        round_trip_ns = (received_ns - sent_ns) - (device_tx_ns - device_rx_ns)
-        return TimePairs(
-            device_rx_ns + (device_tx_ns - device_rx_ns) // 2,
-            sent_ns + (received_ns - sent_ns) // 2,
-            np.maximum(round_trip_ns, 0) / 2,
-        )
-
     def select(self, keep: NDArray[np.intp] | NDArray[np.bool_]) -> "TimePairs":
         """Keep the pairs of a mask or an index."""
         return TimePairs(self.source_ns[keep], self.reference_ns[keep], self.bound_ns[keep])

@@ -13,8 +13,8 @@ from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation
 from lce_rig.extrinsics.estimate import CalibrationEstimate
+from lce_rig.extrinsics.likelihood.image_terms import stack_images
 from lce_rig.extrinsics.likelihood.levels import Levels
-from lce_rig.extrinsics.likelihood.picture_terms import stack_pictures
 from lce_rig.extrinsics.mean_pose import mean_pose
 from lce_rig.extrinsics.relative_pose import relative_covariance, relative_pose
 from lce_rig.extrinsics.shared_scans import scan_key
@@ -41,7 +41,7 @@ _BY_IMAGES = {
 
 
 @dataclass(frozen=True, eq=False)
-class PicturePose:
+class RelativePose:
     """The relative pose of two cameras from their images.
 
     Attributes:
@@ -71,7 +71,7 @@ class CameraPair:
     Attributes:
         captures: that both used, as the first names them.
         T_second_first: (4, 4) to which their extrinsics compose.
-        pictures: the relative pose from their images; None if both saw too few boards.
+        from_images: the relative pose from their images; None if both saw too few boards.
         apart: (6,) tangent from the extrinsics' pose to the images'; None likewise.
         surprise: its squared length in reported standard deviations.
         board_rms_m: rms distance between positions of a board's middle under the extrinsics' pose.
@@ -79,7 +79,7 @@ class CameraPair:
 
     captures: tuple[str, ...]
     T_second_first: Array
-    pictures: PicturePose | None
+    from_images: RelativePose | None
     apart: Array | None
     surprise: float
     board_rms_m: float
@@ -109,22 +109,22 @@ def relate(first: CalibrationEstimate, second: CalibrationEstimate) -> CameraPai
     if not shared:
         return None
     T, J = relative_pose(second.T_cam_lidar, first.T_cam_lidar)
-    pictures = pose_from_pictures(shared)
+    from_images = pose_from_images(shared)
     captures = tuple(one.capture for one, _ in shared)
     board_rms_m = _board_rms_m(shared, T)
-    if pictures is None:
+    if from_images is None:
         return CameraPair(captures, T, None, None, 0.0, board_rms_m)
-    apart = difference(pictures.T_second_first, T)
+    apart = difference(from_images.T_second_first, T)
     # Errors of the images enter both poses and are counted twice, so that the surprise is conservative.
-    cov = relative_covariance(J, second.cov, first.cov) + pictures.cov
+    cov = relative_covariance(J, second.cov, first.cov) + from_images.cov
     surprise = float(apart @ np.linalg.solve(cov, apart))
-    return CameraPair(captures, T, pictures, apart, surprise, board_rms_m)
+    return CameraPair(captures, T, from_images, apart, surprise, board_rms_m)
 
 
-def pose_from_pictures(shared: Sequence[tuple[Observation, Observation]]) -> PicturePose | None:
+def pose_from_images(shared: Sequence[tuple[Observation, Observation]]) -> RelativePose | None:
     """Estimate T_second_first from both cameras' images of the same boards.
 
-    An image's pose has the errors of its corners' noise and errors that corners share (`picture_terms`).
+    An image's pose has the errors of its corners' noise and errors that corners share (`image_terms`).
 
     Returns:
         None for fewer than four placements.
@@ -151,15 +151,15 @@ def pose_from_pictures(shared: Sequence[tuple[Observation, Observation]]) -> Pic
         cov = expansion.jackknife_covariance()
     captures = tuple(one.capture for one in firsts)
     board_rms_m = _board_rms_m(shared, mean)
-    return PicturePose(mean, cov, captures, board_rms_m, scatter, expansion, T_first[:, :3, 3])
+    return RelativePose(mean, cov, captures, board_rms_m, scatter, expansion, T_first[:, :3, 3])
 
 
 def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
     """List T_cam_board (F, 4, 4) and their covariances (F, 6, 6)."""
     images = [observation.image for observation in observations]
     every = np.arange(len(images), dtype=np.intp)
-    pictures = stack_pictures(every, images, np.ones(len(images)))
-    return pictures.T_cam_board, pictures.total_cov(Levels().pose)
+    stacked = stack_images(every, images, np.ones(len(images)))
+    return stacked.T_cam_board, stacked.total_cov(Levels().pose)
 
 
 def _student_weights(chi2: Array) -> Array:
@@ -190,30 +190,30 @@ def camera_findings(
         target: standard deviations to reach.
         limits: of the profile.
     """
-    if pair.pictures is None or pair.apart is None:
+    if pair.from_images is None or pair.apart is None:
         return []
     # Images are accurate enough to show any relevant change.
     strict = limits.model_copy(update={"max_change": limits.max_camera_difference})
-    halves = contrast_halves(pair.pictures.expansion, pair.pictures.centres)
-    changed = split_findings(halves, pair.pictures.captures, target, strict)
+    halves = contrast_halves(pair.from_images.expansion, pair.from_images.centres)
+    changed = split_findings(halves, pair.from_images.captures, target, strict)
     by_images = [replace(each, code=_BY_IMAGES[each.code], subject=" to ".join(names)) for each in changed]
     return [
         *by_images,
-        *_scattered(pair.pictures, names, limits),
-        *_elsewhere(pair, pair.pictures, pair.apart, names, target, limits),
+        *_scattered(pair.from_images, names, limits),
+        *_elsewhere(pair, pair.from_images, pair.apart, names, target, limits),
     ]
 
 
-def _scattered(pictures: PicturePose, names: tuple[str, str], limits: VerdictSettings) -> list[Finding]:
-    if pictures.scatter <= _MAX_SCATTER or pictures.board_rms_m <= limits.max_plane_misfit_m:
+def _scattered(from_images: RelativePose, names: tuple[str, str], limits: VerdictSettings) -> list[Finding]:
+    if from_images.scatter <= _MAX_SCATTER or from_images.board_rms_m <= limits.max_plane_misfit_m:
         return []
-    figures = {"rms_m": pictures.board_rms_m, "scatter": pictures.scatter}
+    figures = {"rms_m": from_images.board_rms_m, "scatter": from_images.scatter}
     return [reason("verdict.cameras_scatter", figures, is_fail=False, subject=" to ".join(names))]
 
 
 def _elsewhere(
     pair: CameraPair,
-    pictures: PicturePose,
+    from_images: RelativePose,
     apart: Array,
     names: tuple[str, str],
     target: CalibrationSettings,
@@ -225,7 +225,7 @@ def _elsewhere(
         return []
     figures = {
         "rms_m": pair.board_rms_m,
-        "images_rms_m": pictures.board_rms_m,
+        "images_rms_m": from_images.board_rms_m,
         "rotation_deg": rotation_deg,
         "translation_m": translation_m,
     }

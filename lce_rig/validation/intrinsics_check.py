@@ -16,7 +16,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
-from lce_rig.lens.difference import LensDifference, compare_lenses
+from lce_rig.lens.difference import LensDifference, certainty_of, compare_lenses
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import model_of
 from lce_rig.validation.weighing import Verdict, reason
@@ -30,6 +30,9 @@ _TURN_MARGINAL, _TURN_FAIL = 1.5, 2.5
 _N_FOLDS = 2
 # Residuals that exceed the possible ones by this much are visible.
 _VISIBLE = 1.2
+# Intrinsics for a profile determine pixels to the image's border. The standard deviation there may be as
+# large as the profile's error where boards were seen, within these limits.
+_KNOWN_PX = (1.0, 5.0)
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,8 @@ class IntrinsicsCheck:
         focal_sigma: standard deviation of that.
         chance: probability of a difference this large if the given intrinsics are right; None if the models
             are of different families.
+        covered: share of the image in which boards were seen.
+        image_sigma_px: standard deviation of the fitted intrinsics, as `LensCertainty.image_sigma_px`.
     """
 
     n_captures: int
@@ -63,6 +68,8 @@ class IntrinsicsCheck:
     focal_ratio: float
     focal_sigma: float
     chance: float | None
+    covered: float
+    image_sigma_px: float
 
     def verdict(self, target_deg: float = 0.2) -> Verdict:
         """Judge the given intrinsics; they pass unless significantly different from the fitted ones.
@@ -144,6 +151,7 @@ def compare_with_given(
     given_focal = np.sqrt(intrinsics.fx_px * intrinsics.fy_px)
     by_focal = np.zeros(fitted.model.size)
     by_focal[:2] = 0.5 / given_focal
+    certainty = certainty_of(fitted.intrinsics, corners_px, fitted.cov, fitted.model)
     check = IntrinsicsCheck(
         n_captures=len({view.capture for view in fitted.views}),
         rms_px=float(np.sqrt(np.mean(given_px**2))),
@@ -156,6 +164,8 @@ def compare_with_given(
         focal_ratio=float(np.sqrt(fitted.intrinsics.fx_px * fitted.intrinsics.fy_px) / given_focal),
         focal_sigma=float(np.sqrt(by_focal @ fitted.cov @ by_focal)),
         chance=_chance(fitted, intrinsics),
+        covered=certainty.covered,
+        image_sigma_px=certainty.image_sigma_px,
     )
     return check, difference
 
@@ -185,6 +195,33 @@ def describe(check: IntrinsicsCheck) -> str:
     )
 
 
+def judge_lens(
+    covered: float, image_sigma_px: float, check: IntrinsicsCheck | None, target_deg: float = 0.2
+) -> Finding:
+    """Judge whether the boards of a session determine the intrinsics better than the profile.
+
+    They do where the profile's do not fit and a pixel's standard deviation near the image's border is smaller
+    than the profile's error where boards were seen. All verbs judge by this.
+
+    Args:
+        covered: share of the image in which boards were seen.
+        image_sigma_px: of the intrinsics from the boards, as `LensCertainty.image_sigma_px`.
+        check: the profile's intrinsics compared with them; None if they are for another resolution.
+        target_deg: target standard deviation of the extrinsics' rotation.
+
+    Returns:
+        "intrinsics.fit" if the profile's fit, else "intrinsics.undetermined" or "intrinsics.better".
+    """
+    error_px = np.inf if check is None else check.displacement_px
+    limit_px = float(np.clip(error_px, *_KNOWN_PX))
+    figures: dict[str, Figure] = {"covered": covered, "image_sigma_px": image_sigma_px, "limit_px": limit_px}
+    if check is not None and check.verdict(target_deg) == "pass":
+        return Finding("intrinsics.fit", "note", figures=figures)
+    if image_sigma_px > limit_px:
+        return Finding("intrinsics.undetermined", "warning", figures=figures)
+    return Finding("intrinsics.better", "note", figures=figures)
+
+
 def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
     """Return the finding that the given intrinsics do not fit, and how they differ.
 
@@ -192,12 +229,16 @@ def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
         check: with a verdict other than "pass".
         target_deg: target standard deviation of the extrinsics' rotation.
     """
+    judgement = judge_lens(check.covered, check.image_sigma_px, check, target_deg)
     figures: dict[str, Figure] = {
         **asdict(check),
+        **judgement.figures,
         "is_visible": check.rms_px >= _VISIBLE * check.possible_px,
         "is_bent": check.is_bent,
         "is_turned": check.is_turned,
         "is_focal_off": check.is_focal_off,
     }
     action = "refocused" if check.is_focal_off else ""
+    if judgement.code == "intrinsics.undetermined":
+        action = "collect"
     return reason("verdict.intrinsics", figures, is_fail=check.verdict(target_deg) == "fail", action=action)

@@ -47,7 +47,7 @@ class Repeatability:
         T_cam_lidar: (4, 4) mean with equal weights.
         deviations: (K, 6) tangents from the mean to each, translation m, rotation rad.
         spread_rotation_deg, spread_translation_m: standard deviation of one calibration, from these.
-        claimed_rotation_deg, claimed_translation_m: the same as reported by the calibrations, rms.
+        reported_rotation_deg, reported_translation_m: the same as reported by the calibrations, rms.
         scatter_rotation_deg, scatter_translation_m: the part of it that is independent between sessions; None
             if a calibration does not report it. All share the rest, constant errors of the LiDAR.
         chi2: least sum of squared distances from one common extrinsic, in units of the reported covariances.
@@ -66,8 +66,8 @@ class Repeatability:
     deviations: Array
     spread_rotation_deg: float
     spread_translation_m: float
-    claimed_rotation_deg: float
-    claimed_translation_m: float
+    reported_rotation_deg: float
+    reported_translation_m: float
     scatter_rotation_deg: float | None
     scatter_translation_m: float | None
     chi2: float
@@ -168,8 +168,8 @@ def compare_calibrations(
         deviations=deviations,
         spread_rotation_deg=float(np.degrees(np.sqrt(spread[3:].sum()))),
         spread_translation_m=float(np.sqrt(spread[:3].sum())),
-        claimed_rotation_deg=float(np.degrees(np.sqrt(np.mean(np.trace(cov[:, 3:, 3:], axis1=1, axis2=2))))),
-        claimed_translation_m=float(np.sqrt(np.mean(np.trace(cov[:, :3, :3], axis1=1, axis2=2)))),
+        reported_rotation_deg=float(np.degrees(np.sqrt(np.mean(np.trace(cov[:, 3:, 3:], axis1=1, axis2=2))))),
+        reported_translation_m=float(np.sqrt(np.mean(np.trace(cov[:, :3, :3], axis1=1, axis2=2)))),
         scatter_rotation_deg=scatter_deg,
         scatter_translation_m=scatter_m,
         chi2=chi2,

@@ -19,7 +19,7 @@ _DIM = 0.45
 
 
 @dataclass(frozen=True, eq=False)
-class CameraView:
+class ImageWithEvents:
     """A camera's view.
 
     Attributes:
@@ -31,7 +31,7 @@ class CameraView:
     events: Events | None = None
 
     @classmethod
-    def of_events(cls, image: Image, events: Events) -> "CameraView":
+    def of_events(cls, image: Image, events: Events) -> "ImageWithEvents":
         """Keep the events shortly before an image."""
         stamp_ns = image.stamp_ns if image.stamp_ns is not None else int(events.t_ns[-1])
         recent = events.between(stamp_ns - _RECENT_NS, stamp_ns)

@@ -202,7 +202,7 @@ PHRASES: dict[str, Phrase] = {
         "come {closer_m:.1f} m closer",
     ),
     "lidar.too_thick": Phrase(
-        "surface {thickness_m:cm} thick, {rms_m:mm} rms (limit {max_rms_m:mm}): "
+        "plane {plane_rms_m:1mm} rms (limit {max_plane_rms_m:1mm}): "
         "the board moved during the scan or is not flat",
         "hold the board still, or put it on a stand",
     ),
@@ -223,7 +223,7 @@ PHRASES: dict[str, Phrase] = {
     ),
     "lidar.no_plate": Phrase(
         "no plate of the board's size (" + _PLATE + ") between {min_range_m:g} and {max_range_m:g} m",
-        "hold the board 1.5 to 3 m from the LiDAR, in sight, with nothing at its edges",
+        "hold the board at that distance, in sight of the LiDAR, with nothing at its edges",
     ),
     "lidar.too_few_points": Phrase(
         "{n_points} points on the board (minimum {min_points})", "come {closer_m:.1f} m closer"
@@ -249,6 +249,10 @@ PHRASES: dict[str, Phrase] = {
     "pair.text": Phrase("{text}", "{advice}"),
     "pair.no_candidate": Phrase(
         "no surface in the scan fits the board", "move the board clear of other things"
+    ),
+    "pair.no_agreement": Phrase(
+        "no three of {n_captures} captures agree with one set of extrinsics",
+        "check the board's size, the intrinsics and the pairing of images with scans",
     ),
     "pair.elsewhere": Phrase(
         _candidates,

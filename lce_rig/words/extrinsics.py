@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.results import WeakestMotion
-from lce_rig.words.rendering import Phrase, Template
+from lce_rig.words.rendering import Phrase, Template, as_line, figures_apart
 
 _AXES = ("x right", "y down", "z forward")
 _RANGES = (
@@ -13,6 +13,8 @@ _RANGES = (
     "and lower range_offset_sigma_m and laser_bias_sigma_m in the profile, or put more rings on the board"
 )
 _LENS = "check that the intrinsics belong to this lens and that the board is flat"
+_CORNERS_TOO = "collect captures with the board in all four corners of the image, tilted by 30 to 45 deg"
+_SAVE = "Write a profile with the session's intrinsics: `lce-rig intrinsics --save-profile FILE`"
 _WAYS = {
     "bootstrap": "bootstrap samples",
     "left_out": "leave-one-out results",
@@ -74,8 +76,8 @@ def _sigma(unit: str, scale: float) -> Template:
         assert isinstance(by_axis, tuple)
         sizes = [scale * float(str(axis)) for axis in by_axis]
         axes = ", ".join(f"{name} {size:.2g}" for name, size in zip(_AXES, sizes, strict=True))
-        reached = f"{scale * sigma:.2g} {unit}, target {scale * target:.2g} {unit}"
-        return f"{what} standard deviation {reached} ({axes})"
+        sigma_text, target_text = figures_apart(scale * sigma, scale * target)
+        return f"{what} standard deviation {sigma_text} {unit}, target {target_text} {unit} ({axes})"
 
     suffix = _suffix(unit)
     text.__doc__ = f"Standard deviation {{sigma_{suffix}}}, target {{target_{suffix}}}, {{by_axis_{suffix}}}."
@@ -111,6 +113,25 @@ def _intrinsics(finding: Finding) -> str:
             f"focal length {abs(percent):.1f} +- {100 * finding.figure('focal_sigma'):.1f} % {larger}"
         )
     return f"the profile's intrinsics {how}: {'; '.join(parts)}"
+
+
+def _reach(finding: Finding) -> str:
+    """The session covers {covered}, determines pixels near the border to {image_sigma_px}, {limit_px}."""
+    q = finding.figures
+    sigma_px, limit_px = q["image_sigma_px"], finding.figure("limit_px")
+    known = "does not determine pixels near its border"
+    if isinstance(sigma_px, float) and math.isfinite(sigma_px):
+        sigma_text, limit_text = figures_apart(sigma_px, limit_px)
+        known = f"determines pixels near its border to {sigma_text} px (limit {limit_text} px)"
+    return f"the session covers {100 * finding.figure('covered'):.0f} % of the image and {known}"
+
+
+def _collect_first(finding: Finding) -> str:
+    """Collect in all four corners, as {covered}, {image_sigma_px}, {limit_px} say; then run intrinsics."""
+    return (
+        f"check whether lens, focus or resolution were changed. {as_line(_reach(finding))} "
+        f"{as_line(_CORNERS_TOO)} Then run `lce-rig intrinsics --save-profile FILE`"
+    )
 
 
 def _scale(finding: Finding) -> str:
@@ -233,13 +254,19 @@ PHRASES: dict[str, Phrase] = {
     "verdict.plate_size": Phrase(_plate, "measure the plate"),
     "verdict.intrinsics": Phrase(
         _intrinsics,
-        "check whether lens or resolution were changed, run `lce-rig intrinsics` and put its numbers "
-        "into the profile",
+        "check whether lens or resolution were changed. " + _SAVE,
         {
-            "refocused": "check whether the lens was refocused, run `lce-rig intrinsics` and put its numbers "
-            "into the profile"
+            "refocused": "check whether the lens was refocused. " + _SAVE,
+            "collect": _collect_first,
         },
     ),
+    "intrinsics.better": Phrase(
+        "the session determines the intrinsics better than the profile: it covers {covered:percent} of the "
+        "image and determines pixels near its border to {image_sigma_px:.2f} px (limit {limit_px:.2f} px)",
+        "put them into the profile",
+    ),
+    "intrinsics.fit": Phrase("the profile's intrinsics fit the boards of the session", "keep them"),
+    "intrinsics.undetermined": Phrase(_reach, _CORNERS_TOO),
     "verdict.changed": Phrase(
         "extrinsics change significantly at capture {capture}, by " + _APART,
         "fasten the sensors, one may have moved, and collect again",

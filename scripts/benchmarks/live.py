@@ -145,8 +145,7 @@ class _Watch:
         """Note when a frame was shown, and when the first that shows the board at another place."""
         now_ns, drawing = time.time_ns(), state.drawing
         if self.tied_s is None and drawing is not None:
-            must_stand = any("must stand still" in note for note in state.notes)
-            self.tied_s = None if must_stand else state.elapsed_s
+            self.tied_s = None if state.requires_still_boards else state.elapsed_s
         if drawing is None or drawing is self._drawing:
             return
         self._drawing = drawing

@@ -12,8 +12,8 @@ from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
 from lce_rig.core.geometry import Array, difference, invert
 from lce_rig.extrinsics import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
+from lce_rig.extrinsics.likelihood.image_terms import stack_images
 from lce_rig.extrinsics.likelihood.levels import MOST_LOST, Levels, Priors
-from lce_rig.extrinsics.likelihood.picture_terms import stack_pictures
 from lce_rig.extrinsics.likelihood.refine import to_extrinsic
 from lce_rig.extrinsics.likelihood.system import PER_CAMERA, State, Terms, assemble, density, linearise
 from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M
@@ -152,7 +152,7 @@ def _at_truth(rig: Rig, session: StillSession) -> Terms:
     found = [item for item in session.candidates if is_board(session, item)]
     board = rig.board.to_board()
     scans = stack_scans([interior(item.lidar[0], board) for item in found])
-    pictures = stack_pictures(np.arange(len(found)), [item.image for item in found], np.ones(len(found)))
+    pictures = stack_images(np.arange(len(found)), [item.image for item in found], np.ones(len(found)))
     T = session.T_cam_lidar
     T_lidar_board = invert(T) @ np.array([session.T_cam_board[item.capture] for item in found])
     constants = np.zeros(PER_CAMERA + len(scans.rings) + N_FIELDS + N_SHIFTS)

@@ -129,8 +129,8 @@ def test_rigs_show_and_check_know_how_pictures_are_made(lce_rig, tmp_path):
     block = "        kind: events\n        reconstruction: {model: mine.onnx, window_s: 0.05}\n"
     (tmp_path / "mine.yaml").write_text(text.replace("        kind: events\n", block, 1), encoding="utf-8")
     shown = lce_rig("rigs", "show", tmp_path / "mine.yaml")
-    assert "from events" in shown.out and "50 ms" in shown.out and "mine.onnx" in shown.out
-    assert "from events" not in lce_rig("rigs", "show", "rlfs").out
+    assert "images from events" in shown.out and "50 ms" in shown.out and "mine.onnx" in shown.out
+    assert "images from events" not in lce_rig("rigs", "show", "rlfs").out
     missing = lce_rig("rigs", "check", tmp_path / "mine.yaml")
     assert missing.code == 3
     for part in ("mine.yaml", "cameras.davis.channels.events.reconstruction.model", "no such file"):

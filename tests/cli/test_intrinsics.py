@@ -20,8 +20,12 @@ def few(simulated, tmp_path_factory):
 
 
 def test_the_lens_is_printed_beside_the_profiles_and_written(lce_rig, few, tmp_path):
-    outcome = lce_rig("intrinsics", few, "--save-profile", tmp_path / "new.yaml")
+    refused = lce_rig("intrinsics", few, "--save-profile", tmp_path / "new.yaml")
+    assert refused.code == 7
+    assert not (tmp_path / "new.yaml").exists()
+    outcome = lce_rig("intrinsics", few, "--save-profile", tmp_path / "new.yaml", "--force")
     assert outcome.code == 0, outcome.err
+    assert "run `lce-rig intrinsics`" not in outcome.out + outcome.err
     assert "radtan5" in outcome.out.splitlines()[0]
     fx = next(line for line in outcome.out.splitlines() if line.lstrip().startswith("fx"))
     assert "349.57" in fx
@@ -48,7 +52,9 @@ def test_stale_intrinsics_are_called_so_and_json_says_it_too(lce_rig, few):
     finally:
         profile.write_text(right)
     assert outcome.code == 0, outcome.err
-    profile_record = json.loads(outcome.out)["cameras"][0]["profile"]
+    camera = json.loads(outcome.out)["cameras"][0]
+    assert camera["judgement"]["code"] in ("intrinsics.better", "intrinsics.undetermined")
+    profile_record = camera["profile"]
     assert profile_record["verdict"] == "fail"
     assert profile_record["focal_ratio"] == pytest.approx(349.57 / 367.0, abs=0.01)
 

@@ -230,9 +230,11 @@ def test_too_few_captures_exit_with_6_and_say_how_many_are_needed(lce_rig, sessi
 
     for k in range(4, 16):
         shutil.rmtree(session / "captures" / f"{k:06d}")
-    outcome = lce_rig("calibrate", session)
-    assert outcome.code == 6
-    assert "4 of 4 captures" in outcome.err and "at least 6" in outcome.err
+    for verb in ("calibrate", "check"):
+        outcome = lce_rig(verb, session)
+        assert outcome.code == (6 if verb == "calibrate" else 0)
+        assert "4 of 4 captures" in outcome.err + outcome.out
+        assert "minimum 6" in outcome.err + outcome.out
 
 
 def test_a_damaged_capture_is_named_and_the_others_still_count(lce_rig, session):

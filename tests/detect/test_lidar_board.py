@@ -300,7 +300,9 @@ def test_bent_board_is_refused_for_its_thickness():
     bent = Scan("lidar", 0, transform(T, local).astype(np.float32), scan.intensity, scan.ring)
     refusal = find(bent)
     assert isinstance(refusal, Refusal)
-    assert refusal.code == "lidar.too_thick" and refusal.figure("rms_m") > refusal.figure("max_rms_m")
+    assert refusal.code == "lidar.too_thick" and refusal.figure("plane_rms_m") > refusal.figure(
+        "max_plane_rms_m"
+    )
 
 
 def test_plate_with_much_else_in_its_plane_is_no_rival_of_a_clear_board():

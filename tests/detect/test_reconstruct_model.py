@@ -238,7 +238,9 @@ def test_the_process_of_a_network_ends_with_ours_even_in_the_middle_of_a_step(tm
 def workers():
     """List the processes of ours in which networks run."""
     pids = [pid for path in Path("/proc/self/task").glob("*/children") for pid in path.read_text().split()]
-    return [int(pid) for pid in pids if b"reconstruct.worker" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    return [
+        int(pid) for pid in pids if b"reconstruct.network_worker" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    ]
 
 
 def is_running(pid):

@@ -17,11 +17,11 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.pipe.driver import ImagePipeSource
 from lce_rig.devices.pipe.image_streams import (
-    JpegPictures,
-    PictureStream,
-    PnmPictures,
-    RawPictures,
-    Y4mPictures,
+    ImageStream,
+    JpegImages,
+    PnmImages,
+    RawImages,
+    Y4mImages,
     find_stream,
 )
 from lce_rig.rig import CameraSettings, load_rig
@@ -68,16 +68,16 @@ def raw(pictures: list[np.ndarray]) -> bytes:
     return b"".join(picture.tobytes() for picture in pictures)
 
 
-STREAMS: dict[str, tuple[Callable[[list[np.ndarray]], bytes], Callable[[], PictureStream]]] = {
-    "y4m": (y4m, Y4mPictures),
-    "grey y4m": (lambda pictures: y4m(pictures, "mono"), Y4mPictures),
-    "fine y4m": (lambda pictures: y4m(pictures, "444"), Y4mPictures),
-    "wide y4m": (lambda pictures: y4m(pictures, "422"), Y4mPictures),
-    "pgm": (pgm, PnmPictures),
-    "deep pgm": (deep_pgm, PnmPictures),
-    "ppm": (ppm, PnmPictures),
-    "jpeg": (jpegs, JpegPictures),
-    "raw": (raw, lambda: RawPictures("GREY", WIDTH, HEIGHT)),
+STREAMS: dict[str, tuple[Callable[[list[np.ndarray]], bytes], Callable[[], ImageStream]]] = {
+    "y4m": (y4m, Y4mImages),
+    "grey y4m": (lambda pictures: y4m(pictures, "mono"), Y4mImages),
+    "fine y4m": (lambda pictures: y4m(pictures, "444"), Y4mImages),
+    "wide y4m": (lambda pictures: y4m(pictures, "422"), Y4mImages),
+    "pgm": (pgm, PnmImages),
+    "deep pgm": (deep_pgm, PnmImages),
+    "ppm": (ppm, PnmImages),
+    "jpeg": (jpegs, JpegImages),
+    "raw": (raw, lambda: RawImages("GREY", WIDTH, HEIGHT)),
 }
 
 
@@ -108,7 +108,7 @@ def test_grey_values_are_kept(kind: str) -> None:
 
 @pytest.mark.parametrize("colour", ["420", "420mpeg2", "422", "444"])
 def test_y4m_luma_is_of_video_range(colour: str) -> None:
-    came = levels(list(Y4mPictures().feed(y4m(grey_pictures(3), colour))))
+    came = levels(list(Y4mImages().feed(y4m(grey_pictures(3), colour))))
     assert came == pytest.approx([(level - 16) * 255 / 219 for level in (30, 40, 50)], abs=1)
 
 
@@ -122,13 +122,13 @@ def test_a_small_picture_inside_a_jpegs_head_does_not_end_it() -> None:
     jpeg = jpegs(grey_pictures(1))
     thumbnail = jpegs([np.zeros((8, 8), np.uint8)])
     segment = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
-    stream = JpegPictures()
+    stream = JpegImages()
     came = list(stream.feed(b"--frame\r\n\r\n" + jpeg[:2] + segment + jpeg[2:] + b"\r\n" + jpeg))
     assert [pixels.shape for pixels in came] == [(HEIGHT, WIDTH)] * 2
 
 
 def test_a_damaged_jpeg_is_counted_and_the_next_one_comes() -> None:
-    stream, jpeg = JpegPictures(), jpegs(grey_pictures(1))
+    stream, jpeg = JpegImages(), jpegs(grey_pictures(1))
     broken = jpeg[:2] + b"\xff\xc0\x00\x05\x08\x00\x00" + jpeg[2:30] + jpeg[-2:]
     came = [pixels for piece in (jpeg, broken, jpeg, jpeg) for pixels in stream.feed(piece)]
     assert stream.n_damaged >= 1
@@ -148,11 +148,11 @@ def test_a_damaged_jpeg_is_counted_and_the_next_one_comes() -> None:
 )
 def test_y4m_that_is_not_read_is_explained(begin: bytes, says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        list(Y4mPictures().feed(begin))
+        list(Y4mImages().feed(begin))
 
 
 def test_pnm_that_ends_in_something_else_is_explained() -> None:
-    stream = PnmPictures()
+    stream = PnmImages()
     with pytest.raises(ValueError, match="a PGM or PPM image was expected"):
         list(stream.feed(pgm(grey_pictures(1)) + b"Segmentation fault"))
 
@@ -342,6 +342,6 @@ def test_ffmpeg_is_read(output: tuple[str, ...]) -> None:
 
 @pytest.mark.parametrize("size", ["W64 H47", "W63 H48", "W60000 H60000"])
 def test_y4m_of_a_size_that_cannot_be_is_refused_in_words(size: str) -> None:
-    stream = Y4mPictures()
+    stream = Y4mImages()
     with pytest.raises(ValueError, match="Y4M images of"):
         list(stream.feed(f"YUV4MPEG2 {size} F30:1 C420jpeg\n".encode()))

@@ -71,8 +71,6 @@ def test_its_lines_are_set_and_started_as_the_profile_says():
         with SyncBoard(given) as board:
             wait_until(lambda: "LCEGO" in fake.commands)
             assert fake.commands.index("LCERT,0,100.000000,2500,50") < fake.commands.index("LCEGO")
-            board.stop_triggers()
-            wait_until(lambda: "LCESP" in fake.commands)
             board.start_triggers(rate_hz=4.0)
             wait_until(lambda: fake.commands.count("LCEGO") == 2)
             assert "LCERT,0,4.000000,2500,50" in fake.commands

@@ -5,8 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.devices.sync_board.board_report import BoardView, clock_state, figures, problems
-from lce_rig.devices.sync_board.board_state import Arrival, BoardState, RunningNumber, Verdict
+from lce_rig.devices.sync_board.board_report import BoardSnapshot, clock_state, figures, problems
+from lce_rig.devices.sync_board.board_state import (
+    IMPLAUSIBLE,
+    RESTARTED,
+    Arrival,
+    BoardState,
+    RunningNumber,
+    Verdict,
+)
 from lce_rig.devices.sync_board.lines import LineReader
 from lce_rig.devices.sync_board.lines.lce1 import Lce1
 from lce_rig.devices.sync_board.lines.messages import (
@@ -41,7 +48,7 @@ def pulses(state, numbers, start_s=0.0, board_s=100.0, period_s=0.05):
 
 def view(state, now_s=10.0, opened_s=0.0, line_s=10.0, dialect=None, wants=("cam",), n_unwritten=0):
     reader = LineReader(dialect or Lce1())
-    return BoardView(
+    return BoardSnapshot(
         state, reader, round(now_s * S), round(opened_s * S), round(line_s * S), wants, n_unwritten
     )
 
@@ -51,8 +58,8 @@ def test_a_time_that_cannot_be_is_left_out_and_the_rest_goes_on():
     pulses(state, range(10))
     for t_us in (100_450_000 + 2**40, 450_000, 110_450_000):
         assert state.take(TriggerEdge(0, 10, t_us, True), arrival(0.501)) == []
-        assert pulses(state, [10 + state.counts.n_implausible]) == [10 + state.counts.n_implausible]
-    assert state.counts.n_implausible == 3 and state.counts.n_resets == 0
+        assert pulses(state, [10 + state.losses.n(IMPLAUSIBLE)]) == [10 + state.losses.n(IMPLAUSIBLE)]
+    assert state.losses.n(IMPLAUSIBLE) == 3 and state.losses.n(RESTARTED) == 0
 
 
 def test_a_number_that_cannot_be_is_left_out_and_the_rest_goes_on():
@@ -61,8 +68,8 @@ def test_a_number_that_cannot_be_is_left_out_and_the_rest_goes_on():
     for wrong in (400, 3, 12):
         assert state.take(TriggerEdge(0, wrong, 100_500_000, True), arrival(0.501)) == []
     assert pulses(state, range(11, 20)) == list(range(11, 20))
-    assert state.counts.n_implausible == 3
-    assert state.counts.n_lost == {"cam": 1}
+    assert state.losses.n(IMPLAUSIBLE) == 3
+    assert state.n_lost_by_line() == {"cam": 1}
 
 
 @given(st.lists(st.integers(1, 60), min_size=1, max_size=30))
@@ -90,7 +97,7 @@ def test_a_computer_that_was_busy_and_reads_all_at_once_is_no_new_beginning():
     for number in range(20, 120):
         state.take(TriggerEdge(0, number, 100_000_000 + number * 50_000, True), arrival(6.0))
     assert pulses(state, range(120, 140)) == list(range(120, 140))
-    assert state.counts.n_resets == state.counts.n_implausible == 0
+    assert state.losses.n(RESTARTED) == state.losses.n(IMPLAUSIBLE) == 0
 
 
 def test_a_new_beginning_is_believed_at_once_after_a_hello_and_else_at_the_second_message():
@@ -100,7 +107,7 @@ def test_a_new_beginning_is_believed_at_once_after_a_hello_and_else_at_the_secon
         if hello:
             state.take(hello, arrival(2.0))
         assert pulses(state, range(1, 10), start_s=2.0, board_s=0.0) == list(range(1 + n_left_out, 10))
-        assert state.counts.n_resets == 1
+        assert state.losses.n(RESTARTED) == 1
 
 
 def test_a_hello_that_was_asked_for_begins_nothing_anew():
@@ -109,7 +116,7 @@ def test_a_hello_that_was_asked_for_begins_nothing_anew():
     pulses(state, range(10))
     state.take(HELLO, arrival(0.51))
     assert pulses(state, range(10, 20)) == list(range(10, 20))
-    assert state.counts.n_resets == 0
+    assert state.losses.n(RESTARTED) == 0
 
 
 def ask(state, steady_s, set_by_s=0.0, there_s=80e-6, back_s=80e-6, board_start_s=100.0, cookie=7):
@@ -142,7 +149,7 @@ def test_a_computer_whose_clock_is_set_is_noticed_followed_and_told():
     state = BoardState({})
     for k in range(200):
         ask(state, 0.1 * k, set_by_s=3.0 * (k >= 100), cookie=k)
-    assert state.counts.n_resets == 0
+    assert state.losses.n(RESTARTED) == 0
     assert [round(step.size_ns / S) for step in state.host_tracker.steps] == [3]
     assert abs(state.host_clock.convert(115 * S) - DAY_NS - 18 * S) < 5000
     (jumped,) = [found for found in problems(view(state)) if found.code == "clock.computer_jumped"]
@@ -175,8 +182,8 @@ def test_boards_with_one_number_for_all_channels_lose_nothing_by_gaps():
     for number in range(40):
         t_us = 100_000_000 + number * 25_000
         state.take(TriggerEdge(number % 2, number, t_us, True), arrival(0.025 * number))
-    assert state.counts.n_pulses == {"cam": 20, "davis": 20}
-    assert sum(state.counts.n_lost.values()) == 0
+    assert state.n_pulses == {"cam": 20, "davis": 20}
+    assert state.n_lost_by_line() == {}
 
 
 def test_every_trouble_is_told():

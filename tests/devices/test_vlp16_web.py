@@ -158,27 +158,6 @@ def test_an_address_where_nothing_answers_is_an_error_with_what_to_check() -> No
         VelodyneWeb("no such host").read()
 
 
-def test_settings_are_made_and_read_back() -> None:
-    with serving(PAGES) as (sensor, web):
-        web.set_rotor_hz(20)
-        web.set_returns("dual")
-        assert (sensor.pages["settings"]["rpm"], sensor.pages["settings"]["returns"]) == ("1200", "Dual")
-        report = web.read()
-    assert (report.wanted_rotor_hz, report.returns) == (20, "dual")
-    with pytest.raises(ValueError, match="5 to 20 Hz"):
-        web.set_rotor_hz(30)
-    with pytest.raises(ValueError, match="strongest, last, dual"):
-        web.set_returns("first")
-
-
-def test_a_setting_that_is_not_made_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lce_rig.devices.vlp16.web._PAUSE_S", 0.0)
-    with serving(PAGES) as (sensor, web):
-        sensor.is_deaf = True
-        with pytest.raises(SourceError, match="rpm"):
-            web.set_rotor_hz(5)
-
-
 WRONG: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "settings.other_model": ({"info": {"model": "HDL-32E"}}, {"model": "HDL-32E"}),
     "settings.motor_off": ({"status": {"motor": {"state": "Off"}}}, {}),

@@ -7,7 +7,7 @@ import pytest
 from lce_rig.core.data import Events, Image
 from lce_rig.core.findings import Finding
 from lce_rig.core.results import Refusal
-from lce_rig.doctor.devices import check_board, check_events, check_picture
+from lce_rig.doctor.devices import check_board, check_events, check_image
 from lce_rig.doctor.observing import SensorReport
 
 from .observed import START_NS, S, camera, codes, examination, make_rig
@@ -23,7 +23,7 @@ def chequered() -> np.ndarray:
 def judged(pixels: np.ndarray):
     seen = camera(duration_s=0.5)
     seen.images["frames"] = Image("cam", "frames", START_NS, pixels)
-    line = check_picture(examination(seen), "cam")
+    line = check_image(examination(seen), "cam")
     assert line is not None
     return line
 

@@ -194,7 +194,6 @@ def measured_plate(
         n_points=len(points),
         n_ring_ends=2 * n_rings,
         n_ring_ends_dropped=0,
-        thickness_m=0.03,
         plane_rms_m=0.01,
         edge_rms_m=0.01,
         template_m=0.01,

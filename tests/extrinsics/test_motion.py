@@ -180,7 +180,7 @@ def test_the_same_scan_in_two_captures_is_one_placement_seen_twice():
     elsewhere = [replace(item, capture=f"1{item.capture[1:]}") for item in captures["events"]]
     result = calibrate_channels({"frames": captures["frames"], "events": elsewhere}, BOARD, OPTIONS, Clocks())
     assert len(result.used) == 15
-    assert "000003+100003" in result.used
+    assert result.same_scan["000003"] == ("000003", "100003")
 
 
 def test_channels_that_put_the_camera_in_two_places_are_held_against_each_other(followed):

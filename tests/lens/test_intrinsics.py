@@ -17,7 +17,12 @@ from lce_rig.lens.lens_coverage import find_weaknesses, reach, tilts_deg
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.lens.models import MODELS, convert, model_of
 from lce_rig.rig import load_rig
-from lce_rig.validation.intrinsics_check import check_intrinsics, compare_with_given, explain
+from lce_rig.validation.intrinsics_check import (
+    check_intrinsics,
+    compare_with_given,
+    explain,
+    judge_lens,
+)
 from tests.lens.lens_views import BOARD, FISHEYE, WIDE, Scene, photograph, with_corners
 
 RATIONAL = replace(WIDE, distortion=(0.3, -0.05, 0.001, 0.0002, 0.01, 0.6, -0.02, 0.03))
@@ -293,6 +298,22 @@ def test_a_lens_that_draws_nothing_where_boards_are_seen_fails(views):
     check = check_intrinsics(views, folded, BOARD)
     assert check.verdict() == "fail"
     assert not np.isfinite(explain(check).figure("displacement_px"))
+
+
+def test_a_lens_is_replaced_only_where_the_boards_determine_it_to_the_border(views):
+    stale = STALE["two per cent longer"]
+    thorough = check_intrinsics(views, stale, BOARD)
+    judgement = judge_lens(thorough.covered, thorough.image_sigma_px, thorough)
+    assert judgement.code == "intrinsics.better"
+    assert judgement.figures["image_sigma_px"] < judgement.figures["limit_px"]
+    scene = Scene(spread=(0.4, 0.6), distance_m=(1.5, 2.5))
+    middle = check_intrinsics(photograph(14, 5, scene), stale, BOARD)
+    judgement = judge_lens(middle.covered, middle.image_sigma_px, middle)
+    assert middle.verdict() != "pass"
+    assert judgement.code == "intrinsics.undetermined"
+    assert judgement.figures["covered"] < 0.3
+    assert judgement.figures["image_sigma_px"] > judgement.figures["limit_px"] >= 1.0
+    assert explain(middle).action == "collect"
 
 
 def test_a_slight_difference_is_marginal_and_a_lower_target_makes_it_fail(views):

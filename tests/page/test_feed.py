@@ -168,10 +168,27 @@ def test_a_page_that_vanished_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> N
         assert watcher.next_state()[0]["n_captures"] == 7
 
 
+def test_a_page_asks_for_the_capture_it_shows_as_the_last(preview: Preview) -> None:
+    with Watcher(preview.urls[0]) as watcher:
+        watcher.watch()
+        preview.publish(state(last_capture="000006"))
+        assert watcher.next_state()[0]["last_capture"] == "000006"
+        assert preview.asked() is None
+        for name in ("000006", "000005"):
+            watcher.send(json.dumps({"take_back": name}))
+        deadline_s, asked = time.monotonic() + 5, list[str]()
+        while len(asked) < 2:
+            assert time.monotonic() < deadline_s
+            if (each := preview.asked()) is not None:
+                asked.append(each.name)
+        assert asked == ["000006", "000005"]
+
+
 @pytest.mark.parametrize(
     "text",
     ["", "no json", "[]", "{}", '{"shown": 5, "visible": true}', '{"shown": true, "visible": true}',
-     '{"shown": 0, "visible": 1}', '{"shown": -1, "visible": true}', "[" * 200, "x" * 5000],
+     '{"shown": 0, "visible": 1}', '{"shown": -1, "visible": true}', "[" * 200, "x" * 5000,
+     '{"take_back": 6}', '{"take_back": "../../etc"}', '{"take_back": ""}', "7", '"take_back"'],
 )  # fmt: skip
 def test_what_no_page_sends_ends_its_connection_only(preview: Preview, text: str) -> None:
     with Watcher(preview.urls[0]) as odd, Watcher(preview.urls[0]) as other:

@@ -143,6 +143,19 @@ def test_an_arrow_leads_to_the_place_until_the_board_is_there(preview: Preview, 
     assert page.each("#arrow path") == []
 
 
+def test_the_last_capture_is_taken_back_by_a_tap(preview: Preview, browser: Browser) -> None:
+    page = browser.open(preview.urls[0], 390, 844)
+    shown(preview, page, has_text("take_back", "take 000006 back"), last_capture="000006")
+    page.tap("take_back")
+    deadline_s = time.monotonic() + 10
+    while (asked := preview.asked()) is None:
+        assert time.monotonic() < deadline_s
+    assert asked.name == "000006"
+    shown(preview, page, "document.getElementById('take_back').hidden", n_captures=1, n_wanted=None)
+    assert page.text("captures").split() == ["1", "capture"]
+    assert not page.complaints
+
+
 def test_the_countdown_runs_while_the_board_is_held(preview: Preview, browser: Browser) -> None:
     page = browser.open(preview.urls[0])
     offset = "Number(document.getElementById('ring').style.strokeDashoffset)"

@@ -8,12 +8,13 @@ import pytest
 import yaml
 
 from lce_rig.core.data import Image
-from lce_rig.core.errors import NotEnoughDataError, UsageError
+from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.export.camera_info import read_camera_info
 from lce_rig.pipeline.intrinsics_files import final, profile_block, save_profile, write_intrinsics
 from lce_rig.pipeline.lens import measure_intrinsics
 from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
 from lce_rig.session import Session
+from lce_rig.validation.intrinsics_check import judge_lens
 from tests.detect.test_image_board import draw, looking
 
 RLES = find_profile("rles").read_text(encoding="utf-8")
@@ -91,7 +92,8 @@ def test_a_profile_of_another_resolution_is_no_obstacle(pictures, tmp_path):
     assert np.abs(sigmas_off(measured)).max() < 4.5
     assert measured.check is None
     assert measured.difference is None
-    save_profile(session, [measured], tmp_path / "new.yaml")
+    assert measured.judgement.code == "intrinsics.better"
+    assert save_profile(session, [measured], tmp_path / "new.yaml") == ("davis",)
     camera = load_rig(tmp_path / "new.yaml").cameras["davis"]
     assert camera.resolution_px == (346, 260)
     assert camera.to_intrinsics() == final(measured)
@@ -159,13 +161,23 @@ def test_another_run_keeps_the_earlier_files_what_is_the_users_and_other_cameras
 
 
 def test_a_new_profile_keeps_the_comments_of_the_old_and_never_replaces_a_file(session, measured, tmp_path):
-    save_profile(session, [measured], tmp_path / "new.yaml")
+    save_profile(session, [measured], tmp_path / "new.yaml", is_forced=True)
     rig = load_rig(tmp_path / "new.yaml")
     assert rig.cameras["davis"].to_intrinsics() == final(measured)
     assert rig.board == RIG.board
     assert "# measure it;" in (tmp_path / "new.yaml").read_text()
     with pytest.raises(UsageError, match="exists already"):
-        save_profile(session, [measured], tmp_path / "new.yaml")
+        save_profile(session, [measured], tmp_path / "new.yaml", is_forced=True)
+
+
+def test_intrinsics_that_are_determined_no_better_are_not_written(session, measured, tmp_path):
+    assert measured.judgement.code == "intrinsics.fit"
+    unknown = replace(measured, judgement=judge_lens(0.08, 65.0, None))
+    assert unknown.judgement.code == "intrinsics.undetermined"
+    for kept in (measured, unknown):
+        with pytest.raises(ResultRefusedError):
+            save_profile(session, [kept], tmp_path / "new.yaml")
+        assert not (tmp_path / "new.yaml").exists()
 
 
 def test_the_block_can_be_pasted_into_the_profile(measured):
@@ -179,5 +191,5 @@ def test_the_block_can_be_pasted_into_the_profile(measured):
 def test_a_lens_of_another_family_goes_into_the_profile_too(session, measured, tmp_path):
     fisheye = replace(LENS, model="equidistant", distortion=(-0.05, 0.01, -0.002, 1e-5))
     other = replace(measured, estimate=replace(measured.estimate, intrinsics=fisheye))
-    save_profile(session, [other], tmp_path / "new.yaml")
+    save_profile(session, [other], tmp_path / "new.yaml", is_forced=True)
     assert load_rig(tmp_path / "new.yaml").cameras["davis"].to_intrinsics() == fisheye

@@ -18,8 +18,8 @@ import pytest
 from lce_rig.core import limits
 from lce_rig.core.data import Image, Scan, join_events
 from lce_rig.core.errors import SourceError
+from lce_rig.core.losses import Losses
 from lce_rig.recordings import open_recording
-from lce_rig.recordings.events.stream import DamageCounts
 from lce_rig.recordings.events.word_codec import EVT3, WordDecoder
 from lce_rig.recordings.protocol import ContinuousRecording
 from lce_rig.recordings.ros.bag_file import BagFile
@@ -431,10 +431,10 @@ def test_a_packet_that_holds_more_events_than_any_camera_sends_is_left_out(tmp_p
     words = np.array([0x8000, 0x6001, 0x0005, 0x2007], "<u2").tobytes()
     sizes = 1, limits.MAX_PACKET_BYTES // 8 + 1, 1
     messages = [("/davis/events", T0_NS + k, packet_message(words * n)) for k, n in enumerate(sizes)]
-    findings = DamageCounts()
-    events = list(BagEvents(write_packet_bag(tmp_path / "a.bag", messages), None).stretches(findings))
+    losses = Losses()
+    events = list(BagEvents(write_packet_bag(tmp_path / "a.bag", messages), None).stretches(losses))
     assert sum(map(len, events)) == 2
-    assert "17 MB" in findings.lines()[0]
+    assert "17 MB" in str(losses.findings()[0].figures["where"])
 
 
 def test_a_packet_whose_words_hold_many_events_each_is_decoded_in_pieces() -> None:

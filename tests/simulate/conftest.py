@@ -13,9 +13,9 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.rig import Rig
 from lce_rig.simulate.backdrop import Backdrop, build_backdrop
+from lce_rig.simulate.image_rendering import expose, render_radiance
 from lce_rig.simulate.lidar import LidarModel, measure_sweep, sweep_scene
 from lce_rig.simulate.options import CameraNoise, LidarNoise
-from lce_rig.simulate.rendering import expose, render_radiance
 from lce_rig.simulate.room import Room, build_room
 from lce_rig.simulate.scene import Scene
 

@@ -9,8 +9,8 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.backdrop import Backdrop
 from lce_rig.simulate.carriers import build_carrier
+from lce_rig.simulate.image_rendering import render_radiance
 from lce_rig.simulate.options import CameraNoise, Carrier, HandMotion
-from lce_rig.simulate.rendering import render_radiance
 from lce_rig.simulate.room import Room
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.subframes import GREY, MovingView, speed_px_s

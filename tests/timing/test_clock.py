@@ -40,12 +40,10 @@ def exchanges(rng, device, n=100, span_s=10.0, way_ns=73_000.0, jitter_ns=100_00
     back = 2 * way_ns * (1 - share) + rng.exponential(jitter_ns, n)
     back *= np.where(rng.uniform(size=n) < 0.03, 200, 1)
     received = sent + there + 20_000 + back
-    return TimePairs.from_exchanges(
-        START_NS + np.int64(sent),
-        START_NS + np.int64(received),
-        device.stamp_ns(sent + there),
-        device.stamp_ns(sent + there + 20_000),
-    )
+    sent_ns, received_ns = START_NS + np.int64(sent), START_NS + np.int64(received)
+    rx_ns, tx_ns = device.stamp_ns(sent + there), device.stamp_ns(sent + there + 20_000)
+    bound_ns = np.maximum((received_ns - sent_ns) - (tx_ns - rx_ns), 0) / 2
+    return TimePairs(rx_ns + (tx_ns - rx_ns) // 2, sent_ns + (received_ns - sent_ns) // 2, bound_ns)
 
 
 def edges(rng, device, n=60, period_s=0.5, noise_ns=20_000.0):

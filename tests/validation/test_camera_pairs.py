@@ -9,7 +9,7 @@ from lce_rig.core.geometry import difference, invert, perturb
 from lce_rig.core.results import Observation
 from lce_rig.extrinsics import EstimateSettings, fit_extrinsic
 from lce_rig.rig.thresholds import CalibrationSettings, VerdictSettings
-from lce_rig.validation.camera_pairs import camera_findings, pose_from_pictures, relate, shared_boards
+from lce_rig.validation.camera_pairs import camera_findings, pose_from_images, relate, shared_boards
 from tests.extrinsics.boards import BOARD
 from tests.extrinsics.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, simulate_two
 
@@ -45,7 +45,7 @@ def sound():
 
 
 def test_pictures_alone_find_where_cameras_sit_as_well_as_they_claim(sound):
-    found = [pose_from_pictures(observed(session)) for session in sound]
+    found = [pose_from_images(observed(session)) for session in sound]
     errors = np.array([difference(each.T_second_first, T_RIGHT_LEFT) for each in found])
     assert np.degrees(np.sqrt(np.mean(np.sum(errors[:, 3:] ** 2, axis=1)))) < 0.03
     assert np.sqrt(np.mean(np.sum(errors[:, :3] ** 2, axis=1))) < 0.001
@@ -56,7 +56,7 @@ def test_pictures_alone_find_where_cameras_sit_as_well_as_they_claim(sound):
 
 
 def test_of_few_boards_the_claim_is_that_of_usual_errors(sound):
-    found = [pose_from_pictures(observed(session)[:5]) for session in sound]
+    found = [pose_from_images(observed(session)[:5]) for session in sound]
     errors = [difference(each.T_second_first, T_RIGHT_LEFT) for each in found]
     nees = [e @ np.linalg.solve(f.cov, e) for e, f in zip(errors, found, strict=True)]
     # Corners of a simulated lens have no errors in common: the claim is rather too large.
@@ -106,7 +106,7 @@ def test_cameras_that_wrongly_scaled_lenses_see_the_boards_in_different_places(s
         T = right.image.T_cam_board.copy()
         T[:3, 3] *= 1.03
         longer.append((left, replace(right, image=replace(right.image, T_cam_board=T))))
-    plain, scaled = (pose_from_pictures(each) for each in (session, longer))
+    plain, scaled = (pose_from_images(each) for each in (session, longer))
     assert plain.scatter < 2 < scaled.scatter
     assert plain.board_rms_m < 0.002 < 0.012 < scaled.board_rms_m
 
@@ -116,19 +116,19 @@ def test_a_board_seen_wrongly_hardly_matters(sound):
     left, right = session[3]
     wrong = perturb(right.image.T_cam_board, np.array([0.05, 0, 0.1, 0.2, 0, 0]))
     session[3] = left, replace(right, image=replace(right.image, T_cam_board=wrong))
-    error = difference(pose_from_pictures(session).T_second_first, T_RIGHT_LEFT)
+    error = difference(pose_from_images(session).T_second_first, T_RIGHT_LEFT)
     assert np.degrees(np.linalg.norm(error[3:])) < 0.1
     assert np.linalg.norm(error[:3]) < 0.003
 
 
 def test_few_boards_tell_nothing_and_none_no_pair(sound):
     session = sound[2]
-    assert pose_from_pictures(observed(session)[:3]) is None
+    assert pose_from_images(observed(session)[:3]) is None
     left = fit_extrinsic(session[LEFT][:6], BOARD, OPTIONS)
     right = fit_extrinsic(session[RIGHT][6:], BOARD, OPTIONS)
     assert relate(left, right) is None
     three = relate(left, fit_extrinsic(session[RIGHT][3:], BOARD, OPTIONS))
-    assert three.pictures is None
+    assert three.from_images is None
     assert len(three.captures) == 3
     assert findings(three) == []
     T = TRUTH[RIGHT] @ invert(TRUTH[LEFT])

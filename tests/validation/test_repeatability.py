@@ -51,7 +51,7 @@ def test_sound_calibrations_spread_as_their_covariance_says():
     distances = np.array([[pair.distance**2 for pair in one.differences] for one in compared])
     assert np.mean(distances) == pytest.approx(6, rel=0.12)
     spread = np.mean([one.spread_translation_m**2 for one in compared])
-    assert spread == pytest.approx(np.mean([one.claimed_translation_m**2 for one in compared]), rel=0.15)
+    assert spread == pytest.approx(np.mean([one.reported_translation_m**2 for one in compared]), rel=0.15)
 
 
 def test_agreement_is_a_note_with_both_figures():

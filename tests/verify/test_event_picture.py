@@ -12,7 +12,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.results import Refusal
 from lce_rig.verify.animation import write_gif, write_video
 from lce_rig.verify.debug_image import draw_debug
-from lce_rig.verify.event_picture import BRIGHTER, DARKER, CameraView, draw_events
+from lce_rig.verify.event_picture import BRIGHTER, DARKER, ImageWithEvents, draw_events
 from tests.verify.test_pictures import (
     BOARD,
     FOLDING,
@@ -66,11 +66,13 @@ def test_events_off_a_picture_that_was_cut_are_left_out() -> None:
 
 
 def test_only_events_shortly_before_the_picture_are_taken_along() -> None:
-    view = CameraView.of_events(IMAGE, events_at([300, 420, 499, 501], [1, 2, 3, 4], [1] * 4, [True] * 4))
+    view = ImageWithEvents.of_events(
+        IMAGE, events_at([300, 420, 499, 501], [1, 2, 3, 4], [1] * 4, [True] * 4)
+    )
     assert view.events is not None and view.events.x.tolist() == [2, 3]
     n = 20_000
     storm = events_at(list(np.linspace(410, 499, n)), [7] * n, [7] * n, [True] * n)
-    shown = CameraView.of_events(IMAGE, storm).events
+    shown = ImageWithEvents.of_events(IMAGE, storm).events
     assert shown is not None and len(shown) == round(0.06 * 346 * 260) and shown.t_ns[-1] == storm.t_ns[-1]
 
 

@@ -61,7 +61,7 @@ def test_planes_meet_once_the_motion_is_taken_off(
 ) -> None:
     meetings = bring_together(observations, channel, timed, CLOCKS)
     assert list(meetings) == [o.capture for o in observations[channel]]
-    together = planes_m([meeting.at_sweep for meeting in meetings.values()])
+    together = planes_m([meeting.at_scan_time for meeting in meetings.values()])
     apart = planes_m([meeting.measured for meeting in meetings.values()])
     # 10 mm is the range noise; a board at 0.3 m/s per axis is seen up to 0.1 s apart.
     assert np.sqrt(np.mean(together**2)) < 0.014 < np.sqrt(np.mean(apart**2))
@@ -73,11 +73,11 @@ def test_the_lidars_board_is_drawn_where_the_picture_shows_it(
 ) -> None:
     for meeting in bring_together(observations, channel, timed, CLOCKS).values():
         T_cam_board = meeting.measured.image.T_cam_board
-        moved = transform(T_FORWARD, meeting.in_picture.points)
+        moved = transform(T_FORWARD, meeting.lidar_at_image_time.points)
         distance_m = (moved - T_cam_board[:3, 3]) @ T_cam_board[:3, 2]
         assert abs(np.mean(distance_m)) < 0.01
         way_m = np.linalg.norm(
-            meeting.in_picture.points.mean(axis=0) - meeting.measured.lidar.points.mean(axis=0)
+            meeting.lidar_at_image_time.points.mean(axis=0) - meeting.measured.lidar.points.mean(axis=0)
         )
         assert meeting.way_m == pytest.approx(way_m, abs=0.005)
 
@@ -87,8 +87,8 @@ def test_without_time_offsets_boards_are_taken_to_have_stood_still(
 ) -> None:
     still = calibration_of((result_of("frames", None),))
     for meeting in bring_together(observations, "frames", still, CLOCKS).values():
-        assert meeting.at_sweep is meeting.measured
-        assert meeting.in_picture is meeting.measured.lidar
+        assert meeting.at_scan_time is meeting.measured
+        assert meeting.lidar_at_image_time is meeting.measured.lidar
         assert meeting.way_m == 0
 
 

@@ -5,7 +5,6 @@ from lce_rig.collect.guidance.evidence import (
     Evidence,
     Precision,
     combine,
-    predict_covariance,
     sigmas,
     weigh_placements,
 )
@@ -44,7 +43,6 @@ __all__ = [
     "measure_coverage",
     "model_sensors",
     "outline_px",
-    "predict_covariance",
     "say",
     "sigmas",
     "spread_candidates",

@@ -330,17 +330,6 @@ class Precision:
         return np.asarray(max(few, 1.0) * self.scatter + self.lasers + self.offset)
 
 
-def predict_covariance(model: SensorModel, T_cam_board: Array, T_cam_lidar: Array) -> Array:
-    """Predict the covariance (6, 6) of T_cam_lidar from captures of boards at places T_cam_board (N, 4, 4).
-
-    Args:
-        model: the sensors.
-        T_cam_board: (N, 4, 4); N may be 0.
-        T_cam_lidar: (4, 4) rough extrinsic: the profile's nominal, or an estimate.
-    """
-    return combine(weigh_placements(model, T_cam_board, T_cam_lidar), model.errors).cov
-
-
 def combine(held: Evidence, errors: ErrorModel) -> Precision:
     """Predict (6, 6) from all placements together, equation (1) of `evidence`."""
     return _precision(held.hessian.sum(axis=0), held.noise.sum(axis=0), held.drift.sum(axis=0), errors)

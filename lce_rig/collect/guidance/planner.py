@@ -151,6 +151,15 @@ class Planner:
         )
         self.candidates, self._evidence = poses[is_seen], evidence.of(is_seen)
 
+    @property
+    def reach_m(self) -> tuple[float, float]:
+        """Nearest and farthest distance at which a placement may be asked for.
+
+        They follow from `NEAREST_M`, the profile's limits on distance and squares, and rings on the board.
+        """
+        distance_m = np.linalg.norm(self.candidates[:, :3, 3], axis=1)
+        return float(distance_m.min()), float(distance_m.max())
+
     def guide(self, held: Array, present: Array | None = None, avoid: Array | None = None) -> Guidance:
         """Say how well the extrinsic is known, and where the board should go.
 

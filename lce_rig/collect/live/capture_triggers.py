@@ -3,11 +3,10 @@
 from typing import Protocol
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
-from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.narration import Narration, narrate_moving, narrate_still
 from lce_rig.collect.offline.slow_motion import MotionGate
-from lce_rig.collect.offline.stillness import StillnessGate, StillnessOptions
+from lce_rig.collect.offline.stillness import StillnessGate
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.geometry import Array
 from lce_rig.core.losses import Losses
@@ -34,6 +33,19 @@ class LiveGate(Protocol):
         """Give the events of a moment that its capture keeps."""
         ...
 
+    @property
+    def is_captured(self) -> bool:
+        """Whether the board still stands where it was captured."""
+        ...
+
+    def note_capture(self, detection: BoardDetection) -> None:
+        """Let a board that was captured, by a key too, be captured again elsewhere only."""
+        ...
+
+    def forget_capture(self, time_ns: int) -> None:
+        """Forget a capture of a detection at a time, as it was taken back."""
+        ...
+
 
 class StillBoards:
     """Captures boards that stand still for `hold_s`; see `LiveGate`."""
@@ -42,16 +54,15 @@ class StillBoards:
         self._hold_s = hold_s
         self._max_motion_m = rig.quality.max_motion_m
         # The first window of stillness has passed when the hold begins.
-        options = StillnessOptions(max_motion_m=self._max_motion_m, dwell_s=hold_s)
-        self._gate = StillnessGate(rig.board.to_board(), options)
-        self._is_judged = self._is_decided = False
+        self._gate = StillnessGate(rig.board.to_board(), self._max_motion_m, hold_s)
+        self._is_judged = self._is_decided = self._is_captured = False
         self._refusal: Refusal | None = None
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
         """Take the next detection; a board that is moved on before its time is not captured."""
         moment = self._gate.take(detection)
         if self._gate.motion_m > self._max_motion_m:
-            self._is_judged = self._is_decided = False
+            self._is_judged = self._is_decided = self._is_captured = False
             return []
         if moment is None or self._is_decided:
             return []
@@ -74,13 +85,26 @@ class StillBoards:
         """Give none: a board that stands still makes too few events."""
         return ()
 
+    @property
+    def is_captured(self) -> bool:
+        """Whether the board still stands where it was captured."""
+        return self._is_captured
+
+    def note_capture(self, detection: BoardDetection) -> None:
+        """Capture a board that was captured no more before it has moved."""
+        self._is_decided = self._is_captured = True
+
+    def forget_capture(self, time_ns: int) -> None:
+        """Let a key capture it again; by itself it is captured after it has moved only."""
+        self._is_captured = False
+
 
 class SlowBoards:
     """Captures boards that move slowly before a camera of events; see `LiveGate`."""
 
     def __init__(self, rig: Rig, novelty: Placements) -> None:
-        self._options = MotionOptions(patience_s=LIVE_PATIENCE_S)
-        self._gate = MotionGate(rig, self._options, novelty, Losses())
+        self._novelty = novelty
+        self._gate = MotionGate(rig, novelty, Losses(), LIVE_PATIENCE_S)
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
         """Take the next detection."""
@@ -88,8 +112,21 @@ class SlowBoards:
 
     def narrate(self, guide: Guide, present: Array) -> Narration:
         """Say what to do with a board that is seen at (4, 4)."""
-        return narrate_moving(guide, present, self._gate.judged, self._options)
+        return narrate_moving(guide, present, self._gate.judged)
 
     def events_of(self, moment: CaptureMoment) -> tuple[EventCut, ...]:
         """Give all of them."""
         return moment.detection.frame.events
+
+    @property
+    def is_captured(self) -> bool:
+        """Never known: boards move."""
+        return False
+
+    def note_capture(self, detection: BoardDetection) -> None:
+        """Count the place of a capture as taken; what the gate itself has chosen is taken already."""
+        self._novelty.add(str(detection.frame.time_ns), detection.images)
+
+    def forget_capture(self, time_ns: int) -> None:
+        """Let the place of a capture be new again."""
+        self._novelty.remove(str(time_ns))

@@ -56,8 +56,15 @@ class Kept:
     latency_s: float
 
 
+@dataclass(frozen=True)
+class TakenBack:
+    """One capture that was taken back, by its name: it has moved to the rejected ones."""
+
+    name: str
+
+
 class CaptureWriter:
-    """Writes captures one after the other."""
+    """Writes captures one after the other, and takes them back in the same order."""
 
     def __init__(self, session: Session, learning: Learning, disk: DiskWriter) -> None:
         """Prepare.
@@ -70,40 +77,53 @@ class CaptureWriter:
         self._session = session
         self._learning = learning
         self._stored = StoredEvents()
-        self._kept: deque[Kept] = deque()
-        self._sink: Sink[Task] = disk.add(session.path, self._store, is_vital=True)
+        self._done: deque[Kept | TakenBack] = deque()
+        self._sink: Sink[Task | TakenBack] = disk.add(session.path, self._write, is_vital=True)
 
     @property
     def is_busy(self) -> bool:
-        """Whether a capture is not on the disk yet."""
+        """Whether a capture is not on the disk, or not taken back, yet."""
         return self._sink.is_busy
 
     def keep(self, task: Task) -> None:
         """Have a capture written; returns at once."""
         self._sink.put(task)
 
-    def take(self) -> list[Kept]:
-        """Give the captures that have become safe since the last call.
+    def take_back(self, name: str) -> None:
+        """Have a capture, which may still wait to be written, put aside; returns at once."""
+        self._sink.put(TakenBack(name))
+
+    def take(self) -> list[Kept | TakenBack]:
+        """Give the captures that have become safe, or were taken back, since the last call.
 
         Raises:
             SessionError: one cannot be written: the disk is full, or gone.
         """
         failure = self._sink.failure
-        kept = [self._kept.popleft() for _ in range(len(self._kept))]
-        if failure is not None and not kept:
+        done = [self._done.popleft() for _ in range(len(self._done))]
+        if failure is not None and not done:
             raise failure
-        return kept
+        return done
 
     def notes(self) -> list[str]:
         """Say what was odd about the events that were stored."""
         return self._stored.notes()
+
+    def _write(self, item: Task | TakenBack) -> None:
+        """Do what is asked, in its order: a capture is stored before it can be taken back."""
+        if isinstance(item, TakenBack):
+            self._session.reject(item.name, "taken back while collecting")
+            self._learning.forget(item.name)
+            self._done.append(item)
+        else:
+            self._store(item)
 
     def _store(self, task: Task) -> None:
         detection = task.moment.detection
         meta = {**task.meta, **task.moment.figures, **board_figures(detection.images)}
         events = [cut.events for cut in task.events]
         name = self._session.add_capture(task.images, detection.frame.scans, meta, events)
-        self._kept.append(Kept(name, detection.images, time.monotonic() - task.asked_s))
+        self._done.append(Kept(name, detection.images, time.monotonic() - task.asked_s))
         # The capture is safe: what follows delays nothing.
         self._stored.note(task.events)
         self._learning.show(name, detection)

@@ -7,30 +7,31 @@ captures (`CaptureWriter`); this loop alone decides and tells the views. Process
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lce_rig.collect.board_tracker import (
     BoardDetection,
     BoardTracker,
     CaptureMoment,
+    ImageKey,
     TakenByHand,
     without_samples,
 )
 from lce_rig.collect.live.capture_triggers import LiveGate, SlowBoards, StillBoards
-from lce_rig.collect.live.capture_writer import CaptureWriter, Task, record_streams
+from lce_rig.collect.live.capture_writer import CaptureWriter, Kept, Task, record_streams
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
 from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.live.monitor import Monitor
 from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_unseen
-from lce_rig.collect.live.state import Ending, Key, LiveOptions, LiveReport, LiveState
+from lce_rig.collect.live.state import Ending, Key, LiveOptions, LiveReport, LiveState, TakeBack
 from lce_rig.collect.placement_dedupe import Placements, capture_poses
 from lce_rig.collect.worker import Worker
 from lce_rig.core.errors import LceRigError
-from lce_rig.core.results import Refusal
+from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.opening import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
@@ -113,7 +114,7 @@ def collect_live(
     sources: Sequence[LiveSource],
     options: LiveOptions | None = None,
     show: Callable[[LiveState], None] = lambda _state: None,
-    keys: Callable[[], Key | None] = lambda: None,
+    keys: Callable[[], Key | TakeBack | None] = lambda: None,
     record_to: Path | None = None,
 ) -> LiveReport:
     """Collect from attached sensors until there is enough.
@@ -189,6 +190,15 @@ def _time_s(detection: BoardDetection) -> float:
     return detection.frame.time_ns * 1e-9
 
 
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """A capture of this run: its name, the time of its detection, and where each camera saw the board."""
+
+    name: str
+    time_ns: int
+    boards: Mapping[ImageKey, ImageBoard]
+
+
 class _Loop:
     def __init__(
         self,
@@ -211,15 +221,15 @@ class _Loop:
         self._began_s = time.monotonic()
         self._search, self._learning = search, learning
         self._gate: LiveGate | None = None
-        self._n_captures = len(session.captures)
-        names = [capture.name for capture in session.captures]
-        self._first_number = int(names[-1]) + 1 if names else 0
-        self._n_asked = 0
+        self._n_before = len(session.captures)
+        self._number = int(session.next_name)
+        self._asked: list[_Asked] = []
+        self._kept: set[str] = set()
         self._captured_s = self._began_s
         self._monitor = Monitor(session, options, sensors, clock)
         self._last: BoardDetection | None = None
 
-    def run(self, keys: Callable[[], Key | None]) -> None:
+    def run(self, keys: Callable[[], Key | TakeBack | None]) -> None:
         """Go on until something ends it; what was lost until then is noted while the sensors are open."""
         while True:
             frame = self._feed.take(_WAIT_S)
@@ -243,13 +253,19 @@ class _Loop:
                 return
 
     def take_kept(self) -> None:
-        """Count the captures that have become safe, and take what they taught."""
+        """Count the captures that have become safe or were taken back, and take what they taught."""
         self._learning.teach()
-        for kept in self._keeper.take():
-            self._n_captures += 1
-            self.report.captured.append(kept.name)
-            self.report.latencies_s.append(kept.latency_s)
-            self._monitor.cue("captured", f"captured {kept.name} ({kept.latency_s:.2f} s)")
+        for done in self._keeper.take():
+            if not isinstance(done, Kept):
+                self.report.taken_back.append(done.name)
+                restore = f"lce-rig captures {self._session.path} --restore {done.name}"
+                self._monitor.cue("taken_back", f"{done.name} taken back ({restore})")
+                continue
+            self.report.latencies_s.append(done.latency_s)
+            self._kept.add(done.name)
+            if any(done.name == each.name for each in self._asked):
+                self._monitor.cue("captured", f"captured {done.name} ({done.latency_s:.2f} s)")
+        self.report.captured = [each.name for each in self._asked if each.name in self._kept]
 
     def close_books(self) -> LiveReport:
         """Gather what is to be reported, and write it into the session's journal."""
@@ -295,8 +311,8 @@ class _Loop:
         guide = self._seeing_guide(detection)
         if guide is None:
             return narration
-        n_wanted, n_waiting = self._options.n_wanted, self._n_asked - len(self.report.captured)
-        if n_wanted is not None and self._n_captures + n_waiting >= n_wanted:
+        n_wanted = self._options.n_wanted
+        if n_wanted is not None and self._n_before + len(self._asked) >= n_wanted:
             return narration  # A slow disk still writes the last ones.
         present = detection.images[guide.key].T_cam_board
         refusal = guide.adds_nothing(present)
@@ -322,14 +338,38 @@ class _Loop:
             "still_boards_only": verdict.requires_still_boards,
         }
         self._keeper.keep(Task(moment, frame.images, gate.events_of(moment), meta, time.monotonic()))
-        name = f"{self._first_number + self._n_asked:06d}"
-        self._n_asked += 1
+        name = f"{self._number:06d}"
+        self._number += 1
+        self._asked.append(_Asked(name, frame.time_ns, detection.images))
+        gate.note_capture(detection)
         self._captured_s = time.monotonic()
         for guide in self._guides:
             if guide.sees(detection):
                 guide.add(name, detection.images[guide.key].T_cam_board)
 
-    def _obey(self, key: Key | None) -> None:
+    @property
+    def _n_captures(self) -> int:
+        """Captures in the session that are safe and were not taken back."""
+        return self._n_before + len(self.report.captured)
+
+    def _take_back(self, asked: TakeBack) -> None:
+        """Take the last capture back, whether it is on the disk yet or not."""
+        last = self._asked[-1].name if self._asked else ""
+        if not last:
+            self._monitor.cue("refused", "nothing to take back: no capture in this run")
+        if not last or asked.name not in ("", last):
+            return  # A tap that came late, or twice, means no other capture.
+        taken = self._asked.pop()
+        self._keeper.take_back(last)
+        self.report.captured = [name for name in self.report.captured if name != last]
+        for guide in self._guides:
+            guide.remove(last)
+        self._find_gate().forget_capture(taken.time_ns)
+
+    def _obey(self, key: Key | TakeBack | None) -> None:
+        if isinstance(key, TakeBack):
+            self._take_back(key)
+            return
         guide = None if self._last is None else self._active_guide(self._last)
         if key == "next" and guide is not None:
             guide.give_up()
@@ -338,9 +378,13 @@ class _Loop:
             self._capture_by_hand(self._last)
 
     def _capture_by_hand(self, detection: BoardDetection) -> None:
-        """Capture what is seen now, however it moves."""
+        """Capture what is seen now, however it moves, unless it was captured a moment ago."""
         if self._seeing_guide(detection) is None:
             self._monitor.cue("refused", "not captured: not every sensor sees the board")
+            return
+        if self._asked and self._is_repeated(detection):
+            name = self._asked[-1].name
+            self._monitor.cue("refused", f"not captured: {name} shows the board here; move it first")
             return
         confirmed = self._search.confirm(CaptureMoment(detection, TakenByHand()))
         if isinstance(confirmed, CaptureMoment):
@@ -348,7 +392,15 @@ class _Loop:
         else:
             self._monitor.cue("refused", f"not captured: {sentence(confirmed)}")
 
-    def _find_ending(self, key: Key | None) -> Ending | None:
+    def _is_repeated(self, detection: BoardDetection) -> bool:
+        """Check whether a board stands where the last capture has it, or was there within the hold."""
+        if self._find_gate().is_captured:
+            return True
+        is_recent = time.monotonic() - self._captured_s < self._options.hold_s
+        places = Placements(_NOVEL_M, _NOVEL_DEG)
+        return is_recent and places.are_alike(self._asked[-1].boards, detection.images)
+
+    def _find_ending(self, key: Key | TakeBack | None) -> Ending | None:
         options, elapsed_s = self._options, time.monotonic() - self._began_s
         lost = self._sensors.lost()
         vital = {name: why for name, why in lost.items() if name in {*self._rig.lidars, *self._rig.cameras}}
@@ -383,7 +435,12 @@ class _Loop:
     def _tell(self, *, has_frame: bool, ending: Ending | None) -> None:
         if has_frame or ending is not None or self._monitor.is_due():
             is_enough, has_ended = self._is_enough(), ending is not None
-            self._show(self._monitor.state(self._n_captures, is_enough=is_enough, has_ended=has_ended))
+            last = self._asked[-1].name if self._asked and not has_ended else ""
+            self._show(
+                self._monitor.state(
+                    self._n_captures, is_enough=is_enough, has_ended=has_ended, last_capture=last
+                )
+            )
 
     def _active_guide(self, detection: BoardDetection) -> Guide:
         """Choose whose words are said: of the guides whose camera sees the board that of fewest captures.

@@ -19,6 +19,7 @@ from lce_rig.collect.guidance import (
     outline_px,
 )
 from lce_rig.core.errors import ProfileError
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
@@ -52,7 +53,7 @@ class Guide:
     Attributes:
         key: camera and channel in which the board is followed.
         lidar: name of the LiDAR.
-        problem: why there is no guidance yet, and what to do; "" while there is.
+        problem: why there is no guidance yet; None while there is.
         guidance: the latest; None before the first.
     """
 
@@ -60,7 +61,7 @@ class Guide:
         """Begin without captures."""
         self.key = key
         self.lidar = lidar
-        self.problem = ""
+        self.problem: Finding | None = None
         self.guidance: Guidance | None = None
         self._min_captures = rig.quality.min_captures
         self._names: list[str] = []
@@ -73,16 +74,19 @@ class Guide:
         try:
             self._model = model_sensors(rig, key[0], lidar)
         except ProfileError as error:
-            self.problem = f"no guidance: {error.what}"
+            self.problem = Finding("guide.no_beams", "warning", lidar, {"cause": error.what})
+            self._at_first: tuple[Planner | None, Finding | None] = None, self.problem
             return
         nominal = rig.nominal(key[0], lidar)
         if nominal is None:
-            self.problem = (
-                f"guidance begins after {rig.quality.min_captures} captures: "
-                f"the profile has no nominal extrinsic of {key[0]} and {lidar}"
+            self.problem = Finding(
+                "guide.no_nominal",
+                "warning",
+                figures={"n_captures": rig.quality.min_captures, "camera": key[0], "lidar": lidar},
             )
         else:
             self._planner = Planner(SensorPlace.upright(self._model, nominal.to_matrix()))
+        self._at_first = self._planner, self.problem
 
     @property
     def n_held(self) -> int:
@@ -124,6 +128,12 @@ class Guide:
         self._held.append(T_cam_board)
         self.guidance = self._coverage = None
 
+    def remove(self, name: str) -> None:
+        """Forget a capture that was taken back; its placement is new again."""
+        left = [k for k, each in enumerate(self._names) if each != name]
+        self._names, self._held = [self._names[k] for k in left], [self._held[k] for k in left]
+        self.guidance = self._coverage = None
+
     def prepare(self, learned: Learned) -> Planner | None:
         """Build a planner that knows what the captures have shown; takes a second and changes nothing."""
         if self._model is None:
@@ -131,10 +141,9 @@ class Guide:
         errors = self._model.errors.learned(learned.plane_rms_m, learned.edge_rms_m, learned.n_captures)
         return Planner(SensorPlace.upright(self._model.with_errors(errors), learned.T_cam_lidar))
 
-    def adopt(self, planner: Planner) -> None:
-        """Take a planner from `prepare`."""
-        self._planner = planner
-        self.problem = ""
+    def adopt(self, planner: Planner | None) -> None:
+        """Take a planner from `prepare`; None to go back to the one before any capture."""
+        self._planner, self.problem = self._at_first if planner is None else (planner, None)
         self.guidance = self._coverage = None
 
     def plan(self, present: Array | None, now_s: float, *, is_asked: bool = True) -> None:

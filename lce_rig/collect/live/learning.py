@@ -28,7 +28,8 @@ class Learning:
         self._worker = Worker("calibrate captures", _Teacher, rig, nice=_NICE)
         self._candidates: dict[int, list[CaptureCandidates]] = {k: [] for k in range(len(guides))}
         self._due: deque[int] = deque()
-        self._taught: deque[tuple[Guide, Planner]] = deque()
+        self._taught: deque[tuple[Guide, Planner | None]] = deque()
+        self._unlearned: set[int] = set()
         self._problem = ""
         self._changed = threading.Condition()
         self._is_closing = False
@@ -59,6 +60,18 @@ class Learning:
                         self._due.append(k)
             self._changed.notify()
 
+    def forget(self, name: str) -> None:
+        """Take back what a capture has shown; returns at once, and what is left is calibrated again."""
+        with self._changed:
+            for k, candidates in self._candidates.items():
+                left = [each for each in candidates if each.capture != name]
+                if len(left) < len(candidates):
+                    self._candidates[k] = left
+                    self._unlearned.add(k)
+                    if k not in self._due:
+                        self._due.append(k)
+            self._changed.notify()
+
     def teach(self) -> None:
         """Let the guides know what was learned since the last call."""
         with self._changed:
@@ -79,16 +92,21 @@ class Learning:
                     return
                 k = self._due.popleft()
                 candidates = list(self._candidates[k])
+            planner: Planner | None = None
             try:
-                planner = self._worker.call("learn", k, candidates)
+                if len(candidates) >= self._min_captures:
+                    planner = self._worker.call("learn", k, candidates)
             except Exception as error:  # Captures are safe even if a calibration fails.
                 if self._is_closing:
                     return
                 self._problem = f"guidance does not learn from captures: {error}"
-                continue
-            if planner is not None:
-                with self._changed:
+            with self._changed:
+                if any(all(each is not left for left in self._candidates[k]) for each in candidates):
+                    continue  # One was taken back meanwhile: it is due again.
+                # What was learned from a capture that was taken back holds no longer.
+                if planner is not None or k in self._unlearned:
                     self._taught.append((self._guides[k], planner))
+                    self._unlearned.discard(k)
 
 
 class _Teacher:

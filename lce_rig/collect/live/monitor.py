@@ -112,7 +112,9 @@ class Monitor:
         """Check whether views have not been updated for long."""
         return time.monotonic() - self._told_s > _EVERY_S
 
-    def state(self, n_captures: int, *, is_enough: bool, has_ended: bool) -> LiveState:
+    def state(
+        self, n_captures: int, *, is_enough: bool, has_ended: bool, last_capture: str = ""
+    ) -> LiveState:
         """Give everything as it is now."""
         self._told_s = now_s = time.monotonic()
         self._watch_sensors()
@@ -144,6 +146,8 @@ class Monitor:
             log=tuple(self._log),
             notes=self._notes(),
             n_logged=self._n_logged,
+            last_capture=last_capture,
+            requires_still_boards=self._clock.verdict().requires_still_boards,
         )
 
     def _phase(self, *, is_enough: bool, has_ended: bool) -> tuple[Phase, str, str]:
@@ -250,5 +254,5 @@ class Monitor:
                 named.setdefault(sentence(problem), []).append(name)
         notes += [f"{', '.join(names)}: {problem}" for problem, names in named.items()]
         if self._guide is not None and self._guide.problem:
-            notes.append(self._guide.problem)
+            notes.append(sentence(self._guide.problem))
         return tuple(notes)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey
-from lce_rig.collect.event_moment import MotionOptions
+from lce_rig.collect.event_moment import BEST_SPEED_MPS
 from lce_rig.collect.guidance import say
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.state import Phase
@@ -68,7 +68,7 @@ def narrate_still(
         return narrate_refused(guide, present, refusal)
     if held_s is not None:
         return Narration("holding", _HOLD, "", max(hold_s - held_s, 0.0))
-    return Narration("moving", _next(guide, present, _HOLD), guide.problem)
+    return Narration("moving", _next(guide, present, _HOLD), _problem(guide))
 
 
 def narrate_refused(guide: Guide, present: Array, refusal: Refusal) -> Narration:
@@ -76,16 +76,14 @@ def narrate_refused(guide: Guide, present: Array, refusal: Refusal) -> Narration
     return Narration("refused", _next(guide, present, recommend(refusal)), f"not here: {describe(refusal)}")
 
 
-def narrate_moving(
-    guide: Guide, present: Array, judged: CaptureMoment | Refusal | None, options: MotionOptions
-) -> Narration:
+def narrate_moving(guide: Guide, present: Array, judged: CaptureMoment | Refusal | None) -> Narration:
     """Say where a board goes that has to move slowly to be captured."""
-    headline = _next(guide, present, f"move it slowly, about {100 * options.best_speed_mps:.0f} cm/s")
+    headline = _next(guide, present, f"move it slowly, about {100 * BEST_SPEED_MPS:.0f} cm/s")
     if isinstance(judged, Refusal):
         return Narration("moving", headline, sentence(judged))
     if isinstance(judged, CaptureMoment) and guide.is_there(present):
         return Narration("holding", "good: go on slowly", f"{judged.figures['speed_mps']:.2f} m/s")
-    return Narration("moving", headline, guide.problem)
+    return Narration("moving", headline, _problem(guide))
 
 
 def stream_name(key: ImageKey) -> str:
@@ -101,6 +99,11 @@ def image_figures(board: ImageBoard) -> str:
 def scan_figures(board: LidarBoard) -> str:
     """Sum a board in a scan up in few words."""
     return f"{board.quality.n_rings} rings, {len(board.points)} points"
+
+
+def _problem(guide: Guide) -> str:
+    """Say why there is no guidance; "" while there is."""
+    return sentence(guide.problem) if guide.problem else ""
 
 
 def _next(guide: Guide, present: Array, otherwise: str) -> str:

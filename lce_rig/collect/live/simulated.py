@@ -328,11 +328,6 @@ class Walker:
         self._rng = scene.stage.rng(_PERSON_STREAM)
         self._way: tuple[Array, Array, float, float] | None = None
 
-    @property
-    def is_walking(self) -> bool:
-        """Whether the board is on its way."""
-        return self._way is not None
-
     def hear(self, camera: str, wanted: Array, now_s: float) -> None:
         """Set out for a placement T_cam_board (4, 4), or as far towards it as the board can be held.
 

@@ -17,6 +17,18 @@ exhausted: nothing new was shown for `LiveOptions.idle_s`; stopped: by the user;
 Key = Literal["stop", "capture", "next"]
 """stop: end; capture: take what is seen now; next: propose another placement."""
 
+
+@dataclass(frozen=True)
+class TakeBack:
+    """A request to take the last capture of this run back.
+
+    Attributes:
+        name: of the capture that whoever asks means: another one stays; "" for the last, whichever it is.
+    """
+
+    name: str = ""
+
+
 #: How long a board stands still before it is captured, beyond the first half second.
 HOLD_S = 1.5
 
@@ -56,7 +68,8 @@ class LiveReport:
     Attributes:
         ending: why it ended.
         is_enough: whether the session holds enough for the profile's target, as far as is known.
-        captured: names of the new captures, in order.
+        captured: names of the new captures, in order, without those taken back.
+        taken_back: names of the captures that were taken back, in order.
         latencies_s: from each decision until its capture was safe on the disk.
         n_frames: frames looked at.
         n_skipped: frames that came while one before was looked at.
@@ -70,6 +83,7 @@ class LiveReport:
     ending: Ending = "stopped"
     is_enough: bool = False
     captured: list[str] = field(default_factory=list)
+    taken_back: list[str] = field(default_factory=list)
     latencies_s: list[float] = field(default_factory=list)
     n_frames: int = 0
     n_skipped: int = 0
@@ -85,7 +99,7 @@ Phase = Literal["starting", "searching", "moving", "holding", "saving", "refused
 elsewhere, or moves; holding: it stands still and is about to be captured; saving: it is being written;
 refused: it stands still where it adds nothing; enough: you may stop; lost: a sensor is gone; ended."""
 
-Sound = Literal["tick", "captured", "refused", "enough", "lost"]
+Sound = Literal["tick", "captured", "taken_back", "refused", "enough", "lost"]
 
 
 @dataclass(frozen=True)
@@ -158,6 +172,7 @@ class LiveState:
         hold_s: how long the board has still to be held; None unless it is being held.
         n_captures: in the session.
         n_wanted: how many are wanted; None where the target decides.
+        last_capture: name of the capture that would be taken back; "" where there is none.
         streams: every stream.
         drawing: the guiding camera's image; None before one has come.
         coverage: how much of what is reachable has been shown; None without guidance.
@@ -165,7 +180,8 @@ class LiveState:
         target_deg, target_mm: the profile's.
         cues: the latest few, oldest first.
         log: the latest messages, oldest first.
-        notes: what holds all the time: "boards must stand still: ...".
+        notes: what holds all the time, in words.
+        requires_still_boards: whether boards must stand still, as `SyncVerdict` says.
         n_logged: messages since the beginning, of which `log` holds the latest.
     """
 
@@ -189,3 +205,5 @@ class LiveState:
     log: tuple[str, ...] = ()
     notes: tuple[str, ...] = field(default=())
     n_logged: int = 0
+    last_capture: str = ""
+    requires_still_boards: bool = True

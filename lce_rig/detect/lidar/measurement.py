@@ -299,7 +299,6 @@ def build_board(
     border = kept[away[is_board] > -BORDER_M]
     points = scan.points[kept].astype(np.float64)
     height = points @ view.plane[:3] + view.plane[3]
-    low_m, high_m = np.percentile(height, [2.5, 97.5])
     rms_m = float(np.sqrt(np.mean(height**2)))
     incidence = np.arccos(np.clip(view.plane[3] / distance_m, 0.0, 1.0))
     # The effective size of the light spot is unknown.
@@ -314,7 +313,6 @@ def build_board(
         n_points=len(kept),
         n_ring_ends=len(edge),
         n_ring_ends_dropped=len(ends.beam) - len(edge),
-        thickness_m=float(high_m - low_m),
         plane_rms_m=rms_m,
         edge_rms_m=float(np.sqrt(np.mean(residual[is_good] ** 2))) if is_good.any() else float("nan"),
         template_m=placement.error_m,

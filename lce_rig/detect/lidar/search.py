@@ -51,15 +51,8 @@ def too_thick(heights_m: Array, limit_m: float) -> Refusal:
         heights_m: (N,) of the returns over the plane.
         limit_m: largest rms of them.
     """
-    low_m, high_m = np.percentile(heights_m, [2.5, 97.5])
-    return Refusal(
-        "lidar.too_thick",
-        figures={
-            "thickness_m": float(high_m - low_m),
-            "rms_m": float(np.sqrt(np.mean(heights_m**2))),
-            "max_rms_m": limit_m,
-        },
-    )
+    figures = {"plane_rms_m": float(np.sqrt(np.mean(heights_m**2))), "max_plane_rms_m": limit_m}
+    return Refusal("lidar.too_thick", figures=figures)
 
 
 def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_limit_m: float) -> Refusal:
@@ -161,7 +154,12 @@ class Limits:
     def widened(self, sigma_m: float) -> "Limits":
         """Allow for the noise that a scan shows."""
         template_m = min(self.template_m + 1.5 * sigma_m, 0.06)
-        return Limits(template_m, self.rms_m + 1.5 * sigma_m, self.min_rings)
+        return Limits(template_m, plane_limit_m(self.rms_m, sigma_m), self.min_rings)
+
+
+def plane_limit_m(rms_m: float, sigma_m: float) -> float:
+    """Return the largest rms distance of returns from a plane: a limit without noise, and the noise."""
+    return rms_m + 1.5 * sigma_m
 
 
 STANDARD = Limits(template_m=0.025, rms_m=0.012, min_rings=4)

@@ -14,7 +14,7 @@ from typing import IO
 from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.devices.pipe.image_streams import JpegPictures, PictureStream, RawPictures, find_stream
+from lce_rig.devices.pipe.image_streams import ImageStream, JpegImages, RawImages, find_stream
 from lce_rig.devices.pixel_formats import FORMATS, find_format
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource
@@ -52,7 +52,7 @@ class ImagePipeSource(LiveSource):
         self._settings = settings
         self._channel = settings.first_channel("frames") or "frames"
         self._stack = ExitStack()
-        self._stream: PictureStream | None = None
+        self._stream: ImageStream | None = None
         self._begin = b""
         self._complaints = b""
         self._n_pictures = self._n_damaged_before = 0
@@ -104,7 +104,7 @@ class ImagePipeSource(LiveSource):
         if n_damaged:
             figures = {"n": n_damaged}
             problems.append(Finding("stream.damaged_images", "warning", figures=figures, action="command"))
-        if isinstance(self._stream, RawPictures) and self._stream.row_bytes % 4:
+        if isinstance(self._stream, RawImages) and self._stream.row_bytes % 4:
             n_row = self._stream.row_bytes
             figures = {"row_bytes": n_row, "padded_bytes": n_row + -n_row % 4}
             problems.append(Finding("device.row_padding", "warning", figures=figures))
@@ -116,7 +116,7 @@ class ImagePipeSource(LiveSource):
             device=" ".join(self._settings.driver.command),
         )
 
-    def _raw_stream(self) -> PictureStream | None:
+    def _raw_stream(self) -> ImageStream | None:
         """Prepare for raw images where the profile names their format."""
         wanted = self._settings.driver.pixel_format
         if wanted is None:
@@ -126,11 +126,7 @@ class ImagePipeSource(LiveSource):
             known = ", ".join(code.strip() for code in FORMATS)
             what = f"{self._who}: driver.pixel_format {wanted!r} is not read here"
             raise SourceError(what, f"It can be {known}, or missing for Y4M, PGM, PPM and JPEG.")
-        return (
-            JpegPictures()
-            if FORMATS[code].is_compressed
-            else RawPictures(code, *self._settings.resolution_px)
-        )
+        return JpegImages() if FORMATS[code].is_compressed else RawImages(code, *self._settings.resolution_px)
 
     def _begin_stream(self) -> None:
         """Find out by its first bytes what the command writes, and whether it is what the profile says.
@@ -144,7 +140,7 @@ class ImagePipeSource(LiveSource):
                 begin = self._begin[:16]
                 what = f"{self._who}: its command writes no Y4M, PGM, PPM or JPEG; it begins {begin!r}"
                 raise SourceError(what, f"For raw images set driver.pixel_format. An example: {_EXAMPLE}")
-        elif isinstance(self._stream, RawPictures) and _HEADER.match(self._begin):
+        elif isinstance(self._stream, RawImages) and _HEADER.match(self._begin):
             wanted = self._settings.driver.pixel_format
             raise SourceError(
                 f"{self._who}: driver.pixel_format says raw {wanted}, but its command writes images with a "

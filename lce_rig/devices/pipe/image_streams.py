@@ -23,7 +23,7 @@ _420 = ("420", "420jpeg", "420mpeg2", "420paldv")  # they differ in where a chro
 _SOI, _EOI, _SOS = b"\xff\xd8", b"\xff\xd9", 0xDA
 
 
-class PictureStream(ABC):
+class ImageStream(ABC):
     """Bytes in as they come, images out.
 
     Attributes:
@@ -76,7 +76,7 @@ class PictureStream(ABC):
         return self._take(end + 1).decode("ascii", "backslashreplace").rstrip()
 
 
-class RawPictures(PictureStream):
+class RawImages(ImageStream):
     """Images of one pixel format and size, with nothing between them and no padding of rows.
 
     Attributes:
@@ -97,7 +97,7 @@ class RawPictures(PictureStream):
         return self._decoder.decode(payload)
 
 
-class Y4mPictures(PictureStream):
+class Y4mImages(ImageStream):
     """YUV4MPEG2 of 8 bits; of finer chroma than 4:2:0 every other sample is taken."""
 
     def __init__(self) -> None:
@@ -161,7 +161,7 @@ class Y4mPictures(PictureStream):
         return PixelDecoder("GREY" if colour == "mono" else "YU12", *self._size)
 
 
-class PnmPictures(PictureStream):
+class PnmImages(ImageStream):
     """PGM and PPM files of 8 or 16 bits, one behind the other."""
 
     def _cut(self) -> bytes | None:
@@ -188,7 +188,7 @@ class PnmPictures(PictureStream):
         return np.array(values if values.ndim == 2 else values[:, :, ::-1])
 
 
-class JpegPictures(PictureStream):
+class JpegImages(ImageStream):
     """JPEG files, one behind the other; anything between them is skipped."""
 
     def __init__(self) -> None:
@@ -230,12 +230,12 @@ class JpegPictures(PictureStream):
         return decode_image(payload)
 
 
-def find_stream(begin: bytes) -> PictureStream | None:
+def find_stream(begin: bytes) -> ImageStream | None:
     """Tell by its first bytes what a stream holds; None where they do not tell."""
     if begin.startswith(b"YUV4MPEG2 "):
-        return Y4mPictures()
+        return Y4mImages()
     if begin.startswith((b"P5", b"P6")):
-        return PnmPictures()
+        return PnmImages()
     if begin.startswith(_SOI) or begin.startswith(b"--"):  # "--": the boundary of a multipart stream
-        return JpegPictures()
+        return JpegImages()
     return None

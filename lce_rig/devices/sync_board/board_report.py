@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.devices.protocol import ClockState
-from lce_rig.devices.sync_board.board_state import BoardState
+from lce_rig.devices.sync_board.board_state import IMPLAUSIBLE, PULSE_LOST, RESTARTED, BoardState
 from lce_rig.devices.sync_board.lines import LineReader
 from lce_rig.devices.sync_board.lines.messages import LineFault, StatusFlag
 from lce_rig.rig.sync_settings import PPS_LINE
@@ -19,7 +19,7 @@ _NO_CLOCK_S = 5.0
 
 
 @dataclass(frozen=True)
-class BoardView:
+class BoardSnapshot:
     """A board at one moment.
 
     Attributes:
@@ -44,7 +44,7 @@ class BoardView:
         return (self.now_ns - then_ns) / NS_PER_S
 
 
-def clock_state(view: BoardView) -> ClockState:
+def clock_state(view: BoardSnapshot) -> ClockState:
     """Say whose clock the timestamps are on, and how it is tied to others."""
     if not view.reader.dialect.has_triggers:
         return ClockState(Finding("clock.receiver", "note"))
@@ -61,7 +61,7 @@ def clock_state(view: BoardView) -> ClockState:
     return ClockState(Finding("clock.board", "note", figures=found))
 
 
-def device_words(view: BoardView) -> str:
+def device_words(view: BoardSnapshot) -> str:
     """Name the board as it names itself."""
     hello = view.state.hello
     if hello is None or not hello.version:
@@ -69,7 +69,7 @@ def device_words(view: BoardView) -> str:
     return f"{hello.board}, firmware {hello.firmware}, LCE{hello.version}"
 
 
-def figures(view: BoardView) -> dict[str, float]:
+def figures(view: BoardSnapshot) -> dict[str, float]:
     """Give the board's figures by name."""
     state, faults = view.state, view.reader.faults
     found: dict[str, float] = {
@@ -77,11 +77,11 @@ def figures(view: BoardView) -> dict[str, float]:
         "n_bad_checksums": faults[LineFault.CHECKSUM],
         "n_malformed": faults[LineFault.MALFORMED] + faults[LineFault.TOO_LONG],
         "n_unknown": faults[LineFault.UNKNOWN],
-        "n_implausible": state.counts.n_implausible,
-        "n_resets": state.counts.n_resets,
+        "n_implausible": state.losses.n(IMPLAUSIBLE),
+        "n_resets": state.losses.n(RESTARTED),
         "line_age_s": view.age_s(view.line_ns),
     }
-    for line, n_pulses in sorted(state.counts.n_pulses.items()):
+    for line, n_pulses in sorted(state.n_pulses.items()):
         found[f"n_pulses.{line}"] = n_pulses
     host = state.host_clock
     if host is not None:
@@ -93,7 +93,7 @@ def figures(view: BoardView) -> dict[str, float]:
     return found
 
 
-def problems(view: BoardView) -> tuple[Finding, ...]:
+def problems(view: BoardSnapshot) -> tuple[Finding, ...]:
     """Find what is wrong now."""
     silent_s = view.age_s(view.line_ns)
     if silent_s > STALLED_S:
@@ -105,39 +105,39 @@ def _warn(code: str, **figures: Figure) -> Finding:
     return Finding(code, "warning", figures=figures)
 
 
-def _line_problems(view: BoardView) -> list[Finding]:
+def _line_problems(view: BoardSnapshot) -> list[Finding]:
     faults = view.reader.faults
-    n_damaged = sum(faults.values()) - faults[LineFault.UNKNOWN] + view.state.counts.n_implausible
+    n_damaged = sum(faults.values()) - faults[LineFault.UNKNOWN] + view.state.losses.n(IMPLAUSIBLE)
     n_lines = n_damaged + view.reader.n_messages
     found = []
     if n_damaged >= _MIN_DAMAGED and n_damaged > _DAMAGED * n_lines:
-        found.append(_warn("stream.damaged_lines", n=n_damaged, n_lines=n_lines))
+        found.append(_warn(IMPLAUSIBLE, n=n_damaged, n_lines=n_lines))
     if view.n_unwritten:
         found.append(_warn("device.commands_not_taken", n=view.n_unwritten))
     return found
 
 
-def _board_problems(view: BoardView) -> list[Finding]:
-    state, counts = view.state, view.state.counts
+def _board_problems(view: BoardSnapshot) -> list[Finding]:
+    state = view.state
     found = []
-    if counts.reset_steady_ns is not None:
-        ago_s = view.age_s(counts.reset_steady_ns)
-        found.append(_warn("device.board_restarted", n=counts.n_resets, ago_s=ago_s))
+    if state.reset_steady_ns is not None:
+        ago_s = view.age_s(state.reset_steady_ns)
+        found.append(_warn(RESTARTED, n=state.losses.n(RESTARTED), ago_s=ago_s))
     if state.error is not None:
         found.append(_warn("device.board_error", message=state.error.text, number=state.error.code))
     for line in view.wants_triggers:
-        if not counts.n_pulses.get(line) and view.age_s(view.opened_ns) > _NO_CLOCK_S:
+        if not state.n_pulses[line] and view.age_s(view.opened_ns) > _NO_CLOCK_S:
             found.append(_warn("stream.no_pulses", line=line))
-    n_lost = sum(counts.n_lost.values())
-    if n_lost:
-        by_line = tuple((line, n) for line, n in sorted(counts.n_lost.items()) if n)
-        found.append(_warn("stream.pulse_lines_lost", n=n_lost, by_line=by_line))
+    by_line = state.n_lost_by_line()
+    if by_line:
+        n_lost, of_lines = sum(by_line.values()), tuple(sorted(by_line.items()))
+        found.append(_warn(PULSE_LOST, n=n_lost, by_line=of_lines))
     if state.status is not None and state.status.n_lost:
         found.append(_warn("stream.lines_dropped_by_board", n=state.status.n_lost))
     return found
 
 
-def _clock_problems(view: BoardView) -> list[Finding]:
+def _clock_problems(view: BoardSnapshot) -> list[Finding]:
     state = view.state
     found = []
     if view.reader.dialect.has_triggers and state.host_clock is None:
@@ -152,7 +152,7 @@ def _clock_problems(view: BoardView) -> list[Finding]:
     return found
 
 
-def _utc_problems(view: BoardView) -> list[Finding]:
+def _utc_problems(view: BoardSnapshot) -> list[Finding]:
     state = view.state
     if not view.reader.dialect.has_triggers:
         if state.utc is None or state.utc.utc_ns is None:
@@ -171,6 +171,7 @@ def _utc_problems(view: BoardView) -> list[Finding]:
         found.append(_warn("clock.board_without_utc"))
     if state.status is not None and not state.status.flags & StatusFlag.PPS_ON:
         found.append(_warn("clock.pps_output_off"))
-    if state.counts.n_lost.get(PPS_LINE):
-        found.append(_warn("stream.pps_lines_lost", n=state.counts.n_lost[PPS_LINE]))
+    n_lost = state.n_lost_by_line().get(PPS_LINE)
+    if n_lost:
+        found.append(_warn("stream.pps_lines_lost", n=n_lost))
     return found

@@ -1,13 +1,15 @@
 """What a sync board's messages add up to: pulses, clocks, and what is wrong; no device, no thread."""
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
 from lce_rig.core.data import Pulse
+from lce_rig.core.findings import Finding
+from lce_rig.core.losses import Losses
 from lce_rig.devices.sync_board.lines.messages import (
     BoardError,
     BoardStatus,
@@ -142,30 +144,18 @@ class Arrival:
     steady_ns: int
 
 
-@dataclass
-class BoardCounts:
-    """How the board did so far.
-
-    Attributes:
-        n_pulses: pulses handed on, by line.
-        n_lost: pulses whose lines never came, by line; gaps in the running numbers tell.
-        n_resets: how often the board restarted.
-        n_implausible: messages skipped because their times or numbers cannot be.
-        reset_steady_ns: when it last restarted.
-    """
-
-    n_pulses: dict[str, int] = field(default_factory=dict)
-    n_lost: dict[str, int] = field(default_factory=dict)
-    n_resets: int = 0
-    n_implausible: int = 0
-    reset_steady_ns: int | None = None
+PULSE_LOST = "stream.pulse_lines_lost"
+RESTARTED = "device.board_restarted"
+IMPLAUSIBLE = "stream.damaged_lines"
 
 
 class BoardState:
     """Messages in, pulses out; clocks and counts in between.
 
     Attributes:
-        counts: how the board did.
+        n_pulses: pulses handed on, by line.
+        losses: pulses whose messages never came, by line; restarts; messages whose figures cannot be.
+        reset_steady_ns: when it last restarted; None where it did not.
         hello, status, utc: the last of each; None before the first.
         pps: the last pulse per second, with its arrival.
         error: the last complaint.
@@ -181,7 +171,9 @@ class BoardState:
             lines: name of the camera on each channel; pulses on others are skipped.
             has_own_counts: whether each channel counts its own pulses.
         """
-        self.counts = BoardCounts()
+        self.n_pulses: Counter[str] = Counter()
+        self.losses = Losses()
+        self.reset_steady_ns: int | None = None
         self.hello: Hello | None = None
         self.status: BoardStatus | None = None
         self.utc: UtcTime | None = None
@@ -212,7 +204,7 @@ class BoardState:
         if board_us is not None:
             verdict = self._time.judge(board_us * 1000, arrival.steady_ns)
             if verdict is Verdict.ODD:
-                self.counts.n_implausible += 1
+                self._count(IMPLAUSIBLE)
                 return []
             if verdict is Verdict.ANEW:
                 self._begin_anew(arrival)
@@ -222,6 +214,10 @@ class BoardState:
     def has_answered(self) -> bool:
         """Whether no time request is under way."""
         return self._asked is None
+
+    def n_lost_by_line(self) -> dict[str, int]:
+        """Count the pulses whose messages never came; gaps in the running numbers tell."""
+        return {each.subject: n for each, n in self.losses.counts() if each.code == PULSE_LOST}
 
     @property
     def host_clock(self) -> ClockModel | None:
@@ -262,11 +258,12 @@ class BoardState:
     def _pulse(self, line: str, count: int, t_us: int, arrival: Arrival) -> list[Pulse]:
         # Where all lines share one running number, its gaps on a line say nothing.
         number = self._numbers.setdefault(line if self._has_own_counts else "", RunningNumber())
+        n_lost = number.n_lost
         if self._has_own_counts and number.judge(count, t_us) is Verdict.ODD:
-            self.counts.n_implausible += 1
+            self._count(IMPLAUSIBLE)
             return []
-        self.counts.n_lost[line] = number.n_lost
-        self.counts.n_pulses[line] = self.counts.n_pulses.get(line, 0) + 1
+        self._count(PULSE_LOST, line, number.n_lost - n_lost)
+        self.n_pulses[line] += 1
         self._arrivals.append((t_us * 1000, arrival.host_ns))
         return [Pulse(line, t_us * 1000, count, arrival.host_ns)]
 
@@ -282,9 +279,12 @@ class BoardState:
             board_ns = 500 * (reply.rx_us + reply.tx_us)
             self.host_tracker.add(board_ns, middle_ns, self.round_trip_ns / 2)
 
+    def _count(self, code: str, line: str = "", n: int = 1) -> None:
+        self.losses.add(Finding(code, "warning", line), n)
+
     def _begin_anew(self, arrival: Arrival) -> None:
-        self.counts.n_resets += 1
-        self.counts.reset_steady_ns = arrival.steady_ns
+        self._count(RESTARTED)
+        self.reset_steady_ns = arrival.steady_ns
         for number in self._numbers.values():
             number.begin()
         self._arrivals.clear()

@@ -13,7 +13,13 @@ from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.protocol import SourceStatus
 from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.sync_board.board_report import BoardView, clock_state, device_words, figures, problems
+from lce_rig.devices.sync_board.board_report import (
+    BoardSnapshot,
+    clock_state,
+    device_words,
+    figures,
+    problems,
+)
 from lce_rig.devices.sync_board.board_state import Arrival, BoardState
 from lce_rig.devices.sync_board.lines import DIALECTS, LineReader
 from lce_rig.devices.sync_board.lines.lce1 import VERSION
@@ -188,9 +194,8 @@ class SyncBoard(LiveSource):
         self._early: list[Pulse] = []
         self._heard = deque[int](maxlen=_N_HEARD_BYTES)
         self._outbox: deque[bytes] = deque()
-        self._are_triggers_on = True
         self._rate_hz: float | None = None
-        self._n_resets_seen = 0
+        self._reset_seen_ns: int | None = None
         self._cookie = 0
         self._opened_ns = self._line_ns = self._asked_ns = self._told_utc_ns = self._greeted_ns = 0
         self._busy_until_ns = 0
@@ -244,12 +249,12 @@ class SyncBoard(LiveSource):
             view = self._view()
             return SourceStatus(
                 self.sensor,
-                n_lost=sum(self._state.counts.n_lost.values()),
+                n_lost=sum(self._state.n_lost_by_line().values()),
                 clock=clock_state(view),
                 problems=problems(view),
                 figures=figures(view),
                 device=device_words(view),
-                n_lost_by_line=dict(self._state.counts.n_lost),
+                n_lost_by_line=self._state.n_lost_by_line(),
             )
 
     @property
@@ -271,14 +276,8 @@ class SyncBoard(LiveSource):
             rate_hz: of all lines in place of the profile's: slow pulses tell which image is of which.
         """
         with self._lock:
-            self._are_triggers_on, self._rate_hz = True, rate_hz
+            self._rate_hz = rate_hz
             self._configure()
-
-    def stop_triggers(self) -> None:
-        """End the pulses of the cameras; those per second go on."""
-        with self._lock:
-            self._are_triggers_on = False
-            self._outbox.append(self._reader.dialect.stop())
 
     def _take(self, data: bytes, arrival: Arrival) -> list[Pulse]:
         self._heard.extend(data)
@@ -296,8 +295,8 @@ class SyncBoard(LiveSource):
         if not self._is_heard and self._is_introduced(bool(messages)):
             self._configure()
             self._is_heard = True
-        if self._state.counts.n_resets != self._n_resets_seen:
-            self._n_resets_seen = self._state.counts.n_resets
+        if self._state.reset_steady_ns != self._reset_seen_ns:
+            self._reset_seen_ns = self._state.reset_steady_ns
             self._busy_until_ns = arrival.steady_ns + _ASK_OFTEN_NS
             self._told_utc_ns = 0
             self._configure()
@@ -314,7 +313,7 @@ class SyncBoard(LiveSource):
             self._outbox.append(
                 dialect.set_trigger(trigger.channel, rate_hz, trigger.phase_us, trigger.pulse_us)
             )
-        if self._settings.triggers and self._are_triggers_on:
+        if self._settings.triggers:
             self._outbox.append(dialect.start())
 
     def _talk(self, port: BoardPort, now_ns: int) -> None:
@@ -355,14 +354,14 @@ class SyncBoard(LiveSource):
         if data:
             port.write(data)
 
-    def _view(self) -> BoardView:
-        return BoardView(
+    def _view(self) -> BoardSnapshot:
+        return BoardSnapshot(
             self._state,
             self._reader,
             time.monotonic_ns(),
             self._opened_ns,
             self._line_ns,
-            tuple(sorted(self._settings.triggers)) if self._are_triggers_on else (),
+            tuple(sorted(self._settings.triggers)),
             self._port.n_unwritten if self._port else 0,
         )
 

@@ -1,4 +1,4 @@
-"""The web page of a Velodyne: what it is, how it does, how it is set, and setting speed and returns.
+"""The web page of a Velodyne: what it is, how it does and how it is set.
 
 Firmware differs in what it tells and in the types of its values: every field may be missing, numbers come as
 text, switches as "On", "on" or true.
@@ -9,14 +9,11 @@ References:
 
 import json
 import math
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from http.client import HTTPException
 from typing import Any
 from urllib.error import HTTPError, URLError
-from urllib.parse import urlencode
-from urllib.request import ProxyHandler, Request, build_opener
+from urllib.request import ProxyHandler, build_opener
 
 from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
@@ -25,10 +22,6 @@ from lce_rig.rig import LidarSettings
 
 _TIMEOUT_S = 2.0
 _MAX_BODY_BYTES = 1 << 20
-# The sensor's server asks for a pause between requests; settings take a moment to be seen.
-_PAUSE_S = 0.2
-_N_READS = 10
-_RETURNS = {"strongest": "Strongest", "last": "Last", "dual": "Dual"}
 # A sensor in the field of a proxy is still a neighbour on the cable.
 _OPENER = build_opener(ProxyHandler({}))
 
@@ -40,7 +33,6 @@ class WebReport:
     Attributes:
         model, serial, firmware: of the sensor.
         pps: "absent", "synchronizing", "locked" or "error".
-        gps_position: from NMEA.
         is_motor_on, is_laser_on: whether they run.
         rotor_hz: measured speed.
         wanted_rotor_hz: speed that is set.
@@ -55,7 +47,6 @@ class WebReport:
     serial: str = ""
     firmware: str = ""
     pps: str = ""
-    gps_position: str = ""
     is_motor_on: bool | None = None
     is_laser_on: bool | None = None
     rotor_hz: float | None = None
@@ -93,42 +84,8 @@ class VelodyneWeb:
             diagnostics = {}
         return to_report(info, status, settings, diagnostics)
 
-    def set_rotor_hz(self, rotor_hz: float) -> None:
-        """Set the rotor's speed, 5 to 20 Hz; it is forgotten when the sensor is switched off.
-
-        Raises:
-            SourceError: it does not answer, or reads back otherwise.
-            ValueError: the sensor does not turn at that speed.
-        """
-        if not 5 <= rotor_hz <= 20:
-            raise ValueError(f"the rotor turns at 5 to 20 Hz, not at {rotor_hz:g}")
-        rpm = round(60 * rotor_hz)
-        self._set("rpm", str(rpm), lambda report: _is_near(report.wanted_rotor_hz, rpm / 60))
-
-    def set_returns(self, returns: str) -> None:
-        """Set what is reported of several returns: "strongest", "last" or "dual"; forgotten as above.
-
-        Raises:
-            SourceError: it does not answer, or reads back otherwise.
-            ValueError: there is no such choice.
-        """
-        if returns not in _RETURNS:
-            raise ValueError(f"returns are {', '.join(_RETURNS)}, not {returns!r}")
-        self._set("returns", _RETURNS[returns], lambda report: report.returns == returns)
-
-    def _set(self, key: str, value: str, is_set: Callable[[WebReport], bool]) -> None:
-        self._request("/cgi/setting", urlencode({key: value}).encode())
-        for _ in range(_N_READS):
-            if is_set(to_report({}, {}, self._get("settings"), {})):
-                return
-            time.sleep(_PAUSE_S)
-        raise SourceError(
-            f"{self.url}: {key} was set to {value}, but reads back otherwise",
-            "Set it on the web page itself.",
-        )
-
     def _get(self, page: str) -> dict[str, Any]:
-        body = self._request(f"/cgi/{page}.json", None)
+        body = self._request(f"/cgi/{page}.json")
         try:
             content = json.loads(body)
         except (ValueError, RecursionError):  # Also where it is no UTF-8.
@@ -138,9 +95,9 @@ class VelodyneWeb:
             raise SourceError(f"{self.url}/cgi/{page}.json is not what a Velodyne answers", hint)
         return content
 
-    def _request(self, path: str, data: bytes | None) -> bytes:
+    def _request(self, path: str) -> bytes:
         try:
-            with _OPENER.open(Request(self.url + path, data), timeout=self._timeout_s) as response:
+            with _OPENER.open(self.url + path, timeout=self._timeout_s) as response:
                 return bytes(response.read(_MAX_BODY_BYTES))
         except (URLError, HTTPException, OSError, ValueError) as error:
             if isinstance(error, HTTPError):
@@ -167,7 +124,6 @@ def to_report(
         _text(info, "serial"),
         _firmware(info),
         _text(status, "gps", "pps_state").lower(),
-        _text(status, "gps", "position"),
         _switch(status, "motor", "state"),
         laser if laser is not None else _switch(settings, "laser"),
         None if rpm is None else rpm / 60,

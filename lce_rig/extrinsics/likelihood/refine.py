@@ -12,8 +12,8 @@ import numpy as np
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import Observation
+from lce_rig.extrinsics.likelihood.image_terms import StackedImages, stack_images
 from lce_rig.extrinsics.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, PoseLevels, Priors
-from lce_rig.extrinsics.likelihood.picture_terms import Pictures, stack_pictures
 from lce_rig.extrinsics.likelihood.system import PER_CAMERA, Assembly, State, Terms, assemble, linearise
 from lce_rig.residuals.along_rays import N_FIELDS, N_SHIFTS, StackedScans, interior, lens_fields, stack_scans
 from lce_rig.residuals.placements import group_placements
@@ -130,15 +130,15 @@ def refine(
     seen = {o.capture: (o, T) for own, T in zip(cameras, T_cam_lidar, strict=True) for o in own}
     order = {name: k for k, name in enumerate(sorted(seen))}
     scans = stack_scans([interior(seen[name][0].lidar, board) for name in order])
-    pictures = tuple(_pictures(own, order) for own in cameras)
+    images = tuple(_stack_images(own, order) for own in cameras)
     if pose_ratios is not None:
-        pictures = tuple(p.with_larger_errors(r) for p, r in zip(pictures, pose_ratios, strict=True))
+        images = tuple(p.with_larger_errors(r) for p, r in zip(images, pose_ratios, strict=True))
     state = State(
         np.array(T_cam_lidar),
         np.array([invert(T) @ o.image.T_cam_board for o, T in (seen[name] for name in order)]),
         np.zeros(PER_CAMERA * len(cameras) + len(scans.rings) + N_FIELDS + N_SHIFTS),
     )
-    problem = _Problem(scans, pictures, board, priors)
+    problem = _Problem(scans, images, board, priors)
     now = levels or usual
     for blur_rad in _BLURS_RAD:
         state = problem.settle(state, now.blurred(blur_rad))
@@ -154,12 +154,12 @@ class _Problem:
     """Constants of the optimisation."""
 
     scans: StackedScans
-    pictures: tuple[Pictures, ...]
+    images: tuple[StackedImages, ...]
     board: Board
     priors: Priors
 
     def linearise(self, state: State) -> Terms:
-        return linearise(self.scans, self.pictures, self.board, state)
+        return linearise(self.scans, self.images, self.board, state)
 
     def settle(self, state: State, levels: Levels, n_steps: int = _STEPS) -> State:
         """Find the optimum at given levels."""
@@ -171,11 +171,11 @@ class _Problem:
         return state
 
 
-def _pictures(observations: Sequence[Observation], order: dict[str, int]) -> Pictures:
+def _stack_images(observations: Sequence[Observation], order: dict[str, int]) -> StackedImages:
     placement = group_placements(observations)
     capture = np.array([order[o.capture] for o in observations], dtype=np.intp)
     n_repeats = np.bincount(placement)[placement].astype(np.float64)
-    return stack_pictures(capture, [o.image for o in observations], n_repeats)
+    return stack_images(capture, [o.image for o in observations], n_repeats)
 
 
 def to_extrinsic(T_cam_lidar: Array, camera: int, n_unknowns: int) -> Array:

@@ -17,8 +17,8 @@ import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, perturb
+from lce_rig.extrinsics.likelihood.image_terms import StackedImages, image_rows
 from lce_rig.extrinsics.likelihood.levels import Levels, PoseLevels, Priors
-from lce_rig.extrinsics.likelihood.picture_terms import Pictures, picture_rows
 from lce_rig.residuals.along_rays import (
     N_FIELDS,
     N_SHIFTS,
@@ -184,15 +184,15 @@ class Terms:
     Attributes:
         ranges: of points.
         edges: of ring ends.
-        pictures: of each camera.
-        picture_rows: linearised, of each camera.
+        images: of each camera.
+        image_rows: linearised, of each camera.
         constants: z of the state.
     """
 
     ranges: RangeSums
     edges: EdgeRows
-    pictures: tuple[Pictures, ...]
-    picture_rows: tuple[Array, ...]
+    images: tuple[StackedImages, ...]
+    image_rows: tuple[Array, ...]
     constants: Array
 
     @property
@@ -201,19 +201,19 @@ class Terms:
         return int(self.ranges.sums.shape[1])
 
 
-def linearise(scans: StackedScans, pictures: Sequence[Pictures], board: Board, state: State) -> Terms:
+def linearise(scans: StackedScans, images: Sequence[StackedImages], board: Board, state: State) -> Terms:
     """Linearise all terms."""
-    per_camera = state.constants[: PER_CAMERA * len(pictures)].reshape(-1, PER_CAMERA)
-    of_lidar = state.constants[PER_CAMERA * len(pictures) :]
+    per_camera = state.constants[: PER_CAMERA * len(images)].reshape(-1, PER_CAMERA)
+    of_lidar = state.constants[PER_CAMERA * len(images) :]
     offsets, lens, shifts = np.split(of_lidar, [len(scans.rings), len(scans.rings) + N_FIELDS])
     T_lidar_board = state.T_lidar_board
     return Terms(
         sum_ranges(scans, T_lidar_board, offsets, lens),
         edge_rows(scans, T_lidar_board, board, lens, shifts),
-        tuple(pictures),
+        tuple(images),
         tuple(
-            picture_rows(own, T, T_lidar_board, float(constants[-1]))
-            for own, T, constants in zip(pictures, state.T_cam_lidar, per_camera, strict=True)
+            image_rows(own, T, T_lidar_board, float(constants[-1]))
+            for own, T, constants in zip(images, state.T_cam_lidar, per_camera, strict=True)
         ),
         state.constants,
     )
@@ -266,13 +266,13 @@ class Assembly:
         self._terms, self._priors = terms, priors
         self._range_block = lru_cache(maxsize=2)(partial(_range_block, terms))
         self._edge_block = lru_cache(maxsize=2)(partial(_edge_block, terms))
-        self._picture_block = lru_cache(maxsize=2)(partial(_picture_block, terms))
+        self._image_block = lru_cache(maxsize=2)(partial(_image_block, terms))
 
     def at(self, levels: Levels) -> Reduced:
         """Weight all terms and eliminate the board poses."""
         of_ranges, range_volume = self._range_block(levels.range_m, levels.ring_m)
         of_edges = self._edge_block(levels.edge_rad, levels.backed_rad, levels.lost_share)
-        of_pictures, picture_volume = self._picture_block(levels.pose)
+        of_pictures, picture_volume = self._image_block(levels.pose)
         return _eliminate(
             of_ranges + of_edges + of_pictures,
             self._terms,
@@ -286,9 +286,7 @@ def _range_block(terms: Terms, range_m: float, ring_m: float) -> tuple[Array, fl
     """Weight the returns' terms, and sum the log determinants of their covariances."""
     block = _no_block(terms)
     weighted, log_volumes = weigh_ranges(terms.ranges, range_m, ring_m)
-    place = np.r_[
-        0:6, 6 + PER_CAMERA * len(terms.pictures) : block.shape[1] - 1 - N_SHIFTS, block.shape[1] - 1
-    ]
+    place = np.r_[0:6, 6 + PER_CAMERA * len(terms.images) : block.shape[1] - 1 - N_SHIFTS, block.shape[1] - 1]
     block[:, place[:, None], place] = range_system(terms.ranges, weighted)
     return block, float(log_volumes.sum())
 
@@ -301,15 +299,15 @@ def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: fl
     return block
 
 
-def _picture_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, float]:
+def _image_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, float]:
     """Weight the images' terms, and sum the log determinants of their covariances."""
     block, log_volume = _no_block(terms), 0.0
-    for c, (pictures, rows) in enumerate(zip(terms.pictures, terms.picture_rows, strict=True)):
-        cov = pictures.total_cov(pose_levels)
+    for c, (images, rows) in enumerate(zip(terms.images, terms.image_rows, strict=True)):
+        cov = images.total_cov(pose_levels)
         own = 6 + PER_CAMERA * c
         place = np.r_[own : own + 6, 0:6, own + 6, block.shape[1] - 1]
         products = np.swapaxes(rows, 1, 2) @ np.linalg.solve(cov, rows)
-        block[pictures.capture[:, None, None], place[:, None], place] += products
+        block[images.capture[:, None, None], place[:, None], place] += products
         log_volume += float(np.linalg.slogdet(cov)[1].sum())
     return block, log_volume
 
@@ -341,7 +339,7 @@ def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, float]:
 
     Offsets of L rings have the covariance sigma_laser^2 (I - 1 1^T / L) + sigma_offset^2 1 1^T.
     """
-    L, C = terms.n_rings, len(terms.pictures)
+    L, C = terms.n_rings, len(terms.images)
     prior = np.zeros((len(terms.constants), len(terms.constants)))
     scale = PER_CAMERA * np.arange(C) + 6
     prior[scale, scale] = 1 / priors.scale**2

@@ -9,6 +9,7 @@ const DEAD_MS = 3500; // the rig sends something every second
  * @param {(state: object, picture: Blob|null) => Promise<void>} onState shows an update
  * @param {(isOpen: boolean, isRefused: boolean) => void} onLine is told when the line opens and when it is lost
  * @param {(ageS: number|null) => void} onBeat is told that nothing is new, and for how long
+ * @returns {(name: string) => void} asks for a capture to be taken back
  */
 export function connect(onState, onLine, onBeat) {
   let tries = 0;
@@ -78,6 +79,11 @@ export function connect(onState, onLine, onBeat) {
   }, 500);
   document.addEventListener("visibilitychange", answer);
   open();
+  return (name) => {
+    if (socket !== null && socket.readyState === WebSocket.OPEN) {
+      socket.send(JSON.stringify({ take_back: name }));
+    }
+  };
 }
 
 // A new collection has a new token: this page's link is then no good any more.

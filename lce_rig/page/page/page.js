@@ -12,7 +12,7 @@ let phase = null;
 let isAfterGap = false;
 let wasOpen = false;
 
-connect(
+const takeBack = connect(
   async (state, picture) => {
     phase = state.phase;
     setBanner("");
@@ -60,6 +60,8 @@ function toggle(id, isOn, choose) {
   button.addEventListener("click", () => set(button.getAttribute("aria-pressed") !== "true"));
   return set;
 }
+
+byId("take_back").addEventListener("click", () => takeBack(byId("take_back").dataset.capture));
 
 toggle("sound", false, setSound);
 

@@ -28,6 +28,7 @@ export function showPanels(state) {
   setText("detail", state.detail);
   showHeadline(state.headline);
   showCaptures(state.n_captures, state.n_wanted);
+  showTakeBack(state.last_capture);
   showSigma("rotation", state.sigma_deg, state.target_deg, "°");
   showSigma("translation", state.sigma_mm, state.target_mm, " mm");
   byId("coverage").hidden = state.coverage === null;
@@ -80,6 +81,7 @@ function showHeadline(words) {
 function showCaptures(count, wanted) {
   const before = byId("count").textContent;
   setText("count", String(count));
+  setText("captures_word", (wanted ?? count) === 1 ? "capture" : "captures");
   setText("of", wanted === null ? "" : `of ${wanted}`);
   if (count > Number(before)) {
     const box = byId("captures");
@@ -87,6 +89,14 @@ function showCaptures(count, wanted) {
     void box.offsetWidth; // begins the flash anew
     box.classList.add("new");
   }
+}
+
+// The button names the capture that it takes back: one that came since stays.
+function showTakeBack(name) {
+  const button = byId("take_back");
+  button.hidden = name === "";
+  button.dataset.capture = name;
+  setText("take_back", `take ${name} back`);
 }
 
 function showSigma(id, sigma, target, unit) {

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from lce_rig.core import limits
 from lce_rig.core.data import EventColumns
+from lce_rig.core.losses import Losses
 from lce_rig.recordings.events.aedat4_file import Aedat4File, field_at, vector_at
 from lce_rig.recordings.events.stream import (
     NS_PER_US,
-    DamageCounts,
     NoEventsError,
     join_small,
     parse_size,
@@ -44,18 +44,18 @@ class Aedat4Events:
         _, attributes = self._file.header.streams[number]
         self.resolution_px = parse_size(attributes.get("sizeX", ""), attributes.get("sizeY", ""))
 
-    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
+    def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events, some packets at a time."""
-        yield from join_small(self._packets(findings), _STRETCH_EVENTS)
+        yield from join_small(self._packets(losses), _STRETCH_EVENTS)
 
     def duration_ns(self) -> int | None:
         """Compare the first packet with the last; None where they are damaged."""
         last = self._file.last_packet(self._number, _decode_packet)
-        first = next((packet for packet in self._packets(DamageCounts()) if len(packet)), None)
+        first = next((packet for packet in self._packets(Losses()) if len(packet)), None)
         return int(last.t_ns[-1]) - int(first.t_ns[0]) if first is not None and last else None
 
-    def _packets(self, findings: DamageCounts) -> Iterator[EventColumns]:
-        return self._file.packets(self._number, findings, _decode_packet)
+    def _packets(self, losses: Losses) -> Iterator[EventColumns]:
+        return self._file.packets(self._number, losses, _decode_packet)
 
 
 def _decode_packet(table: bytes) -> EventColumns:

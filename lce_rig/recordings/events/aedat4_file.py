@@ -18,7 +18,8 @@ from typing import BinaryIO, TypeVar
 
 from lce_rig.core import limits, unpacking
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import DamageCounts, open_recorded
+from lce_rig.core.losses import Losses
+from lce_rig.recordings.events.stream import damage, open_recorded
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 _LZ4_MAGIC, _ZSTD_MAGIC = b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd"
@@ -92,12 +93,10 @@ class Aedat4File:
             self.notes.append(f"{self.path.name}: {what} of stream {numbers[0]}, the first of {len(numbers)}")
         return numbers[0] if numbers else None
 
-    def packets(
-        self, stream: int, findings: DamageCounts, decode: Callable[[bytes], _Content]
-    ) -> Iterator[_Content]:
+    def packets(self, stream: int, losses: Losses, decode: Callable[[bytes], _Content]) -> Iterator[_Content]:
         """Yield the packets of a stream, decoded from their flatbuffers; damaged ones are skipped."""
         with open_recorded(self.path) as file:
-            for place in self._places(file, findings):
+            for place in self._places(file, losses):
                 if place.stream != stream:
                     continue
                 file.seek(place.at)
@@ -105,19 +104,19 @@ class Aedat4File:
                     content = decode(_decompress(file.read(place.n_bytes))[4:])
                 except Exception as error:  # Damage shows in any way: lz4, zstd, struct, sizes.
                     where = f"{place.where}: {str(error) or type(error).__name__}"
-                    findings.add("broken packets skipped", where)
+                    losses.add(damage("recording.broken_packets", where))
                     continue
                 yield content
 
     def n_packets(self, stream: int) -> int:
         """Count the packets of a stream; only their heads are read."""
         with open_recorded(self.path) as file:
-            return sum(place.stream == stream for place in self._places(file, DamageCounts()))
+            return sum(place.stream == stream for place in self._places(file, Losses()))
 
     def last_packet(self, stream: int, decode: Callable[[bytes], _Content]) -> _Content | None:
         """Decode the last whole packet of a stream, not those before it; None where there is none."""
         with open_recorded(self.path) as file:
-            places = [place for place in self._places(file, DamageCounts()) if place.stream == stream]
+            places = [place for place in self._places(file, Losses()) if place.stream == stream]
             for place in reversed(places):
                 file.seek(place.at)
                 try:
@@ -126,7 +125,7 @@ class Aedat4File:
                     continue
         return None
 
-    def _places(self, file: BinaryIO, findings: DamageCounts) -> Iterator[PacketPlace]:
+    def _places(self, file: BinaryIO, losses: Losses) -> Iterator[PacketPlace]:
         n_bytes = self.path.stat().st_size
         end = min(self.header.end or n_bytes, n_bytes)
         position, n_packets = self.header.begin, 0
@@ -136,9 +135,9 @@ class Aedat4File:
             if size is None:
                 following = self._next_packet(file, position + 1, end)
                 if following is None:
-                    findings.add("torn ends of the file skipped", f"{end - position} bytes, {where}")
+                    losses.add(damage("recording.torn_end", f"{end - position} bytes, {where}"))
                     return
-                findings.add("broken packets skipped", f"{where}: its head is damaged")
+                losses.add(damage("recording.broken_packets", f"{where}: its head is damaged"))
                 position, n_packets = following, n_packets + 1
                 continue
             yield PacketPlace(number, position + 8, size, where)

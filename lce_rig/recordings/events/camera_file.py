@@ -4,11 +4,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from lce_rig.core.data import Image, Sample, Stream
+from lce_rig.core.losses import Losses
 from lce_rig.recordings.events import open_events
 from lce_rig.recordings.events.aedat4 import decode_frame
 from lce_rig.recordings.events.aedat4_file import Aedat4File
 from lce_rig.recordings.events.choice import CameraEvents
-from lce_rig.recordings.events.stream import DamageCounts, NoEventsError
+from lce_rig.recordings.events.stream import NoEventsError, damage, worded
 from lce_rig.recordings.fingerprint import fingerprint
 from lce_rig.recordings.merging import merge_by_time
 from lce_rig.recordings.protocol import SourceOptions, Span
@@ -55,15 +56,15 @@ class EventCameraFile:
             SourceError: after all that can be read, where the events' clock was set back.
         """
         parts: list[Iterator[Sample]] = []
-        findings = DamageCounts()
+        losses = Losses()
         if self._events is not None:
             parts.append(self._events.samples())
         if self._has_frames:
-            parts.append(self._images(findings))
+            parts.append(self._images(losses))
         try:
             yield from merge_by_time(parts, self._rig)
         finally:
-            found = [f"{self.path.name}: frames: {line}" for line in findings.lines()]
+            found = [f"{self.path.name}: frames: {line}" for line in worded(losses)]
             found += [] if self._events is None else self._events.notes
             self.notes += [note for note in found if note not in self.notes]
 
@@ -85,7 +86,7 @@ class EventCameraFile:
         number = self._file.first_stream("FRME")
         if number is None:
             return False
-        first = next(self._file.packets(number, DamageCounts(), decode_frame), None)
+        first = next(self._file.packets(number, Losses(), decode_frame), None)
         last = self._file.last_packet(number, decode_frame)
         if first is None or last is None:
             return False
@@ -102,11 +103,11 @@ class EventCameraFile:
         self.notes.append(f"{self.path.name}: {self._camera}.{channel} {_meaning(first.exposure_ns)}")
         return True
 
-    def _images(self, findings: DamageCounts) -> Iterator[Sample]:
+    def _images(self, losses: Losses) -> Iterator[Sample]:
         last_ns: int | None = None
-        for frame in self._file.packets(self._number, findings, decode_frame):
+        for frame in self._file.packets(self._number, losses, decode_frame):
             if last_ns is not None and frame.mid_exposure_ns <= last_ns:
-                findings.add("out of order skipped")
+                losses.add(damage("recording.frames_out_of_order"))
                 continue
             last_ns = frame.mid_exposure_ns
             yield Image(self._camera, self._channel, last_ns, frame.pixels)

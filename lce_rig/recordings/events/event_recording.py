@@ -11,14 +11,16 @@ from numpy.typing import NDArray
 from lce_rig.core import limits
 from lce_rig.core.data import EventColumns, Events, join_events
 from lce_rig.core.errors import SourceError
+from lce_rig.core.losses import Losses
 from lce_rig.recordings.events.stream import (
     NO_EVENTS,
     NS_PER_US,
-    DamageCounts,
     EventStream,
     KnowsItsLength,
     NoEventsError,
+    damage,
     seconds_in,
+    worded,
 )
 
 # Sorting a stream of events by time, with minimal memory.
@@ -26,7 +28,10 @@ from lce_rig.recordings.events.stream import (
 # Recorders with several threads, and readout that is not in order, mix timestamps by this much at most.
 REORDER_NS = 20_000_000
 # Counters of 31 and 32 bits of microseconds are common; they wrap after 36 and 72 minutes.
-_WRAPS_NS = tuple((1 << bits) * NS_PER_US for bits in (31, 32))
+_WRAPS_NS = {
+    "recording.clock_wrapped_31": (1 << 31) * NS_PER_US,
+    "recording.clock_wrapped_32": (1 << 32) * NS_PER_US,
+}
 # Eight months.
 _MAX_WRAPS = 10_000
 _MAX_GAP_NS = 60_000_000_000
@@ -39,9 +44,7 @@ _MAX_STRAY_SHARE = 0.01
 _MAX_DAMAGED_SHARE = 0.25
 
 
-def in_time_order(
-    path: Path, stretches: Iterator[EventColumns], findings: DamageCounts
-) -> Iterator[EventColumns]:
+def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses) -> Iterator[EventColumns]:
     """Yield stretches whose timestamps never decrease, within and from one to the next.
 
     Timestamps mixed within 20 ms are sorted; counters that wrap are unwrapped; stray timestamps are skipped.
@@ -50,23 +53,23 @@ def in_time_order(
         SourceError: the timestamps run back for good; everything before has been yielded.
     """
     clock = _Clock(path)
-    sorter = _Sorter(path, findings)
+    sorter = _Sorter(path, losses)
     for stretch in stretches:
-        sound = _on_any_clock(stretch, findings)
+        sound = _on_any_clock(stretch, losses)
         if len(sound):
-            yield from sorter.push(clock.unwrap(sound, findings))
+            yield from sorter.push(clock.unwrap(sound, losses))
     if sorter.held is not None:
         yield sorter.held
 
 
-def _on_any_clock(stretch: EventColumns, findings: DamageCounts) -> EventColumns:
+def _on_any_clock(stretch: EventColumns, losses: Losses) -> EventColumns:
     """Leave out timestamps so far from zero that their differences overflow."""
     t_ns = stretch.t_ns
     limit = limits.MAX_TIME_NS
     if not len(t_ns) or (t_ns.min() > -limit and t_ns.max() < limit):
         return stretch
     is_sound = (t_ns > -limit) & (t_ns < limit)
-    findings.add("events with timestamps beyond any clock skipped", n=int(np.count_nonzero(~is_sound)))
+    losses.add(damage("recording.events_beyond_clocks"), int(np.count_nonzero(~is_sound)))
     return stretch.select(is_sound)
 
 
@@ -77,10 +80,10 @@ class _Sorter:
         held: ordered events that have not been yielded.
     """
 
-    def __init__(self, path: Path, findings: DamageCounts) -> None:
+    def __init__(self, path: Path, losses: Losses) -> None:
         self.held: EventColumns | None = None
         self._path = path
-        self._findings = findings
+        self._losses = losses
         self._first_ns = 0
         self._delivered_ns: int | None = None
 
@@ -117,7 +120,7 @@ class _Sorter:
         back_s = (before_ns - after_ns) * 1e-9
         where = f"{seconds_in(before_ns, self._first_ns)} the timestamps decrease by {back_s:.3f} s"
         if self._delivered_ns is None and before_ns - self._first_ns < _MAX_LEAD_NS:
-            self._findings.add("events before the clock was set skipped", where, reset)
+            self._losses.add(damage("recording.events_before_clock_set", where), reset)
             self._first_ns = after_ns
             return together.select(slice(reset, None))
         sound = self._tidied(together.select(slice(0, reset)))
@@ -134,15 +137,15 @@ class _Sorter:
         n_stray = int(np.count_nonzero(stray))
         if n_stray:
             where = seconds_in(int(events.t_ns[max(int(np.argmax(stray)) - 1, 0)]), self._first_ns)
-            self._findings.add("events with stray timestamps skipped", where, n_stray)
+            self._losses.add(damage("recording.events_stray", where), n_stray)
             events = events.select(~stray)
         if self._delivered_ns is not None:
             is_late = events.t_ns < self._delivered_ns
-            self._findings.add("events that came too late skipped", n=int(np.count_nonzero(is_late)))
+            self._losses.add(damage("recording.events_late"), int(np.count_nonzero(is_late)))
             events = events.select(~is_late)
         n_back = int(np.count_nonzero(np.diff(events.t_ns) < 0))
         if n_back:
-            self._findings.add("places where timestamps decrease by up to 20 ms, sorted", n=n_back)
+            self._losses.add(damage("recording.events_sorted"), n_back)
             events = events.select(np.argsort(events.t_ns, kind="stable"))
         return events
 
@@ -156,7 +159,7 @@ class _Clock:
         self._shift_ns = 0
         self._n_wraps = 0
 
-    def unwrap(self, stretch: EventColumns, findings: DamageCounts) -> EventColumns:
+    def unwrap(self, stretch: EventColumns, losses: Losses) -> EventColumns:
         """Undo the wraps of the next stretch.
 
         Raises:
@@ -166,14 +169,14 @@ class _Clock:
         steps = np.diff(raw, prepend=raw[0] if self._last_ns is None else self._last_ns)
         self._last_ns = int(raw[-1])
         shifts = np.zeros(0, np.int64)
-        if steps.min() < _MAX_GAP_NS - _WRAPS_NS[0]:
+        if steps.min() < _MAX_GAP_NS - min(_WRAPS_NS.values()):
             shifts = np.zeros(len(raw), np.int64)
-            for wrap_ns in _WRAPS_NS:
+            for code, wrap_ns in _WRAPS_NS.items():
                 wrapped = (steps < _MAX_GAP_NS - wrap_ns) & (steps >= -wrap_ns)
                 shifts[wrapped] = wrap_ns
                 n_wraps = int(np.count_nonzero(wrapped))
                 self._n_wraps += n_wraps
-                findings.add(f"wraps of a {wrap_ns * 1e-9 / 60:.1f} min clock undone", n=n_wraps)
+                losses.add(damage(code), n_wraps)
             if self._n_wraps > _MAX_WRAPS:
                 raise SourceError(
                     f"{self._path}: its clock wraps more than {_MAX_WRAPS} times", "It is damaged."
@@ -244,18 +247,18 @@ class EventRecording:
         self.path = path
         self.sensor = sensor
         self._stream = stream
-        self._findings = DamageCounts()
+        self._losses = Losses()
         self._assumed: list[str] = []
         self._span_ns: tuple[int, int] | None = None
-        if not any(len(stretch) for stretch in self._stretches(self._findings)):
-            said = "; ".join(self._findings.lines())
+        if not any(len(stretch) for stretch in self._stretches(self._losses)):
+            said = "; ".join(worded(self._losses))
             raise NoEventsError(f"{path} holds no events" + (f": {said}" if said else ""))
         self.resolution_px = self._settle_resolution(resolution_px)
 
     @property
     def notes(self) -> list[str]:
         """What was assumed, repaired or skipped so far, in words; grows while the recording is read."""
-        found = self._assumed + self._findings.lines()
+        found = self._assumed + worded(self._losses)
         return self._stream.notes + [f"{self.path.name}: {line}" for line in found]
 
     @property
@@ -277,7 +280,7 @@ class EventRecording:
         return self._span_ns
 
     def _unordered(self) -> SourceError:
-        said = "; ".join(self._findings.lines())
+        said = "; ".join(worded(self._losses))
         what = f"{self.path} holds no events that can be sorted by time"
         return SourceError(what + (f": {said}" if said else ""))
 
@@ -313,17 +316,17 @@ class EventRecording:
         Raises:
             SourceError: the timestamps run back for good, or events lie off the sensor.
         """
-        findings = DamageCounts()
+        losses = Losses()
         first_ns = last_ns = None
         try:
-            for stretch in in_time_order(self.path, self._stretches(findings), findings):
-                on_sensor = self._on_sensor(stretch, findings)
+            for stretch in in_time_order(self.path, self._stretches(losses), losses):
+                on_sensor = self._on_sensor(stretch, losses)
                 if len(on_sensor):
                     first_ns = int(on_sensor.t_ns[0]) if first_ns is None else first_ns
                     last_ns = int(on_sensor.t_ns[-1])
                     yield self.to_events(on_sensor)
         finally:
-            self._findings.merge(findings)
+            self._losses.keep_more(losses)
         if first_ns is not None and last_ns is not None:
             self._span_ns = first_ns, last_ns
 
@@ -342,10 +345,10 @@ class EventRecording:
         # Arrival is known of a stretch's first event, not of a window's.
         return replace(join_events(parts), host_ns=None)
 
-    def _stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
+    def _stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Read the stream; a disk that fails is an error the user can repair."""
         try:
-            yield from self._stream.stretches(findings)
+            yield from self._stream.stretches(losses)
         except OSError as error:
             raise SourceError(f"{self.path} cannot be read: {error.strerror or error}") from None
 
@@ -377,7 +380,7 @@ class EventRecording:
         if profile_px or file_px:
             return profile_px or file_px or (0, 0)
         width = height = 0
-        for stretch in self._stretches(DamageCounts()):
+        for stretch in self._stretches(Losses()):
             if len(stretch):
                 width = max(width, int(stretch.x.max()) + 1)
                 height = max(height, int(stretch.y.max()) + 1)
@@ -389,7 +392,7 @@ class EventRecording:
         self._assumed.append(f"declares no resolution; {width}x{height}, the extent of its events, is used")
         return width, height
 
-    def _on_sensor(self, stretch: EventColumns, findings: DamageCounts) -> EventColumns:
+    def _on_sensor(self, stretch: EventColumns, losses: Losses) -> EventColumns:
         width, height = self.resolution_px
         right, bottom = int(stretch.x.max()), int(stretch.y.max())
         if right < width and bottom < height:
@@ -402,7 +405,7 @@ class EventRecording:
                 f"row {bottom}; camera {self.sensor!r} has {_size(self.resolution_px)} pixels",
                 "Give this camera's recording, or correct resolution_px in the profile.",
             )
-        findings.add("events off the sensor skipped", f"column {right}, row {bottom}", n_off)
+        losses.add(damage("recording.events_off_sensor", f"column {right}, row {bottom}"), n_off)
         return stretch.select(is_on)
 
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from lce_rig.core import limits, unpacking
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import DamageCounts, open_recorded, to_ns
+from lce_rig.core.losses import Losses
+from lce_rig.recordings.events.stream import damage, open_recorded, to_ns
 
 _BLOCK_EVENTS = 1 << 20
 _COLUMNS = ("t", "x", "y", "p")
@@ -71,7 +72,7 @@ class Hdf5Events:
         self.resolution_px = (width, height) if width and height else None
         self._offset_us = _integer(file, "t_offset") or _integer(events, "t_offset") or 0
 
-    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
+    def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events a million at a time.
 
         Raises:
@@ -83,15 +84,15 @@ class Hdf5Events:
                 end = min(begin + _BLOCK_EVENTS, self._n_events)
                 try:
                     block = [column.read(begin, end) for column in columns]
-                    yield self._to_columns(block, findings)
+                    yield self._to_columns(block, losses)
                 except _DAMAGE as error:
                     if begin:
                         lost = f"event {begin}: {error}"
-                        findings.add("torn ends of the file skipped", lost)
+                        losses.add(damage("recording.torn_end", lost))
                         return
                     raise _unreadable(self._path, file, error) from None
 
-    def _to_columns(self, block: list[NDArray[Any]], findings: DamageCounts) -> EventColumns:
+    def _to_columns(self, block: list[NDArray[Any]], losses: Losses) -> EventColumns:
         t_us, x, y, polarity = block
         if t_us.dtype.kind == "f":
             is_whole = np.floor(t_us) == t_us
@@ -99,7 +100,7 @@ class Hdf5Events:
                 raise ValueError("events/t holds fractions, not whole microseconds")
         is_pixel = _is_pixel(x) & _is_pixel(y)
         if not np.all(is_pixel):
-            findings.add("events beyond any sensor skipped", n=int(np.count_nonzero(~is_pixel)))
+            losses.add(damage("recording.events_beyond_sensors"), int(np.count_nonzero(~is_pixel)))
             t_us, x, y, polarity = (column[is_pixel] for column in (t_us, x, y, polarity))
         t_ns = to_ns(t_us, self._offset_us)
         return EventColumns(t_ns, x.astype(np.uint16), y.astype(np.uint16), polarity > 0)

@@ -7,7 +7,8 @@ from pathlib import Path
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.core.event_file import EventArchive
-from lce_rig.recordings.events.stream import DamageCounts, open_recorded
+from lce_rig.core.losses import Losses
+from lce_rig.recordings.events.stream import open_recorded
 
 _STRETCH_EVENTS = 1 << 20
 
@@ -26,7 +27,7 @@ class NpzEvents:
         with _archive(path) as archive:
             self.resolution_px = archive.resolution_px
 
-    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
+    def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events a million at a time.
 
         Raises:

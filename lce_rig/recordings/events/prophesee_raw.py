@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from lce_rig.core import limits
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
+from lce_rig.core.losses import Losses
 from lce_rig.recordings.events.counter import WrappingCounter
-from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, open_recorded, parse_size
+from lce_rig.recordings.events.stream import NS_PER_US, damage, open_recorded, parse_size
 from lce_rig.recordings.events.word_codec import EVT3, WordDecoder
 
 # Prophesee's EVT2 (32-bit words) and EVT2.1 (64-bit words, 32 pixels of a row each).
@@ -133,7 +134,7 @@ class PropheseeEvents:
                 f"{path.name}: its header's size {limits.describe(size)} is not a sensor's and is ignored"
             )
 
-    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
+    def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events of the file, block by block."""
         dtype = np.dtype(_WORDS[self._version])
         decoder: Any = WordDecoder(EVT3) if self._version == "3" else Evt2Decoder(self._version == "21")
@@ -144,10 +145,10 @@ class PropheseeEvents:
                 words: NDArray[Any] = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
                 yield decoder.decode(_swapped(words) if self._is_swapped else words)
                 if n_torn:
-                    findings.add("bytes of a torn last word skipped", n=n_torn)
-        findings.add("events before the first timestamp skipped", n=decoder.n_untimed)
-        findings.add("inconsistent time words repaired", n=decoder.n_repaired)
-        findings.add(f"words of no EVT{self._version} code skipped", n=decoder.n_unknown)
+                    losses.add(damage("recording.torn_word"), n_torn)
+        losses.add(damage("recording.events_untimed"), decoder.n_untimed)
+        losses.add(damage("recording.time_words_repaired"), decoder.n_repaired)
+        losses.add(damage("recording.unknown_words"), decoder.n_unknown)
 
 
 def _read_header(path: Path, file: BinaryIO) -> dict[str, str]:

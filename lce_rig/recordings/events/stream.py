@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, runtime_checkable
 
@@ -12,6 +11,9 @@ from numpy.typing import NDArray
 from lce_rig.core import limits
 from lce_rig.core.data import EventColumns, join_events
 from lce_rig.core.errors import SourceError, reading
+from lce_rig.core.findings import Finding
+from lce_rig.core.losses import Losses
+from lce_rig.words import sentence
 
 NS_PER_US = 1000
 _PIXELS = re.compile("[0-9]{1,9}")
@@ -40,37 +42,14 @@ def join_small(stretches: Iterator[EventColumns], n_events: int) -> Iterator[Eve
         yield join_events(parts)
 
 
-@dataclass
-class DamageCounts:
-    """Events skipped or repaired while reading: their number, and the first position.
+def damage(code: str, where: str = "") -> Finding:
+    """Make the finding of what was skipped or lost while reading, with the first place and the cause."""
+    return Finding(code, "warning", figures={"where": where} if where else {})
 
-    Attributes:
-        counts: how many by kind ("broken packets").
-        first: where the first of a kind was met and why.
-    """
 
-    counts: dict[str, int] = field(default_factory=dict)
-    first: dict[str, str] = field(default_factory=dict)
-
-    def add(self, kind: str, where: str = "", n: int = 1) -> None:
-        """Count n more of a kind; the place is kept of the first only."""
-        if n > 0:
-            self.first.setdefault(kind, where)
-            self.counts[kind] = self.counts.get(kind, 0) + n
-
-    def merge(self, other: "DamageCounts") -> None:
-        """Take over what a more complete pass over the same recording found."""
-        for kind, count in other.counts.items():
-            if count >= self.counts.get(kind, 0):
-                self.counts[kind], self.first[kind] = count, other.first[kind]
-
-    def lines(self) -> list[str]:
-        """Say every finding in one line: "3 damaged packets skipped (first: message 17, 2.1 s in: ...)"."""
-        found = []
-        for kind in sorted(self.counts):
-            where = f" (first: {self.first[kind]})" if self.first[kind] else ""
-            found.append(f"{self.counts[kind]} {kind}{where}")
-        return found
+def worded(losses: Losses) -> list[str]:
+    """Say each loss in one line."""
+    return [sentence(finding) for finding in losses.findings()]
 
 
 class EventStream(Protocol):
@@ -84,7 +63,7 @@ class EventStream(Protocol):
     resolution_px: tuple[int, int] | None
     notes: list[str]
 
-    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
+    def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events from the beginning, as they lie in the file; may be called again and again.
 
         Raises:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from lce_rig.core import limits, unpacking
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import DamageCounts, open_recorded, parse_size, to_ns
+from lce_rig.core.losses import Losses
+from lce_rig.recordings.events.stream import damage, open_recorded, parse_size, to_ns
 
 _BLOCK_BYTES = 1 << 18
 _N_COLUMNS = 4
@@ -54,7 +55,7 @@ class TextEvents:
             )
         self.resolution_px = parse_size(first[0].decode(), first[1].decode()) if self._has_size else None
 
-    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
+    def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events of some megabytes of text at a time."""
         with _open(self._path) as file:
             if self._has_size:
@@ -65,14 +66,14 @@ class TextEvents:
                 try:
                     block, is_whole = _read_lines(file)
                 except _ZIP_DAMAGE as error:
-                    findings.add("torn ends of the file skipped", f"line {n_lines}: {error}")
+                    losses.add(damage("recording.torn_end", f"line {n_lines}: {error}"))
                     return
                 if not block and is_whole:
                     return
-                yield _to_columns(_parse_block(block, n_lines, findings))
+                yield _to_columns(_parse_block(block, n_lines, losses))
                 n_lines += block.count(b"\n")
             said = f"line {n_lines}: it is longer than {limits.MAX_LINE_BYTES} bytes"
-            findings.add("torn ends of the file skipped", said)
+            losses.add(damage("recording.torn_end", said))
 
 
 def _read_lines(file: IO[bytes]) -> tuple[bytes, bool]:
@@ -105,7 +106,7 @@ def _open(path: Path) -> Iterator[IO[bytes]]:
             yield member
 
 
-def _parse_block(block: bytes, first_line: int, findings: DamageCounts) -> NDArray[np.float64]:
+def _parse_block(block: bytes, first_line: int, losses: Losses) -> NDArray[np.float64]:
     """Parse whole lines; (N, 4). The fast way serves where every line is sound, as nearly always."""
     lines = block.splitlines()
     table = _parse_quickly(block, lines)
@@ -116,7 +117,7 @@ def _parse_block(block: bytes, first_line: int, findings: DamageCounts) -> NDArr
         line = lines[i]
         if line.strip() and not line.lstrip().startswith(b"#"):
             where = f"line {first_line + i}: {line[:60].decode(errors='replace')!r}"
-            findings.add("broken lines skipped", where)
+            losses.add(damage("recording.broken_lines", where))
     return table
 
 

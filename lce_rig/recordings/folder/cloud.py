@@ -186,20 +186,22 @@ def to_scan(
         have = ", ".join(_shown(cloud.dtype, name) for name in cloud.dtype.names or ()) or "none"
         raise SourceError(f"{where}: the point cloud has no field {missing[0]!r}; its fields are {have}")
     points = np.stack([cloud[fields[axis]].astype(np.float32) for axis in "xyz"], axis=1)
-    is_finite = np.isfinite(points).all(axis=1)
-    range_m, flat_m = np.zeros(len(points)), np.zeros(len(points))
-    exact = points[is_finite].astype(np.float64)
-    range_m[is_finite], flat_m[is_finite] = np.linalg.norm(exact, axis=1), np.hypot(exact[:, 0], exact[:, 1])
+    x, y, z = points.T.astype(np.float64)
+    flat_m = np.hypot(x, y)
+    is_finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
     # No laser of a spinning LiDAR looks along its axis: such a point has no ring.
-    keep = np.flatnonzero(flat_m > MIN_RANGE_M)
-    if len(keep) == 0:
+    is_kept = is_finite & (flat_m > MIN_RANGE_M)
+    n_finite, n_kept = int(is_finite.sum()), int(is_kept.sum())
+    if n_kept == 0:
         raise SourceError(f"{where}: the point cloud has no valid point ({len(points)} in all)")
-    _check_unit(float(np.median(range_m[keep])), settings, where)
-    points, cloud, notes = points[keep], cloud[keep], list[str]()
+    _check_unit(float(np.median(np.hypot(flat_m, z)[is_kept])), settings, where)
+    notes: list[str] = []
+    if n_kept < len(points):
+        points, cloud = points[is_kept], cloud[is_kept]
     ring = _ring(cloud, fields, points, where, notes)
     offset_ns, stamp_ns = _times(cloud, fields, settings, stamp_ns, notes)
     scan = Scan(lidar, stamp_ns, points, _intensity(cloud, fields, notes), ring, offset_ns, host_ns)
-    return CloudReading(scan, int((~is_finite).sum()), int(is_finite.sum() - len(keep)), tuple(notes))
+    return CloudReading(scan, len(is_finite) - n_finite, n_finite - n_kept, tuple(notes))
 
 
 def _is_scalar(field: np.dtype[Any]) -> bool:
@@ -238,7 +240,7 @@ def _ring(
     name = _find(fields, RING_FIELDS)
     with np.errstate(invalid="ignore"):  # of NaN that signals
         values = np.zeros(len(cloud)) if name is None else cloud[name].astype(np.float64)
-    ids, ring_of_point = np.unique(values, return_inverse=True)
+    ids, ring_of_point = _distinct(values)
     is_constant = len(cloud) > 100 and len(ids) == 1
     if name is None or is_constant or not np.isfinite(values).all() or len(ids) > _MOST_RINGS:
         try:
@@ -255,6 +257,17 @@ def _ring(
         return values.astype(np.int16)
     notes.append(f"field {name!r} does not count rings from the lowest: renumbered by elevation")
     return rank[ring_of_point].astype(np.int16)
+
+
+def _distinct(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Do as np.unique with return_inverse, faster where values are small whole numbers, as rings are."""
+    numbers = values.astype(np.uint8)
+    if not (numbers == values).all():
+        return np.unique(values, return_inverse=True)
+    ids = np.flatnonzero(np.bincount(numbers, minlength=256))
+    place = np.zeros(256, dtype=np.intp)
+    place[ids] = np.arange(len(ids))
+    return ids.astype(np.float64), place[numbers]
 
 
 def _counts_upwards(rank: NDArray[np.intp]) -> bool:

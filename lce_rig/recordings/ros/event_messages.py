@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from lce_rig.core import limits
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.events.stream import NS_PER_US, DamageCounts, seconds_in
+from lce_rig.core.losses import Losses
+from lce_rig.recordings.events.stream import NS_PER_US, damage, seconds_in
 from lce_rig.recordings.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
 from lce_rig.recordings.ros.bag_file import BagFile, list_topics
 from lce_rig.recordings.ros.event_array import decode_event_array
@@ -134,13 +135,13 @@ class PacketDecoder:
                 yield EventColumns(events.t_ns, events.x, events.y, events.polarity, host_ns)
                 host_ns = None
 
-    def account(self, findings: DamageCounts) -> None:
+    def account(self, losses: Losses) -> None:
         """Count what was skipped, and what could not be decoded inside packets."""
-        findings.add("packets of triggers skipped", n=self._n_trigger_packets)
-        findings.add("events before the first timestamp skipped", n=self._evt3.n_untimed)
+        losses.add(damage("recording.trigger_packets"), self._n_trigger_packets)
+        losses.add(damage("recording.events_untimed"), self._evt3.n_untimed)
         n_repaired = self._evt3.n_repaired + self._compressed.n_repaired
-        findings.add("inconsistent time words repaired", n=n_repaired)
-        findings.add("words of no known code skipped", n=self._evt3.n_unknown + self._compressed.n_unknown)
+        losses.add(damage("recording.time_words_repaired"), n_repaired)
+        losses.add(damage("recording.unknown_words"), self._evt3.n_unknown + self._compressed.n_unknown)
 
 
 def _pieces(words: NDArray[np.uint16]) -> Iterator[NDArray[np.uint16]]:
@@ -203,16 +204,16 @@ class BagEvents:
 
     def duration_ns(self) -> int | None:
         """Count from the receipt of the first message to that of the last."""
-        first = next((message for _, message in _messages(self._bag, self._topic, DamageCounts())), None)
+        first = next((message for _, message in _messages(self._bag, self._topic, Losses())), None)
         end_ns = self._bag.end_ns(self._topic)
         return None if first is None or end_ns is None else end_ns - first.log_ns
 
-    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
+    def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events, one or several messages at a time."""
         decoder = PacketDecoder()
         last_number: int | None = None
         first_ns: int | None = None
-        for index, message in _messages(self._bag, self._topic, findings):
+        for index, message in _messages(self._bag, self._topic, losses):
             first_ns = message.log_ns if first_ns is None else first_ns
             try:
                 if self._is_array:
@@ -225,14 +226,14 @@ class BagEvents:
                 yield from decoder.decode(packet)
             except ValueError as error:
                 where = f"message {index}, received {seconds_in(message.log_ns, first_ns)}: {error}"
-                findings.add("broken packets skipped", where)
+                losses.add(damage("recording.broken_packets", where))
                 continue
             if last_number is not None and packet.number > last_number + 1:
                 lost = packet.number - last_number - 1
-                findings.add("packets lost in recording", f"before message {index}", lost)
+                losses.add(damage("recording.packets_lost", f"before message {index}"), lost)
             last_number = packet.number
         yield from decoder.finish()
-        decoder.account(findings)
+        decoder.account(losses)
 
     def _check_size(self, header: EventHeader) -> None:
         size = header.width_px, header.height_px
@@ -240,7 +241,7 @@ class BagEvents:
             raise ValueError(f"it is of {size[0]}x{size[1]} pixels")
 
     def _first_header(self) -> EventHeader | None:
-        for _, message in _messages(self._bag, self._topic, DamageCounts()):
+        for _, message in _messages(self._bag, self._topic, Losses()):
             try:
                 if self._is_array:
                     return decode_event_array(message.data, message.encoding)[0]
@@ -250,7 +251,7 @@ class BagEvents:
         return None
 
 
-def _messages(bag: BagFile, topic: str, findings: DamageCounts) -> Iterator[tuple[int, RawMessage]]:
+def _messages(bag: BagFile, topic: str, losses: Losses) -> Iterator[tuple[int, RawMessage]]:
     """Yield the messages of a topic with their number; a tear in the bag is counted and ends them."""
     messages = bag.messages({topic})
     index = 0
@@ -258,7 +259,7 @@ def _messages(bag: BagFile, topic: str, findings: DamageCounts) -> Iterator[tupl
         try:
             message = next(messages, None)
         except SourceError as error:
-            findings.add("places where the bag is torn", error.what)
+            losses.add(damage("recording.bag_torn", error.what))
             return
         if message is None:
             return
@@ -287,7 +288,7 @@ def _choose_topic(bag: BagFile, asked: str | None) -> str:
 def _holds_triggers(bag: BagFile, topic: str) -> bool:
     if bag.topics[topic][0] not in PACKET_TYPES:
         return False
-    for _, message in _messages(bag, topic, DamageCounts()):
+    for _, message in _messages(bag, topic, Losses()):
         with suppress(ValueError):
             return parse_packet(message.data, message.encoding).encoding == "trigger"
     return False

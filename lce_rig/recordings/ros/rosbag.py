@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from lce_rig.core import limits
 from lce_rig.core.data import Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
+from lce_rig.core.losses import Losses
 from lce_rig.recordings.events.choice import CameraEvents
 from lce_rig.recordings.events.event_recording import EventRecording
-from lce_rig.recordings.events.stream import DamageCounts, NoEventsError
+from lce_rig.recordings.events.stream import NoEventsError, damage, worded
 from lce_rig.recordings.folder.cloud import to_scan
 from lce_rig.recordings.folder.image_file import decode_image, to_8_bit
 from lce_rig.recordings.merging import merge_by_time
@@ -188,7 +189,6 @@ def decode_pointcloud2(message: Any) -> NDArray[Any]:
 CLOCK_JUMP_NS = 1_000_000_000
 # Drivers start within this many messages of each other; the span of a later one is not known beforehand.
 _N_PROBED = 500
-_NOT_DECODED = "could not be decoded"
 
 
 @dataclass
@@ -197,7 +197,7 @@ class _BagStream:
 
     last_ns: int | None = None
     n_yielded: int = 0
-    findings: DamageCounts = field(default_factory=DamageCounts)
+    losses: Losses = field(default_factory=Losses)
     notes: set[str] = field(default_factory=set)
 
 
@@ -267,8 +267,10 @@ class BagRecording:
         finally:
             self._summarise(streams)
         for topic, stream in streams.items():
-            if stream.n_yielded == 0 and stream.findings.counts:
-                cause = stream.findings.first.get(_NOT_DECODED, "its timestamps do not increase")
+            found = {each.code: each for each in stream.losses.findings()}
+            if stream.n_yielded == 0 and found:
+                failed = found.get("recording.not_decoded")
+                cause = failed.figures["where"] if failed else "its timestamps do not increase"
                 raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}")
 
     def _open_events(self) -> dict[Stream, CameraEvents]:
@@ -332,7 +334,7 @@ class BagRecording:
             return self._to_sample(message, content, target, stamp_ns, stream)
         except (SourceError, ValueError) as error:
             cause = error.what if isinstance(error, SourceError) else str(error)
-            stream.findings.add(_NOT_DECODED, cause)
+            stream.losses.add(damage("recording.not_decoded", cause))
             return None
 
     def _to_sample(
@@ -351,12 +353,14 @@ class BagRecording:
         cloud = decode_pointcloud2(content)
         reading = to_scan(cloud, target.sensor, settings, message.topic, stamp_ns, message.log_ns)
         stream.notes.update(reading.notes)
-        stream.findings.add("points without a return", n=reading.n_not_finite + reading.n_zero_range)
+        stream.losses.add(
+            damage("recording.points_without_return"), reading.n_not_finite + reading.n_zero_range
+        )
         return reading.scan
 
     def _summarise(self, streams: dict[str, _BagStream]) -> None:
         for topic, stream in streams.items():
-            lines = sorted(stream.notes) + stream.findings.lines()
+            lines = sorted(stream.notes) + worded(stream.losses)
             self.notes += [f"{topic}: {line}" for line in lines]
 
 
@@ -386,11 +390,11 @@ def _is_in_order(sample: Image | Scan, stream: _BagStream) -> bool:
         stream.last_ns = stamp_ns
         return True
     if stamp_ns == stream.last_ns:
-        stream.findings.add("sent twice (equal timestamps)")
+        stream.losses.add(damage("recording.sent_twice"))
         return False
     if stream.last_ns - stamp_ns < CLOCK_JUMP_NS:
-        stream.findings.add("out of order (timestamps decrease)")
+        stream.losses.add(damage("recording.out_of_order"))
         return False
-    stream.findings.add("jumps of the clock back by more than 1 s")
+    stream.losses.add(damage("recording.clock_set_back"))
     stream.last_ns = stamp_ns
     return True

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lce_rig.collect.guidance import SensorModel, SensorPlace
+from lce_rig.collect.guidance import SensorModel, SensorPlace, combine, weigh_placements
 from lce_rig.collect.guidance.sensor_noise import ErrorModel
 from lce_rig.core.geometry import Array, invert
 from lce_rig.rig import QualitySettings
@@ -50,3 +50,8 @@ def placements(n: int, seed: int) -> Array:
         if scan_board(invert(T_FORWARD) @ T_cam_board, rng, exact, BOARD) is not None:
             found.append(T_cam_board)
     return np.array(found)
+
+
+def predict_covariance(model: SensorModel, T_cam_board: Array, T_cam_lidar: Array) -> Array:
+    """Predict the covariance (6, 6) of T_cam_lidar from boards at T_cam_board (N, 4, 4)."""
+    return combine(weigh_placements(model, T_cam_board, T_cam_lidar), model.errors).cov

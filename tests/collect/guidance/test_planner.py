@@ -1,6 +1,8 @@
 """Where the board is sent, when it is enough, and what is refused."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,14 +15,14 @@ from lce_rig.collect.guidance import (
     is_there,
     model_sensors,
     outline_px,
-    predict_covariance,
     sigmas,
 )
+from lce_rig.collect.guidance.candidates import NEAREST_M
 from lce_rig.collect.guidance.planner import SPACINGS
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import perturb
 from lce_rig.rig import load_rig
-from tests.collect.guidance.boards import model, placements, view
+from tests.collect.guidance.boards import model, placements, predict_covariance, view
 from tests.extrinsics.boards import T_FORWARD
 
 NONE = np.zeros((0, 4, 4))
@@ -29,6 +31,21 @@ NONE = np.zeros((0, 4, 4))
 @pytest.fixture(scope="module")
 def planner():
     return Planner(view(), n_places=100)
+
+
+@pytest.mark.parametrize(("profile", "camera"), [("rlfs", "cam"), ("rles", "davis")])
+def test_the_guide_names_the_distances_that_are_asked_for(profile, camera):
+    rig = load_rig(profile)
+    nominal = rig.nominal(camera, "lidar" if "lidar" in rig.lidars else next(iter(rig.lidars)))
+    near_m, far_m = Planner(
+        SensorPlace.upright(model_sensors(rig, camera, nominal.lidar), nominal.to_matrix())
+    ).reach_m
+    limits = rig.quality
+    assert max(NEAREST_M, limits.min_distance_m) <= near_m < 1.3
+    assert near_m < far_m <= limits.max_distance_m
+    guide = (Path(__file__).parents[3] / "docs" / "how-to-calibrate.md").read_text()
+    assert f"distance from {NEAREST_M:g} m" in guide
+    assert re.search(rf"{far_m:.1f} m with(?: the profile)?\s+`{profile}`", guide)
 
 
 @pytest.fixture(scope="module")

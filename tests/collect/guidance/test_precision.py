@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.collect.guidance import combine, predict_covariance, sigmas, weigh_placements
+from lce_rig.collect.guidance import combine, sigmas, weigh_placements
 from lce_rig.collect.guidance.evidence import combine_with_each
 from lce_rig.collect.guidance.sensor_noise import ErrorModel
 from lce_rig.core.geometry import difference, invert
@@ -17,7 +17,7 @@ from lce_rig.residuals.features import FeatureSettings, extract_features
 from lce_rig.residuals.moments import Problem, Weights
 from lce_rig.solvers.covariance import symmetric_inverse
 from lce_rig.solvers.registration import vec_rotation
-from tests.collect.guidance.boards import SURROGATE, model, placements
+from tests.collect.guidance.boards import SURROGATE, model, placements, predict_covariance
 from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, photograph, scan_board
 
 

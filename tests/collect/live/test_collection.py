@@ -2,15 +2,18 @@
 
 import json
 import re
+import threading
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from lce_rig.collect.live.collection import collect_live
 from lce_rig.collect.live.guide import make_guides
-from lce_rig.collect.live.state import Key, LiveOptions, LiveState
+from lce_rig.collect.live.state import Key, LiveOptions, LiveState, TakeBack
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.session import Session
 from tests.collect.live.replay import Show, placements, rig
@@ -90,6 +93,81 @@ def test_keys_capture_at_once_ask_for_another_place_and_stop(tmp_path: Path) -> 
         assert [capture.meta.get("by_hand") for capture in session.captures] == [1.0]
     wanted = [s.drawing.wanted for s in states if s.drawing is not None and s.drawing.wanted is not None]
     assert len({each.tobytes() for each in wanted}) >= 2
+
+
+def test_captures_are_taken_back_one_by_one_and_nothing_is_lost_or_counted_twice(tmp_path: Path) -> None:
+    path, states = tmp_path / "session", list[LiveState]()
+    show = Show(placements(), each_s=2.0)
+    # Both, the last first; then one that is gone already, as a second tap on a slow page asks for.
+    asked: list[Key | TakeBack] = [TakeBack(), TakeBack(), TakeBack("000001")]
+
+    def key() -> Key | TakeBack | None:
+        has_two = any(state.n_captures == 2 for state in states)
+        return asked.pop(0) if asked and has_two else None
+
+    with show.running(), Session.create(path, rig()) as session:
+        report = collect_live(session, show.sources, QUICK, states.append, key)
+        assert report.ending == "frames" and report.taken_back == ["000001", "000000"]
+        assert [each.name for each in session.captures] == report.captured
+        assert report.captured == ["000002", "000003", "000004"]
+        assert [each.name for each in session.rejected] == ["000000", "000001"]
+        for capture in (*session.captures, *session.rejected):
+            capture.check()
+    rejected = [entry for entry in session.read_journal() if entry["event"] == "rejected"]
+    assert {entry["reason"] for entry in rejected} == {"taken back while collecting"}
+    counts = [state.n_captures for state in states]
+    assert [b for a, b in pairwise(counts) if a != b] == [1, 2, 1, 0, 1, 2, 3]
+    sounds = [cue.sound for cue in {cue.number: cue for s in states for cue in s.cues}.values()]
+    assert sounds.count("taken_back") == 2 and sounds.count("captured") == 5
+
+
+def test_a_capture_on_its_way_to_the_disk_is_taken_back_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states: list[LiveState] = []
+    show = Show(placements()[:1], each_s=100.0)
+
+    def key() -> Key | TakeBack | None:
+        if not states or not states[-1].last_capture:
+            return "stop" if any(state.last_capture for state in states) else None
+        return TakeBack()
+
+    with show.running(), Session.create(tmp_path / "session", rig()) as session:
+        add, is_asked = session.add_capture, threading.Event()
+
+        def add_slowly(*given: Any) -> str:
+            """Write as a disk does that is busy until somebody has pressed the key."""
+            is_asked.wait(20.0)
+            return add(*given)
+
+        monkeypatch.setattr(session, "add_capture", add_slowly)
+
+        def watch(state: LiveState) -> None:
+            states.append(state)
+            if any(each.last_capture for each in states[:-1]):
+                is_asked.set()
+
+        report = collect_live(session, show.sources, QUICK, watch, key)
+        assert report.captured == [] and report.taken_back == ["000000"]
+        assert not session.captures and [each.name for each in session.rejected] == ["000000"]
+    assert max(state.n_captures for state in states) == 0
+
+
+def test_a_key_press_makes_no_second_capture_of_a_board_that_was_captured_as_it_stands(
+    tmp_path: Path,
+) -> None:
+    states: list[LiveState] = []
+    show = Show(placements()[:1], each_s=100.0)
+
+    def key() -> Key | None:
+        if states and states[-1].elapsed_s > 8.0:
+            return "stop"
+        return "capture" if states and states[-1].n_captures else None
+
+    with show.running(), Session.create(tmp_path / "session", rig()) as session:
+        report = collect_live(session, show.sources, replace(QUICK, n_wanted=None), states.append, key)
+    assert report.captured == ["000000"]
+    assert any("000000 shows the board here" in line for line in states[-1].log)
 
 
 def test_what_was_seen_before_the_sensors_fell_silent_is_not_shown_as_seen_now(tmp_path: Path) -> None:

@@ -36,6 +36,22 @@ def test_each_capture_moves_the_wanted_placement_and_lowers_the_prediction(guide
     assert guide.n_held == 8
 
 
+def test_a_capture_that_is_taken_back_is_forgotten(guide: Guide) -> None:
+    for k in range(3):
+        guide.plan(None, float(k))
+        last = guide.wanted
+        assert last is not None
+        guide.add(f"{k:06d}", last)
+    guide.plan(None, 5.0)
+    refused = guide.adds_nothing(last)
+    assert refused is not None and refused.figures["capture"] == "000002"
+    assert guide.guidance is not None and guide.guidance.n_captures == 3
+    guide.remove("000002")
+    guide.plan(None, 6.0)
+    assert guide.n_held == guide.guidance.n_captures == 2
+    assert guide.adds_nothing(last) is None
+
+
 def test_the_wanted_placement_stays_until_it_is_captured_or_given_up(guide: Guide) -> None:
     guide.plan(None, 0.0)
     first = guide.wanted
@@ -55,7 +71,8 @@ def test_the_wanted_placement_stays_until_it_is_captured_or_given_up(guide: Guid
 def test_without_a_nominal_extrinsic_guidance_begins_with_the_first_calibration(guide: Guide) -> None:
     (blind,) = make_guides(without_nominal())
     blind.plan(None, 0.0)
-    assert blind.wanted is None and "nominal extrinsic" in blind.problem
+    assert blind.problem is not None and blind.problem.code == "guide.no_nominal"
+    assert blind.wanted is None
     assert blind.coverage() is None and blind.adds_nothing(np.eye(4)) is None
     nominal = rig().nominal("davis", "lidar")
     assert nominal is not None
@@ -63,7 +80,9 @@ def test_without_a_nominal_extrinsic_guidance_begins_with_the_first_calibration(
     assert planner is not None
     blind.adopt(planner)
     blind.plan(None, 1.0)
-    assert blind.wanted is not None and blind.problem == ""
+    assert blind.wanted is not None and blind.problem is None
+    blind.adopt(None)
+    assert blind.problem is not None and blind.wanted is None, "what was learned was taken back"
 
 
 def test_what_captures_leave_over_raises_the_prediction(guide: Guide) -> None:
@@ -87,7 +106,8 @@ def test_a_lidar_whose_beams_are_not_known_is_collected_without_guidance() -> No
     lidar = rig().lidars["lidar"].model_copy(update={"model": "HDL-64"})
     (guide,) = make_guides(rig().model_copy(update={"lidars": {"lidar": lidar}}))
     guide.plan(None, 0.0)
-    assert guide.wanted is None and "HDL-64" in guide.problem
+    assert guide.problem is not None and guide.problem.code == "guide.no_beams"
+    assert guide.wanted is None and "HDL-64" in str(guide.problem.figures["cause"])
     assert guide.outline_px(np.eye(4)) is None
 
 

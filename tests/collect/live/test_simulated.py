@@ -29,10 +29,11 @@ def walk(scene: LiveScene, view: SensorPlace, wanted: HeldPose) -> tuple[Array, 
     scene.hold(T_world_cam @ build_pose(view, HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0)))
     walker = Walker(scene, Person(0.02, 1.0, 0.0), {"davis": view})
     walker.hear("davis", build_pose(view, wanted), 100.0)
-    now_s = 100.0
-    while walker.is_walking:
-        now_s += 0.1
+    now_s, before = 100.0, np.eye(4)
+    while not np.array_equal(before, scene.T_world_board):
+        before, now_s = scene.T_world_board, now_s + 0.1
         walker.walk(now_s)
+    now_s -= 0.1
     return invert(T_world_cam) @ scene.T_world_board, now_s - 100.0
 
 

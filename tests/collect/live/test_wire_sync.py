@@ -84,7 +84,7 @@ def test_pulses_tie_the_cameras_pictures_to_the_lidars_time(
 
         def watch(state: LiveState) -> None:
             states.append(state)
-            if state.notes and not any("must stand still" in note for note in state.notes):
+            if not state.requires_still_boards:
                 is_tied.set()
 
         with Session.create(tmp_path / "session", rig) as session:

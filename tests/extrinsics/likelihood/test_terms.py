@@ -9,8 +9,8 @@ from scipy.linalg import block_diag
 
 from lce_rig.core.geometry import difference, invert, perturb
 from lce_rig.extrinsics.consensus import find_consensus
+from lce_rig.extrinsics.likelihood.image_terms import image_rows, stack_images
 from lce_rig.extrinsics.likelihood.levels import Levels, Priors
-from lce_rig.extrinsics.likelihood.picture_terms import picture_rows, stack_pictures
 from lce_rig.extrinsics.likelihood.system import Assembly, State, assemble, linearise
 from lce_rig.residuals.along_rays import (
     N_FIELDS,
@@ -40,13 +40,13 @@ def scans(observations):
 
 
 @pytest.fixture(scope="module")
-def pictures(observations):
-    return stack_pictures(np.arange(4), [o.image for o in observations], np.ones(4))
+def images(observations):
+    return stack_images(np.arange(4), [o.image for o in observations], np.ones(4))
 
 
 @pytest.fixture(scope="module")
-def T_lidar_board(pictures):
-    return invert(T_FORWARD) @ pictures.T_cam_board
+def T_lidar_board(images):
+    return invert(T_FORWARD) @ images.T_cam_board
 
 
 def ranges_to(scans, T_lidar_board):
@@ -123,15 +123,15 @@ def test_ring_ends_displaced_against_all_returns_are_what_the_shifts_say(scans, 
     assert np.ptp(expected - plain.rows[:, -1]) > 5e-4
 
 
-def test_derivatives_of_pictures_are_those_of_differences(pictures, T_lidar_board):
-    rows = picture_rows(pictures, T_FORWARD, T_lidar_board, 0.0)
+def test_derivatives_of_pictures_are_those_of_differences(images, T_lidar_board):
+    rows = image_rows(images, T_FORWARD, T_lidar_board, 0.0)
     for axis in range(6):
         tangent = STEP * np.eye(6)[axis]
         by_camera = [
-            difference(perturb(T_FORWARD, s * tangent) @ T_lidar_board, pictures.T_cam_board) for s in (1, -1)
+            difference(perturb(T_FORWARD, s * tangent) @ T_lidar_board, images.T_cam_board) for s in (1, -1)
         ]
         by_board = [
-            difference(T_FORWARD @ perturb(T_lidar_board, s * tangent), pictures.T_cam_board) for s in (1, -1)
+            difference(T_FORWARD @ perturb(T_lidar_board, s * tangent), images.T_cam_board) for s in (1, -1)
         ]
         assert np.allclose(rows[:, :, axis], (by_camera[0] - by_camera[1]) / (2 * STEP), atol=1e-7)
         assert np.allclose(rows[:, :, 6 + axis], (by_board[0] - by_board[1]) / (2 * STEP), atol=1e-7)
@@ -159,13 +159,13 @@ def plain_rows(terms, scans, T_lidar_board, levels, r):
     """Rows [by z, by every board pose, residual] of all terms, and the covariance of their noise."""
     F, L, G = len(terms.ranges.sums), terms.n_rings, len(terms.constants)
     rows, noise = [], []
-    by_camera = terms.picture_rows[0]
+    by_camera = terms.image_rows[0]
     for k in range(F):
         own = np.zeros((6, G + 6 * F + 1))
         own[:, :6], own[:, 6], own[:, -1] = by_camera[k, :, :6], by_camera[k, :, 12], by_camera[k, :, 13]
         own[:, G + 6 * k : G + 6 * k + 6] = by_camera[k, :, 6:12]
         rows.append(own)
-        noise.append(terms.pictures[0].total_cov(levels.pose)[k])
+        noise.append(terms.images[0].total_cov(levels.pose)[k])
     by_plane = freedoms(scans, T_lidar_board)
     for i, k in enumerate(scans.capture):
         own = np.zeros((1, G + 6 * F + 1))
@@ -188,9 +188,9 @@ def without_ends(edges):
     return replace(edges, capture=none, **{name: getattr(edges, name)[none] for name in EDGE_FIELDS})
 
 
-def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, pictures, T_lidar_board):
+def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, images, T_lidar_board):
     L, G = len(scans.rings), 7 + len(scans.rings) + N_FIELDS + N_SHIFTS
-    terms = linearise(scans, (pictures,), BOARD, State(T_FORWARD[None], T_lidar_board, np.zeros(G)))
+    terms = linearise(scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, np.zeros(G)))
     terms = replace(terms, edges=without_ends(terms.edges))
     priors = Priors()
     r = ranges_to(scans, T_lidar_board)
@@ -217,11 +217,9 @@ def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, pictu
         assert np.isclose(fast[1] - fast[0], plainly(changed) - plainly(base), rtol=1e-5)
 
 
-def test_what_a_search_for_levels_keeps_is_right_at_each_step_and_gone_with_it(
-    scans, pictures, T_lidar_board
-):
+def test_what_a_search_for_levels_keeps_is_right_at_each_step_and_gone_with_it(scans, images, T_lidar_board):
     zeros = np.zeros(7 + len(scans.rings) + N_FIELDS + N_SHIFTS)
-    terms = linearise(scans, (pictures,), BOARD, State(T_FORWARD[None], T_lidar_board, zeros))
+    terms = linearise(scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, zeros))
     assembly, base = Assembly(terms, Priors()), Levels()
     for changed in (base, replace(base, range_m=0.02), replace(base, lost_share=0.3), base):
         plainly = assemble(terms, changed, Priors()).minus_2_log_evidence

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lce_rig.core.losses import Losses
 from lce_rig.recordings.events.aedat4 import Aedat4Image, decode_frame
 from lce_rig.recordings.events.aedat4_file import Aedat4File
-from lce_rig.recordings.events.stream import DamageCounts
-from tests.notes import kinds
 from tests.recordings.events.aedat4_files import RawFrame, flatbuffer, write_davis
 from tests.recordings.events.encoders import random_events
 
@@ -20,11 +19,11 @@ GREY = RNG.integers(0, 256, (260, 346), dtype=np.uint8)
 COLOUR = RNG.integers(0, 256, (260, 346, 3), dtype=np.uint8)
 
 
-def read(path: Path, findings: DamageCounts | None = None) -> list[Aedat4Image]:
+def read(path: Path, losses: Losses | None = None) -> list[Aedat4Image]:
     file = Aedat4File(path)
     number = file.first_stream("FRME")
     assert number is not None
-    return list(file.packets(number, findings or DamageCounts(), decode_frame))
+    return list(file.packets(number, losses or Losses(), decode_frame))
 
 
 @pytest.mark.parametrize("style", ["dv", "dv-processing", "exposure only"])
@@ -88,9 +87,9 @@ def test_a_damaged_frame_costs_only_itself_and_is_counted(tmp_path: Path) -> Non
     second = [found.start() for found in re.finditer(b"FRME", data)][-2]
     data[second : second + 4] = b"????"
     path.write_bytes(data[:-100])
-    findings = DamageCounts()
-    assert [f.mid_exposure_ns for f in read(path, findings)] == [(START_US + 4000) * 1000]
-    assert kinds(findings.counts) == {"broken packets": 1, "torn ends": 1}
+    losses = Losses()
+    assert [f.mid_exposure_ns for f in read(path, losses)] == [(START_US + 4000) * 1000]
+    assert losses.by_code() == {"recording.broken_packets": 1, "recording.torn_end": 1}
 
 
 def test_pictures_that_contradict_themselves_are_refused_by_what_is_wrong() -> None:

@@ -16,11 +16,12 @@ import pytest
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.core.event_file import encode_events
+from lce_rig.core.losses import Losses
 from lce_rig.recordings.events import open_events
 from lce_rig.recordings.events.aedat4 import decode_frame
-from lce_rig.recordings.events.stream import DamageCounts, parse_size, to_ns
+from lce_rig.recordings.events.stream import parse_size, to_ns
 from lce_rig.recordings.events.text import TextEvents
-from tests.notes import has_note, kinds
+from tests.notes import has_note
 from tests.recordings.events import encoders
 from tests.recordings.events.aedat4_files import STREAM, XML, RawFrame, flatbuffer, frame_packet
 from tests.recordings.events.encoders import listed, random_events
@@ -266,9 +267,9 @@ def test_one_long_word_among_many_short_ones_takes_no_memory(tmp_path: Path) -> 
     (tmp_path / "a.txt").write_bytes(
         b"346 260\n" + b"1 1 1 1\n" * 9999 + b"1" * 4000 + b" 1 1 1\n0.1 1 1 1\n"
     )
-    findings = DamageCounts()
-    assert sum(map(len, TextEvents(tmp_path / "a.txt").stretches(findings))) == 10_000
-    assert kinds(findings.counts) == {"broken lines": 1}
+    losses = Losses()
+    assert sum(map(len, TextEvents(tmp_path / "a.txt").stretches(losses))) == 10_000
+    assert losses.by_code() == {"recording.broken_lines": 1}
 
 
 @pytest.mark.parametrize("word", [b"nan", b"inf", b"1e300", b"1e999", b"-1e300", b"1" * 200, b"\xff\x00"])

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
+from lce_rig.core.losses import Losses
 from lce_rig.recordings.events.event_recording import REORDER_NS, EventRecording
-from lce_rig.recordings.events.stream import DamageCounts
 from tests.notes import has_note
 from tests.recordings.events.encoders import random_events
 
@@ -29,7 +29,7 @@ class ListedStream:
         self.notes: list[str] = []
         self._stretches = stretches
 
-    def stretches(self, findings: DamageCounts) -> Iterator[EventColumns]:
+    def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         yield from self._stretches
 
 

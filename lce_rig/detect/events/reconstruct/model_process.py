@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from lce_rig.detect.events.reconstruct.network_worker import MAX_BYTES, read_arrays, write_arrays
 from lce_rig.detect.events.reconstruct.onnx_session import NetworkError, Port
 from lce_rig.detect.events.reconstruct.voxels import FloatArray
-from lce_rig.detect.events.reconstruct.worker import MAX_BYTES, read_arrays, write_arrays
 
 LOAD_S = 60.0
 """Limit of starting the process, importing onnxruntime and loading a network."""
@@ -72,7 +72,7 @@ class _Worker:
         # Modules are found as here; the folder in which the user happens to be is no place for them.
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(os.path.isabs, sys.path))}
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "lce_rig.detect.events.reconstruct.worker", str(self._memory_fd)],
+            [sys.executable, "-m", "lce_rig.detect.events.reconstruct.network_worker", str(self._memory_fd)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

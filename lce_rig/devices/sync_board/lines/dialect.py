@@ -56,12 +56,10 @@ class Dialect(ABC):
     """How a kind of board talks.
 
     Attributes:
-        has_checksum: whether damage to a line shows.
         has_own_counts: whether each channel counts its own pulses, so that a gap is a lost one.
         has_triggers: whether the board tells of the pulses that it sends to cameras.
     """
 
-    has_checksum = True
     has_own_counts = True
     has_triggers = True
 
@@ -87,10 +85,6 @@ class Dialect(ABC):
 
     def start(self) -> bytes:
         """Let the pulses begin; empty where they always run."""
-        return b""
-
-    def stop(self) -> bytes:
-        """End the pulses; empty where they always run."""
         return b""
 
 

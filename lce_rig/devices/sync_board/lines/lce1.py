@@ -68,10 +68,6 @@ class Lce1(Dialect):
         """Let the pulses begin."""
         return write_sentence("LCEGO")
 
-    def stop(self) -> bytes:
-        """End the pulses."""
-        return write_sentence("LCESP")
-
 
 def _number(field: bytes, largest: int = MAX_COUNT) -> int:
     if not _NUMBER.match(field) or int(field) > largest:

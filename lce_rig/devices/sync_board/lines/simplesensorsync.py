@@ -25,7 +25,6 @@ from lce_rig.devices.sync_board.lines.messages import (
 class SimpleSensorSync(Dialect):
     """The dialect `simplesensorsync`; all channels share one running count."""
 
-    has_checksum = False
     has_own_counts = False
 
     def __init__(self) -> None:

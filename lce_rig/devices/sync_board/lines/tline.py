@@ -15,8 +15,6 @@ _PULSE = re.compile(rb"T, ?(0|[1-9][0-9]{0,9}), ?(0|[1-9][0-9]{0,15})\Z")
 class TLine(Dialect):
     """The dialect `tline`; all pulses are on channel 0."""
 
-    has_checksum = False
-
     def __init__(self) -> None:
         self._nmea = Nmea()
 
@@ -40,7 +38,3 @@ class TLine(Dialect):
     def start(self) -> bytes:
         """Let the pulses begin."""
         return b"GO\n"
-
-    def stop(self) -> bytes:
-        """End the pulses."""
-        return b"STOP\n"

@@ -20,7 +20,7 @@ from lce_rig.residuals.along_rays import Indices
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
+class StackedImages:
     """One camera's board poses in P captures.
 
     Attributes:
@@ -42,13 +42,13 @@ class Pictures:
             Q += getattr(levels, name) ** 2 * shape
         return self.cov + Q
 
-    def with_larger_errors(self, ratios: PoseLevels) -> "Pictures":
+    def with_larger_errors(self, ratios: PoseLevels) -> "StackedImages":
         """Scale the images' errors beyond corner noise relative to the levels."""
         shapes = {name: getattr(ratios, name) ** 2 * shape for name, shape in self.shapes.items()}
         return replace(self, shapes=shapes)
 
 
-def stack_pictures(capture: Indices, images: Sequence[ImageBoard], n_repeats: Array) -> Pictures:
+def stack_images(capture: Indices, images: Sequence[ImageBoard], n_repeats: Array) -> StackedImages:
     """Stack the images of one camera.
 
     Args:
@@ -64,12 +64,12 @@ def stack_pictures(capture: Indices, images: Sequence[ImageBoard], n_repeats: Ar
     about, along = (v[:, :, None] * v[:, None, :] for v in (normal, sight))
     shapes["tilt_rad"][:, 3:, 3:], shapes["spin_rad"][:, 3:, 3:] = np.eye(3) - about, about
     shapes["depth_m"][:, :3, :3], shapes["across_m"][:, :3, :3] = along, np.eye(3) - along
-    return Pictures(
+    return StackedImages(
         capture, T, cov, {name: n_repeats[:, None, None] * shape for name, shape in shapes.items()}
     )
 
 
-def picture_rows(pictures: Pictures, T_cam_lidar: Array, T_lidar_board: Array, scale: float) -> Array:
+def image_rows(images: StackedImages, T_cam_lidar: Array, T_lidar_board: Array, scale: float) -> Array:
     """Linearise the tangent from T_cam_board to T_cam_lidar T_lidar_board.
 
     Returns:
@@ -77,13 +77,13 @@ def picture_rows(pictures: Pictures, T_cam_lidar: Array, T_lidar_board: Array, s
         camera measures to t_cam_board (1 + s): squares or a focal length that differ from the profile
         says.
     """
-    Y = T_lidar_board[pictures.capture]
+    Y = T_lidar_board[images.capture]
     R = T_cam_lidar[:3, :3]
     rows = np.zeros((len(Y), 6, 14))
     rows[:, :3, :3] = rows[:, 3:, 3:6] = np.eye(3)
     rows[:, :3, 3:6] = -skew(Y[:, :3, 3] @ R.T)
     rows[:, :3, 6:9] = rows[:, 3:, 9:12] = R
-    rows[:, :3, 12] = -pictures.T_cam_board[:, :3, 3]
-    rows[:, :, 13] = difference(T_cam_lidar @ Y, pictures.T_cam_board)
+    rows[:, :3, 12] = -images.T_cam_board[:, :3, 3]
+    rows[:, :, 13] = difference(T_cam_lidar @ Y, images.T_cam_board)
     rows[:, :3, 13] += scale * rows[:, :3, 12]
     return rows
