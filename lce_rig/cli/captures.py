@@ -75,6 +75,11 @@ def _require_there(session: "Session", rejecting: list[str], restoring: list[str
         *((name, there, aside, "rejected already") for name in rejecting),
         *((name, aside, there, "not rejected") for name in restoring),
     ):
+        if name in other and name in known:
+            raise UsageError(
+                f"{session.path}: capture {name} is in captures/ and in rejected/",
+                "Move one of the two out of the session.",
+            )
         if name in other:
             raise UsageError(f"{session.path}: capture {name} is {state}")
         if name not in known:
@@ -126,7 +131,7 @@ def _table(records: list[dict[str, Any]]) -> Any:
         table.add_row(
             record["name"],
             show.escape(", ".join(record["streams"])) or "[red]damaged[/]",
-            show.escape(record["source"]),
+            show.escape(record["damage"] or record["source"]),
             show.escape(", ".join(record["used_by"])) or "-",
             state,
         )

@@ -259,7 +259,7 @@ def new_profile(
       lce-rig rigs new truck --lidar OS1-64 --camera front --intrinsics camera_info.yaml \\
                              --board 8x6,0.07,0.767x0.626
       lce-rig rigs new truck --from drive.bag --lidar OS1-64 --board 8x6,0.07,0.767x0.626
-      lce-rig rigs new mine --from rlfs --set board.square_m=0.08 --unset sync
+      lce-rig rigs new mine --from rlfs --set board.square_m=0.08 --unset nominal_extrinsics
     """
     from lce_rig.rig import edit_text, load_rig, shipped_profiles
 
@@ -400,10 +400,10 @@ def _board_settings(text: str | None) -> list[tuple[str, str]]:
     board = parse_board(text)
     return [
         ("board.inner_corners", f"[{board.cols}, {board.rows}]"),
-        ("board.square_m", f"{board.square_m:g}"),
-        ("board.width_m", f"{board.width_m:g}"),
-        ("board.height_m", f"{board.height_m:g}"),
-        ("board.pattern_offset_m", f"[{board.pattern_offset_m[0]:g}, {board.pattern_offset_m[1]:g}]"),
+        ("board.square_m", f"{board.square_m}"),
+        ("board.width_m", f"{board.width_m}"),
+        ("board.height_m", f"{board.height_m}"),
+        ("board.pattern_offset_m", f"{list(board.pattern_offset_m)}"),
     ]
 
 

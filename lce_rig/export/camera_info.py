@@ -8,7 +8,7 @@ import numpy as np
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError, ProfileError
-from lce_rig.core.limits import MAX_DOCUMENT_BYTES, describe, read_file
+from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
 from lce_rig.core.results import Calibration
 from lce_rig.export.files import header, numbers, quoted, reads_back
 from lce_rig.export.frames import choose_channels

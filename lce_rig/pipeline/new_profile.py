@@ -23,7 +23,7 @@ _FAMILIES: dict[str, Literal["radtan", "equidistant"]] = {
 }
 BOARD_FORM = "COLSxROWS,SQUARE,WIDTHxHEIGHT[,RIGHT,UP], lengths in m, such as 8x6,0.07,0.767x0.626"
 _LENS_FORM = (
-    "MODEL,WIDTHxHEIGHT,FX,FY,CX,CY,K1,..., such as radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23"
+    "MODEL,WIDTHxHEIGHT,FX,FY,CX,CY,K1,..., such as radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0"
 )
 
 
@@ -100,7 +100,7 @@ def parse_board(text: str) -> Board:
 
 
 def parse_intrinsics(text: str) -> Intrinsics:
-    """Read a camera_info file, or intrinsics as "radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23".
+    """Read a camera_info file, or intrinsics as "radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0".
 
     Raises:
         UsageError: it is neither.
@@ -109,8 +109,8 @@ def parse_intrinsics(text: str) -> Intrinsics:
     model, *values = re.split(r"\s*,\s*|\s+", text.strip())
     if len(values) < 5 and not (values and values[0] and model in _FAMILIES):
         path = Path(text)
-        if not path.exists():
-            raise UsageError(f"--intrinsics {text}: there is no such file", f"Or give {_LENS_FORM}.")
+        if not text or len(text) > 4000 or not path.exists():
+            raise UsageError(f"--intrinsics {text[:200]}: there is no such file", f"Or give {_LENS_FORM}.")
         return load_camera_info(path)
     size = _SIZE.fullmatch(values[0])
     try:

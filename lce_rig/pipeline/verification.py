@@ -12,7 +12,15 @@ from lce_rig.detect.events.search import EventImage
 from lce_rig.export.result import SavedResult, read_result
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import Progress, detect, event_channels, event_picture, silent
-from lce_rig.pipeline.result_files import OVERLAYS, RESULT, Result, keep_foreign, result_content, result_parts
+from lce_rig.pipeline.result_files import (
+    OVERLAYS,
+    RESULT,
+    Result,
+    keep_foreign,
+    result_content,
+    result_parts,
+    stored_results,
+)
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.session.session import DEBUG

@@ -87,10 +87,10 @@ def draft_profile(
         "board:                            # measure it; do not rely on the CAD model",
         f"  inner_corners: [{board.cols}, {board.rows}]           "
         "# where four squares meet: [along the width, along the height]",
-        f"  square_m: {board.square_m:g}",
-        f"  width_m: {board.width_m:g}",
-        f"  height_m: {board.height_m:g}",
-        f"  pattern_offset_m: [{board.pattern_offset_m[0]:g}, {board.pattern_offset_m[1]:g}]"
+        f"  square_m: {board.square_m}",
+        f"  width_m: {board.width_m}",
+        f"  height_m: {board.height_m}",
+        f"  pattern_offset_m: [{board.pattern_offset_m[0]}, {board.pattern_offset_m[1]}]"
         "    # pattern's centre from the plate's centre: [right, up]",
         "",
         "lidars:",
