@@ -54,9 +54,7 @@ def drift(
     saved = None if result is None else read_result(result)
     rig = None if rig_name is None else load_rig(rig_name)
     with show.progress_bar("reading") as progress:
-        report = watch_drift(
-            recording, saved, rig=rig, ignore_board=ignore_board, progress=progress
-        )
+        report = watch_drift(recording, saved, rig=rig, ignore_board=ignore_board, progress=progress)
     files = [] if output is None else report.write(output)
     if as_json:
         pairs = [pair.document() for pair in report.pairs]
