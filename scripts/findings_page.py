@@ -32,6 +32,7 @@ from results of earlier versions, which held words only.
 | `check` | what was detected in each capture, or its refusal |
 | `calibrate` | the content of result.json, with `findings` and `captures_refused` of each camera and LiDAR |
 | `verify` | residuals of each capture; `doubts`: findings by which captures contradict the extrinsics |
+| `drift` | for each camera and LiDAR its `state`, each axis with figures, `findings` |
 | `repeat` | `findings` on the sessions; for each camera and LiDAR figures and a `finding`, the verdict |
 | `rigs check` | `findings`: what the profile allows but rarely means |
 | `doctor` | each check with its `findings` ([more](doctor.md)) |

@@ -188,6 +188,10 @@ def collect(
             f"{session}: no capture from {', '.join(map(str, paths))}",
             _remedy(report),
         )
+    from lce_rig.cli.collect_live import show_next
+    from lce_rig.collect.live.guide import predict
+
+    show_next(session, rig, predict(Session.open(session)), n_captures)
 
 
 _OF_RECORDINGS = (

@@ -2,7 +2,7 @@
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +14,12 @@ from lce_rig.cli import show
 from lce_rig.cli.simulate import TRUTH, require_kind, write_truth
 from lce_rig.core.errors import LceRigError
 from lce_rig.screen.keys import Controls, controls
+from lce_rig.words import sentence
 
 if TYPE_CHECKING:
     from lce_rig.collect.live.simulated import SimulatedRig
     from lce_rig.collect.live.state import LiveReport, LiveState, TakeBack
+    from lce_rig.core.findings import Finding
     from lce_rig.devices.reading import LiveSource
     from lce_rig.page import Preview
     from lce_rig.rig import Rig
@@ -97,6 +99,7 @@ def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
                     saved = f"{path}: {show.counted(n_captures, 'capture')} ({n_captures - n_before} new)"
                     stack.callback(show.note, saved)
     _tell(report, n_captures, asked, simulated, given)
+    show_next(path, rig, report.predicted, n_captures)
 
 
 def _idle_s(given: LiveArguments, asked: Controls) -> float | None:
@@ -211,6 +214,18 @@ def _tell(
             f"{show.counted(n_captures, 'capture')} are not enough: the target is not predicted to be met",
             _remedy(report, simulated),
         )
+
+
+def show_next(path: Path, rig: "Rig", predicted: "Sequence[Finding]", n_captures: int) -> None:
+    """Print the predicted standard deviations and the next command."""
+    for found in predicted:
+        show.note(sentence(found))
+    if n_captures < rig.quality.min_captures:
+        show.note(f"{show.counted(n_captures, 'capture')} (minimum {rig.quality.min_captures}): collect more")
+    elif predicted and not all(found.figures["is_enough"] for found in predicted):
+        show.note("the target is not predicted to be met: collect more, or see what these captures give")
+    if n_captures >= rig.quality.min_captures:
+        show.note(f"next: lce-rig calibrate {path}")
 
 
 def _ending(report: "LiveReport", n_captures: int, given: LiveArguments) -> str:

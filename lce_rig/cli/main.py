@@ -28,6 +28,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("lce_rig.cli.calibrate", "Estimate the extrinsics of a session."),
     "intrinsics": ("lce_rig.cli.intrinsics", "Estimate the cameras' intrinsics from a session."),
     "verify": ("lce_rig.cli.verify", "Project the point clouds into the images and print residuals."),
+    "drift": ("lce_rig.cli.drift", "Check without a board whether extrinsics still hold."),
     "results": ("lce_rig.cli.results", "List the results of a session with figures and verdicts."),
     "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of sessions, or the results of one."),
 }

@@ -53,6 +53,13 @@ _CAPTURES, _DURATION_S = 30, 20.0
     help="Set the seed; the same seed gives the same bytes.",
 )
 @click.option(
+    "--mounting",
+    type=click.IntRange(0),
+    metavar="SEED",
+    help="Mount the sensors as the session with this seed does; placements and noise follow from --seed "
+    "[default: the same seed].",
+)
+@click.option(
     "--motion",
     type=click.Choice(["still", "moving"]),
     help="Hold the board still, or move it by hand. Only a moving board gives events "
@@ -186,6 +193,7 @@ def _options(rig: "Rig", motion: Any, choices: dict[str, Any]) -> "SimulationOpt
         hand=hand,
         lidar=lidar,
         noise_level=choices["noise_level"],
+        mounting_seed=choices["mounting"],
         has_decoy_plate=choices["decoy"],
         carrier=choices["carrier"] or options.carrier,
         frame_offset_s=choices["frame_offset"],

@@ -38,7 +38,7 @@ def verify(
 ) -> None:
     """Project the point clouds of SESSION (default: session/) into the images and print residuals.
 
-    Images and a contact sheet replace those in SESSION/calibration/overlays/, with --result FILE those in
+    Images and contact sheets replace those in SESSION/calibration/overlays/, with --result FILE those in
     SESSION/overlays/, with --name NAME those beside that result. Exits with 7 if the verdict is fail or these
     captures contradict the extrinsics.
     """
@@ -100,6 +100,8 @@ def _summary(checked: Any) -> list[str]:
         )
     lines.append(f"verdict of the calibration: {checked.calibration.verdict}")
     lines.append(f"these captures: {'; '.join(map(describe, checked.findings)) or 'agree'}")
-    if checked.contact_sheet is not None:
-        lines.append(f"images: {show.escape(str(checked.contact_sheet))}")
+    if checked.contact_sheets:
+        first, *others = checked.contact_sheets
+        last = f" to {others[-1].name}" if others else ""
+        lines.append(f"images: {show.escape(str(first))}{last}")
     return lines

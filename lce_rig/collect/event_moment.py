@@ -9,7 +9,6 @@ Events need motion, LiDAR wants stillness. A detection will do where, in a camer
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,32 +22,18 @@ from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.rig_time import rig_time_ns
 
+SPEED_WINDOW_S = 0.5
+# Neither too few events nor smear.
+BEST_SPEED_MPS = 0.1
+
 _LEAST_DETECTIONS = 3
-
-
-@dataclass(frozen=True)
-class MotionOptions:
-    """How a moving board is judged.
-
-    Attributes:
-        window_s: over which its speed is measured.
-        min_speed_mps: slower boards make no events.
-        best_speed_mps: neither too few events nor smear.
-        plenty_events_px: events a pixel of the board in a second that are enough however slow it is.
-        patience_s: how long a moment waits for a better one of the same place.
-        search_interval_s: how often a whole image is searched while no board is in sight.
-    """
-
-    window_s: float = 0.5
-    min_speed_mps: float = 0.03
-    best_speed_mps: float = 0.1
-    plenty_events_px: float = 4.0
-    patience_s: float = 2.0
-    search_interval_s: float = 0.3
+# Slower boards make no events, unless there are as many a pixel in a second as below.
+_MIN_SPEED_MPS = 0.03
+_PLENTY_EVENTS_PX = 4.0
 
 
 def judge_detection(
-    detection: BoardDetection, around: Sequence[BoardDetection], rig: Rig, options: MotionOptions
+    detection: BoardDetection, around: Sequence[BoardDetection], rig: Rig
 ) -> CaptureMoment | Refusal | None:
     """Check whether a detection is worth a capture.
 
@@ -56,7 +41,6 @@ def judge_detection(
         detection: what the sensors saw.
         around: all detections shortly before and after, itself among them.
         rig: the profile.
-        options: how a moving board is judged.
 
     Returns:
         The moment; why it is none; or None where the tracker has counted why.
@@ -69,7 +53,7 @@ def judge_detection(
         return _explain_unseen(detection, cuts, rig)
     if not detection.lidars:
         return None
-    judged = [_judge_camera(key, detection, around, cuts[key[0]], rig, options) for key in watched]
+    judged = [_judge_camera(key, detection, around, cuts[key[0]], rig) for key in watched]
     return next((found for found in judged if isinstance(found, CaptureMoment)), judged[0])
 
 
@@ -79,7 +63,6 @@ def _judge_camera(
     around: Sequence[BoardDetection],
     cut: EventCut,
     rig: Rig,
-    options: MotionOptions,
 ) -> CaptureMoment | Refusal | None:
     if key in detection.unfit:
         return detection.unfit[key]
@@ -92,8 +75,8 @@ def _judge_camera(
     made = {"events_px": events_px, "min_events_px": limits.min_events_px}
     if speed_mps > limits.max_board_speed_mps:
         return too_fast(speed_mps, limits)
-    is_slow = speed_mps < options.min_speed_mps
-    if is_slow and events_px < max(options.plenty_events_px, limits.min_events_px):
+    is_slow = speed_mps < _MIN_SPEED_MPS
+    if is_slow and events_px < max(_PLENTY_EVENTS_PX, limits.min_events_px):
         return Refusal("image.stood_still", figures=made)
     if events_px < limits.min_events_px:
         return Refusal("image.made_few_events", figures={**made, "speed_mps": speed_mps})

@@ -43,6 +43,7 @@ def to_json(state: LiveState, update: int, *, has_picture: bool) -> str:
         "n_captures": int(state.n_captures),
         "n_wanted": state.n_wanted,
         "last_capture": state.last_capture,
+        "goes_on": state.goes_on,
         "streams": [asdict(stream) | {"rate_hz": _number(stream.rate_hz)} for stream in state.streams],
         "drawing": None if state.drawing is None else _drawing(state.drawing, has_picture),
         "coverage": None if state.coverage is None else asdict(state.coverage),

@@ -121,6 +121,7 @@ class PlainView:
         self._said_s = -_PLAIN_EVERY_S
         self._n_logged = 0
         self._notes: set[str] = set()
+        self._n_explained = 0
 
     def show(self, state: LiveState) -> None:
         """Print what is new."""
@@ -132,6 +133,10 @@ class PlainView:
         for text in state.log[len(state.log) - n_new :]:
             _print(text)
         self._n_logged = state.n_logged
+        # Once for each capture: the figures change as more is learned, too.
+        if state.goes_on and state.n_captures != self._n_explained:
+            self._n_explained = state.n_captures
+            _print(f"{_clock(state)} {state.goes_on}")
         said = (state.phase, state.headline)
         is_due = (
             self._said is None or said[0] != self._said[0] or state.elapsed_s - self._said_s > _PLAIN_EVERY_S
@@ -258,6 +263,7 @@ def _progress(state: LiveState) -> Any:
             style="green" if is_known and sigma <= target else "yellow",
         )
         lines.append(f" (target {target:g})\n")
+    lines.append(state.goes_on)
     lines.rstrip()
     return lines
 

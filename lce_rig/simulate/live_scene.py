@@ -10,7 +10,7 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, pose
 from lce_rig.rig import Rig
 from lce_rig.simulate.carriers import build_carrier
-from lce_rig.simulate.image_rendering import SUBPIXELS, develop, focus, render_radiance, shot_noise_e
+from lce_rig.simulate.image_rendering import develop, focus, glance, render_radiance, shot_noise_e
 from lce_rig.simulate.lidar import Sweep, sweep_again, sweep_scene
 from lce_rig.simulate.options import SimulationOptions
 from lce_rig.simulate.poses import can_be_held, count_rings
@@ -21,7 +21,10 @@ from lce_rig.simulate.trajectory import between
 _NOISE_STREAM = 102
 # A place that no beam reaches.
 _NOWHERE = pose(np.eye(3), np.array([0.0, 0.0, -1e6]))
-_SUBPIXELS_ON_THE_WAY = 2
+# Noise is drawn once, this much larger than the image, and cut out elsewhere for every image.
+_SPARE_PX = 128
+# Scans of the standing room, each of a beam phase of its own, which take turns.
+_PHASES = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +44,8 @@ class LiveScene:
     """Renders images and scans of a moving board.
 
     What is still is rendered once; each image and scan has its own noise. The beams of a board that is held
-    keep their phase from scan to scan.
+    keep their phase from scan to scan. On its way only the board is rendered, coarsely, into an image of the
+    room that stays as it is: nothing is captured there.
 
     Attributes:
         stage: the simulated rig and its room.
@@ -61,13 +65,16 @@ class LiveScene:
         self._scene: Scene | None = None
         self._light: dict[str, _Light] = {}
         self._sweeps: dict[str, Sweep] = {}
-        self._rooms: dict[str, Sweep] = {}
+        self._rooms: dict[str, list[Sweep]] = {}
+        self._phase = 0
+        self._normals: dict[str, NDArray[np.float32]] = {}
+        self._empty: dict[str, NDArray[np.uint8]] = {}
 
     def hold(self, T_world_board: Array) -> None:
         """Hold the board still at (4, 4)."""
         self._show(T_world_board, is_held=True)
-        # The rotor is not synchronised with anything: the beam phase differs at each place.
-        self._rooms.clear()
+        # The rotor is not synchronised with anything: the beam phase differs from place to place.
+        self._phase = (self._phase + 1) % _PHASES
 
     def pass_by(self, start: Array, end: Array, share: float) -> None:
         """Move the board between two poses (4, 4)."""
@@ -104,31 +111,45 @@ class LiveScene:
 
     def _take_image(self, camera: str, stamp_ns: int) -> Image:
         stage = self.stage
-        if camera not in self._light:
-            self._light[camera] = self._look(camera)
-        light = self._light[camera]
-        pixels = develop(self._with_noise(light))
+        if self._is_held and camera not in self._light:
+            self._light[camera] = self._expose(focus(self._radiance(camera), stage.options.camera))
+        is_held = self._is_held
+        pixels = develop(self._with_noise(camera, self._light[camera])) if is_held else self._glance(camera)
         channel = stage.rig.cameras[camera].first_channel("frames") or "frames"
         return Image(camera, channel, stamp_ns, pixels, stamp_ns)
 
-    def _look(self, camera: str) -> _Light:
-        """Render what falls on a camera's sensor; coarsely on the way, as nothing is captured there."""
-        noise, n_subpixels = self.stage.options.camera, SUBPIXELS if self._is_held else _SUBPIXELS_ON_THE_WAY
-        linear = focus(render_radiance(self._render(), self.stage.backdrops[camera], n_subpixels), noise)
+    def _radiance(self, camera: str) -> Array:
+        return render_radiance(self._render(), self.stage.backdrops[camera])
+
+    def _glance(self, camera: str) -> NDArray[np.uint8]:
+        """Take an image of a board on its way."""
+        noise, backdrop = self.stage.options.camera, self.stage.backdrops[camera]
+        if camera not in self._empty:
+            light = self._expose(focus(backdrop.radiance, noise))
+            self._empty[camera] = develop(self._with_noise(camera, light))
+        pixels = np.array(self._empty[camera])
+        part, linear = glance(self._render(), backdrop, noise)
+        pixels[part] = develop(self._with_noise(camera, self._expose(linear)))
+        return pixels
+
+    def _expose(self, linear: NDArray[np.float32]) -> _Light:
+        """Find the noise of the light (h, w, 3) on a sensor."""
+        noise = self.stage.options.camera
         if not np.isfinite(noise.full_well_e):
             return _Light(linear, None)
         return _Light(linear, np.asarray(shot_noise_e(linear, noise) / np.float32(noise.full_well_e)))
 
-    def _with_noise(self, light: _Light) -> NDArray[np.float32]:
-        """Add noise, which OpenCV draws three times as fast as NumPy."""
-        import cv2
-
+    def _with_noise(self, camera: str, light: _Light) -> NDArray[np.float32]:
+        """Add noise: a piece of a field that is drawn once, cut out at a random place."""
         if light.sigma is None:
             return light.linear
-        cv2.setRNGSeed(int(self._noise.integers(1 << 31)))
-        noisy = np.empty(light.linear.shape, dtype=np.float32)
-        cv2.randn(noisy, np.zeros(1), np.ones(1))
-        noisy *= light.sigma
+        if camera not in self._normals:
+            height, width = self.stage.backdrops[camera].range_m.shape
+            shape = height + _SPARE_PX, width + _SPARE_PX, 3
+            self._normals[camera] = self._noise.standard_normal(shape, dtype=np.float32)
+        height, width = light.linear.shape[:2]
+        v, u = self._noise.integers(_SPARE_PX, size=2)
+        noisy = self._normals[camera][v : v + height, u : u + width] * light.sigma
         noisy += light.linear
         return noisy
 
@@ -137,10 +158,11 @@ class LiveScene:
         model, noise = stage.models[lidar], stage.options.lidar_noise
         if lidar not in self._sweeps:
             T_world_lidar = stage.T_world_sensor[lidar]
-            if lidar not in self._rooms:
+            rooms = self._rooms.setdefault(lidar, [])
+            if len(rooms) <= self._phase:
                 empty = Scene(stage.room.raycaster, (), stage.board, _NOWHERE)
-                self._rooms[lidar] = sweep_scene(empty, T_world_lidar, model, noise, self._noise)
-            room = self._rooms[lidar]
+                rooms.append(sweep_scene(empty, T_world_lidar, model, noise, self._noise))
+            room = rooms[min(self._phase, len(rooms) - 1)]
             self._sweeps[lidar] = sweep_again(room, self._render(), T_world_lidar, model, noise)
         return stage.measure(lidar, self._sweeps[lidar], self._noise, stamp_ns)
 

@@ -166,6 +166,8 @@ class SimulationOptions:
         has_decoy_plate: whether a blank plate of the board's size stands in the room.
         truth_rotation_deg, truth_translation_m: how far the true extrinsics lie from the profile's nominal
             ones at most; never more than 0.8 of the tolerances that the profile gives.
+        mounting_seed: of the true extrinsics and of the sensors' own errors; None for the session's seed.
+            Sessions of one mounting seed are of one rig, with other placements, room and noise.
         lidar_height_m: height of the LiDAR above the floor.
         print_reflectivity: of the dark squares at 905 nm (the ink of the paper's boards is bright there).
         motion: whether the board is held still or moved by hand; only a moving one makes events.
@@ -189,6 +191,7 @@ class SimulationOptions:
     has_decoy_plate: bool = False
     truth_rotation_deg: float = 2.0
     truth_translation_m: float = 0.02
+    mounting_seed: int | None = None
     lidar_height_m: float = 1.0
     print_reflectivity: float = 0.85
     motion: Motion = "still"

@@ -142,12 +142,15 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
     )
     lenses = {name: rig.cameras[name].to_intrinsics() for name in cameras}
     models = {name: _lidar_model(rig, name) for name in rig.lidars}
+    mounted = _mounting_seed(seed, options)
     bias = {
-        name: _laser_bias(models[name], np.random.default_rng([seed, OF_SESSION, LASERS, k]), options)
+        name: _laser_bias(models[name], np.random.default_rng([mounted, OF_SESSION, LASERS, k]), options)
         for k, name in enumerate(rig.lidars)
     }
     pixels = {
-        name: draw_pixels(lenses[name], options.events, np.random.default_rng([seed, OF_SESSION, PIXELS, k]))
+        name: draw_pixels(
+            lenses[name], options.events, np.random.default_rng([mounted, OF_SESSION, PIXELS, k])
+        )
         for k, name in enumerate(cameras)
         if options.motion == "moving" and rig.cameras[name].first_channel("events")
     }
@@ -161,6 +164,10 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
     backdrops = {name: build_backdrop(room, T_world_sensor[name], lenses[name]) for name in cameras}
     board = rig.board.to_board()
     return Stage(rig, seed, options, board, room, T_world_sensor, backdrops, models, bias, pixels, views)
+
+
+def _mounting_seed(seed: int, options: SimulationOptions) -> int:
+    return seed if options.mounting_seed is None else options.mounting_seed
 
 
 def _simulated_cameras(rig: Rig, options: SimulationOptions) -> list[str]:
@@ -180,7 +187,7 @@ def _sensor_poses(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, 
     """Chain the perturbed nominal extrinsics into T_base_sensor, the base being the first LiDAR."""
     links: list[tuple[str, str, Array]] = []
     for index, entry in enumerate(rig.nominal_extrinsics):
-        rng = np.random.default_rng([seed, OF_SESSION, TRUTH, index])
+        rng = np.random.default_rng([_mounting_seed(seed, options), OF_SESSION, TRUTH, index])
         angle_deg = min(options.truth_rotation_deg, 0.8 * entry.tolerance_deg) * rng.uniform(0.4, 1.0)
         shift_m = min(options.truth_translation_m, 0.8 * entry.tolerance_m) * rng.uniform(0.4, 1.0)
         axes = rng.standard_normal((2, 3))

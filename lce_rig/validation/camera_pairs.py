@@ -15,8 +15,7 @@ from lce_rig.core.results import Observation
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.likelihood.image_terms import stack_images
 from lce_rig.extrinsics.likelihood.levels import Levels
-from lce_rig.extrinsics.mean_pose import mean_pose
-from lce_rig.extrinsics.relative_pose import relative_covariance, relative_pose
+from lce_rig.extrinsics.relative_pose import mean_pose, relative_covariance, relative_pose
 from lce_rig.extrinsics.shared_scans import scan_key
 from lce_rig.residuals.placements import group_placements
 from lce_rig.residuals.quadratics import Quadratics, without_prior

@@ -21,6 +21,8 @@ PANEL: Colour = (38, 34, 32)
 MAGENTA: Colour = (235, 60, 255)
 ORANGE: Colour = (60, 160, 255)
 BLUE: Colour = (255, 180, 90)
+GREEN: Colour = (110, 210, 90)
+RED: Colour = (90, 90, 255)
 
 _SHIFT = 4  # cv2 takes sub-pixel coordinates in sixteenths
 _FONT = cv2.FONT_HERSHEY_SIMPLEX

@@ -91,7 +91,7 @@ def draw_debug(
     view_px = _PANE_PX // 2
     left = _camera_pane(image, image_result, board, intrinsics, _PANORAMA_PX + view_px)
     points = np.zeros((0, 3)) if scan is None else np.asarray(scan.points, dtype=np.float64)
-    limits_m = (0.0, 10.0) if scan is None else range_limits(scan)
+    limits_m = (0.0, 10.0) if scan is None else range_limits([scan])
     views = np.hstack(
         [
             _top_view(points, candidates, chosen, colour, board, limits_m, view_px),

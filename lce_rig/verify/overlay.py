@@ -1,6 +1,6 @@
 """Project the point cloud into the camera's image, with the board as detected by both sensors."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,17 @@ from lce_rig.verify import canvas
 from lce_rig.verify.canvas import BLACK, FAINT, INK, MAGENTA, ORANGE, WHITE, Picture
 from lce_rig.verify.event_picture import draw_event_key, draw_events
 
+MARKS = (
+    ("board, LiDAR points", "point"),
+    ("board, ring ends", "end"),
+    ("board outline, camera", "line"),
+    ("corners, camera", "corner"),
+)
+"""What the legend calls each mark, those of the LiDAR first."""
+
 _FOLD_MARGIN = 0.9
+# Points of a dense scan become smaller, so that the image remains visible between them.
+_MOST_COVERED = 0.15
 
 
 def draw_overlay(
@@ -29,6 +39,8 @@ def draw_overlay(
     board: Board,
     residuals: Mapping[str, float | str],
     title: str,
+    limits_m: tuple[float, float] | None = None,
+    warning: str = "",
     events: Events | None = None,
 ) -> Picture:
     """Project a whole scan, coloured by range, into the image, and draw both sensors' detections.
@@ -46,6 +58,8 @@ def draw_overlay(
         board: the board, for its outline.
         residuals: figures by name with unit, such as {"plane (mm)": 4.2}, in display order.
         title: one line above the image.
+        limits_m: ends of the range scale; those of the scan if None.
+        warning: why the capture was not used, below the legend.
         events: those shortly before an image reconstructed from events; drawn below it with the board's ring
             ends and outline.
 
@@ -54,8 +68,8 @@ def draw_overlay(
     """
     picture, factor = canvas.enlarged(image.pixels)
     unit = picture.shape[1] / 1000
-    low_m, high_m = range_limits(scan)
-    _draw_scan(picture, factor, scan, intrinsics, T_cam_lidar, (low_m, high_m), 1.6 * unit)
+    limits_m = limits_m or range_limits([scan])
+    _draw_scan(picture, factor, scan, intrinsics, T_cam_lidar, limits_m, 1.6 * unit)
     if image_board is not None:
         draw_image_board(picture, factor, image_board, board, intrinsics)
     if lidar_board is not None:
@@ -64,8 +78,10 @@ def draw_overlay(
         ends = _to_picture(lidar_board.edge_points, T_cam_lidar, intrinsics, factor)[0]
         canvas.draw_diamonds(picture, ends, ORANGE, 4.2 * unit)
     width_px, has_lidar, has_image = picture.shape[1], lidar_board is not None, image_board is not None
-    legend = _legend(width_px, (low_m, high_m), residuals, has_lidar, has_image)
+    legend = _legend(width_px, limits_m, residuals, has_lidar, has_image)
     parts = [_title_strip(title, width_px), picture, legend]
+    if warning:
+        parts.append(_warning_strip(warning, width_px))
     if events is not None:
         ends = np.zeros((0, 3)) if lidar_board is None else lidar_board.edge_points
         ends = _to_picture(ends, T_cam_lidar, intrinsics, factor)[0]
@@ -99,9 +115,9 @@ def camera_part(overlay: Picture, image: Image) -> Picture:
     return overlay[top : top + image.pixels.shape[0] * width_px // image.pixels.shape[1]]
 
 
-def range_limits(scan: Scan) -> tuple[float, float]:
+def range_limits(scans: Sequence[Scan]) -> tuple[float, float]:
     """Choose the ends of the range scale in m: the nearest point and the 95th percentile, at most 20 m."""
-    ranges_m = np.linalg.norm(scan.points, axis=1)
+    ranges_m = np.concatenate([np.zeros(0), *(np.linalg.norm(scan.points, axis=1) for scan in scans)])
     if not len(ranges_m):
         return 0.0, 10.0
     low_m = float(np.floor(ranges_m.min()))
@@ -155,6 +171,8 @@ def _draw_scan(
     radius_px: float,
 ) -> None:
     pixels, ranges_m = _to_picture(np.asarray(scan.points, dtype=np.float64), T_cam_lidar, intrinsics, factor)
+    most_px = np.sqrt(_MOST_COVERED * picture.shape[0] * picture.shape[1] / (np.pi * max(len(pixels), 1)))
+    radius_px = float(min(radius_px, most_px))
     order = np.argsort(-ranges_m, kind="stable")
     canvas.draw_discs(picture, pixels[order], canvas.turbo(ranges_m[order], *limits_m), radius_px)
 
@@ -163,6 +181,15 @@ def _title_strip(title: str, width_px: int) -> Picture:
     text_px = 13 * width_px / 1000
     strip = canvas.panel(width_px, round(2.6 * text_px))
     canvas.draw_text(strip, title, text_px, 1.8 * text_px, text_px, INK)
+    return strip
+
+
+def _warning_strip(warning: str, width_px: int) -> Picture:
+    text_px, left = 11 * width_px / 1000, 16 * width_px / 1000
+    lines = canvas.wrapped(warning, width_px - 2 * left, text_px)
+    strip = canvas.panel(width_px, round((1.9 * len(lines) + 0.8) * text_px))
+    for k, line in enumerate(lines):
+        canvas.draw_text(strip, line, left, (1.4 + 1.9 * k) * text_px, text_px, ORANGE)
     return strip
 
 
@@ -183,13 +210,9 @@ def _legend(
     legend = canvas.panel(width_px, round((n_lines + 0.9) * line_px))
     rows = [(0.95 + row) * line_px for row in range(n_lines)]
 
-    marks = []
-    if has_lidar:
-        marks += [("board, LiDAR points", "point"), ("board, ring ends", "end")]
-    if has_image:
-        marks += [("board outline, camera", "line"), ("corners, camera", "corner")]
+    marks = (MARKS[:2] if has_lidar else ()) + (MARKS[2:] if has_image else ())
     for (name, kind), baseline in zip(marks, rows, strict=False):
-        _draw_mark(legend, kind, 24 * unit, baseline - 0.45 * text_px, unit)
+        draw_mark(legend, kind, 24 * unit, baseline - 0.45 * text_px, unit)
         canvas.draw_text(legend, name, 48 * unit, baseline, text_px)
     canvas.draw_text(legend, "range from the LiDAR", 300 * unit, rows[0], text_px)
     scale = (round(300 * unit), round(rows[0] + 0.7 * text_px), round(270 * unit), round(1.3 * text_px))
@@ -208,7 +231,8 @@ def _figure(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:.3g}"
 
 
-def _draw_mark(legend: Picture, kind: str, u: float, v: float, unit: float) -> None:
+def draw_mark(legend: Picture, kind: str, u: float, v: float, unit: float) -> None:
+    """Draw one of `MARKS` at (u, v) px of a legend, `unit` times as large as in one of 1000 px."""
     at = np.array([[u, v]])
     if kind == "point":
         canvas.draw_discs(legend, at, MAGENTA, 4 * unit, WHITE)

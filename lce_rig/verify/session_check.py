@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,11 +25,10 @@ from lce_rig.extrinsics.time_offsets import at_scan_time, deskew_points
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.validation.verdict import residuals_beyond
-from lce_rig.verify.canvas import Picture
 from lce_rig.verify.event_picture import ImageWithEvents
-from lce_rig.verify.overlay import camera_part, draw_overlay
-from lce_rig.verify.overlay_files import write_overlays
-from lce_rig.words import as_json
+from lce_rig.verify.overlay import camera_part, draw_overlay, range_limits
+from lce_rig.verify.overlay_files import Overlay, SheetHead, write_overlays
+from lce_rig.words import as_json, sentence
 
 # Boards that moved between image and scan, motion-compensated as in the calibration.
 
@@ -151,6 +151,8 @@ def match_candidates(candidates: CaptureCandidates, board: Board, T_cam_lidar: A
 Progress = Callable[[int, int], None]
 # Boards displaced by slightly wrong extrinsics are measured; farther surfaces are other objects.
 _ELSEWHERE_M = 0.5
+# Scans that choose the range scale of a session's images.
+_SCANS_OF_SCALE = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +167,7 @@ class SessionCheck:
         metrics: their summary; None without any.
         meetings: by capture, the boards of the residuals.
         pictures: one per capture, once they are drawn.
-        contact_sheet: all of them on one sheet; None before.
+        contact_sheets: all of them, on one sheet or more.
     """
 
     pair: Pair
@@ -175,7 +177,7 @@ class SessionCheck:
     metrics: Metrics | None
     meetings: Mapping[str, Meeting]
     pictures: tuple[Path, ...] = ()
-    contact_sheet: Path | None = None
+    contact_sheets: tuple[Path, ...] = ()
 
     def moved(self, old: Path, new: Path) -> "SessionCheck":
         """Update the files' paths to a new folder."""
@@ -183,8 +185,8 @@ class SessionCheck:
         def renamed(path: Path) -> Path:
             return new / path.relative_to(old)
 
-        sheet = None if self.contact_sheet is None else renamed(self.contact_sheet)
-        return replace(self, pictures=tuple(map(renamed, self.pictures)), contact_sheet=sheet)
+        pictures, sheets = (tuple(map(renamed, paths)) for paths in (self.pictures, self.contact_sheets))
+        return replace(self, pictures=pictures, contact_sheets=sheets)
 
     def document(self) -> dict[str, Any]:
         """List everything as plain types for JSON."""
@@ -199,6 +201,7 @@ class SessionCheck:
             else {**asdict(self.metrics), "mge_m": self.metrics.mge_m},
             "captures": {r.capture: _figures(r, self.calibration.captures_used) for r in self.residuals},
             "pictures": [str(path) for path in self.pictures],
+            "contact_sheets": [str(path) for path in self.contact_sheets],
         }
 
 
@@ -249,7 +252,7 @@ def draw_check(
         session: the source of the captures.
         detections: of the session.
         check: of one channel on these captures.
-        folder: receives `<capture>.png` and `contact_sheet.png`.
+        folder: receives `<capture>.png` and contact sheets.
         view_of: returns the channel's image in a capture; None if it cannot be read.
         progress: called with (done, total).
 
@@ -257,22 +260,55 @@ def draw_check(
         SessionError: an image cannot be written.
     """
     residuals = {residual.capture: residual for residual in check.residuals}
+    names = detections.captures(check.pair)
+    limits_m = _range_limits(session, check.pair.lidar, names)
 
-    def overlays() -> Iterator[tuple[str, Picture, Picture]]:
-        names = detections.captures(check.pair)
+    def overlays() -> Iterator[Overlay]:
         for done, name in enumerate(names, start=1):
             capture = session.capture(name)
-            view, (image, _) = view_of(capture), detections.of(check.pair, name)
+            view = view_of(capture)
             if view is not None:
-                title = f"{session.rig.name}  {check.pair}  {name}"
-                meeting = check.meetings.get(name)
-                legend = _legend(name, residuals.get(name), meeting, check.calibration)
-                seen = image if isinstance(image, ImageBoard) else None
-                yield from _draw(capture, session.rig, check.calibration, view, seen, meeting, legend, title)
+                seen = detections.of(check.pair, name)[0]
+                image = seen if isinstance(seen, ImageBoard) else None
+                yield from _draw(capture, session.rig, check, view, image, residuals.get(name), limits_m)
             progress(done, len(names))
 
-    files = write_overlays(folder, overlays())
-    return replace(check, pictures=tuple(files[:-1]), contact_sheet=files[-1] if files else None)
+    head = SheetHead(
+        f"{session.rig.name}  {check.pair}",
+        check.calibration.verdict,
+        _head_lines(check, len(names)),
+        limits_m,
+    )
+    pictures, sheets = write_overlays(folder, overlays(), head)
+    return replace(check, pictures=tuple(pictures), contact_sheets=tuple(sheets))
+
+
+def _range_limits(session: Session, lidar: str, names: Sequence[str]) -> tuple[float, float]:
+    """Choose one range scale for all images of a session from scans throughout it."""
+    scans = []
+    for name in names[:: max(1, len(names) // _SCANS_OF_SCALE)]:
+        with suppress(SessionError):
+            scans.append(session.capture(name).scan(lidar))
+    return range_limits(scans)
+
+
+def _head_lines(check: SessionCheck, n_captures: int) -> list[str]:
+    """State the figures of all captures, and what speaks against the extrinsics."""
+    c, m = check.calibration, check.metrics
+    lines = [
+        f"{n_captures} captures, {len(c.captures_used)} used; "
+        f"uncertainty {c.sigma_rotation_deg:.2g} deg, {1000 * c.sigma_translation_m:.2g} mm (1 sigma)"
+        + (
+            ""
+            if m is None
+            else f"; mean over captures: {_residual_words(m.mpe_m, m.mee_m, m.reprojection_px)}"
+        )
+    ]
+    return lines + [sentence(finding) for finding in (*c.findings, *check.findings)]
+
+
+def _residual_words(plane_m: float, edge_m: float, corner_px: float) -> str:
+    return f"planes {1000 * plane_m:.1f} mm, edges {1000 * edge_m:.1f} mm, corners {corner_px:.2f} px"
 
 
 def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: int) -> tuple[Finding, ...]:
@@ -330,18 +366,19 @@ def _observe(
 def _draw(
     capture: Capture,
     rig: Rig,
-    calibration: Calibration,
+    check: SessionCheck,
     view: ImageWithEvents,
     seen: ImageBoard | None,
-    meeting: Meeting | None,
-    legend: Mapping[str, float | str],
-    title: str,
-) -> Iterator[tuple[str, Picture, Picture]]:
-    """Draw one capture; None if its scan cannot be read."""
+    residual: CaptureResidual | None,
+    limits_m: tuple[float, float],
+) -> Iterator[Overlay]:
+    """Draw one capture; none if its scan cannot be read."""
     try:
-        scan = capture.scan(calibration.lidar)
+        scan = capture.scan(check.pair.lidar)
     except SessionError:
         return
+    name, calibration, meeting = capture.name, check.calibration, check.meetings.get(capture.name)
+    warning = _warning(name, calibration)
     picture = draw_overlay(
         view.image,
         scan if meeting is None else _without(scan, meeting.measured.lidar),
@@ -350,11 +387,23 @@ def _draw(
         lidar_board=None if meeting is None else meeting.lidar_at_image_time,
         image_board=seen if meeting is None else meeting.measured.image,
         board=rig.board.to_board(),
-        residuals=legend,
-        title=title,
+        residuals=_legend(name, residual, meeting, calibration),
+        title=f"{rig.name}  {check.pair}  {name}",
+        limits_m=limits_m,
+        warning=warning,
         events=view.events,
     )
-    yield capture.name, picture, camera_part(picture, view.image)
+    r = residual
+    words = "" if r is None else _residual_words(r.plane_mean_m, r.edge_mean_m, r.reprojection_px)
+    yield Overlay(name, picture, camera_part(picture, view.image), words, warning)
+
+
+def _warning(name: str, calibration: Calibration) -> str:
+    """Say why a capture was not used; empty if it was, or if the extrinsics come from another session."""
+    if name in calibration.captures_used or not calibration.captures_used:
+        return ""
+    refusal = calibration.captures_refused.get(name)
+    return "not used" if refusal is None else f"refused, {refusal.stage}: {sentence(refusal)}"
 
 
 def _without(scan: Scan, lidar: LidarBoard) -> Scan:
@@ -377,8 +426,9 @@ def _legend(
     if meeting is not None and meeting.way_m > 0:
         figures["moved (mm)"] = round(1000 * meeting.way_m, 1)
     refusal = calibration.captures_refused.get(name)
-    is_used = name in calibration.captures_used
-    figures["capture"] = "used" if is_used else f"refused, {refusal.stage}" if refusal else "not used"
+    if calibration.captures_used:
+        is_used = name in calibration.captures_used
+        figures["capture"] = "used" if is_used else f"refused, {refusal.stage}" if refusal else "not used"
     figures["sigma"] = (
         f"{calibration.sigma_rotation_deg:.2g} deg, {1000 * calibration.sigma_translation_m:.2g} mm"
     )

@@ -186,3 +186,18 @@ def test_sessions_without_a_result_are_calibrated_and_left_as_they_are(lce_rig, 
     assert document["calibrated"] == ["half0", "half1"]
     assert document["pairs"][0]["finding"]["code"] == "repeat.agree"
     assert not (halves[0] / "calibration").exists()
+
+
+@pytest.mark.long
+def test_simulated_sessions_agree_if_the_sensors_are_mounted_alike_and_disagree_if_not(lce_rig, tmp_path):
+    monday, tuesday, other = (tmp_path / name for name in ("monday", "tuesday", "other"))
+    for session, seed, mounting in ((monday, 1, ()), (tuesday, 2, ("--mounting", "1")), (other, 3, ())):
+        made = lce_rig("simulate", "--rig", "rles", session, "--captures", "8", "--seed", seed, *mounting)
+        assert made.code == 0, made.err
+    (pair,) = compared(lce_rig, monday, tuesday)["pairs"]
+    assert pair["agrees"]
+    (pair,) = compared(lce_rig, monday, other, code=7)["pairs"]
+    assert not pair["agrees"]
+    truths = [json.loads((session / "truth.json").read_text()) for session in (monday, tuesday)]
+    assert truths[0]["T_cam_lidar"] == truths[1]["T_cam_lidar"]
+    assert truths[0]["captures"] != truths[1]["captures"]

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from lce_rig.collect import CollectOptions, collect
-from lce_rig.collect.offline.stillness import StillnessOptions
 from lce_rig.recordings import open_recording
 from lce_rig.rig import dump_rig, parse_rig
 from lce_rig.session import Session
@@ -83,7 +82,7 @@ def test_a_board_that_never_stands_still_is_never_captured(tmp_path, stage, path
         report = collect(session, [open_recording(bag, rig)])
         assert report.captured == []
         # A hand never holds a board quite still: how much is still enough is an option.
-        loose = CollectOptions(stillness=StillnessOptions(max_motion_m=0.5))
+        loose = CollectOptions(max_motion_m=0.5)
         assert collect(session, [open_recording(bag, rig)], loose).captured == ["000000"]
 
 

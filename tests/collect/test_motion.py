@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
-from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.offline.slow_motion import _Neighbours, find_moving_moments
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.losses import Losses
@@ -29,7 +28,7 @@ def rig() -> Rig:
 
 def choose(detections: Iterable[BoardDetection], rig: Rig) -> tuple[list[CaptureMoment], dict[str, int]]:
     tally = Losses()
-    moments = find_moving_moments(detections, rig, MotionOptions(), Placements(0.15, 10.0), tally)
+    moments = find_moving_moments(detections, rig, Placements(0.15, 10.0), tally)
     return list(moments), tally.by_code()
 
 
@@ -126,7 +125,7 @@ def test_the_moments_are_the_same_however_often_they_are_sought(rig: Rig) -> Non
     first, again = (times_s(choose(detections, rig)[0]) for _ in range(2))
     assert first == again and first
     # Whoever stops early has had the first of them.
-    moments = find_moving_moments(detections, rig, MotionOptions(), Placements(0.15, 10.0), Losses())
+    moments = find_moving_moments(detections, rig, Placements(0.15, 10.0), Losses())
     assert times_s([next(moments)]) == first[:1]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment, HeldStill
 from lce_rig.collect.offline.search_ahead import RestingTracker, glance_at, sight_ahead
-from lce_rig.collect.offline.stillness import StillnessOptions, find_still_moments
+from lce_rig.collect.offline.stillness import find_still_moments
 from lce_rig.core.geometry import transform
 from lce_rig.core.results import Refusal
 from lce_rig.detect.finder import BoardFinder
@@ -17,9 +17,14 @@ from tests.collect.live.replay import placements, rig
 T0_NS = 1_700_000_000_000_000_000
 
 
-def see(watcher: BoardTracker, k: int, time_s: float) -> BoardDetection:
+def frame_of(k: int, time_s: float) -> Frame:
+    """Give what the sensors saw of a placement, as at another time."""
     capture = placements()[k]
-    return watcher.sight(Frame(T0_NS + round(time_s * 1e9), capture.images[:1], capture.scans))
+    return Frame(T0_NS + round(time_s * 1e9), capture.images[:1], capture.scans)
+
+
+def see(watcher: BoardTracker, k: int, time_s: float) -> BoardDetection:
+    return watcher.sight(frame_of(k, time_s))
 
 
 def nearest_m(detection: BoardDetection, k: int) -> float:
@@ -62,7 +67,7 @@ def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> 
     assert not any(each.is_usable for each in seen)
     refusal = seen[-1].unfit["davis", "frames"]
     assert refusal.code == "image.small_squares" and refusal.figures["min_square_px"] == 1000
-    assert list(find_still_moments(seen, watcher.finder.board, StillnessOptions())) == []
+    assert list(find_still_moments(seen, watcher.finder.board, 0.01)) == []
     assert watcher.refusals.by_code()["image.small_squares"] == 30
 
 
@@ -117,7 +122,7 @@ def test_other_things_in_the_scan_are_not_the_board_once_nominal_extrinsics_have
 
 def test_images_searched_ahead_give_the_same_detections() -> None:
     order = (0, 0, 0, 1, 1, 2, 3, 3, 0, 0, 1, 2)
-    frames = [see(BoardTracker(rig(), 0.3), k, 0.1 * i).frame for i, k in enumerate(order)]
+    frames = [frame_of(k, 0.1 * i) for i, k in enumerate(order)]
     one, two = BoardTracker(rig(), 0.3), BoardTracker(rig(), 0.3)
     for alone, ahead in zip(
         map(one.sight, frames), sight_ahead(two, frames, is_still_wanted=False), strict=True
@@ -131,7 +136,7 @@ def test_images_searched_ahead_give_the_same_detections() -> None:
 
 def test_images_are_searched_where_a_board_rests_and_left_out_where_it_moves() -> None:
     order = (0, 0, 0, 1, 2, 3, 1, 1, 1)
-    frames = [see(BoardTracker(rig(), 0.3), k, 0.1 * i).frame for i, k in enumerate(order)]
+    frames = [frame_of(k, 0.1 * i) for i, k in enumerate(order)]
     tracker = RestingTracker(rig(), 0.0, 1.0)
     found = [tracker.look(frame, glances) for frame, glances in glance_at(frames)]
     assert [bool(each.images) for each in found] == [True] * 3 + [False] * 3 + [True] * 3
@@ -139,7 +144,7 @@ def test_images_are_searched_where_a_board_rests_and_left_out_where_it_moves() -
 
 
 def test_a_scene_without_a_board_is_seldom_searched_while_nothing_changes() -> None:
-    frame = see(BoardTracker(rig(), 0.3), 0, 0.0).frame
+    frame = frame_of(0, 0.0)
     (image,) = frame.images
     noise = np.random.default_rng(0).integers(88, 93, (25, *image.pixels.shape)).astype(np.uint8)
     flat = [replace(image, pixels=pixels) for pixels in noise]

@@ -15,6 +15,7 @@ from lce_rig.devices.sync_board.board_state import (
     Verdict,
 )
 from lce_rig.devices.sync_board.lines import LineReader
+from lce_rig.devices.sync_board.lines.boards_of_others import Nmea
 from lce_rig.devices.sync_board.lines.lce1 import Lce1
 from lce_rig.devices.sync_board.lines.messages import (
     BoardError,
@@ -25,7 +26,6 @@ from lce_rig.devices.sync_board.lines.messages import (
     TimeReply,
     TriggerEdge,
 )
-from lce_rig.devices.sync_board.lines.nmea import Nmea
 from lce_rig.words import sentence
 
 S = 1_000_000_000

@@ -98,5 +98,5 @@ def test_the_notebook_runs_from_top_to_bottom(workplace):
     for cell in cells:
         exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
     assert (workplace / "session" / "calibration" / "result.json").exists()
-    sheet = names["checks"][0].contact_sheet
+    sheet = names["checks"][0].contact_sheets[0]
     assert sheet.exists() and sheet.parent.parent.name == "calibration"

@@ -3,7 +3,7 @@
 import numpy as np
 
 from lce_rig.core.geometry import difference, perturb
-from lce_rig.extrinsics.mean_pose import mean_pose
+from lce_rig.extrinsics.relative_pose import mean_pose
 from tests.extrinsics.boards import T_FORWARD
 
 RNG = np.random.default_rng(0)

@@ -34,7 +34,7 @@ def test_a_state_is_on_the_screen_whole(preview: Preview, browser: Browser, widt
     assert (page.text("count"), page.text("of").strip()) == ("7", "of 15")
     assert page.text("elapsed") == "01:23"
     assert page.text("rotation").split() == ["rotation", "0.20°", "/", "0.10"]
-    assert page.text("translation").split() == ["translation", "4.0", "mm", "/", "5.0"]
+    assert page.text("translation").split() == ["position", "4.0", "mm", "/", "5.0"]
     assert page.each(".bar.full") == ["translation", "roll"]
     page.wait_until(
         "Math.abs(document.querySelector('#left_right em').getBoundingClientRect().width"

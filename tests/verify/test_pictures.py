@@ -17,7 +17,14 @@ from lce_rig.rig import QualitySettings
 from lce_rig.verify.canvas import MAGENTA, ORANGE, PANEL, Picture, round_ticks, text_width_px, wrapped
 from lce_rig.verify.debug_image import draw_debug
 from lce_rig.verify.overlay import draw_overlay
-from lce_rig.verify.overlay_files import contact_sheet, write_overlays, write_picture
+from lce_rig.verify.overlay_files import (
+    Overlay,
+    SheetHead,
+    contact_sheets,
+    is_overlay,
+    write_overlays,
+    write_picture,
+)
 from tests.detect.test_image_board import draw, looking
 from tests.extrinsics.boards import measured_plate
 
@@ -79,6 +86,7 @@ def overlay(camera: Intrinsics, points: Array, **boards: object) -> Picture:
         residuals={"plane (mm)": 4.25, "verdict": "pass"},
         title="capture 000000",
         events=boards.get("events"),  # type: ignore[arg-type]
+        warning=str(boards.get("warning", "")),
     )
 
 
@@ -205,28 +213,57 @@ def test_ticks_are_round_and_within_the_scale(low: float, high: float) -> None:
     assert len({f"{tick:g}" for tick in ticks}) == len(ticks)
 
 
-def test_a_contact_sheet_holds_every_picture_once() -> None:
-    colours = [(20 * index, 200, 30 + 20 * index) for index in range(7)]
-    tiles = [
-        (f"{index:06d}", np.full((100, 160, 3), colour, np.uint8)) for index, colour in enumerate(colours)
-    ]
-    sheet = contact_sheet(tiles, columns=3, tile_width_px=160)
-    for colour in colours:
-        assert int(np.all(sheet == colour, axis=-1).sum()) == 16000
-    assert np.all(sheet[0, 0] == PANEL)
+HEAD = SheetHead("rig  cam and lidar", "fail", ("7 captures", "the board moved: hold it still"), (1.0, 9.0))
+
+
+def tile(index: int, warning: str = "") -> Overlay:
+    colour = (10 + 3 * index, 200, 30 + 2 * index)
+    return Overlay(f"{index:06d}", drawn := np.full((270, 480, 3), colour, np.uint8), drawn, "", warning)
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 18, 40])
+def test_contact_sheets_hold_every_picture_once_and_are_at_most_2000_px_wide(n: int) -> None:
+    tiles = [tile(index) for index in range(n)]
+    sheets = contact_sheets(tiles, HEAD)
+    assert all(sheet.shape[1] <= 2000 and sheet.shape[0] <= 2000 for sheet in sheets)
+    for each in tiles:
+        n_px = [int(np.all(sheet == each.part[0, 0], axis=-1).sum()) for sheet in sheets]
+        assert sorted(n_px)[-1] == sum(n_px) == 270 * 480
+    assert all(np.all(sheet[0, 0] == PANEL) for sheet in sheets)
+
+
+def test_contact_sheets_need_a_picture() -> None:
     with pytest.raises(ValueError, match="at least one"):
-        contact_sheet([])
+        contact_sheets([], HEAD)
 
 
-def test_overlays_are_written_with_a_contact_sheet_and_read_back_unchanged(tmp_path: Path) -> None:
+def test_a_capture_that_was_not_used_is_framed_on_the_contact_sheet() -> None:
+    used, refused = (contact_sheets([tile(0), tile(1, warning)], HEAD)[0] for warning in ("", "moved " * 30))
+    assert count(refused, ORANGE) > count(used, ORANGE) + 4 * 2 * (270 + 480)
+    # The whole reason is below the image, on as many lines as it takes.
+    assert refused.shape[0] > used.shape[0] + 2 * 22
+
+
+def test_overlays_are_written_with_contact_sheets_and_read_back_unchanged(tmp_path: Path) -> None:
     drawn = overlay(FOLDING, wall())
-    files = write_overlays(
-        tmp_path / "overlays", [("000000", drawn, drawn), ("cam/../../000001", drawn, drawn)]
-    )
-    assert [file.parent for file in files] == [tmp_path / "overlays"] * 3
-    assert files[-1].name == "contact_sheet.png"
+    names = ("000000", "cam/../../000001")
+    files, sheets = write_overlays(tmp_path / "overlays", [Overlay(n, drawn, drawn) for n in names], HEAD)
+    assert [file.parent for file in [*files, *sheets]] == [tmp_path / "overlays"] * 3
+    assert [sheet.name for sheet in sheets] == ["contact_sheet.png"]
     assert np.array_equal(cv2.imread(str(files[0])), drawn)
-    assert write_overlays(tmp_path / "none", []) == []
+    assert write_overlays(tmp_path / "none", [], HEAD) == ([], [])
+
+
+def test_many_overlays_have_numbered_contact_sheets_which_are_known_as_such(tmp_path: Path) -> None:
+    files, sheets = write_overlays(tmp_path, [tile(index) for index in range(40)], HEAD)
+    assert [sheet.name for sheet in sheets] == ["contact_sheet_1.png", "contact_sheet_2.png"]
+    assert all(map(is_overlay, [*files, *sheets])) and not is_overlay(tmp_path / "contact_sheet_mine.png")
+
+
+def test_the_reason_of_a_refusal_is_below_the_legend() -> None:
+    plain, marked = overlay(FOLDING, wall()), overlay(FOLDING, wall(), warning="refused, pair: moved")
+    assert np.array_equal(marked[: len(plain)], plain)
+    assert count(marked[len(plain) :], ORANGE) > 50
 
 
 def test_a_picture_that_cannot_be_written_names_the_file(tmp_path: Path) -> None:

@@ -326,8 +326,12 @@ class Precision:
         It estimates the scatter from the captures themselves, and makes up for how few they are (as
         `Quadratics.jackknife_covariance` does).
         """
-        few = (n_captures - 1) / max(n_captures - N_UNKNOWNS - 2, 2)
-        return np.asarray(max(few, 1.0) * self.scatter + self.lasers + self.offset)
+        return np.asarray(few_captures_factor(n_captures) * self.scatter + self.lasers + self.offset)
+
+
+def few_captures_factor(n_captures: int) -> float:
+    """Compute by what a calibration multiplies the covariance of scatter because captures are few."""
+    return max((n_captures - 1) / max(n_captures - N_UNKNOWNS - 2, 2), 1.0)
 
 
 def combine(held: Evidence, errors: ErrorModel) -> Precision:

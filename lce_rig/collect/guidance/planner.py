@@ -12,6 +12,7 @@ from lce_rig.collect.guidance.evidence import (
     Precision,
     combine,
     combine_with_each,
+    few_captures_factor,
     shortfall,
     sigmas,
     weigh_placements,
@@ -97,6 +98,8 @@ SPACINGS = (1.0, 0.5)
 AVOIDED_M = 0.4
 # A metre of way, or a turn by a radian, costs as much as an answer that is so much worse.
 _EFFORT = 0.01
+# Nobody is told of more captures to come than this.
+_MOST_MORE = 60
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
@@ -117,6 +120,10 @@ class Guidance:
         sigma_rotation_deg, sigma_translation_m: predicted error now.
         next_rotation_deg, next_translation_m: the same after the wanted placement.
         is_enough: whether the calibration is predicted to meet the profile's target, with a margin.
+        n_least: captures that it takes at least.
+        stated_rotation_deg, stated_translation_m: predicted standard deviations that the calibration will
+            state, which makes up for few captures; they have to be at most `ENOUGH_SHARE` of the target.
+        n_more: about how many more captures it takes; 0 where there are enough, None where not known.
         T_cam_board: (4, 4) wanted; None where no reachable placement is new.
         spacing: of `SPACINGS`, how far a board must be from every capture to count as new.
     """
@@ -127,6 +134,10 @@ class Guidance:
     next_rotation_deg: float
     next_translation_m: float
     is_enough: bool
+    n_least: int
+    stated_rotation_deg: float
+    stated_translation_m: float
+    n_more: int | None
     T_cam_board: Array | None
     spacing: float = SPACINGS[0]
 
@@ -183,6 +194,7 @@ class Planner:
         rotation, translation = sigmas(now.cov)
         then = now.cov if best is None else after.cov[best]
         next_rotation, next_translation = sigmas(then)
+        stated_rotation, stated_translation = sigmas(now.claimed(len(held)))
         return Guidance(
             n_captures=len(held),
             sigma_rotation_deg=float(np.degrees(rotation)),
@@ -190,6 +202,10 @@ class Planner:
             next_rotation_deg=float(np.degrees(next_rotation)),
             next_translation_m=float(next_translation),
             is_enough=self._is_enough(now, len(held)),
+            n_least=self._n_least,
+            stated_rotation_deg=float(np.degrees(stated_rotation)),
+            stated_translation_m=float(stated_translation),
+            n_more=self._count_more(now, now.scatter if best is None else after.scatter[best], len(held)),
             T_cam_board=wanted,
             spacing=spacing,
         )
@@ -246,12 +262,35 @@ class Planner:
         return weigh_placements(self.view.model, poses, self.view.T_cam_lidar)
 
     def _is_enough(self, now: Precision, n_captures: int) -> bool:
-        if n_captures < max(FEWEST_FOR_ENOUGH, self.view.model.limits.min_captures):
+        if n_captures < self._n_least:
             return False
         rotation, translation = sigmas(now.claimed(n_captures))
         model = self.view.model
         worse = max(rotation / model.target_sigma_rad, translation / model.target_sigma_m)
         return bool(worse <= ENOUGH_SHARE)
+
+    @property
+    def _n_least(self) -> int:
+        return max(FEWEST_FOR_ENOUGH, self.view.model.limits.min_captures)
+
+    def _count_more(self, now: Precision, scatter_then: Array, n_captures: int) -> int | None:
+        """Estimate how many more captures it takes, if each brings as much information as the next one.
+
+        Args:
+            now: of the captures.
+            scatter_then: (6, 6) `Precision.scatter` after the next capture.
+            n_captures: so far.
+        """
+        model = self.view.model
+        targets = np.square(ENOUGH_SHARE * np.array([model.target_sigma_rad, model.target_sigma_m]))
+        # More captures change nothing of what all share.
+        constant = np.square(sigmas(now.lasers + now.offset))
+        before, after = (1 / np.maximum(np.square(sigmas(s)), 1e-18) for s in (now.scatter, scatter_then))
+        for n_more in range(max(self._n_least - n_captures, 0), _MOST_MORE):
+            scatter = 1 / (before + n_more * np.maximum(after - before, 0.0))
+            if np.all(few_captures_factor(n_captures + n_more) * scatter + constant <= targets):
+                return n_more
+        return None
 
     def _choose(self, cost: Array, held: Array, present: Array | None) -> tuple[int | None, float]:
         """Choose the candidate of the least finite cost that is new, the farther from all held the better.

@@ -3,11 +3,10 @@
 from typing import Protocol
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
-from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.narration import Narration, narrate_moving, narrate_still
 from lce_rig.collect.offline.slow_motion import MotionGate
-from lce_rig.collect.offline.stillness import StillnessGate, StillnessOptions
+from lce_rig.collect.offline.stillness import StillnessGate
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.geometry import Array
 from lce_rig.core.losses import Losses
@@ -55,8 +54,7 @@ class StillBoards:
         self._hold_s = hold_s
         self._max_motion_m = rig.quality.max_motion_m
         # The first window of stillness has passed when the hold begins.
-        options = StillnessOptions(max_motion_m=self._max_motion_m, dwell_s=hold_s)
-        self._gate = StillnessGate(rig.board.to_board(), options)
+        self._gate = StillnessGate(rig.board.to_board(), self._max_motion_m, hold_s)
         self._is_judged = self._is_decided = self._is_captured = False
         self._refusal: Refusal | None = None
 
@@ -105,9 +103,8 @@ class SlowBoards:
     """Captures boards that move slowly before a camera of events; see `LiveGate`."""
 
     def __init__(self, rig: Rig, novelty: Placements) -> None:
-        self._options = MotionOptions(patience_s=LIVE_PATIENCE_S)
         self._novelty = novelty
-        self._gate = MotionGate(rig, self._options, novelty, Losses())
+        self._gate = MotionGate(rig, novelty, Losses(), LIVE_PATIENCE_S)
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
         """Take the next detection."""
@@ -115,7 +112,7 @@ class SlowBoards:
 
     def narrate(self, guide: Guide, present: Array) -> Narration:
         """Say what to do with a board that is seen at (4, 4)."""
-        return narrate_moving(guide, present, self._gate.judged, self._options)
+        return narrate_moving(guide, present, self._gate.judged)
 
     def events_of(self, moment: CaptureMoment) -> tuple[EventCut, ...]:
         """Give all of them."""

@@ -23,20 +23,19 @@ from lce_rig.collect.board_tracker import (
 from lce_rig.collect.live.capture_triggers import LiveGate, SlowBoards, StillBoards
 from lce_rig.collect.live.capture_writer import CaptureWriter, Kept, Task, record_streams
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
-from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
+from lce_rig.collect.live.guide import GIVE_UP_S, Guide, count_in, make_guides
 from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.live.monitor import Monitor
 from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_unseen
 from lce_rig.collect.live.state import Ending, Key, LiveOptions, LiveReport, LiveState, TakeBack
-from lce_rig.collect.placement_dedupe import Placements, capture_poses
+from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.collect.worker import Worker
-from lce_rig.core.errors import LceRigError
 from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.opening import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.rig import Rig
-from lce_rig.session import Capture, Session
+from lce_rig.session import Session
 from lce_rig.timing.rig_clock import RigClock
 from lce_rig.timing.scan_pairing import Frame
 from lce_rig.timing.sync import pair_times
@@ -137,7 +136,7 @@ def collect_live(
     board = next((source for source in sources if isinstance(source, SyncTimes)), None)
     guides = make_guides(rig)
     for capture in session.captures:
-        _count_in(capture, session, guides)
+        count_in(capture, session, guides)
     # Leaving closes in turn: nothing new comes, then what was decided is written.
     with DiskWriter() as disk:
         record, recorded = None, None
@@ -172,17 +171,6 @@ def _swift_turns() -> Iterator[None]:
         yield
     finally:
         sys.setswitchinterval(before_s)
-
-
-def _count_in(capture: Capture, session: Session, guides: Sequence[Guide]) -> None:
-    """Let guides know a capture of an earlier run."""
-    try:
-        poses, lidars = capture_poses(capture, session), capture.lidars
-    except LceRigError:
-        return  # A damaged capture is named when it is used.
-    for guide in guides:
-        if guide.key in poses and guide.lidar in lidars:
-            guide.add(capture.name, poses[guide.key])
 
 
 def _time_s(detection: BoardDetection) -> float:
@@ -274,6 +262,7 @@ class _Loop:
         if report.ending == "exhausted":
             waited_s = time.monotonic() - self._captured_s
             report.notes.append(f"no capture in the last {waited_s:.0f} s, {self._monitor.last_words()}")
+        report.predicted = [found for guide in self._guides if (found := guide.predict()) is not None]
         ties = self._clock.problems() + self._clock.account()
         report.notes += self._keeper.notes() + self._learning.notes()
         report.notes += [f"{each.subject}: {sentence(each)}" for each in ties]
@@ -438,9 +427,21 @@ class _Loop:
             last = self._asked[-1].name if self._asked and not has_ended else ""
             self._show(
                 self._monitor.state(
-                    self._n_captures, is_enough=is_enough, has_ended=has_ended, last_capture=last
+                    self._n_captures,
+                    is_enough=is_enough,
+                    has_ended=has_ended,
+                    last_capture=last,
+                    goes_on="" if has_ended else self._explain(),
                 )
             )
+
+    def _explain(self) -> str:
+        """Say why it goes on, by the guide that needs most captures."""
+        lacking = [why for guide in self._guides if (why := guide.explain()) is not None]
+        if not lacking:
+            return ""
+        most = max(lacking, key=lambda why: why.figures.get("n_more") or 0)
+        return (f"{most.subject}: " if len(self._guides) > 1 else "") + sentence(most)
 
     def _active_guide(self, detection: BoardDetection) -> Guide:
         """Choose whose words are said: of the guides whose camera sees the board that of fewest captures.

@@ -1,5 +1,6 @@
 """What the captures have shown of one camera and one LiDAR, and where the board goes next."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,11 +19,14 @@ from lce_rig.collect.guidance import (
     model_sensors,
     outline_px,
 )
-from lce_rig.core.errors import ProfileError
-from lce_rig.core.findings import Finding
+from lce_rig.collect.guidance.planner import ENOUGH_SHARE
+from lce_rig.collect.placement_dedupe import capture_poses
+from lce_rig.core.errors import LceRigError, ProfileError
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
+from lce_rig.session import Capture, Session
 
 #: Another placement is proposed after a board was wanted at one for so long.
 GIVE_UP_S = 30.0
@@ -64,6 +68,8 @@ class Guide:
         self.problem: Finding | None = None
         self.guidance: Guidance | None = None
         self._min_captures = rig.quality.min_captures
+        self._target_deg = rig.calibration.target_sigma_deg
+        self._target_mm = 1000 * rig.calibration.target_sigma_m
         self._names: list[str] = []
         self._held: list[Array] = []
         self._avoid: list[Array] = []
@@ -188,6 +194,41 @@ class Guide:
         held, avoid = self._held_poses(), self._avoided()
         return self._planner.adds_nothing(held, present, self._names, avoid, self.wanted)
 
+    def explain(self) -> Finding | None:
+        """Find why more captures are needed, and about how many; None where there are enough."""
+        guidance = self.guidance
+        if guidance is None or guidance.is_enough or not self._names:
+            return None
+        figures: dict[str, Figure] = {"n_more": guidance.n_more, "n_least": guidance.n_least}
+        if guidance.n_captures < guidance.n_least:
+            return Finding("guide.few_captures", "note", self.key[0], figures)
+        rotation_deg, position_m = guidance.stated_rotation_deg, guidance.stated_translation_m
+        limit_deg, limit_m = ENOUGH_SHARE * self._target_deg, ENOUGH_SHARE * self._target_mm / 1000
+        if rotation_deg / limit_deg > position_m / limit_m:
+            figures |= {"rotation_deg": rotation_deg, "limit_deg": limit_deg}
+            return Finding("guide.rotation_above", "note", self.key[0], figures)
+        figures |= {"position_m": position_m, "limit_m": limit_m}
+        return Finding("guide.position_above", "note", self.key[0], figures)
+
+    def predict(self) -> Finding | None:
+        """Give the predicted standard deviations for the captures; None where nothing can be predicted."""
+        if self._planner is None or not self._names:
+            return None
+        guidance = self.guidance or self._planner.guide(self._held_poses())
+        return Finding(
+            "guide.predicted",
+            "note",
+            f"{self.key[0]}, {self.lidar}",
+            {
+                "n_captures": guidance.n_captures,
+                "rotation_deg": guidance.sigma_rotation_deg,
+                "target_deg": self._target_deg,
+                "position_mm": 1000 * guidance.sigma_translation_m,
+                "target_mm": self._target_mm,
+                "is_enough": guidance.is_enough,
+            },
+        )
+
     def instruct(self, present: Array) -> list[Instruction]:
         """Say what to do with a board (4, 4)."""
         if self._planner is None or self.wanted is None:
@@ -216,6 +257,29 @@ class Guide:
 
     def _held_poses(self) -> Array:
         return np.stack(self._held) if self._held else np.zeros((0, 4, 4))
+
+
+def count_in(capture: Capture, session: Session, guides: Sequence[Guide]) -> None:
+    """Let guides know a capture of a session."""
+    try:
+        poses, lidars = capture_poses(capture, session), capture.lidars
+    except LceRigError:
+        return  # A damaged capture is named when it is used.
+    for guide in guides:
+        if guide.key in poses and guide.lidar in lidars:
+            guide.add(capture.name, poses[guide.key])
+
+
+def predict(session: Session) -> list[Finding]:
+    """Predict the standard deviations for the captures of a session with nominal extrinsics.
+
+    Captures without stored poses of the board, such as those of a folder, are not searched for it.
+    """
+    with_poses = [each for each in session.captures if isinstance(each.meta.get("T_cam_board"), dict)]
+    guides = make_guides(session.rig) if with_poses else []
+    for capture in with_poses:
+        count_in(capture, session, guides)
+    return [found for guide in guides if (found := guide.predict()) is not None]
 
 
 def make_guides(rig: Rig) -> list[Guide]:

@@ -113,7 +113,7 @@ class Monitor:
         return time.monotonic() - self._told_s > _EVERY_S
 
     def state(
-        self, n_captures: int, *, is_enough: bool, has_ended: bool, last_capture: str = ""
+        self, n_captures: int, *, is_enough: bool, has_ended: bool, last_capture: str = "", goes_on: str = ""
     ) -> LiveState:
         """Give everything as it is now."""
         self._told_s = now_s = time.monotonic()
@@ -147,6 +147,7 @@ class Monitor:
             notes=self._notes(),
             n_logged=self._n_logged,
             last_capture=last_capture,
+            goes_on=goes_on,
             requires_still_boards=self._clock.verdict().requires_still_boards,
         )
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey
-from lce_rig.collect.event_moment import MotionOptions
+from lce_rig.collect.event_moment import BEST_SPEED_MPS
 from lce_rig.collect.guidance import say
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.state import Phase
@@ -76,11 +76,9 @@ def narrate_refused(guide: Guide, present: Array, refusal: Refusal) -> Narration
     return Narration("refused", _next(guide, present, recommend(refusal)), f"not here: {describe(refusal)}")
 
 
-def narrate_moving(
-    guide: Guide, present: Array, judged: CaptureMoment | Refusal | None, options: MotionOptions
-) -> Narration:
+def narrate_moving(guide: Guide, present: Array, judged: CaptureMoment | Refusal | None) -> Narration:
     """Say where a board goes that has to move slowly to be captured."""
-    headline = _next(guide, present, f"move it slowly, about {100 * options.best_speed_mps:.0f} cm/s")
+    headline = _next(guide, present, f"move it slowly, about {100 * BEST_SPEED_MPS:.0f} cm/s")
     if isinstance(judged, Refusal):
         return Narration("moving", headline, sentence(judged))
     if isinstance(judged, CaptureMoment) and guide.is_there(present):

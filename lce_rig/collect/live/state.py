@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from lce_rig.collect.guidance import Coverage
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
 
 Ending = Literal["enough", "frames", "timeout", "exhausted", "stopped", "lost"]
@@ -77,6 +78,7 @@ class LiveReport:
         lost: sensors that were lost when it ended, and why, by name.
         error: the sensor that is lost for good; None where none is.
         notes: what else was odd.
+        predicted: the predicted standard deviations, for each camera and LiDAR of which they are known.
         n_recorded: samples of the raw streams on the disk; None where they were not recorded.
     """
 
@@ -91,6 +93,7 @@ class LiveReport:
     lost: dict[str, SourceError] = field(default_factory=dict)
     error: SourceError | None = None
     notes: list[str] = field(default_factory=list)
+    predicted: list[Finding] = field(default_factory=list)
     n_recorded: int | None = None
 
 
@@ -172,6 +175,7 @@ class LiveState:
         hold_s: how long the board has still to be held; None unless it is being held.
         n_captures: in the session.
         n_wanted: how many are wanted; None where the target decides.
+        goes_on: about how many more captures are needed, and why; "" where there are enough.
         last_capture: name of the capture that would be taken back; "" where there is none.
         streams: every stream.
         drawing: the guiding camera's image; None before one has come.
@@ -206,4 +210,5 @@ class LiveState:
     notes: tuple[str, ...] = field(default=())
     n_logged: int = 0
     last_capture: str = ""
+    goes_on: str = ""
     requires_still_boards: bool = True

@@ -5,11 +5,10 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from lce_rig.collect.board_tracker import BoardTracker, CaptureMoment, ImageKey
-from lce_rig.collect.event_moment import MotionOptions
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.collect.offline.search_ahead import sight_ahead
 from lce_rig.collect.offline.slow_motion import find_moving_moments
-from lce_rig.collect.offline.stillness import StillnessOptions, find_still_moments
+from lce_rig.collect.offline.stillness import find_still_moments
 from lce_rig.collect.offline.stored_events import StoredEvents
 from lce_rig.collect.placement_dedupe import Placements, board_figures, capture_poses, known_placements
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
@@ -25,6 +24,8 @@ from lce_rig.words import describe
 
 # The moments of a recording that are worth a capture.
 
+# How often a whole image is searched while no board is in sight.
+_SEARCH_S = 0.3
 # How often an image without a board is searched thoroughly, which takes most of a second.
 _THOROUGH_S = 1.0
 # A process of its own for images takes a second to start.
@@ -42,8 +43,7 @@ class MomentSearch:
     Attributes:
         rig: the profile.
         streams: what the recording holds.
-        stillness: when a board stands still; None takes the profile's `quality.max_motion_m`.
-        motion: how a moving board is judged.
+        max_motion_m: how far a board that stands still may move in half a second.
         min_move_m, min_turn_deg: how far placements of a moving board must be apart.
         losses: what became no moment so far.
         n_samples: images and scans to come, about.
@@ -51,8 +51,7 @@ class MomentSearch:
 
     rig: Rig
     streams: Collection[Stream]
-    stillness: StillnessOptions | None
-    motion: MotionOptions
+    max_motion_m: float
     min_move_m: float
     min_turn_deg: float
     n_samples: int = 0
@@ -83,20 +82,18 @@ class MomentSearch:
         cameras = {camera for camera, _ in self.reconstructed}
         if cameras:
             samples = with_event_pictures(samples, self.rig, cameras, self.losses)
-        stillness = self.stillness or StillnessOptions(max_motion_m=self.rig.quality.max_motion_m)
-        interval_s = self.motion.search_interval_s if self.has_events else stillness.search_interval_s
-        watcher = BoardTracker(self.rig, interval_s, self.losses, _THOROUGH_S)
+        watcher = BoardTracker(self.rig, _SEARCH_S, self.losses, _THOROUGH_S)
         # Why a scan got no image made of events is counted where it was not made.
         frames = pair_by_time(samples, self.rig, Losses() if cameras else self.losses)
         is_long = self.n_samples >= _LONG_SAMPLES
-        are_still = not self.has_events and stillness.max_motion_m <= _GLANCED_M
+        are_still = not self.has_events and self.max_motion_m <= _GLANCED_M
         ahead = sight_ahead(watcher, frames, is_still_wanted=are_still)
         detections = ahead if is_long else map(watcher.sight, frames)
         if self.has_events:
             taken = Placements(self.min_move_m, self.min_turn_deg)
-            moments = find_moving_moments(detections, self.rig, self.motion, taken, self.losses)
+            moments = find_moving_moments(detections, self.rig, taken, self.losses)
         else:
-            moments = find_still_moments(detections, self.rig.board.to_board(), stillness)
+            moments = find_still_moments(detections, self.rig.board.to_board(), self.max_motion_m)
         for moment in moments:
             confirmed = watcher.confirm(moment)
             if isinstance(confirmed, Refusal):
@@ -123,16 +120,14 @@ class CollectOptions:
         target: number of captures wanted: recordings are read until the session has as many.
         min_move_m, min_turn_deg: a board differs from one captured before when it moved or turned as far; for
             continuous recordings only.
-        stillness: when a board stands still; None takes the profile's `quality.max_motion_m`.
-        motion: how a moving board is judged, where events are recorded.
+        max_motion_m: how far a board that stands still may move; None takes the profile's.
     """
 
     max_captures: int | None = None
     target: int | None = None
     min_move_m: float = 0.15
     min_turn_deg: float = 10.0
-    stillness: StillnessOptions | None = None
-    motion: MotionOptions = field(default_factory=MotionOptions)
+    max_motion_m: float | None = None
 
 
 @dataclass
@@ -256,8 +251,7 @@ class _Collector:
         search = MomentSearch(
             rig,
             frozenset(recording.streams),
-            options.stillness,
-            options.motion,
+            rig.quality.max_motion_m if options.max_motion_m is None else options.max_motion_m,
             options.min_move_m,
             options.min_turn_deg,
             recording.n_samples,

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, MovedSlowly
-from lce_rig.collect.event_moment import MotionOptions, judge_detection
+from lce_rig.collect.event_moment import BEST_SPEED_MPS, SPEED_WINDOW_S, judge_detection
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.losses import Losses
 from lce_rig.core.results import Refusal
@@ -24,7 +24,6 @@ _UNSTEADY_M = 0.01
 def find_moving_moments(
     detections: Iterable[BoardDetection],
     rig: Rig,
-    options: MotionOptions,
     taken: Placements,
     tally: Losses,
 ) -> Iterator[CaptureMoment]:
@@ -35,11 +34,10 @@ def find_moving_moments(
     Args:
         detections: in order of time.
         rig: the profile.
-        options: how a moving board is judged.
         taken: no placements yet; it says how far apart they must be.
         tally: receives why other detections are no moments.
     """
-    gate = MotionGate(rig, options, taken, tally)
+    gate = MotionGate(rig, taken, tally)
     for detection in detections:
         yield from gate.take(detection)
     yield from gate.finish()
@@ -53,14 +51,13 @@ class MotionGate:
             no camera of events saw the board.
     """
 
-    def __init__(self, rig: Rig, options: MotionOptions, taken: Placements, tally: Losses) -> None:
-        """Begin without detections; for the arguments see `find_moving_moments`."""
+    def __init__(self, rig: Rig, taken: Placements, tally: Losses, patience_s: float = 2.0) -> None:
+        """Begin without detections; a moment waits for `patience_s` for a better one of the same place."""
         self.judged: CaptureMoment | Refusal | None = None
         self._rig = rig
-        self._options = options
         self._tally = tally
-        self._neighbours = _Neighbours(options.window_s)
-        self._chooser = _Chooser(options, taken)
+        self._neighbours = _Neighbours(SPEED_WINDOW_S)
+        self._chooser = _Chooser(patience_s, taken)
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
         """Take the next detection, and give the moments that nothing better can follow."""
@@ -75,7 +72,7 @@ class MotionGate:
     ) -> list[CaptureMoment]:
         moments: list[CaptureMoment] = []
         for detection, around in detections:
-            self.judged = judge_detection(detection, around, self._rig, self._options)
+            self.judged = judge_detection(detection, around, self._rig)
             if isinstance(self.judged, Refusal):
                 self._tally.add(self.judged)
             moment = self.judged if isinstance(self.judged, CaptureMoment) else None
@@ -86,8 +83,8 @@ class MotionGate:
 class _Chooser:
     """Holds moments back until it is known whether a better one of the same place follows shortly."""
 
-    def __init__(self, options: MotionOptions, taken: Placements) -> None:
-        self._options = options
+    def __init__(self, patience_s: float, taken: Placements) -> None:
+        self._patience_s = patience_s
         self._taken = taken
         self._pending: deque[CaptureMoment] = deque()
 
@@ -120,13 +117,13 @@ class _Chooser:
             kept.append(moment)
 
     def _is_young(self, moment: CaptureMoment, now_ns: int) -> bool:
-        return 0 <= now_ns - moment.detection.frame.time_ns < self._options.patience_s * 1e9
+        return 0 <= now_ns - moment.detection.frame.time_ns < self._patience_s * 1e9
 
     def _badness(self, moment: CaptureMoment) -> tuple[bool, float]:
         is_short = any(cut.missing_ns > 0 for cut in moment.detection.frame.events)
         motion = moment.motion
         assert isinstance(motion, MovedSlowly)
-        speed_ratio = max(motion.speed_mps, 1e-3) / self._options.best_speed_mps
+        speed_ratio = max(motion.speed_mps, 1e-3) / BEST_SPEED_MPS
         return is_short, abs(float(np.log(speed_ratio))) + motion.unsteady_m / _UNSTEADY_M
 
 

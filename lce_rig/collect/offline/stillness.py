@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,29 +10,15 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard
 
-
-@dataclass(frozen=True)
-class StillnessOptions:
-    """When a board counts as standing still.
-
-    Attributes:
-        window_s: for how long it has to.
-        max_motion_m: how far it may move meanwhile; a hand never holds it quite still.
-        dwell_s: after this long a capture is taken without waiting for the board to be moved on.
-        search_interval_s: how often a whole picture is searched while no board is in sight.
-    """
-
-    window_s: float = 0.5
-    max_motion_m: float = 0.01
-    dwell_s: float = 2.0
-    search_interval_s: float = 0.3
+# For how long a board has to stand still.
+_WINDOW_S = 0.5
 
 
 def find_still_moments(
-    detections: Iterable[BoardDetection], board: Board, options: StillnessOptions
+    detections: Iterable[BoardDetection], board: Board, max_motion_m: float
 ) -> Iterator[CaptureMoment]:
-    """Yield the stillest moment of every stretch in which the board stands still."""
-    gate = StillnessGate(board, options)
+    """Yield the stillest moment of every stretch in which the board moves no more than that."""
+    gate = StillnessGate(board, max_motion_m)
     for detection in detections:
         moment = gate.take(detection)
         if moment is not None:
@@ -49,16 +34,21 @@ class StillnessGate:
     It is the middle of a window in which nothing moved more than its figure `motion_m`. A stretch ends when
     the board moves, is lost, or has stood for `dwell_s`; it is then reported once.
 
+    Args:
+        board: the profile's.
+        max_motion_m: how far it may move in a window; a hand never holds it quite still.
+        dwell_s: after this long a capture is taken without waiting for the board to be moved on.
+
     Attributes:
         motion_m: how far the board moved in the last window; infinite where there is no whole one.
         held_s: for how long the present stretch has lasted, since its first whole window; None out of one.
     """
 
-    def __init__(self, board: Board, options: StillnessOptions) -> None:
+    def __init__(self, board: Board, max_motion_m: float, dwell_s: float = 2.0) -> None:
         self.motion_m = np.inf
         self.held_s: float | None = None
         self._board = board
-        self._options = options
+        self._max_motion_m, self._dwell_ns = max_motion_m, dwell_s * 1e9
         self._window: deque[BoardDetection] = deque()
         self._best: CaptureMoment | None = None
         self._best_m = np.inf
@@ -66,9 +56,9 @@ class StillnessGate:
 
     def take(self, detection: BoardDetection) -> CaptureMoment | None:
         """Take the next detection, and give the moment of a stretch that has ended with it."""
-        options, now_ns = self._options, detection.frame.time_ns
+        now_ns = detection.frame.time_ns
         self.motion_m = self._measure(detection)
-        is_still = self.motion_m <= options.max_motion_m
+        is_still = self.motion_m <= self._max_motion_m
         if is_still:
             self._since_ns = now_ns if self._best is None else self._since_ns
             if self._best is None or self.motion_m < self._best_m:
@@ -76,7 +66,7 @@ class StillnessGate:
                 self._best = CaptureMoment(middle, HeldStill(round(self.motion_m, 6)))
                 self._best_m = self.motion_m
         self.held_s = (now_ns - self._since_ns) * 1e-9 if is_still else None
-        if self._best is not None and (not is_still or now_ns - self._since_ns > options.dwell_s * 1e9):
+        if self._best is not None and (not is_still or now_ns - self._since_ns > self._dwell_ns):
             return self.finish()
         return None
 
@@ -87,22 +77,20 @@ class StillnessGate:
 
     def _measure(self, detection: BoardDetection) -> float:
         """Put a detection into the window and measure how far the board moved in it."""
-        window, options = self._window, self._options
+        window = self._window
         is_seen = detection.is_usable
-        if not is_seen or _is_gap(window, detection, options):
+        if not is_seen or _is_gap(window, detection):
             window.clear()
         if is_seen:
             window.append(detection)
-        while len(window) > 2 and _span_s(window) - _step_s(window) >= options.window_s:
+        while len(window) > 2 and _span_s(window) - _step_s(window) >= _WINDOW_S:
             window.popleft()
-        is_full = len(window) > 2 and _span_s(window) >= options.window_s * 0.999
-        return _motion_m(window, self._board, options.max_motion_m) if is_full else np.inf
+        is_full = len(window) > 2 and _span_s(window) >= _WINDOW_S * 0.999
+        return _motion_m(window, self._board, self._max_motion_m) if is_full else np.inf
 
 
-def _is_gap(window: deque[BoardDetection], detection: BoardDetection, options: StillnessOptions) -> bool:
-    return (
-        bool(window) and not 0 < detection.frame.time_ns - window[-1].frame.time_ns < options.window_s * 1e9
-    )
+def _is_gap(window: deque[BoardDetection], detection: BoardDetection) -> bool:
+    return bool(window) and not 0 < detection.frame.time_ns - window[-1].frame.time_ns < _WINDOW_S * 1e9
 
 
 def _span_s(window: deque[BoardDetection]) -> float:

@@ -13,8 +13,7 @@ from lce_rig.core.results import Observation
 from lce_rig.extrinsics.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.likelihood.levels import Levels, Priors
-from lce_rig.extrinsics.likelihood.refine import JointEstimate, refine
-from lce_rig.extrinsics.likelihood.spread import inflate
+from lce_rig.extrinsics.likelihood.refine import JointEstimate, inflate, refine
 from lce_rig.extrinsics.likelihood.system import PER_CAMERA
 from lce_rig.extrinsics.metrics import error_to_reference
 from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M, EstimateSettings

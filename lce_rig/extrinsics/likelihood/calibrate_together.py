@@ -11,8 +11,7 @@ from lce_rig.core.results import Observation, Refusal
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.likelihood.calibrate_jointly import add_figures, describe, expand_joint, what_is_known
 from lce_rig.extrinsics.likelihood.levels import PoseLevels
-from lce_rig.extrinsics.likelihood.refine import refine
-from lce_rig.extrinsics.likelihood.spread import inflate
+from lce_rig.extrinsics.likelihood.refine import inflate, refine
 from lce_rig.extrinsics.options import EstimateSettings
 from lce_rig.extrinsics.shared_scans import scan_key
 from lce_rig.residuals.placements import group_shared_placements

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
@@ -17,7 +18,8 @@ from lce_rig.extrinsics.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_
 from lce_rig.extrinsics.likelihood.system import PER_CAMERA, Assembly, State, Terms, assemble, linearise
 from lce_rig.residuals.along_rays import N_FIELDS, N_SHIFTS, StackedScans, interior, lens_fields, stack_scans
 from lce_rig.residuals.placements import group_placements
-from lce_rig.residuals.quadratics import Quadratics
+from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
+from lce_rig.solvers.covariance import symmetric_inverse
 
 # Noise levels from the data: those of maximum likelihood.
 #
@@ -218,3 +220,39 @@ def _summarise(state: State, terms: Terms, levels: Levels, priors: Priors) -> Jo
         levels=levels,
         cost=cost,
     )
+
+
+# Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.
+_SURE = 2.0
+
+
+def inflate(
+    joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0, n_seen: int | None = None
+) -> tuple[Array, float]:
+    """Multiply a camera's covariance (6, 6) according to the spread over placements.
+
+    The spread of the optimum without each placement (`lce_rig.residuals.quadratics`) is independent of the
+    noise model. If it significantly exceeds the model's covariance, there are errors that the model lacks.
+
+    Args:
+        joint: of F captures.
+        placement: (F,) number of each capture's placement.
+        camera: its number.
+        n_seen: number of placements that it saw; all if None.
+
+    Returns:
+        The covariance and the factor, 1 if model and spread agree.
+    """
+    cov = joint.cov[camera]
+    n = int(placement.max()) + 1 if n_seen is None else n_seen
+    ratio = float(np.trace(symmetric_inverse(cov) @ jackknife(joint, placement, camera))) / len(cov)
+    # A mean of 6 chi squares over n - 1 freedoms each.
+    chance = np.sqrt(2 / (len(cov) * max(n - 1, 1)))
+    factor = ratio if ratio > 1 + _SURE * chance else 1.0
+    return factor * cov, factor
+
+
+def jackknife(joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0) -> Array:
+    """Compute the jackknife covariance (6, 6) of a camera's extrinsics over placements."""
+    cost = replace(joint.cost, placement=placement)
+    return jackknife_scatter(cost.moves() @ joint.to_extrinsics[camera].T)

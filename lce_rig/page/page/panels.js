@@ -31,6 +31,7 @@ export function showPanels(state) {
   showTakeBack(state.last_capture);
   showSigma("rotation", state.sigma_deg, state.target_deg, "°");
   showSigma("translation", state.sigma_mm, state.target_mm, " mm");
+  setText("goes_on", state.goes_on);
   byId("coverage").hidden = state.coverage === null;
   if (state.coverage !== null) COVERAGE.forEach((name) => fillBar(byId(name), state.coverage[name]));
   byId("streams").replaceChildren(...state.streams.map(streamLine));

@@ -52,6 +52,38 @@ def test_a_capture_that_is_taken_back_is_forgotten(guide: Guide) -> None:
     assert guide.adds_nothing(last) is None
 
 
+def test_it_says_why_it_goes_on_and_for_how_long_until_there_are_enough() -> None:
+    modest = rig().calibration.model_copy(update={"target_sigma_deg": 5.0, "target_sigma_m": 0.5})
+    (guide,) = make_guides(rig().model_copy(update={"calibration": modest}))
+    assert guide.explain() is None and guide.predict() is None, "before the first capture nothing is known"
+    for k in range(11):
+        guide.plan(None, float(k))
+        why = guide.explain()
+        if k >= 2:
+            assert why is not None and why.code == "guide.few_captures"
+            assert why.figures == {"n_more": 11 - k, "n_least": 11}
+        assert guide.wanted is not None
+        guide.add(f"{k:06d}", guide.wanted)
+    guide.plan(None, 11.0)
+    assert guide.explain() is None
+    predicted = guide.predict()
+    assert predicted is not None and predicted.figures["is_enough"] is True
+    assert predicted.figures["n_captures"] == 11
+
+
+def test_what_more_captures_cannot_reach_is_said_without_their_number() -> None:
+    strict = rig().calibration.model_copy(update={"target_sigma_m": 0.005})
+    (guide,) = make_guides(rig().model_copy(update={"calibration": strict}))
+    for k in range(12):
+        guide.plan(None, float(k))
+        assert guide.wanted is not None
+        guide.add(f"{k:06d}", guide.wanted)
+    guide.plan(None, 12.0)
+    why = guide.explain()
+    assert why is not None and why.code == "guide.position_above" and why.figures["n_more"] is None
+    assert why.figure("position_m") > why.figure("limit_m") == pytest.approx(0.0045)
+
+
 def test_the_wanted_placement_stays_until_it_is_captured_or_given_up(guide: Guide) -> None:
     guide.plan(None, 0.0)
     first = guide.wanted

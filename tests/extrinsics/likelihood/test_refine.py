@@ -9,8 +9,7 @@ from lce_rig.core.geometry import difference, exp_so3, invert, perturb, pose
 from lce_rig.extrinsics import EstimateSettings, error_to_reference, fit_extrinsic
 from lce_rig.extrinsics.consensus import find_consensus
 from lce_rig.extrinsics.likelihood.levels import Levels, Priors
-from lce_rig.extrinsics.likelihood.refine import refine
-from lce_rig.extrinsics.likelihood.spread import inflate
+from lce_rig.extrinsics.likelihood.refine import inflate, refine
 from lce_rig.residuals.along_rays import SHIFTS, turn_about_z
 from lce_rig.residuals.placements import group_placements
 from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, photograph, simulate

@@ -2,11 +2,9 @@
 
 from collections.abc import Callable
 
+from lce_rig.devices.sync_board.lines.boards_of_others import Nmea, SimpleSensorSync, TLine
 from lce_rig.devices.sync_board.lines.dialect import Dialect, LineReader, Reading
 from lce_rig.devices.sync_board.lines.lce1 import Lce1
-from lce_rig.devices.sync_board.lines.nmea import Nmea
-from lce_rig.devices.sync_board.lines.simplesensorsync import SimpleSensorSync
-from lce_rig.devices.sync_board.lines.tline import TLine
 
 DIALECTS: dict[str, Callable[[], Dialect]] = {
     "lce1": Lce1,

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 
+from lce_rig.devices.sync_board.lines.boards_of_others import read_rmc
 from lce_rig.devices.sync_board.lines.dialect import Dialect, Reading, split_sentence, write_sentence
 from lce_rig.devices.sync_board.lines.messages import (
     MAX_COUNT,
@@ -18,7 +19,6 @@ from lce_rig.devices.sync_board.lines.messages import (
     TimeReply,
     TriggerEdge,
 )
-from lce_rig.devices.sync_board.lines.nmea import read_rmc
 
 VERSION = 1
 

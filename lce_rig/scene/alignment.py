@@ -1,0 +1,167 @@
+"""How well extrinsics bring a scene's depth edges onto its image edges, by part of the scene."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array, exp_so3, pose, transform
+from lce_rig.scene.depth_edges import DepthEdges
+from lce_rig.scene.edge_field import EdgeField
+
+AXES = ("translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z")
+"""Order of a tangent, axes of the camera."""
+IS_ROTATION = np.array([False, False, False, True, True, True])
+
+_COLUMNS, _ROWS = 8, 3  # parts of the image
+_BESIDE_RAD = 0.05  # Edges so far outside the image count: other extrinsics bring them in.
+_REACH = np.where(IS_ROTATION, np.radians(3.0), 0.3)
+_STEPS = np.linspace(-1.0, 1.0, 61)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneView:
+    """One capture: what the LiDAR and the camera saw of the scene's edges."""
+
+    capture: str
+    edges: DepthEdges
+    field: EdgeField
+
+
+class Alignment:
+    """The score of extrinsics on several captures: the sum of the fields at the projected depth edges.
+
+    Captures of a standing rig show the same edges, so a part of the image is one witness over all captures.
+
+    Args:
+        views: at least one.
+        intrinsics: of the camera.
+        T_cam_lidar: (4, 4) that perturbations start from.
+    """
+
+    def __init__(self, views: Sequence[SceneView], intrinsics: Intrinsics, T_cam_lidar: Array) -> None:
+        self._intrinsics, self.T_cam_lidar = intrinsics, T_cam_lidar
+        points = np.concatenate([view.edges.points for view in views])
+        pixels, _ = intrinsics.project(transform(T_cam_lidar, points))
+        margin_px = -_BESIDE_RAD * intrinsics.fx_px
+        near = intrinsics.is_inside(pixels, margin_px)
+        of_view = np.repeat(np.arange(len(views)), [len(view.edges) for view in views])
+        self._points, self.n_captures = points[near], len(views)
+        self._weight = np.concatenate([view.edges.weight for view in views])[near]
+        self._is_level = np.concatenate([view.edges.is_level for view in views])[near]
+        self._fields = [view.field for view in views]
+        self._of_view = of_view[near]
+        self._slices = [
+            slice(*np.searchsorted(self._of_view, (k, k + 1)).tolist()) for k in range(len(views))
+        ]
+        column = np.clip(pixels[near, 0] / intrinsics.width_px * _COLUMNS, 0, _COLUMNS - 1).astype(np.intp)
+        row = np.clip(pixels[near, 1] / intrinsics.height_px * _ROWS, 0, _ROWS - 1).astype(np.intp)
+        self._part = column * _ROWS + row
+
+    def __len__(self) -> int:
+        """Count the depth edges in or near the images."""
+        return len(self._points)
+
+    @property
+    def weight_of_parts(self) -> Array:
+        """Sum of weights of the parts of the image (columns, rows)."""
+        return self._by_part(self._weight).reshape(_COLUMNS, _ROWS)
+
+    def _by_part(self, values: Array) -> Array:
+        return np.asarray(np.bincount(self._part, values, _COLUMNS * _ROWS), dtype=np.float64)
+
+    def scores(self, tangent: Array) -> tuple[Array, Array]:
+        """Score perturbed extrinsics.
+
+        Args:
+            tangent: (6,) (translation m, rotation rad), axes of the camera.
+
+        Returns:
+            Sums over the parts of the image, and over the captures, both divided by the number of captures.
+        """
+        T = self.perturbed(tangent)
+        pixels, _ = self._intrinsics.project(transform(T, self._points))
+        values = np.empty(len(self._points))
+        for field, chosen in zip(self._fields, self._slices, strict=True):
+            values[chosen] = field.sample(pixels[chosen], self._is_level[chosen])
+        values *= self._weight / self.n_captures
+        by_capture = np.bincount(self._of_view, values, self.n_captures)
+        return self._by_part(values), np.asarray(by_capture, dtype=np.float64)
+
+    def perturbed(self, tangent: Array) -> Array:
+        """Apply a tangent (6,) to the extrinsics, (4, 4)."""
+        T = self.T_cam_lidar
+        return pose(exp_so3(tangent[3:]) @ T[:3, :3], T[:3, 3] + tangent[:3])
+
+    def curve(self, axis: int, start: Array) -> "Curve":
+        """Score extrinsics along one axis of the tangent, the others as in `start` (6,)."""
+        offsets = _STEPS * _REACH[axis]
+        rows = [self.scores(start + offset * np.eye(6)[axis]) for offset in offsets]
+        return Curve(offsets, np.array([parts for parts, _ in rows]), np.array([each for _, each in rows]))
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """The score along one axis.
+
+    Attributes:
+        offsets: (K,) m or rad.
+        by_part: (K, P) score of each part of the image.
+        by_capture: (K, C) of each capture.
+    """
+
+    offsets: Array
+    by_part: Array
+    by_capture: Array
+
+    @property
+    def total(self) -> Array:
+        """The score, (K,)."""
+        return np.asarray(self.by_part.sum(axis=1))
+
+    @property
+    def peak(self) -> float:
+        """Where the score is highest."""
+        return float(_peaks(self.total[:, None], self.offsets)[0])
+
+    def sigma(self) -> float:
+        """Standard deviation of the peak: the larger of the jackknives over parts and over captures."""
+        return max(self._jackknife(self.by_part), self._jackknife(self.by_capture))
+
+    def _jackknife(self, shares: Array) -> float:
+        shares = shares[:, np.any(shares != 0, axis=0)]
+        n = shares.shape[1]
+        if n < 2:
+            return 0.0
+        peaks = _peaks(shares.sum(axis=1, keepdims=True) - shares, self.offsets)
+        return float(np.sqrt((n - 1) / n * np.sum((peaks - peaks.mean()) ** 2)))
+
+    def at(self, offset: float) -> Array:
+        """Interpolate the parts' scores at an offset, (P,)."""
+        return np.array([np.interp(offset, self.offsets, part) for part in self.by_part.T])
+
+    def significance(self, offset: float, other: float | None = None) -> float:
+        """How surely the score at an offset exceeds that at another: the sum over parts by its scatter.
+
+        Args:
+            offset: the one that should be better.
+            other: the one compared with; None for the mean of those a third of the range away and more.
+        """
+        if other is None:
+            away = np.abs(self.offsets - offset) > 2 / 3 * self.offsets[-1]
+            reference = self.by_part[away].mean(axis=0)
+        else:
+            reference = self.at(other)
+        gains = self.at(offset) - reference
+        return float(gains.sum() / max(np.sqrt(np.sum(gains**2)), 1e-12))
+
+
+def _peaks(columns: Array, offsets: Array) -> Array:
+    """Find the highest point of each column (K, N), between grid points by a parabola."""
+    index = np.clip(columns.argmax(axis=0), 1, len(offsets) - 2)
+    pick = np.arange(columns.shape[1])
+    before, at, after = (columns[index + shift, pick] for shift in (-1, 0, 1))
+    bend = before - 2 * at + after
+    step = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
+    return np.asarray(offsets[index] + np.clip(step, -1, 1) * (offsets[1] - offsets[0]))

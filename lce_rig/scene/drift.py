@@ -1,0 +1,222 @@
+"""Whether extrinsics still hold, axis by axis, from the scene's edges alone."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.geometry import Array
+from lce_rig.scene.alignment import AXES, IS_ROTATION, Alignment, Curve, SceneView
+
+State = Literal["unchanged", "changed", "unknown"]
+
+# Tuned on rlfs01 (docs/drift.md); the other recordings were only measured.
+_THRESHOLD_SIGMAS = 3.0
+_POWER_SIGMAS = 1.645  # At the smallest change, 95 % of the trials exceed the threshold.
+# What one scene's peak is off by, beyond the scatter of its parts: m and rad, order of AXES.
+_BIAS = np.array([0.005, 0.005, 0.015, *np.radians([0.10, 0.05, 0.15])])
+# A witness that sees only larger changes cannot tell.
+_LARGEST = np.where(IS_ROTATION, np.radians(1.5), 0.10)
+_MIN_EDGES = 60
+_MIN_PARTS = 6  # of the image, that carry edges
+_MIN_SCORE = 0.10  # mean log-likelihood ratio of a depth edge; 0 where edges do not belong together
+_NEARLY = 0.1  # An axis that scores so much less alone may be the one that changed.
+_MIN_SIGNIFICANCE = 1.5  # of a peak above the rest of its curve
+_PRIOR = np.where(IS_ROTATION, np.radians(2.0), 0.10)  # of the joint maximum
+
+
+@dataclass(frozen=True)
+class AxisDrift:
+    """What the scene says about one axis, were it the only one that changed besides those reported changed.
+
+    Attributes:
+        axis: "translation_x" to "rotation_z", axes of the camera.
+        state: "unknown" where the scene cannot tell.
+        change: from the deployed extrinsics to the scene's, m or deg.
+        sigma: standard deviation of `change`, the deployed extrinsics' own uncertainty included.
+        smallest: the smallest change that would have been seen in 95 % of trials.
+        reason: why it cannot tell, the code of a finding; "" otherwise.
+        instead: axes of which one might have changed in place of this one, since it explains nearly as much.
+    """
+
+    axis: str
+    state: State
+    change: float
+    sigma: float
+    smallest: float
+    reason: str = ""
+    instead: tuple[str, ...] = ()
+
+    @property
+    def is_rotation(self) -> bool:
+        """Whether the figures are in deg."""
+        return self.axis.startswith("rotation")
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """Deployed extrinsics compared with the edges of a scene.
+
+    Attributes:
+        axes: one verdict each, order of AXES; all "unknown" where nothing could be compared.
+        findings: the summary first, then one of each axis and what is missing.
+        T_cam_lidar: (4, 4) deployed.
+        T_best: (4, 4) where all six axes together fit best; the deployed where nothing could be compared.
+        curves: the score along each axis about the deployed extrinsics; empty where nothing was compared.
+        n_captures, n_edges: compared.
+    """
+
+    axes: tuple[AxisDrift, ...]
+    findings: tuple[Finding, ...]
+    T_cam_lidar: Array
+    T_best: Array
+    curves: Mapping[str, Curve]
+    n_captures: int
+    n_edges: int
+
+    @property
+    def state(self) -> State:
+        """The verdict: changed if any axis is; unchanged only if no axis is unknown."""
+        states = {axis.state for axis in self.axes}
+        return "changed" if "changed" in states else "unknown" if "unknown" in states else "unchanged"
+
+
+def watch(
+    views: Sequence[SceneView],
+    intrinsics: Intrinsics,
+    T_cam_lidar: Array,
+    cov: Array,
+    *,
+    is_joint: bool = True,
+) -> Drift:
+    """Compare deployed extrinsics with the scene of some captures.
+
+    Each axis is searched alone within 3 deg or 30 cm. The change with the highest score is applied and the
+    other axes are searched again, until none is significant: one changed axis is not reported as several.
+
+    Args:
+        views: the captures.
+        intrinsics: of the camera.
+        T_cam_lidar: (4, 4) deployed.
+        cov: (6, 6) of the deployed extrinsics' tangent.
+        is_joint: whether to search for the best extrinsics in all axes, too.
+    """
+    n_edges, missing = 0, []
+    if views and any(len(view.edges) for view in views):
+        alignment = Alignment(views, intrinsics, T_cam_lidar)
+        n_edges = len(alignment)
+        missing = _sides_without_edges(alignment)
+    if n_edges < _MIN_EDGES * max(len(views), 1) ** 0.5 or _n_parts(alignment) < _MIN_PARTS:
+        figures: dict[str, Figure] = {"n_edges": n_edges, "n_captures": len(views)}
+        few = Finding("scene.few_edges", "error", figures=figures)
+        axes = tuple(AxisDrift(axis, "unknown", 0.0, np.inf, np.inf, "scene.few_edges") for axis in AXES)
+        return Drift(axes, (few, *missing), T_cam_lidar, T_cam_lidar, {}, len(views), n_edges)
+
+    sigma_deployed = np.sqrt(np.diag(cov))
+    curves = [alignment.curve(axis, np.zeros(6)) for axis in range(6)]
+    axes, tangent = _decide(alignment, curves, sigma_deployed)
+    best = _maximise(alignment, tangent) if is_joint else tangent
+    findings = (_summary(axes, len(views)), *map(_of_axis, axes), *missing)
+    by_axis = dict(zip(AXES, curves, strict=True))
+    return Drift(axes, findings, T_cam_lidar, alignment.perturbed(best), by_axis, len(views), n_edges)
+
+
+def _n_parts(alignment: Alignment) -> int:
+    return int(np.count_nonzero(alignment.weight_of_parts))
+
+
+def _decide(
+    alignment: Alignment, curves: list[Curve], sigma_deployed: Array
+) -> tuple[tuple[AxisDrift, ...], Array]:
+    """Take changes one by one, the most rewarding first; (the verdicts, the tangent of all changes)."""
+    tangent, changed = np.zeros(6), {}
+    while True:
+        verdicts = {
+            axis: _judge(axis, curves[axis], sigma_deployed[axis], alignment)
+            for axis in range(6)
+            if axis not in changed
+        }
+        moved = [axis for axis, verdict in verdicts.items() if verdict.state == "changed"]
+        if not moved:
+            break
+        axis = max(moved, key=lambda each: curves[each].total.max())
+        least = (1 - _NEARLY) * curves[axis].total.max()
+        instead = tuple(AXES[each] for each in moved if each != axis and curves[each].total.max() > least)
+        tangent[axis] += curves[axis].peak
+        changed[axis] = replace(verdicts[axis], instead=instead)
+        curves = [alignment.curve(each, tangent) for each in range(6)]
+    return tuple((verdicts | changed)[axis] for axis in range(6)), tangent
+
+
+def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment) -> AxisDrift:
+    """Decide one axis from the score along it."""
+    unit = float(np.degrees(1.0)) if IS_ROTATION[axis] else 1.0
+    peak, scatter = curve.peak, curve.sigma()
+    sigma = float(np.sqrt(scatter**2 + sigma_deployed**2 + _BIAS[axis] ** 2))
+    smallest = (_THRESHOLD_SIGMAS + _POWER_SIGMAS) * sigma
+    mean_score = float(curve.total.max() / alignment.weight_of_parts.sum() * alignment.n_captures)
+    reason = ""
+    if abs(peak) > 0.95 * curve.offsets[-1]:
+        reason = "scene.no_peak"
+    elif mean_score < _MIN_SCORE or curve.significance(peak) < _MIN_SIGNIFICANCE:
+        reason = "scene.flat"
+    elif smallest > _LARGEST[axis]:
+        reason = "scene.large_scatter"
+    is_changed = abs(peak) > _THRESHOLD_SIGMAS * sigma and reason in ("", "scene.large_scatter")
+    state: State = "changed" if is_changed else "unknown" if reason else "unchanged"
+    figures = (unit * peak, unit * sigma, unit * smallest)
+    return AxisDrift(AXES[axis], state, *figures, "" if is_changed else reason)
+
+
+def _maximise(alignment: Alignment, start: Array) -> Array:
+    """Find the tangent (6,) with the highest score in all axes together, held weakly to the deployed one."""
+    from scipy.optimize import minimize
+
+    def cost(scaled: NDArray[np.float64]) -> float:
+        score = alignment.scores(scaled * _PRIOR)[0].sum()
+        return float(0.5 * scaled @ scaled - score)
+
+    options = {"xtol": 0.01, "ftol": 1e-4, "maxiter": 6}
+    found = minimize(cost, start / _PRIOR, method="Powell", options=options)
+    return np.asarray(found.x * _PRIOR)
+
+
+def _summary(axes: tuple[AxisDrift, ...], n_captures: int) -> Finding:
+    changed = tuple(axis.axis for axis in axes if axis.state == "changed")
+    unknown = tuple(axis.axis for axis in axes if axis.state == "unknown")
+    figures: dict[str, Figure] = {"n_captures": n_captures, "changed": changed, "unknown": unknown}
+    if changed:
+        return Finding("scene.changed", "error", figures=figures)
+    if unknown:
+        return Finding("scene.unknown", "warning", figures=figures)
+    return Finding("scene.unchanged", "note", figures=figures)
+
+
+def _of_axis(axis: AxisDrift) -> Finding:
+    unit = "deg" if axis.is_rotation else "m"
+    figures: dict[str, Figure] = {
+        f"change_{unit}": axis.change,
+        f"sigma_{unit}": axis.sigma,
+        f"smallest_{unit}": axis.smallest,
+    }
+    if axis.state == "changed":
+        return Finding("scene.axis_changed", "error", axis.axis, {**figures, "instead": axis.instead})
+    if axis.state == "unchanged":
+        return Finding("scene.axis_unchanged", "note", axis.axis, figures)
+    return Finding(axis.reason, "warning", axis.axis, figures)
+
+
+def _sides_without_edges(alignment: Alignment) -> list[Finding]:
+    """Name the thirds of the image in which nothing tells."""
+    columns = alignment.weight_of_parts.sum(axis=1)
+    thirds = [part.sum() for part in np.array_split(columns, 3)]
+    total = max(sum(thirds), 1e-12)
+    return [
+        Finding("scene.side_without_edges", "note", side, {"share": float(third / total)})
+        for side, third in zip(("left", "middle", "right"), thirds, strict=True)
+        if third < 0.05 * total
+    ]

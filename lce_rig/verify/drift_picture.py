@@ -1,0 +1,84 @@
+"""One page on drift: a scene's edges under two extrinsics, and the score along each axis."""
+
+from typing import Any
+
+import numpy as np
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image
+from lce_rig.core.geometry import Array, transform
+from lce_rig.scene.alignment import AXES
+from lce_rig.scene.depth_edges import DepthEdges
+from lce_rig.scene.drift import Drift
+from lce_rig.verify import canvas
+from lce_rig.verify.canvas import BLACK, INK, MAGENTA, ORANGE, Picture
+from lce_rig.words.extrinsics import motion_words
+
+_PAGE_PX = 1600
+_COLOURS = {"unchanged": "#2a7d3f", "changed": "#c0392b", "unknown": "#7a7f85"}
+_CHART_DPI = 100
+
+
+def draw_drift(drift: Drift, image: Image, edges: DepthEdges, intrinsics: Intrinsics, title: str) -> Picture:
+    """Draw one capture's depth edges under both extrinsics side by side, above the score along each axis.
+
+    Args:
+        drift: the verdict.
+        image: of the capture.
+        edges: of its scan.
+        intrinsics: of the camera.
+        title: one line.
+
+    Returns:
+        BGR (H, W, 3).
+    """
+    half = _PAGE_PX // 2
+    panels = []
+    for name, T in (("deployed", drift.T_cam_lidar), ("best fit", drift.T_best)):
+        picture = _draw_edges(image, edges, intrinsics, T)
+        picture = canvas.fitted(picture, half, round(half * picture.shape[0] / picture.shape[1]))
+        strip = canvas.panel(half, 40)
+        canvas.draw_text(strip, f"{title}  {name}", 12, 27, 13, INK)
+        panels.append(np.vstack([strip, picture]))
+    page = np.hstack(panels)
+    return np.vstack([page, _draw_curves(drift)]) if drift.curves else page
+
+
+def _draw_edges(image: Image, edges: DepthEdges, intrinsics: Intrinsics, T_cam_lidar: Array) -> Picture:
+    picture, factor = canvas.enlarged(image.pixels)
+    pixels, _ = intrinsics.project(transform(T_cam_lidar, edges.points))
+    is_inside = intrinsics.is_inside(pixels)
+    unit = picture.shape[1] / 1000
+    for is_level, colour in ((True, ORANGE), (False, MAGENTA)):
+        chosen = is_inside & (edges.is_level == is_level)
+        canvas.draw_discs(picture, (pixels[chosen] + 0.5) * factor - 0.5, colour, 2.2 * unit, BLACK)
+    return picture
+
+
+def _draw_curves(drift: Drift) -> Picture:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure: Any = Figure(figsize=(_PAGE_PX / _CHART_DPI, 5.2), dpi=_CHART_DPI, facecolor="white")
+    chart: Any = FigureCanvasAgg(figure)
+    grid = figure.subplots(2, 3)
+    # Rotations above translations.
+    order = [*range(3, 6), *range(3)]
+    for axes, index in zip(grid.ravel(), order, strict=True):
+        verdict, curve = drift.axes[index], drift.curves[AXES[index]]
+        unit, scale = ("deg", np.degrees(1.0)) if verdict.is_rotation else ("mm", 1000.0)
+        shown = 1.0 if verdict.is_rotation else 1000.0
+        axes.plot(scale * curve.offsets, curve.total, color=_COLOURS[verdict.state])
+        axes.axvline(0.0, color="black", linewidth=0.8)
+        if np.isfinite(verdict.smallest):
+            axes.axvspan(
+                -shown * verdict.smallest, shown * verdict.smallest, color=_COLOURS[verdict.state], alpha=0.12
+            )
+        axes.set_xlim(scale * curve.offsets[0], scale * curve.offsets[-1])
+        axes.set_title(f"{motion_words(AXES[index])}: {verdict.state}", fontsize=9)
+        axes.set_xlabel(unit, fontsize=8)
+        axes.tick_params(labelsize=8)
+    figure.suptitle("score along each axis; shaded: changes too small to be seen surely", fontsize=10)
+    figure.tight_layout()
+    chart.draw()
+    return np.ascontiguousarray(np.asarray(chart.buffer_rgba())[..., 2::-1])

@@ -1,0 +1,82 @@
+"""A simulated room with exact truth, seen in four captures by a small camera and a VLP-16."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lce_rig.core.results import Calibration, Certificate, Metrics
+from lce_rig.export.result import write_result
+from lce_rig.pipeline.drift import build_view
+from lce_rig.rig import Rig, find_profile, parse_rig, set_value
+from lce_rig.scene.alignment import SceneView
+from lce_rig.session import Session
+from lce_rig.simulate import SimulatedCapture, simulate_captures, truth_extrinsics
+
+COV = np.diag([0.003] * 3 + [0.0015] * 3) ** 2
+SEED = 2
+
+
+class Seen(NamedTuple):
+    """What the sensors saw, and the truth."""
+
+    rig: Rig
+    captures: list[SimulatedCapture]
+    truth: Calibration
+    views: list[SceneView]
+
+
+def small_rig() -> Rig:
+    """The rig rlfs with a camera of half its resolution, which renders fast."""
+    text = find_profile("rlfs").read_text(encoding="utf-8")
+    camera = "cameras.cam"
+    for key, value in {
+        "resolution_px": "[640, 360]",
+        "intrinsics.fx_px": "448.7",
+        "intrinsics.fy_px": "448.4",
+        "intrinsics.cx_px": "317.5",
+        "intrinsics.cy_px": "187.4",
+    }.items():
+        text = set_value(text, f"{camera}.{key}", value)
+    return parse_rig(text)
+
+
+def deployed(T_cam_lidar: NDArray[np.float64]) -> Calibration:
+    """Make a result with given extrinsics."""
+    return Calibration(
+        camera="cam",
+        channels=("frames",),
+        lidar="lidar",
+        T_cam_lidar=T_cam_lidar,
+        cov=COV,
+        certificate=Certificate(True, 1e-9),
+        metrics=Metrics(0.008, 0.006, 0.1),
+        n_captures=4,
+        n_detected=4,
+        captures_used=("000000",),
+        captures_refused={},
+        verdict="pass",
+    )
+
+
+@pytest.fixture(scope="session")
+def seen() -> Seen:
+    """Simulate the captures once."""
+    rig = small_rig()
+    captures = list(simulate_captures(rig, n_captures=4, seed=SEED))
+    truth = deployed(truth_extrinsics(rig, SEED)["cam", "lidar"])
+    views = [build_view(rig, truth, str(c.index), c.images[0], c.scans[0]) for c in captures]
+    return Seen(rig, captures, truth, views)
+
+
+@pytest.fixture(scope="session")
+def room(seen: Seen, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session of the captures with the true extrinsics as its result."""
+    path = tmp_path_factory.mktemp("scene") / "room"
+    with Session.create(path, seen.rig) as session:
+        for capture in seen.captures:
+            session.add_capture(capture.images, capture.scans, {})
+    write_result(path / "calibration" / "result.json", seen.rig.name, [seen.truth])
+    return path

@@ -1,0 +1,70 @@
+"""Outlines of near objects, found at their true azimuth and height."""
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Scan
+from lce_rig.scene.depth_edges import Beam, find_depth_edges
+
+NEEDLE = Beam(0.0, 0.0)
+STEP = np.radians(0.2)
+AZIMUTHS = np.arange(-0.6, 0.6, STEP)
+
+
+def scan_of(range_at, elevations_deg):
+    """Measure a scene given as range over (azimuth, elevation), rad."""
+    az, el = np.meshgrid(AZIMUTHS, np.radians(elevations_deg))
+    r = range_at(az, el)
+    points = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=-1) * r[..., None]
+    ring = np.broadcast_to(np.arange(len(elevations_deg))[:, None], az.shape)
+    flat = points.reshape(-1, 3).astype(np.float32)
+    return Scan("lidar", 0, flat, np.zeros(len(flat), np.float32), ring.ravel().astype(np.int16))
+
+
+def pillar(az, el):
+    return np.where(np.abs(az) < 0.1, 3.0, 6.0)
+
+
+def test_upright_outlines_lie_between_the_last_return_and_the_next() -> None:
+    edges = find_depth_edges(scan_of(pillar, range(-15, 16, 2)), NEEDLE)
+    azimuth = np.arctan2(edges.points[:, 1], edges.points[:, 0])
+    assert len(edges) == 2 * 16 and not edges.is_level.any()
+    assert np.abs(np.abs(azimuth) - 0.1).max() < STEP / 2
+    assert np.linalg.norm(edges.points, axis=1) == pytest.approx(3.0, abs=1e-3)
+    assert edges.weight == pytest.approx(np.sqrt(3.0), abs=1e-3)
+
+
+def test_a_wide_beam_moves_outlines_inwards_by_its_radius() -> None:
+    scan = scan_of(pillar, range(-15, 16, 2))
+    thin, wide = (find_depth_edges(scan, beam) for beam in (NEEDLE, Beam(0.012, 0.004)))
+    spread = [np.abs(np.arctan2(e.points[:, 1], e.points[:, 0])) for e in (thin, wide)]
+    assert spread[0] - spread[1] == pytest.approx((0.012 + 0.004 * 3.0) / 2 / 3.0, abs=1e-4)
+
+
+def test_a_floor_has_no_outlines_though_its_rings_lie_far_apart() -> None:
+    floor = scan_of(lambda az, el: 1.0 / np.sin(-el) + 0 * az, np.arange(-20, -4, 0.5))
+    assert len(find_depth_edges(floor, NEEDLE)) == 0
+
+
+def test_level_outlines_are_found_where_rings_are_dense() -> None:
+    def table(az, el):
+        return np.where(el < 0.02, 3.0, 6.0) + 0 * az
+
+    dense = find_depth_edges(scan_of(table, np.arange(-10, 10, 0.5)), NEEDLE)
+    height = np.arcsin(dense.points[:, 2] / np.linalg.norm(dense.points, axis=1))
+    assert dense.is_level.all() and len(dense) > 200
+    assert np.abs(height - 0.02).max() < np.radians(0.25) + 1e-6
+    assert len(find_depth_edges(scan_of(table, np.arange(-15, 16, 2)), NEEDLE)) == 0
+
+
+def test_single_returns_between_two_surfaces_are_no_outline() -> None:
+    def mixed(az, el):
+        return np.where(np.abs(az) < STEP / 2, 4.0, 6.0)
+
+    assert len(find_depth_edges(scan_of(mixed, range(-15, 16, 2)), NEEDLE)) == 0
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_an_almost_empty_scan_has_no_outlines(n) -> None:
+    empty = scan_of(pillar, [0]).select(np.arange(n))
+    assert len(find_depth_edges(empty, NEEDLE)) == 0

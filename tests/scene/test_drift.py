@@ -1,0 +1,133 @@
+"""The scene's opinion on extrinsics, against a simulated room's truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.core.geometry import difference, perturb
+from lce_rig.core.results import Calibration
+from lce_rig.scene.alignment import AXES, Alignment
+from lce_rig.scene.drift import watch
+from lce_rig.scene.edge_field import build_edge_field
+
+
+def judge(seen, tangent=(0.0,) * 6, views=None, is_joint=False):
+    c: Calibration = seen.truth
+    lens = seen.rig.cameras["cam"].to_intrinsics()
+    moved = perturb(c.T_cam_lidar, np.array(tangent))
+    return watch(seen.views if views is None else views, lens, moved, c.cov, is_joint=is_joint)
+
+
+def along(axis, size):
+    return size * np.eye(6)[AXES.index(axis)]
+
+
+def test_the_truth_is_unchanged(seen) -> None:
+    drift = judge(seen, is_joint=True)
+    assert drift.state == "unchanged"
+    assert all(abs(axis.change) < 2 * axis.sigma for axis in drift.axes)
+    tangent = difference(drift.T_best, seen.truth.T_cam_lidar)
+    assert np.degrees(np.linalg.norm(tangent[3:])) < 0.4
+    assert np.linalg.norm(tangent[:3]) < 0.025
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+@pytest.mark.parametrize(
+    ("axis", "size"),
+    [
+        ("rotation_x", np.radians(1.0)),
+        ("rotation_y", np.radians(0.6)),
+        ("rotation_z", np.radians(1.4)),
+        ("translation_x", 0.05),
+        ("translation_y", 0.05),
+        ("translation_z", 0.10),
+    ],
+)
+def test_one_changed_axis_is_seen_with_its_size(seen, axis, size, sign) -> None:
+    drift = judge(seen, along(axis, sign * size))
+    assert drift.state == "changed"
+    (found,) = [each for each in drift.axes if each.state == "changed"]
+    injected = np.degrees(size) if found.is_rotation else size
+    assert axis in (found.axis, *found.instead)
+    if found.axis == axis:
+        assert found.change == pytest.approx(-sign * injected, abs=3 * found.sigma)
+
+
+def test_the_estimate_follows_a_small_change(seen) -> None:
+    changes = [judge(seen, along("rotation_y", np.radians(d))).axes[4].change for d in (-0.2, 0.0, 0.2)]
+    assert np.diff(changes) == pytest.approx([-0.2, -0.2], abs=0.05)
+
+
+def test_changes_of_two_axes_are_both_seen(seen) -> None:
+    turned = along("rotation_y", np.radians(1.0)) + along("rotation_x", np.radians(1.2))
+    drift = judge(seen, turned, is_joint=True)
+    assert {axis.axis for axis in drift.axes if axis.state == "changed"} >= {"rotation_y"}
+    left = difference(drift.T_best, seen.truth.T_cam_lidar)
+    assert np.degrees(np.linalg.norm(left[3:])) < 0.5
+
+
+@pytest.mark.parametrize("size_deg", [4.0, 8.0, -15.0])
+def test_a_change_beyond_the_range_is_never_an_all_clear(seen, size_deg) -> None:
+    assert judge(seen, along("rotation_y", np.radians(size_deg))).state != "unchanged"
+
+
+def of_images(seen, change):
+    """Replace the images of the views."""
+    focal_px = seen.rig.cameras["cam"].to_intrinsics().fx_px
+    return [
+        replace(view, field=build_edge_field(change(capture.images[0].grey), focal_px, None))
+        for view, capture in zip(seen.views, seen.captures, strict=True)
+    ]
+
+
+NOISE = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda grey: np.full_like(grey, 90),
+        lambda grey: (grey // 255 + NOISE.integers(0, 9, grey.shape)).astype(np.uint8),
+        lambda grey: np.ascontiguousarray(grey[:, ::-1]),
+        lambda grey: np.ascontiguousarray(grey[::-1, ::-1]),
+    ],
+    ids=["even", "dark", "mirrored", "upside down"],
+)
+def test_images_without_the_scene_s_edges_cannot_tell(seen, change) -> None:
+    drift = judge(seen, views=of_images(seen, change))
+    assert {axis.state for axis in drift.axes} == {"unknown"}
+
+
+def test_one_capture_claims_no_more_than_all(seen) -> None:
+    alone, all_of_them = judge(seen, views=seen.views[:1]), judge(seen)
+    assert alone.state != "changed"
+    for one, many in zip(alone.axes, all_of_them.axes, strict=True):
+        assert one.state == "unknown" or one.smallest > 0.9 * many.smallest
+
+
+def test_too_few_edges_cannot_tell(seen) -> None:
+    view = seen.views[0]
+    edges = view.edges
+    few = replace(edges, points=edges.points[:9], weight=edges.weight[:9], is_level=edges.is_level[:9])
+    for views in ([], [replace(view, edges=few)]):
+        drift = judge(seen, views=views)
+        assert drift.state == "unknown" and drift.findings[0].code == "scene.few_edges"
+
+
+def test_a_side_without_edges_is_named(seen) -> None:
+    lens = seen.rig.cameras["cam"].to_intrinsics()
+    T = seen.truth.T_cam_lidar
+    views = []
+    for view in seen.views:
+        right = (view.edges.points @ T[0, :3] + T[0, 3]) > 0
+        kept = replace(
+            view.edges,
+            points=view.edges.points[right],
+            weight=view.edges.weight[right],
+            is_level=view.edges.is_level[right],
+        )
+        views.append(replace(view, edges=kept))
+    assert Alignment(views, lens, T).weight_of_parts[:3].sum() == 0
+    found = judge(seen, views=views).findings
+    assert "left" in [f.subject for f in found if f.code == "scene.side_without_edges"]
