@@ -14,6 +14,7 @@
     scripts/bench.py offline     a bag of VLP-16 and 1280x720 at 30 Hz, of --seconds, collected from
     scripts/bench.py usable      are captures that are taken usable? live sessions, --record, recordings
     scripts/bench.py uncertainty  the joint estimate: errors against their bound, truth of its claim
+    scripts/bench.py scene       extrinsics checked without a board, on recordings by others
     scripts/bench.py speed       detection, Algorithm 1, the command line
 
 Simulated boards are kept, as long as neither simulator nor detectors change; random choices are seeded. Run
@@ -39,6 +40,7 @@ PARTS = {
     "live": 0,
     "offline": 0,
     "usable": 20,
+    "scene": 0,
     "speed": 0,
 }
 
@@ -96,6 +98,8 @@ def main() -> None:
         bench(seeds, arguments.captures or 5, arguments.only, arguments.first_seed)
     elif arguments.part == "faults":
         bench(arguments.seeds or PARTS["faults"], n_sessions=arguments.scans)
+    elif arguments.part == "scene":
+        bench(min(arguments.splits, 2), arguments.only)
     elif arguments.part == "corruptions":
         bench(arguments.only)
     elif arguments.part == "live":

@@ -99,7 +99,7 @@ def _print_screen(checks: "list[Check]") -> None:
         console.print(_screen(lines))
     # Rich fills wrapped lines up with blanks.
     for line in capture.get().splitlines():
-        show.say(line.rstrip())
+        click.echo(line.rstrip())
 
 
 @dataclass(frozen=True)

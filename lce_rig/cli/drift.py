@@ -29,9 +29,15 @@ if TYPE_CHECKING:
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Write images into this folder."
 )
+@click.option("--ignore-board", is_flag=True, help="Leave out edges at the board, where an image shows one.")
 @json_option
 def drift(
-    recording: Path, result: Path | None, rig_name: str | None, output: Path | None, as_json: bool
+    recording: Path,
+    result: Path | None,
+    rig_name: str | None,
+    output: Path | None,
+    ignore_board: bool,
+    as_json: bool,
 ) -> None:
     """Check on RECORDING (default: session/), without a board, whether extrinsics still hold.
 
@@ -48,7 +54,7 @@ def drift(
     saved = None if result is None else read_result(result)
     rig = None if rig_name is None else load_rig(rig_name)
     with show.progress_bar("reading") as progress:
-        report = watch_drift(recording, saved, rig=rig, progress=progress)
+        report = watch_drift(recording, saved, rig=rig, ignore_board=ignore_board, progress=progress)
     files = [] if output is None else report.write(output)
     if as_json:
         pairs = [pair.document() for pair in report.pairs]

@@ -93,9 +93,11 @@ def cli(debug: bool) -> None:
 
 
 def _report(error: LceRigError) -> int:
-    click.secho(f"error: {error.what}", fg="red", err=True)
+    from lce_rig.cli import show
+
+    click.secho(show.wrapped(f"error: {error.what}", sys.stderr), fg="red", err=True)
     for line in error.hint.splitlines():
-        click.echo(f"  {line}", err=True)
+        show.note(f"  {line}")
     return error.exit_code
 
 

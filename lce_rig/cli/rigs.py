@@ -72,36 +72,29 @@ def show_profile(rig_name: str, as_json: bool, as_yaml: bool) -> None:
     elif as_yaml:
         click.echo(dump_rig(rig), nl=False)
     else:
-        for table in (_sensor_table(rig), _reconstruction_table(rig), _board_table(rig), _limit_table(rig)):
+        for table in (*_sensor_tables(rig), _reconstruction_table(rig), _board_table(rig), _limit_table(rig)):
             if table.row_count:
                 screen.print_table(table)
         _print_warnings(rig)
 
 
-def _sensor_table(rig: "Rig") -> Any:
-
-    table = screen.plain_table(
-        f"{rig.name}: {rig.description}", "sensor", "model", "frame", "optics", "topic", "timestamps"
-    )
+def _sensor_tables(rig: "Rig") -> tuple[Any, Any]:
+    """List the sensors, then where their data come from; side by side they are wider than a terminal."""
+    sensors = screen.plain_table(f"{rig.name}: {rig.description}", "sensor", "model", "frame", "optics")
+    sources = screen.plain_table("", "sensor", "topic", "timestamps")
     for name, lidar in rig.lidars.items():
-        optics = f"{lidar.min_range_m:g}-{lidar.max_range_m:g} m"
-        table.add_row(name, lidar.model, lidar.frame, optics, lidar.topic or "-", _stamps(lidar.timestamps))
+        sensors.add_row(name, lidar.model, lidar.frame, f"{lidar.min_range_m:g}-{lidar.max_range_m:g} m")
+        sources.add_row(name, lidar.topic or "-", _stamps(lidar.timestamps))
     for name, camera in rig.cameras.items():
         given, (width, height) = camera.intrinsics, camera.resolution_px
         optics = f"{width}x{height}, f {given.fx_px:.1f} {given.fy_px:.1f} px, {given.model}"
+        sensors.add_row(name, camera.model, camera.optical_frame, optics)
         for channel, settings in camera.channels.items():
-            row = (
-                camera.model,
-                camera.optical_frame,
-                optics,
-                settings.topic or "-",
-                _stamps(settings.timestamps),
-            )
-            table.add_row(f"{name}/{channel}", *row)
-    for column in table.columns:
+            sources.add_row(f"{name}/{channel}", settings.topic or "-", _stamps(settings.timestamps))
+    for column in (*sensors.columns, *sources.columns):
         # A truncated topic or frame is unusable.
         column.overflow = "fold"
-    return table
+    return sensors, sources
 
 
 def _stamps(settings: Any) -> str:

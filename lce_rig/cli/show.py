@@ -1,7 +1,9 @@
 """Print to a terminal: tables, progress bars, notes. Results go to stdout, all else to stderr."""
 
 import json
+import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -11,16 +13,32 @@ import click
 Progress = Callable[[int, int], None]
 COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 """Colour of each verdict."""
+_MOST_UNBROKEN = 24
 
 
 def note(text: str) -> None:
     """Print a line that is not the result, on stderr."""
-    click.echo(text, err=True)
+    click.echo(wrapped(text, sys.stderr), err=True)
 
 
 def say(text: str) -> None:
     """Print a line of the result on stdout."""
-    click.echo(text)
+    click.echo(wrapped(text, sys.stdout))
+
+
+def wrapped(text: str, stream: Any) -> str:
+    """Break lines at words to the width of the terminal that gets them, indented; files get them whole."""
+    if not stream.isatty():
+        return text
+    width = shutil.get_terminal_size().columns
+
+    def fill(line: str) -> str:
+        indent = " " * min(len(line) - len(line.lstrip(" ")) + 2, width // 2)
+        return textwrap.fill(
+            line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+        )
+
+    return "\n".join(map(fill, text.split("\n")))
 
 
 def counted(n: int, noun: str) -> str:
@@ -30,7 +48,7 @@ def counted(n: int, noun: str) -> str:
 
 def warn(text: str) -> None:
     """Print a warning on stderr."""
-    click.secho(f"warning: {text}", fg="yellow", err=True)
+    click.secho(wrapped(f"warning: {text}", sys.stderr), fg="yellow", err=True)
 
 
 def print_json(document: Any) -> None:
@@ -58,6 +76,9 @@ def print_table(table: Any) -> None:
     """Print a rich table on stdout, at full width if stdout is not a terminal."""
     from rich.console import Console
 
+    for column in table.columns:
+        # Where space is short, sentences wrap, not names and figures.
+        column.no_wrap = max((len(str(cell)) for cell in column.cells), default=0) <= _MOST_UNBROKEN
     Console(width=None if sys.stdout.isatty() else 160).print(table)
 
 

@@ -123,6 +123,7 @@ class BoardFinder:
             region=region,
             last=last,
             max_reprojection_px=limits.max_reprojection_px,
+            min_square_px=limits.min_square_px,
             is_thorough=is_thorough,
         )
 

@@ -227,6 +227,7 @@ def _explain(item: CaptureCandidates, pairs: _Pairs, rows: NDArray[np.intp], R: 
     best = int(np.argmin((angle / NORMAL_TOLERANCE_RAD) ** 2 + (distance / CENTRE_TOLERANCE_M) ** 2))
     figures = {
         "n_candidates": len(item.lidar),
+        "candidate": int(pairs.candidate[rows[best]]),
         "distance_m": float(distance[best]),
         "rotation_deg": float(np.degrees(angle[best])),
     }

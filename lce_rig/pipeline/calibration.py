@@ -14,7 +14,7 @@ from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import invert, sigma_sizes, tangent_sizes
-from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal
+from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, OtherCamera, Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.extrinsics import (
@@ -451,12 +451,25 @@ def _compared(calibration: Calibration, reference: Reference | None) -> Calibrat
 
 def refusals_of(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refusal]:
     """State why captures of a pair are unusable: a sensor found no board, or both sensors disagree."""
+    return match_sensors(rig, detections, pair)[0]
+
+
+def match_sensors(
+    rig: Rig, detections: Detections, pair: Pair
+) -> tuple[dict[str, Refusal], dict[str, LidarBoard]]:
+    """Choose the LiDAR's candidates that agree with the images.
+
+    Returns:
+        As `refusals_of`; and capture -> the candidate that is the board, where three captures agree at least.
+    """
+    chosen: dict[str, LidarBoard] = {}
     candidates, refused = _candidates(detections, pair)
     if len(candidates) >= 3:
         consensus = find_consensus(candidates, rig.board.to_board())
         nowhere = Refusal("pair.no_agreement", figures={"n_captures": len(candidates)})
         refused |= consensus.refused if consensus else {item.capture: nowhere for item in candidates}
-    return dict(sorted(refused.items()))
+        chosen = {each.capture: each.lidar for each in consensus.observations} if consensus else {}
+    return dict(sorted(refused.items())), chosen
 
 
 def clocks_of(rig: Rig, camera: str, lidar: str) -> Clocks:

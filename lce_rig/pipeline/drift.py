@@ -2,15 +2,19 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError, SourceError
-from lce_rig.core.results import Calibration
+from lce_rig.core.geometry import transform
+from lce_rig.core.results import Calibration, ImageBoard, Refusal
+from lce_rig.detect.events.figures import outline_px
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.export.result import SavedResult, read_result
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import RESULT, result_parts
@@ -28,6 +32,7 @@ from lce_rig.words import as_json
 
 MAX_CAPTURES = 60
 """More captures add time and memory but, of one place, no information: they are thinned out evenly."""
+_BOARD_MARGIN_RAD = 0.04  # Extrinsics may be off by as much.
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +106,7 @@ def drift(
     result: SavedResult | None = None,
     *,
     rig: Rig | None = None,
+    ignore_board: bool = False,
     progress: Progress = silent,
 ) -> DriftReport:
     """Compare the extrinsics of a result with the scene of a session or of a recording.
@@ -109,6 +115,7 @@ def drift(
         source: a session, or a recording of pairs of images and scans.
         result: the deployed extrinsics; None for the session's own result.
         rig: the profile of a recording; a session has its own.
+        ignore_board: leave out the edges at the board of a session, where its images show one.
         progress: called with (done, total) captures.
 
     Raises:
@@ -131,12 +138,17 @@ def drift(
             raise SourceError(
                 f"camera {calibration.camera} has no channel of frames", "`drift` does not use events yet."
             )
-        pairs.append(_watch_pair(rig, session, source, calibration, progress))
+        pairs.append(_watch_pair(rig, session, source, calibration, ignore_board, progress))
     return DriftReport(rig, tuple(pairs))
 
 
 def _watch_pair(
-    rig: Rig, session: Session | None, source: Path, calibration: Calibration, progress: Progress
+    rig: Rig,
+    session: Session | None,
+    source: Path,
+    calibration: Calibration,
+    ignore_board: bool,
+    progress: Progress,
 ) -> PairDrift:
     lens = rig.cameras[calibration.camera].to_intrinsics()
     views: list[SceneView] = []
@@ -148,6 +160,8 @@ def _watch_pair(
     )
     for name, image, scan in samples:
         view = build_view(rig, calibration, name, image, scan)
+        if ignore_board:
+            view = without_board(view, BoardFinder(rig).image(image), rig, calibration)
         views.append(view)
         if example is None or len(view.edges) > len(example[2].edges):
             example = name, image, view
@@ -158,8 +172,22 @@ def build_view(rig: Rig, calibration: Calibration, name: str, image: Image, scan
     """Find the edges of one capture's scan and image."""
     lidar, lens = rig.lidars[calibration.lidar], rig.cameras[calibration.camera].to_intrinsics()
     edges = find_depth_edges(scan, Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad))
-    step_rad = edges.ring_step_rad if edges.is_level.any() else None
-    return SceneView(name, edges, build_edge_field(image.grey, lens.fx_px, step_rad))
+    return SceneView(name, edges, build_edge_field(image.grey, lens.fx_px))
+
+
+def without_board(
+    view: SceneView, found: ImageBoard | Refusal, rig: Rig, calibration: Calibration
+) -> SceneView:
+    """Leave out the edges at and near the board, if the image shows one."""
+    if isinstance(found, Refusal):
+        return view
+    lens = rig.cameras[calibration.camera].to_intrinsics()
+    outline = outline_px(found.T_cam_board, rig.board.to_board(), lens)
+    hull = cv2.convexHull(outline[np.isfinite(outline).all(axis=1)].astype(np.float32))
+    pixels, _ = lens.project(transform(calibration.T_cam_lidar, view.edges.points))
+    margin_px = _BOARD_MARGIN_RAD * lens.fx_px
+    is_apart = [cv2.pointPolygonTest(hull, pixel, True) < -margin_px for pixel in pixels.tolist()]
+    return replace(view, edges=view.edges.select(np.array(is_apart, dtype=bool)))
 
 
 def _session_samples(

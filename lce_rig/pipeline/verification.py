@@ -6,11 +6,11 @@ from functools import partial
 from pathlib import Path
 
 from lce_rig.core.errors import SessionError
-from lce_rig.core.results import Calibration, Refusal
-from lce_rig.detect.detection import Detections, Pair
+from lce_rig.core.results import Calibration, LidarBoard, Refusal
+from lce_rig.detect.detection import Detections, LidarDetection, Pair
 from lce_rig.detect.events.search import EventImage
 from lce_rig.export.result import SavedResult, read_result
-from lce_rig.pipeline.calibration import clocks_of
+from lce_rig.pipeline.calibration import clocks_of, match_sensors
 from lce_rig.pipeline.detect_session import Progress, detect, event_channels, event_picture, silent
 from lce_rig.pipeline.result_files import (
     OVERLAYS,
@@ -208,7 +208,10 @@ def write_debug_images(
 
     base = folder or session.own(DEBUG)
     jobs = [(pair, name) for pair in detections.pairs for name in detections.captures(pair)]
+    matches = {pair: match_sensors(session.rig, detections, pair) for pair in detections.pairs}
     for done, (pair, name) in enumerate(jobs, start=1):
+        refused, chosen = matches[pair]
+        mismatch = refused.get(name)
         capture, (image, lidar) = session.capture(name), detections.of(pair, name)
         view = _view(session, pair.camera, pair.channel, event_image, capture)
         try:
@@ -223,7 +226,10 @@ def write_debug_images(
             lidar,
             board=session.rig.board.to_board(),
             intrinsics=session.rig.cameras[pair.camera].to_intrinsics(),
+            limits=session.rig.quality,
             title=f"{pair}  {name}",
+            chosen=_index_of(chosen.get(name), lidar),
+            mismatch=mismatch if mismatch is not None and mismatch.stage == "pair" else None,
             events=None if view is None else view.events,
         )
         own = base if len(detections.pairs) == 1 else base / pair.folder_name
@@ -232,6 +238,10 @@ def write_debug_images(
         write_picture(own / f"{name}.png", picture)
         progress(done, len(jobs))
     return base
+
+
+def _index_of(chosen: LidarBoard | None, lidar: LidarDetection) -> int:
+    return next((k for k, each in enumerate(lidar) if each is chosen), 0) if isinstance(lidar, list) else 0
 
 
 def _view(

@@ -49,7 +49,6 @@ class Alignment:
         of_view = np.repeat(np.arange(len(views)), [len(view.edges) for view in views])
         self._points, self.n_captures = points[near], len(views)
         self._weight = np.concatenate([view.edges.weight for view in views])[near]
-        self._is_level = np.concatenate([view.edges.is_level for view in views])[near]
         self._fields = [view.field for view in views]
         self._of_view = of_view[near]
         self._slices = [
@@ -84,7 +83,7 @@ class Alignment:
         pixels, _ = self._intrinsics.project(transform(T, self._points))
         values = np.empty(len(self._points))
         for field, chosen in zip(self._fields, self._slices, strict=True):
-            values[chosen] = field.sample(pixels[chosen], self._is_level[chosen])
+            values[chosen] = field.sample(pixels[chosen])
         values *= self._weight / self.n_captures
         by_capture = np.bincount(self._of_view, values, self.n_captures)
         return self._by_part(values), np.asarray(by_capture, dtype=np.float64)

@@ -1,6 +1,7 @@
-"""A live collection in a terminal: one screen of 80x24, or plain lines for scripts and logs."""
+"""A live collection in a terminal: one screen, of 80x24 or larger, or plain lines for scripts and logs."""
 
 import sys
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import pairwise
@@ -35,12 +36,13 @@ def draw_outlines(
     """
     # A character is about twice as high as wide: its dots are square.
     columns = min(size[0] - 2, round(2 * (size[1] - 2) * picture_px[0] / picture_px[1]))
-    dots = np.zeros((4 * (size[1] - 2), 2 * columns), dtype=bool)
+    rows = min(size[1] - 2, max(round(columns * picture_px[1] / picture_px[0] / 2), 1))
+    dots = np.zeros((4 * rows, 2 * columns), dtype=bool)
     scale = np.array(dots.shape[::-1]) / np.array(picture_px)
-    for polygon, stride in ((solid_px, 1), (dotted_px, _STEPS // 12)):
+    for polygon, stride in ((solid_px, 1), (dotted_px, _STEPS // max(12, 2 * rows))):
         if polygon is not None:
             _draw(dots, polygon * scale, stride)
-    bits = dots.reshape(size[1] - 2, 4, columns, 2).transpose(0, 2, 1, 3) * _BITS
+    bits = dots.reshape(rows, 4, columns, 2).transpose(0, 2, 1, 3) * _BITS
     lines = ["".join(chr(0x2800 + int(code)) for code in row) for row in bits.sum(axis=(2, 3))]
     return [f"┌{'─' * columns}┐", *(f"│{line}│" for line in lines), f"└{'─' * columns}┘"]
 
@@ -67,10 +69,11 @@ _STYLES: dict[Phase, str] = {
     "ended": "white on grey30",
 }
 _BELLS = {"captured": 1, "taken_back": 1, "refused": 2, "enough": 3, "lost": 3, "tick": 0}
-_HEIGHT = 24
-_LOG_LINES, _NOTE_LINES, _DRAWING_SIZE = 3, 2, (40, 9)
-# Two lines of 80 characters, broken between words.
-_LONGEST_NOTE = 150
+_HEIGHT, _WIDTH = 24, 80
+# Bars and figures; the drawing stands beside them.
+_SIDE_WIDTH = 40
+# A message may take so many lines; none of lce-rig's is longer at 80 columns.
+_MESSAGE_LINES = 4
 # Written small in the headline, too: 8 M would be something else.
 _UNITS = ("m", "cm", "mm", "deg", "s", "cm/s")
 _PLAIN_EVERY_S = 3.0
@@ -164,18 +167,27 @@ class ScreenView:
                 for _ in range(_BELLS[cue.sound]):
                     self._console.bell()
         self._n_cued = state.cues[-1].number if state.cues else 0
-        height = self._console.height
-        screen = render(state, has_keys=self._has_keys, links=self._links, height=height)
+        height, width = self._console.height, self._console.width
+        screen = render(state, has_keys=self._has_keys, links=self._links, height=height, width=width)
         self._live.update(screen, refresh=True)
 
 
 def render(
-    state: LiveState, *, has_keys: bool = True, links: tuple[str, ...] = (), height: int = _HEIGHT
+    state: LiveState,
+    *,
+    has_keys: bool = True,
+    links: tuple[str, ...] = (),
+    height: int = _HEIGHT,
+    width: int = _WIDTH,
 ) -> Any:
-    """Lay a state out for a terminal of 80x24 or lower; of the page's links the likeliest is shown."""
-    from rich.columns import Columns
+    """Lay a state out for a terminal; of the page's links the likeliest is shown.
+
+    Sentences wrap. What is left over goes to messages and to a larger drawing; where lines are short, the
+    banner's edges and then the coverage bars make way.
+    """
     from rich.console import Group
     from rich.padding import Padding
+    from rich.table import Table
     from rich.text import Text
 
     wanted = f" of {state.n_wanted}" if state.n_wanted is not None else ""
@@ -192,98 +204,134 @@ def render(
     headline = " ".join(word if word.strip(",") in _UNITS else word.upper() for word in words)
     if state.hold_s is not None:
         headline += f"   {state.hold_s:.1f} s"
-    n_lacking = max(_HEIGHT - height, 0)
-    edge = 0 if n_lacking else 1
-    banner = Padding(Text(headline, style="bold", justify="center"), (edge, 2), style=_STYLES[state.phase])
-    detail = Text(state.detail or " ", overflow="ellipsis", no_wrap=True, style="italic")
-    parts = [title, banner, detail, _stream_table(state.streams)]
-    drawing = _drawing(state, n_lacking)
-    side = _progress(state)
-    parts.append(Columns([side, drawing], padding=(0, 2)) if drawing is not None else side)
-    # A note that is alone may take the lines of all, and in a higher terminal each may take two.
-    may_wrap = (len(state.notes) == 1 and not n_lacking) or height >= _HEIGHT + _NOTE_LINES
-    parts += [
-        Text(f"! {note}"[:_LONGEST_NOTE], style="yellow", no_wrap=not may_wrap, overflow="ellipsis")
-        for note in state.notes[:_NOTE_LINES]
-    ]
-    n_lines = max(_LOG_LINES - len(links[:1]) - n_lacking // 4, 1)
-    parts += [Text(line, style="dim", no_wrap=True, overflow="ellipsis") for line in state.log[-n_lines:]]
+    banner = _wrap(headline, width - 4)
+    detail = _wrap(state.detail or " ", width)
+    streams, n_streams = _stream_table(state.streams, width)
     # A link that is cut is none: it wraps where it is too long.
-    parts += [Text(f"page: {link}", overflow="fold") for link in links[:1]]
-    if has_keys:
-        parts.append(Text(HELP, style="bold dim"))
-    return Group(*parts)
+    page = [line for link in links[:1] for line in _folded(f"page: {link}", width)]
+    keys = [HELP] if has_keys else []
+    newest = _wrap(state.log[-1], width) if state.log else []
+    notes = [_wrap(f"! {note}", width) for note in state.notes]
+
+    n_fixed = 1 + len(banner) + len(detail) + n_streams + len(page) + len(keys)
+    side = _progress(state)
+    n_room = height - n_fixed - len(newest) - sum(map(len, notes[:1]))
+    edge = 1 if n_room - len(side) >= 2 else 0
+    if n_room < len(side):
+        side = side[len(_BARS) :]
+    n_room = height - n_fixed - len(side) - 2 * edge
+    messages = _fill(notes, state.log, n_room, width)
+    n_room -= len(messages)
+    drawing = _drawing(state, (width - _SIDE_WIDTH - 2, len(side) + n_room))
+    said = Text("\n".join(banner), style="bold", justify="center")
+    parts: list[Any] = [title, Padding(said, (edge, 2), style=_STYLES[state.phase])]
+    parts += [Text("\n".join(detail), style="italic"), streams]
+    beside = Table.grid(padding=(0, 1, 0, 0))
+    beside.add_column(width=min(_SIDE_WIDTH, width))
+    beside.add_row(Text("\n").join(side), *([] if drawing is None or width < _WIDTH else [drawing]))
+    parts += [beside, *messages, *map(Text, page)]
+    return Group(*parts, *(Text(line, style="bold dim") for line in keys))
 
 
-def _stream_table(streams: tuple[StreamState, ...]) -> Any:
+def _wrap(text: str, width: int) -> list[str]:
+    """Break a sentence between words into at most `_MESSAGE_LINES` lines."""
+    return textwrap.wrap(text, max(width, 10), max_lines=_MESSAGE_LINES, placeholder=" …") or [" "]
+
+
+def _folded(text: str, width: int) -> list[str]:
+    return [text[k : k + width] for k in range(0, len(text), width)]
+
+
+def _fill(notes: list[list[str]], log: tuple[str, ...], n_lines: int, width: int) -> list[Any]:
+    """Choose whole notes and messages for some lines: the newest message, notes, then older messages."""
+    from rich.text import Text
+
+    newest = _wrap(log[-1], width) if log else []
+    # A drawing that is larger than the bars beside it is worth as much as what happened long ago.
+    n_left = n_lines - len(newest)
+    warnings: list[str] = []
+    for note in notes:
+        if len(note) > n_left:
+            break
+        warnings, n_left = warnings + note, n_left - len(note)
+    older: list[str] = []
+    n_old = n_left if n_lines <= _HEIGHT // 2 else n_left // 3
+    for message in reversed(log[:-1]):
+        lines = _wrap(message, width)
+        if len(older) + len(lines) > n_old:
+            break
+        older = lines + older
+    said = [Text(line, style="yellow") for line in warnings]
+    return said + [Text(line, style="dim") for line in (*older, *newest)]
+
+
+def _stream_table(streams: tuple[StreamState, ...], width: int) -> tuple[Any, int]:
+    """Lay the streams out, reasons wrapped; also count the lines."""
     from rich.table import Table
     from rich.text import Text
 
     table = Table(box=None, show_header=False, padding=(0, 1, 0, 0), pad_edge=False)
+    widths = [14, 7, 9] if any(stream.n_lost for stream in streams) else [14, 7]
     table.add_column(width=14, no_wrap=True)
     table.add_column(width=7, justify="right", no_wrap=True)
-    table.add_column(width=9, no_wrap=True)
-    table.add_column(no_wrap=True, overflow="ellipsis")
+    if len(widths) > 2:
+        table.add_column(width=9, no_wrap=True)
+    left = max(width - sum(widths) - len(widths), 20)
+    table.add_column(width=left)
+    n_lines = 0
     for stream in streams:
         is_bad = stream.sees_board is False or bool(stream.reason)
         mark, style = (
             ("x", "bold red") if is_bad else ("o", "bold green") if stream.sees_board else ("-", "dim")
         )
-        lost = f"{stream.n_lost} lost" if stream.n_lost else ""
-        table.add_row(
-            Text(f"{mark} {stream.name}", style=style),
-            f"{stream.rate_hz:.1f}/s" if stream.rate_hz < 1000 else f"{stream.rate_hz / 1e6:.2f}M/s",
-            Text(lost, style="red"),
-            Text(stream.reason or stream.figures, style="red" if is_bad else ""),
+        rate = f"{stream.rate_hz:.1f}/s" if stream.rate_hz < 1000 else f"{stream.rate_hz / 1e6:.2f}M/s"
+        lost = (
+            [Text(f"{stream.n_lost} lost" if stream.n_lost else "", style="red")] if len(widths) > 2 else []
         )
-    return table
+        said = _wrap(stream.reason or stream.figures or " ", left)
+        n_lines += len(said)
+        reason = Text("\n".join(said), style="red" if is_bad else "")
+        table.add_row(Text(f"{mark} {stream.name}", style=style), rate, *lost, reason)
+    return table, n_lines
 
 
-def _progress(state: LiveState) -> Any:
-    """Show coverage as bars, and the predicted standard deviations against their targets."""
+def _progress(state: LiveState) -> list[Any]:
+    """Show coverage as bars, predicted standard deviations against their targets, and what is left to do."""
     from rich.text import Text
 
-    lines = Text()
+    lines: list[Any] = []
     for name in _BARS:
         share = 0.0 if state.coverage is None else float(getattr(state.coverage, name))
         filled = round(14 * share)
         style = "green" if share >= 0.99 else "yellow"
-        lines.append(f"{name.replace('_', '-'):<11}")
-        lines.append("█" * filled, style=style)
-        lines.append("░" * (14 - filled) + f" {100 * share:3.0f} %\n", style="dim")
+        empty = "░" * (14 - filled) + f" {100 * share:3.0f} %"
+        lines.append(Text.assemble(f"{name.replace('_', '-'):<11}", ("█" * filled, style), (empty, "dim")))
     for name, sigma, target, unit in (
         ("rotation", state.sigma_deg, state.target_deg, "deg"),
         ("position", state.sigma_mm, state.target_mm, "mm"),
     ):
         is_known = np.isfinite(sigma)
         shown = f"{sigma:.2g}" if sigma < 10 else f"{sigma:.0f}"
-        lines.append(f"{name:<11}")
-        lines.append(
-            f"+-{shown} {unit}" if is_known else "-",
-            style="green" if is_known and sigma <= target else "yellow",
-        )
-        lines.append(f" (target {target:g})\n")
-    lines.append(state.goes_on)
-    lines.rstrip()
+        figure = f"+-{shown} {unit}" if is_known else "-"
+        style = "green" if is_known and sigma <= target else "yellow"
+        lines.append(Text.assemble(f"{name:<11}", (figure, style), f" (target {target:g})"))
+    if state.goes_on:
+        lines += [Text(line) for line in _wrap(state.goes_on, _SIDE_WIDTH)]
     return lines
 
 
-def _drawing(state: LiveState, n_lacking: int) -> Any:
-    """Draw where the board is (dotted) and where it should be, as small as it gets."""
+def _drawing(state: LiveState, most: tuple[int, int]) -> Any:
+    """Draw where the board is (dotted) and where it should be, with columns and lines at most."""
     from rich.text import Text
 
     drawing = state.drawing
-    if drawing is None:
+    if drawing is None or most[0] < 10 or most[1] < 4:
         return None
     height, width = drawing.pixels.shape[:2]
-    columns, lines = _DRAWING_SIZE
-    # No lower than the bars beside it, whose lines are taken anyway.
-    size = columns, max(lines - n_lacking, 7)
-    rows = draw_outlines((width, height), drawing.wanted_px, drawing.present_px, size)
-    if sum("." in stream.name for stream in state.streams) > 1:
-        # Guidance goes from camera to camera: whose image this is stands in its border.
-        name = f" {drawing.camera} "[: len(rows[0]) - 3]
-        rows[0] = f"┌─{name}{rows[0][2 + len(name) :]}"
+    rows = draw_outlines((width, height), drawing.wanted_px, drawing.present_px, most)
+    # Guidance goes from camera to camera: whose image this is stands in its border.
+    name = f" {drawing.camera} "[: len(rows[0]) - 3]
+    rows[0] = f"┌─{name}{rows[0][2 + len(name) :]}"
     return Text("\n".join(rows), style="green" if drawing.is_there else "", no_wrap=True)
 
 

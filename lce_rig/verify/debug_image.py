@@ -10,8 +10,11 @@ from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.detect.events.figures import outline_px
+from lce_rig.detect.image.corners import find_grid, seen_grid
+from lce_rig.detect.lidar.search import plane_limit_m
+from lce_rig.rig import QualitySettings
 from lce_rig.verify import canvas
-from lce_rig.verify.canvas import BLACK, BLUE, FAINT, INK, MAGENTA, ORANGE, WHITE, Picture
+from lce_rig.verify.canvas import BLACK, BLUE, FAINT, INK, MAGENTA, ORANGE, WHITE, Colour, Picture
 from lce_rig.verify.event_picture import draw_event_key, draw_events
 from lce_rig.verify.overlay import draw_image_board, range_limits
 from lce_rig.words import describe, recommend
@@ -40,7 +43,7 @@ _LIDAR_FIGURES = {
     "distance_m": "distance {:.2f} m",
     "n_rings": "{:.0f} rings",
     "n_points": "{:.0f} points",
-    "thickness_m": "thickness {:.1f} mm",
+    "plane_rms_m": "plane {:.1f} mm rms",
     "width_m": "width {:.0f} mm",
     "height_m": "height {:.0f} mm",
     "edge_rms_m": "edges {:.1f} mm rms",
@@ -55,8 +58,10 @@ def draw_debug(
     *,
     board: Board,
     intrinsics: Intrinsics,
+    limits: QualitySettings,
     title: str,
     chosen: int = 0,
+    mismatch: Refusal | None = None,
     events: Events | None = None,
 ) -> Picture:
     """Draw the camera's image beside three views of the scan, with figures or cause and action below.
@@ -68,28 +73,35 @@ def draw_debug(
         lidar_result: candidates, best first, or why the scan was refused.
         board: the board.
         intrinsics: the camera.
+        limits: of the profile.
         title: one line above.
         chosen: index of the candidate used, which is drawn enlarged.
+        mismatch: why no candidate is the board in the image, if the sensors disagree; the best one is drawn
+            enlarged and in another colour.
         events: the events shortly before an image reconstructed from events, drawn over it below.
 
     Returns:
         (H, 1600, 3) uint8 BGR.
     """
     candidates = [] if isinstance(lidar_result, Refusal) else list(lidar_result)
+    colour = MAGENTA
+    if mismatch is not None:
+        best = mismatch.figures.get("candidate", 0)
+        chosen, colour = best if isinstance(best, int) else 0, ORANGE
     view_px = _PANE_PX // 2
     left = _camera_pane(image, image_result, board, intrinsics, _PANORAMA_PX + view_px)
     points = np.zeros((0, 3)) if scan is None else np.asarray(scan.points, dtype=np.float64)
     limits_m = (0.0, 10.0) if scan is None else range_limits([scan])
     views = np.hstack(
         [
-            _top_view(points, candidates, chosen, board, limits_m, view_px),
-            _board_view(points, candidates, chosen, board, view_px),
+            _top_view(points, candidates, chosen, colour, board, limits_m, view_px),
+            _board_view(points, candidates, chosen, colour, board, view_px),
         ]
     )
-    right = np.vstack([_panorama(points, candidates, chosen, limits_m, _PANE_PX), views])
+    right = np.vstack([_panorama(points, candidates, chosen, colour, limits_m, _PANE_PX), views])
     strip = canvas.panel(2 * _PANE_PX, 34)
     canvas.draw_text(strip, title, 14, 23, 13, INK)
-    reports = [_image_report(image_result), _lidar_report(lidar_result, chosen)]
+    reports = [_image_report(image_result), _lidar_report(lidar_result, chosen, mismatch, limits)]
     above = np.hstack([left, right])
     if image is None or events is None:
         return np.vstack([strip, above, np.hstack(reports)])
@@ -109,7 +121,18 @@ def _camera_pane(
     if isinstance(result, ImageBoard):
         draw_image_board(picture, factor, result, board, intrinsics)
         _draw_axes(picture, factor, result, board)
+    else:
+        _draw_found_corners(picture, factor, image, board)
     return canvas.fitted(picture, _PANE_PX, height_px, BLACK)
+
+
+def _draw_found_corners(picture: Picture, factor: int, image: Image, board: Board) -> None:
+    """Mark the corners found in a refused image, of the whole pattern or a part of it."""
+    whole = find_grid(image.grey, board, is_thorough=False)
+    grid_px = seen_grid(image.grey) if whole is None else whole.grid_px
+    if grid_px is not None:
+        pixels = (grid_px.reshape(-1, 2) + 0.5) * factor - 0.5
+        canvas.draw_discs(picture, pixels, ORANGE, max(1.5, picture.shape[1] / 400), BLACK)
 
 
 def _event_pane(
@@ -151,7 +174,12 @@ def _draw_axes(picture: Picture, factor: int, found: ImageBoard, board: Board) -
 
 
 def _panorama(
-    points: Array, candidates: Sequence[LidarBoard], chosen: int, limits_m: tuple[float, float], width_px: int
+    points: Array,
+    candidates: Sequence[LidarBoard],
+    chosen: int,
+    colour: Colour,
+    limits_m: tuple[float, float],
+    width_px: int,
 ) -> Picture:
     """Unroll the scan: azimuth from +180 deg at the left to -180, elevation from +20 deg to -20."""
     pane = canvas.panel(width_px, _PANORAMA_PX, BLACK)
@@ -169,9 +197,10 @@ def _panorama(
     canvas.draw_discs(pane, place(points[order]), canvas.turbo(ranges_m[order], *limits_m), 0.9)
     for index, found in enumerate(candidates):
         pixels = place(found.points)
-        canvas.draw_discs(pane, pixels, MAGENTA if index == chosen else WHITE, 1.4)
+        own = colour if index == chosen else WHITE
+        canvas.draw_discs(pane, pixels, own, 1.4)
         centre = pixels.mean(axis=0)
-        _draw_number(pane, index, chosen, (float(centre[0]), float(pixels[:, 1].min() - 6)))
+        _draw_number(pane, index, own, (float(centre[0]), float(pixels[:, 1].min() - 6)))
     _label(pane, "LiDAR, unrolled")
     for degrees in (135, 90, 45, 0, -45, -90, -135):
         u = (0.5 - degrees / 360) * (width_px - 1)
@@ -183,6 +212,7 @@ def _top_view(
     points: Array,
     candidates: Sequence[LidarBoard],
     chosen: int,
+    colour: Colour,
     board: Board,
     limits_m: tuple[float, float],
     size_px: int,
@@ -210,9 +240,10 @@ def _top_view(
     canvas.draw_discs(pane, place(near), colours, 0.8)
     for index, found in enumerate(candidates):
         outline = transform(found.T_lidar_board, board.outline())[[0, 1, 2, 3, 0]]
-        canvas.draw_line(pane, place(outline), MAGENTA if index == chosen else WHITE, 2)
+        own = colour if index == chosen else WHITE
+        canvas.draw_line(pane, place(outline), own, 2)
         centre = place(found.points.mean(axis=0)[None])[0]
-        _draw_number(pane, index, chosen, (float(centre[0]) + 12, float(centre[1]) - 8))
+        _draw_number(pane, index, own, (float(centre[0]) + 12, float(centre[1]) - 8))
     middle = np.array([[size_px / 2, size_px / 2]])
     canvas.draw_discs(pane, middle, WHITE, 4, BLACK)
     _label(pane, "from above, x up")
@@ -220,7 +251,12 @@ def _top_view(
 
 
 def _board_view(
-    points: Array, candidates: Sequence[LidarBoard], chosen: int, board: Board, size_px: int
+    points: Array,
+    candidates: Sequence[LidarBoard],
+    chosen: int,
+    colour: Colour,
+    board: Board,
+    size_px: int,
 ) -> Picture:
     """Look at the chosen candidate face on: returns, ring ends and the outline laid over them."""
     pane = canvas.panel(size_px, size_px, BLACK)
@@ -242,14 +278,16 @@ def _board_view(
     around = points[np.linalg.norm(points - centre, axis=1) < np.hypot(board.width_m, board.height_m)]
     canvas.draw_discs(pane, place(around), (110, 110, 110), 1.5)
     canvas.draw_line(pane, place(transform(found.T_lidar_board, board.outline())[[0, 1, 2, 3, 0]]), WHITE, 2)
-    canvas.draw_discs(pane, place(found.points), MAGENTA, 2.0)
-    canvas.draw_diamonds(pane, place(found.edge_points), ORANGE, 4.5)
-    _label(pane, f"candidate {chosen + 1} of {len(candidates)}, face on")
+    canvas.draw_discs(pane, place(found.points), colour, 2.0)
+    if colour == MAGENTA:
+        canvas.draw_diamonds(pane, place(found.edge_points), ORANGE, 4.5)
+    refused = "" if colour == MAGENTA else ", refused"
+    _label(pane, f"candidate {chosen + 1} of {len(candidates)}, face on{refused}")
     return pane
 
 
-def _draw_number(pane: Picture, index: int, chosen: int, at: tuple[float, float]) -> None:
-    canvas.draw_text(pane, f"{index + 1}", at[0], at[1], 12, MAGENTA if index == chosen else WHITE, align=0.5)
+def _draw_number(pane: Picture, index: int, colour: Colour, at: tuple[float, float]) -> None:
+    canvas.draw_text(pane, f"{index + 1}", at[0], at[1], 12, colour, align=0.5)
 
 
 def _label(pane: Picture, text: str) -> None:
@@ -259,23 +297,30 @@ def _label(pane: Picture, text: str) -> None:
 
 def _image_report(result: ImageBoard | Refusal) -> Picture:
     if isinstance(result, Refusal):
-        return _refusal("camera", result)
+        return _refusal("camera: refused", result)
     notes = ["pose ambiguous from the image alone"] if result.is_ambiguous else []
     return _figures("camera: board found", result.figures(), _IMAGE_FIGURES, notes)
 
 
-def _lidar_report(result: Sequence[LidarBoard] | Refusal, chosen: int) -> Picture:
+def _lidar_report(
+    result: Sequence[LidarBoard] | Refusal, chosen: int, mismatch: Refusal | None, limits: QualitySettings
+) -> Picture:
     if isinstance(result, Refusal):
-        return _refusal("LiDAR", result)
+        return _refusal("LiDAR: refused", result)
+    if mismatch is not None:
+        return _refusal("LiDAR: no candidate is the board", mismatch)
     rivals = len(result) - 1
     notes = [f"{rivals} other plate{'s' if rivals > 1 else ''} of the board's size"] if rivals else []
     figures = result[chosen].figures() if chosen < len(result) else {}
+    if figures:
+        limit_m = plane_limit_m(limits.max_thickness_m, figures["range_noise_m"])
+        notes.append(f"plane limit {1000 * limit_m:.1f} mm")
     return _figures("LiDAR: board found", figures, _LIDAR_FIGURES, notes)
 
 
-def _refusal(sensor: str, refusal: Refusal) -> Picture:
+def _refusal(heading: str, refusal: Refusal) -> Picture:
     pane = canvas.panel(_PANE_PX, _REPORT_PX)
-    canvas.draw_text(pane, f"{sensor}: refused", 14, 28, _TEXT_PX + 2, ORANGE)
+    canvas.draw_text(pane, heading, 14, 28, _TEXT_PX + 2, ORANGE)
     width_px = _PANE_PX - 120
     canvas.draw_text(pane, "seen", 14, 58, _TEXT_PX, FAINT)
     below = canvas.draw_paragraph(pane, describe(refusal), 90, 58, width_px, _TEXT_PX)

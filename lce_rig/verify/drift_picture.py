@@ -11,7 +11,7 @@ from lce_rig.scene.alignment import AXES
 from lce_rig.scene.depth_edges import DepthEdges
 from lce_rig.scene.drift import Drift
 from lce_rig.verify import canvas
-from lce_rig.verify.canvas import BLACK, INK, MAGENTA, ORANGE, Picture
+from lce_rig.verify.canvas import BLACK, INK, MAGENTA, Picture
 from lce_rig.words.extrinsics import motion_words
 
 _PAGE_PX = 1600
@@ -49,9 +49,7 @@ def _draw_edges(image: Image, edges: DepthEdges, intrinsics: Intrinsics, T_cam_l
     pixels, _ = intrinsics.project(transform(T_cam_lidar, edges.points))
     is_inside = intrinsics.is_inside(pixels)
     unit = picture.shape[1] / 1000
-    for is_level, colour in ((True, ORANGE), (False, MAGENTA)):
-        chosen = is_inside & (edges.is_level == is_level)
-        canvas.draw_discs(picture, (pixels[chosen] + 0.5) * factor - 0.5, colour, 2.2 * unit, BLACK)
+    canvas.draw_discs(picture, (pixels[is_inside] + 0.5) * factor - 0.5, MAGENTA, 2.2 * unit, BLACK)
     return picture
 
 

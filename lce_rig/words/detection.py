@@ -49,11 +49,14 @@ def _cause(finding: Finding) -> Finding:
 
 
 def _candidates(finding: Finding) -> str:
-    """Best of {n_candidates} candidates: {distance_m}, {rotation_deg} from the predicted pose."""
-    n = finding.figures["n_candidates"]
-    which = "the only candidate" if n == 1 else f"best of {n} candidates"
-    apart = f"{100 * finding.figure('distance_m'):.0f} cm, {finding.figure('rotation_deg'):.0f} deg"
-    return f"{which} in the scan: {apart} from the pose predicted by the image and the other captures"
+    """Best of {n_candidates} candidates: {distance_m}, {rotation_deg} from where the image has the board."""
+    n, distance_m = finding.figures["n_candidates"], finding.figure("distance_m")
+    which = "the only candidate" if n == 1 else f"the best of {n} candidates"
+    apart = f"{distance_m:.1f} m" if distance_m >= 1 else f"{100 * distance_m:.0f} cm"
+    return (
+        f"{which} in the scan is {apart}, {finding.figure('rotation_deg'):.0f} deg from where the image has "
+        "the board"
+    )
 
 
 def _hint_or(otherwise: str) -> Template:
@@ -130,6 +133,11 @@ PHRASES: dict[str, Phrase] = {
         "board cut off by the {side} border: " + _OTHER, "move the board away from the {side} border"
     ),
     "image.part": Phrase(_OTHER, _UNCOVER, {"events": f"{MOVE_SLOWLY}; {_UNCOVER}"}),
+    "image.part_of_small": Phrase(
+        "squares of {square_px:.1f} px are too small (minimum {min_square_px:g} px): "
+        "{n_cols_seen}x{n_rows_seen} of " + _CORNERS + " detected",
+        "come closer, by {closer_share:percent} of the distance or more",
+    ),
     "image.other_board": Phrase(
         _OTHER, "correct board.inner_corners in the profile: one less than squares along each side"
     ),

@@ -7,21 +7,21 @@ from lce_rig.words.rendering import Phrase, figures_apart
 
 
 def _few_captures(finding: Finding) -> str:
-    """About {n_more} more: minimum {n_least} captures."""
-    return f"{_more(finding)}: minimum {finding.figures['n_least']} captures"
+    """About {n_more} more (minimum {n_least} captures)."""
+    return f"{_more(finding)} (minimum {finding.figures['n_least']} captures)"
 
 
 def _rotation_above(finding: Finding) -> str:
-    """About {n_more} more: {rotation_deg} once held-out captures are checked, limit {limit_deg}."""
+    """About {n_more} more (held-out {rotation_deg} > {limit_deg})."""
     stated, limit = figures_apart(finding.figure("rotation_deg"), finding.figure("limit_deg"))
-    return f"{_more(finding)}: held-out {stated} deg, limit {limit}"
+    return f"{_more(finding)} (held-out {stated} > {limit} deg)"
 
 
 def _position_above(finding: Finding) -> str:
-    """About {n_more} more: {position_m} once held-out captures are checked, limit {limit_m}."""
+    """About {n_more} more (held-out {position_m} > {limit_m})."""
     figures = 1000 * finding.figure("position_m"), 1000 * finding.figure("limit_m")
     stated, limit = figures_apart(*figures)
-    return f"{_more(finding)}: held-out {stated} mm, limit {limit}"
+    return f"{_more(finding)} (held-out {stated} > {limit} mm)"
 
 
 def _more(finding: Finding) -> str:

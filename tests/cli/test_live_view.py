@@ -36,14 +36,14 @@ STATE = LiveState(
     target_deg=0.2,
     target_mm=10.0,
     cues=(Cue(1, "captured"), Cue(2, "refused")),
-    log=("01:02 captured 000006 (0.12 s)", "01:04 not captured: " + 20 * "it stands there already "),
-    notes=("boards must stand still: " + 20 * "no clock is tied ", "second", "third"),
+    log=("01:02 captured 000006 (0.12 s)", "01:04 not captured: " + 4 * "it stands there already "),
+    notes=("boards must stand still: " + 6 * "no clock is tied ", "second", "third"),
 )
 
 
 def drawn(state: LiveState, links: tuple[str, ...] = (), width: int = 80, height: int = 24) -> list[str]:
     console = Console(width=width, height=height, file=io.StringIO(), force_terminal=False)
-    console.print(render(state, links=links, height=height))
+    console.print(render(state, links=links, height=height, width=width))
     out = console.file
     assert isinstance(out, io.StringIO)
     return out.getvalue().rstrip("\n").split("\n")
@@ -85,6 +85,34 @@ def test_a_note_that_is_alone_is_told_to_its_end() -> None:
     assert len(drawn(replace(STATE, notes=STATE.notes[:1]))) <= 24, "however long it is"
 
 
+SAID = replace(
+    STATE,
+    detail="cannot be used here: the board at 4.3 m is tilted 62 deg (limit 60 deg), half of it is hidden",
+    streams=(*STREAMS[:2], replace(STREAMS[2], reason=STREAMS[2].reason + " or lower it by 12 cm, slowly")),
+    notes=(
+        "boards must stand still: no sync board ties the cameras' clocks, whatever they are, to the LiDAR's",
+    ),
+    log=(
+        "01:02 captured 000006",
+        "01:09 000007 taken back (lce-rig captures /a/b/of-today --restore 000007)",
+    ),
+    goes_on="about 3 more (held-out 0.19 > 0.18 deg)",
+)
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (100, 30), (120, 40)])
+def test_no_sentence_is_cut_and_a_wide_terminal_has_a_larger_drawing(width: int, height: int) -> None:
+    lines = drawn(SAID, width=width, height=height)
+    assert len(lines) <= height and max(len(line) for line in lines) <= width
+    # Beside each other stand the streams' columns, and the bars and the drawing.
+    words = " ".join(" ".join(lines).split())
+    for sentence in (SAID.detail, *SAID.notes, SAID.log[-1], SAID.goes_on):
+        assert sentence in words
+    assert all(word in words for word in SAID.streams[2].reason.split())
+    drawing = next(line for line in lines if "┌" in line)
+    assert drawing.index("┐") - drawing.index("┌") >= (20 if height == 24 else 0.45 * width)
+
+
 def test_a_small_terminal_shows_the_keys_and_the_last_message_too() -> None:
     lines = drawn(replace(STATE, streams=STREAMS[:3]), width=60, height=20)
     assert len(lines) <= 20 and "q stop" in lines[-1]
@@ -109,7 +137,7 @@ def test_every_phase_has_a_look(phase: str) -> None:
 
 def test_the_bell_rings_once_for_each_cue() -> None:
     class Bells:
-        height = 24
+        height, width = 24, 80
 
         n = 0
 

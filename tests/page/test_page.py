@@ -145,7 +145,7 @@ def test_an_arrow_leads_to_the_place_until_the_board_is_there(preview: Preview, 
 
 def test_the_last_capture_is_taken_back_by_a_tap(preview: Preview, browser: Browser) -> None:
     page = browser.open(preview.urls[0], 390, 844)
-    shown(preview, page, has_text("take_back", "take 000006 back"), last_capture="000006")
+    shown(preview, page, has_text("take_back", "take back\n000006"), last_capture="000006")
     page.tap("take_back")
     deadline_s = time.monotonic() + 10
     while (asked := preview.asked()) is None:
@@ -187,6 +187,28 @@ def test_instructions_are_as_large_as_fits(
         assert text["height"] <= box["height"] + 1
         assert text["width"] <= box["width"] + 1
         assert text["height"] > 0.4 * box["height"] or text["width"] > 0.7 * box["width"]
+
+
+@pytest.mark.parametrize(("width", "height"), [*SIZES, (390, 844), (320, 900)])
+def test_no_word_of_an_instruction_is_broken(
+    preview: Preview, browser: Browser, width: int, height: int
+) -> None:
+    page = browser.open(preview.urls[0], width, height)
+    for words in ("collection has ended", "cam: synchronisation lost", "wait"):
+        shown(preview, page, has_text("headline", words), headline=words, detail="", phase="ended")
+        # Boxes of a word that is broken lie a line apart; a first letter has a box of its own.
+        apart_px = """(() => {
+          const text = document.querySelector('#headline span').firstChild;
+          return [...text.data.matchAll(/\\S+/g)].map((found) => {
+            const word = document.createRange();
+            word.setStart(text, found.index);
+            word.setEnd(text, found.index + found[0].length);
+            const tops = [...word.getClientRects()].map((box) => box.top);
+            return Math.max(...tops) - Math.min(...tops);
+          });
+        })()"""
+        assert max(page.evaluate(apart_px)) < 5
+    assert page.text("camera") == "cam"
 
 
 def test_what_sensors_say_is_text_and_not_markup(preview: Preview, browser: Browser) -> None:

@@ -76,7 +76,7 @@ def of_images(seen, change):
     """Replace the images of the views."""
     focal_px = seen.rig.cameras["cam"].to_intrinsics().fx_px
     return [
-        replace(view, field=build_edge_field(change(capture.images[0].grey), focal_px, None))
+        replace(view, field=build_edge_field(change(capture.images[0].grey), focal_px))
         for view, capture in zip(seen.views, seen.captures, strict=True)
     ]
 
@@ -109,7 +109,7 @@ def test_one_capture_claims_no_more_than_all(seen) -> None:
 def test_too_few_edges_cannot_tell(seen) -> None:
     view = seen.views[0]
     edges = view.edges
-    few = replace(edges, points=edges.points[:9], weight=edges.weight[:9], is_level=edges.is_level[:9])
+    few = edges.select(np.arange(len(edges)) < 9)
     for views in ([], [replace(view, edges=few)]):
         drift = judge(seen, views=views)
         assert drift.state == "unknown" and drift.findings[0].code == "scene.few_edges"
@@ -121,13 +121,7 @@ def test_a_side_without_edges_is_named(seen) -> None:
     views = []
     for view in seen.views:
         right = (view.edges.points @ T[0, :3] + T[0, 3]) > 0
-        kept = replace(
-            view.edges,
-            points=view.edges.points[right],
-            weight=view.edges.weight[right],
-            is_level=view.edges.is_level[right],
-        )
-        views.append(replace(view, edges=kept))
+        views.append(replace(view, edges=view.edges.select(right)))
     assert Alignment(views, lens, T).weight_of_parts[:3].sum() == 0
     found = judge(seen, views=views).findings
     assert "left" in [f.subject for f in found if f.code == "scene.side_without_edges"]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lce_rig.core.data import Events, Image
 from lce_rig.core.errors import SourceError
 from lce_rig.core.results import Refusal
+from lce_rig.rig import QualitySettings
 from lce_rig.verify.animation import write_gif, write_video
 from lce_rig.verify.debug_image import draw_debug
 from lce_rig.verify.event_picture import BRIGHTER, DARKER, ImageWithEvents, draw_events
@@ -98,6 +99,7 @@ def test_a_debug_picture_has_the_events_below_the_reconstruction(is_found: bool)
         [lidar_board(wall())],
         board=BOARD,
         intrinsics=FOLDING,
+        limits=QualitySettings(),
         title="capture 000000",
         events=events_at([450] * 30, list(range(30)), [9] * 30, [True] * 30),
     )

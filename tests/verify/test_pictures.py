@@ -13,6 +13,7 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.rig import QualitySettings
 from lce_rig.verify.canvas import MAGENTA, ORANGE, PANEL, Picture, round_ticks, text_width_px, wrapped
 from lce_rig.verify.debug_image import draw_debug
 from lce_rig.verify.overlay import draw_overlay
@@ -24,6 +25,7 @@ from lce_rig.verify.overlay_files import (
     write_overlays,
     write_picture,
 )
+from tests.detect.test_image_board import draw, looking
 from tests.extrinsics.boards import measured_plate
 
 BOARD = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)
@@ -148,10 +150,51 @@ def test_a_debug_picture_is_made_of_whatever_there_is(has_image: bool, has_lidar
         [lidar_board(points), lidar_board(points - [0, 0.2, 0])] if has_lidar else refusal,
         board=BOARD,
         intrinsics=FOLDING,
+        limits=QualitySettings(),
         title="capture 000000",
     )
     assert drawn.shape[1] == 1600
     assert (count(drawn[:, 800:], MAGENTA) > 100) == has_lidar
+
+
+def test_corners_found_in_a_refused_image_are_drawn() -> None:
+    camera = Intrinsics(349.57, 349.18, 172.49, 126.24, 346, 260)
+    pixels = draw(BOARD, camera, looking(10, 0, 20, (0, 0, 2.0)))
+    refusal = Refusal("image.tilted", figures={"tilt_deg": 71.0, "max_tilt_deg": 70.0, "turn_deg": 6.0})
+    drawn = debug_picture(Image("cam", "frames", None, pixels), refusal, camera)
+    blank = debug_picture(Image("cam", "frames", None, np.full_like(pixels, 110)), refusal, camera)
+    assert count(drawn[34:600, :800], ORANGE) > 100 > count(blank[34:600, :800], ORANGE)
+
+
+def debug_picture(image: Image, refusal: Refusal, camera: Intrinsics) -> NDArray[np.uint8]:
+    return draw_debug(
+        image, None, refusal, refusal, board=BOARD, intrinsics=camera, limits=QualitySettings(), title=""
+    )
+
+
+def test_a_candidate_that_is_elsewhere_is_not_drawn_as_the_board() -> None:
+    points = wall()
+    figures = {"n_candidates": 2, "candidate": 1, "distance_m": 3.0, "rotation_deg": 20.0}
+    arguments = (
+        Image("cam", "frames", None, grey(FOLDING)),
+        scan_of(points),
+        image_board(FOLDING),
+        [lidar_board(points), lidar_board(points - [0, 0.2, 0])],
+    )
+    right, wrong = (
+        draw_debug(
+            *arguments,
+            board=BOARD,
+            intrinsics=FOLDING,
+            limits=QualitySettings(),
+            title="",
+            mismatch=mismatch,
+        )
+        for mismatch in (None, Refusal("pair.elsewhere", figures=figures))
+    )
+    assert count(right[:, 800:], MAGENTA) > 100
+    assert count(wrong[:, 800:], MAGENTA) == 0
+    assert count(wrong[:, 800:], ORANGE) > count(right[:, 800:], ORANGE)
 
 
 def test_text_is_broken_to_fit_and_nothing_is_lost() -> None:

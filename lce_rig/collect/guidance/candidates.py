@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from lce_rig.collect.guidance.sensor_noise import SensorModel
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
+from lce_rig.detect.image.quality import LEAST_SQUARE_PX
 
 NEAREST_M = 1.2
 TILTS_DEG = (0.0, 22.0, 42.0)
@@ -18,8 +19,6 @@ ROLLS_DEG = (-12.0, 0.0, 12.0)
 SEEN_SHARE = 0.8
 #: How far below and above the LiDAR arms hold the board's centre.
 REACH_M = (-0.9, 0.8)
-#: Least side of a square, foreshortened by the tilt, from which corners are found without fail.
-LEAST_SQUARE_PX = 5.0
 # Free border of the image, as a share of its width: people do not hold the board to the pixel.
 _MARGIN = 0.03
 _GRAZING_COSINE = 0.45

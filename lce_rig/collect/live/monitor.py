@@ -154,7 +154,7 @@ class Monitor:
     def _phase(self, *, is_enough: bool, has_ended: bool) -> tuple[Phase, str, str]:
         said = self._narration
         if has_ended:
-            return "ended", "collection has ended", said.headline if is_enough else ""
+            return "ended", "collection has ended", _MET if is_enough else ""
         if self._lost:
             name = sorted(self._lost)[0]
             error = self._sensors.lost().get(name)

@@ -198,6 +198,7 @@ def find_in_reconstruction(
         max_reprojection_px=limits.max_reprojection_px,
         min_contrast=limits.min_event_contrast,
         min_sharpness=limits.min_event_sharpness,
+        min_square_px=limits.min_square_px,
         is_from_events=True,
     )
 

@@ -6,19 +6,22 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageQuality, Refusal
-from lce_rig.detect.image.corners import seen_grid, square_values
+from lce_rig.detect.image.corners import seen_grid, square_size_px, square_values
 from lce_rig.detect.image.saddle import Crossings
 
 # 10 to 90 % of an edge blurred by a Gaussian span 2.56 sigma.
 _EDGE_WIDTH_PER_SIGMA = 2.56
+LEAST_SQUARE_PX = 5.0
+"""Least side of a square, foreshortened by the tilt, from which corners are found without fail."""
+# Wider images are searched at this width at most.
+_SEARCHED_PX = 1280
 
 
 def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
     """Measure the corners' surroundings."""
     grid = crossings.grid_px
     height, width = grey.shape
-    sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1) for axis in (0, 1)]
-    square_px = float(min(side.min() for side in sides))
+    square_px = _square_px(grid)
     edge_width_px = _EDGE_WIDTH_PER_SIGMA * float(np.median(crossings.edge_sigma_px[crossings.is_fitted]))
     alternating = crossings.contrast * (-1.0) ** np.indices(crossings.contrast.shape).sum(axis=0)
     alternating *= -1.0 if np.median(alternating) < 0 else 1.0
@@ -78,7 +81,9 @@ def _alternation(values: Array, signs: Array) -> float:
     return float(values[signs > 0].mean() - values[signs < 0].mean())
 
 
-def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool = False) -> Refusal:
+def explain_absence(
+    grey: NDArray[np.uint8], board: Board, is_from_events: bool = False, min_square_px: float = 0.0
+) -> Refusal:
     """Return why the board was not found, from the grey values and from other checkerboards in the image."""
     low, dark, bright = (float(value) for value in np.percentile(grey, (1, 50, 99)))
     if bright < 50:
@@ -88,7 +93,7 @@ def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool 
         return Refusal("image.overexposed", figures={"white_share": white_share})
     seen = seen_grid(grey)
     if seen is not None:
-        return explain_other_grid(grey, board, seen, is_from_events)
+        return explain_other_grid(grey, board, seen, is_from_events, min_square_px)
     wanted = {"n_cols": board.cols, "n_rows": board.rows}
     action = _action(is_from_events)
     if bright - low < 50:
@@ -100,12 +105,20 @@ def explain_absence(grey: NDArray[np.uint8], board: Board, is_from_events: bool 
 
 
 def explain_other_grid(
-    grey: NDArray[np.uint8], board: Board, seen_px: Array, is_from_events: bool = False
+    grey: NDArray[np.uint8],
+    board: Board,
+    seen_px: Array,
+    is_from_events: bool = False,
+    min_square_px: float = 0.0,
 ) -> Refusal:
-    """Say that another grid of corners is in the image than the profile's.
+    """Say that another grid of corners is in the image than the profile's, or only a part of it is found.
 
     Args:
+        grey: (H, W) the image.
+        board: the board wanted.
         seen_px: (rows, cols, 2).
+        is_from_events: whether the image was reconstructed from events.
+        min_square_px: the profile's minimum side of a square.
     """
     wanted, seen = _sizes(board, seen_px)
     figures = {"n_cols": wanted[0], "n_rows": wanted[1], "n_cols_seen": seen[0], "n_rows_seen": seen[1]}
@@ -117,7 +130,15 @@ def explain_other_grid(
     if is_part and side:
         return Refusal("image.cut_off", figures={**figures, "side": side})
     if is_part:
-        return Refusal("image.part", figures=figures, action=action)
+        least_px = max(LEAST_SQUARE_PX * max(1.0, grey.shape[1] / _SEARCHED_PX), min_square_px)
+        square_px = square_size_px(grey, board.cols * board.rows)
+        if square_px < least_px:
+            closer_share = 1 - square_px / least_px
+            size = {"square_px": square_px, "min_square_px": least_px, "closer_share": closer_share}
+            return Refusal("image.part_of_small", figures={**figures, **size})
+        # A pattern that goes on beyond the corners found is neither covered nor another one.
+        code = "image.unclear" if extent(grey, seen_px)[1] else "image.part"
+        return Refusal(code, figures=figures, action=action)
     return Refusal("image.other_board", figures=figures)
 
 
@@ -152,6 +173,11 @@ def _sizes(board: Board, seen_px: Array) -> tuple[tuple[int, int], tuple[int, in
     either = ((cols, rows), (rows, cols))
     seen = min(either, key=lambda size: abs(size[0] - wanted[0]) + abs(size[1] - wanted[1]))
     return wanted, seen
+
+
+def _square_px(grid_px: Array) -> float:
+    """Measure the shortest side of a square."""
+    return float(min(np.linalg.norm(np.diff(grid_px, axis=axis), axis=-1).min() for axis in (0, 1)))
 
 
 def _side_beyond(grey: NDArray[np.uint8], grid_px: Array) -> str:

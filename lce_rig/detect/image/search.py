@@ -56,6 +56,7 @@ def find_image_board(
     max_reprojection_px: float = 1.0,
     min_contrast: float = 12.0,
     min_sharpness: float = 1.5,
+    min_square_px: float = 0.0,
     is_from_events: bool = False,
     is_thorough: bool = True,
 ) -> ImageBoard | Refusal:
@@ -75,6 +76,7 @@ def find_image_board(
         max_reprojection_px: refuse where the corners' rms distance from the board's image is larger.
         min_contrast: refuse where black and white differ by fewer grey values.
         min_sharpness: refuse where fewer edge widths fit into a square.
+        min_square_px: the profile's minimum, named where squares are too small to find all corners.
         is_from_events: whether the image was reconstructed from events, which changes the action.
         is_thorough: whether a board that is not found at once is searched for at other scales, and its
             absence explained, which takes most of a second.
@@ -92,12 +94,13 @@ def find_image_board(
     if crossings is None and not is_thorough:
         return NOT_SEEN_AT_ONCE
     if crossings is None or np.mean(crossings.is_fitted) < _MIN_FITTED:
-        return explain_absence(grey, board, is_from_events)
+        return explain_absence(grey, board, is_from_events, min_square_px)
     quality = grid_quality(grey, crossings)
     outer_contrast, goes_on = extent(grey, crossings.grid_px)
     if outer_contrast < _MIN_OUTER_CONTRAST or goes_on:
         seen = seen_grid(grey)
-        return explain_other_grid(grey, board, crossings.grid_px if seen is None else seen, is_from_events)
+        seen = crossings.grid_px if seen is None else seen
+        return explain_other_grid(grey, board, seen, is_from_events, min_square_px)
     problem = quality_problem(quality, min_contrast, min_sharpness, is_from_events)
     if problem is not None:
         return problem

@@ -58,8 +58,12 @@ export function fitHeadline() {
   let high = Math.max(low, Math.min(box.clientHeight, innerWidth / 5));
   const fits = (px) => {
     text.style.fontSize = `${px}px`;
-    return text.offsetHeight <= box.clientHeight && text.scrollWidth <= box.clientWidth;
+    const width = Math.max(text.offsetWidth, text.scrollWidth);
+    return text.offsetHeight <= box.clientHeight && width <= box.clientWidth;
   };
+  // Words stay whole, but one that is wider than the place even when it is small.
+  text.style.overflowWrap = "normal";
+  if (!fits(low)) text.style.overflowWrap = "anywhere";
   if (!fits(high)) {
     while (high - low > 1) {
       const middle = (low + high) / 2;
@@ -97,7 +101,7 @@ function showTakeBack(name) {
   const button = byId("take_back");
   button.hidden = name === "";
   button.dataset.capture = name;
-  setText("take_back", `take ${name} back`);
+  setText("take_back", `take back\n${name}`);
 }
 
 function showSigma(id, sigma, target, unit) {

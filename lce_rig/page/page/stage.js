@@ -29,6 +29,7 @@ export async function showDrawing(drawing, jpeg) {
     byId("legend").hidden = drawing.is_there;
     keepClear(centre(drawing.present_px), drawing.width_px);
   }
+  byId("camera").textContent = drawing?.camera ?? "";
   drawOutline("present", drawing?.present_px ?? null);
   drawOutline("wanted", drawing?.wanted_px ?? null);
   drawArrow(drawing);

@@ -1,0 +1,203 @@
+"""The scene as a witness: false alarms, changes seen, truth of the smallest change, joint maximum, time."""
+
+import tempfile
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.recordings import RIGS, SETS, RecordedSet
+from benchmarks.tables import print_head, print_row
+from lce_rig import pipeline
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array, difference, perturb
+from lce_rig.core.results import Calibration
+from lce_rig.detect.finder import BoardFinder
+from lce_rig.pipeline.drift import build_view, without_board
+from lce_rig.scene.alignment import AXES, IS_ROTATION, SceneView
+from lce_rig.scene.drift import Drift, watch
+from lce_rig.session import Session
+
+_NAMES = ("rlfs01", "rlfs02", "acfr_vlp16", "os1_64")
+_SETS = (*SETS, RecordedSet("os1_64", str(RIGS / "os1_64.yaml"), (("os1_64", "frames"),)))
+_OF_ONE_RIG = (("rlfs01", "rlfs02"), ("rlfs02", "rlfs01"))
+_PART = 5
+_SIZES = (
+    np.array([0.05, 0.05, 0.05, *np.radians([1.0, 0.5, 1.0])]),
+    np.array([0.03, 0.03, 0.03, *np.radians([0.3, 0.3, 0.3])]),
+)
+_UNIT = np.where(IS_ROTATION, np.degrees(1.0), 1000.0)
+
+
+class _Watched:
+    """The views of one recorded set, and its board calibration."""
+
+    def __init__(self, recorded: RecordedSet, ignore_board: bool) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            recorded.collect(Path(folder) / "session")
+            session = Session.open(Path(folder) / "session")
+            (self.calibration,) = pipeline.calibrate(session).pairs
+            c: Calibration = self.calibration
+            self.lens: Intrinsics = session.rig.cameras[c.camera].to_intrinsics()
+            samples = [(s.name, s.image(c.camera, "frames"), s.scan(c.lidar)) for s in session.captures]
+            start = time.perf_counter()
+            self.views = [build_view(session.rig, c, *sample) for sample in samples]
+            self.edges_ms = 1000 * (time.perf_counter() - start) / len(samples)
+            if ignore_board:
+                finder = BoardFinder(session.rig)
+                self.views = [
+                    without_board(view, finder.image(image), session.rig, c)
+                    for view, (_, image, _) in zip(self.views, samples, strict=True)
+                ]
+
+    def parts(self, n_splits: int) -> list[list[SceneView]]:
+        """Split the captures at random into parts of five, several times."""
+        rng = np.random.default_rng(0)
+        orders = [rng.permutation(len(self.views)) for _ in range(n_splits)]
+        return [
+            [self.views[k] for k in order[first : first + _PART]]
+            for order in orders
+            for first in range(0, len(order) - _PART + 1, _PART)
+        ]
+
+    def judge(self, views: list[SceneView], tangent: Array, *, is_joint: bool = False) -> Drift:
+        """Watch the board calibration, moved by a tangent."""
+        c = self.calibration
+        return watch(views, self.lens, perturb(c.T_cam_lidar, tangent), c.cov, is_joint=is_joint)
+
+
+def bench_scene(n_splits: int, only: str = "") -> None:
+    """Print the tables of docs/drift.md."""
+    for ignore_board in (False, True):
+        print(f"\n### {'Edges at the board left out' if ignore_board else 'All edges'}")
+        sets = [each for each in _SETS if each.name in _NAMES and each.is_there and only in each.name]
+        watched = {each.name: _Watched(each, ignore_board) for each in sets}
+        _print_unchanged(watched, n_splits)
+        _print_changed(watched, n_splits)
+        _print_joint(watched, n_splits)
+
+
+def _print_unchanged(watched: dict[str, _Watched], n_splits: int) -> None:
+    print("\nUnchanged rigs, and images mirrored (nothing fits)\n")
+    print_head(
+        "calibrated on", "watched", "parts", "no change seen", "cannot tell", "false alarms", "mirrored"
+    )
+    for source, target in [*((name, name) for name in watched), *_OF_ONE_RIG]:
+        if source not in watched or target not in watched:
+            continue
+        own, deployed = watched[target], watched[source].calibration
+        states: Counter[str] = Counter()
+        mirrored: Counter[str] = Counter()
+        parts = own.parts(n_splits)
+        for views in parts:
+            arguments = (own.lens, deployed.T_cam_lidar, deployed.cov)
+            states[watch(views, *arguments, is_joint=False).state] += 1
+            mirrored[watch(list(map(_mirrored, views)), *arguments, is_joint=False).state] += 1
+        shown = (states["unchanged"], states["unknown"], states["changed"])
+        print_row(source, target, len(parts), *shown, _counts(mirrored))
+
+
+def _counts(states: Counter[str]) -> str:
+    return ", ".join(f"{n} {state}" for state, n in sorted(states.items()))
+
+
+def _mirrored(view: SceneView) -> SceneView:
+    mirrored = np.ascontiguousarray(view.field.values[:, ::-1])
+    return replace(view, field=replace(view.field, values=mirrored))
+
+
+def _print_changed(watched: dict[str, _Watched], n_splits: int) -> None:
+    print("\nOne axis changed, both signs; of the changes not seen, those for which the axis was unknown\n")
+    print_head(
+        "set", "axis", "seen", "cannot tell", "below the claim", "false all-clear", "right axis",
+        "3 cm, .3 deg: seen",
+        "smallest claimed (median)", "at the smallest: seen",
+    )  # fmt: skip
+    for name, own in watched.items():
+        parts = own.parts(n_splits)
+        before = [own.judge(views, np.zeros(6)) for views in parts]
+        for axis, label in enumerate(AXES):
+            tally: Counter[str] = Counter()
+            smallest = [drift.axes[axis].smallest for drift in before]
+            for views, drift in zip(parts, before, strict=True):
+                unit = float(_UNIT[axis]) if IS_ROTATION[axis] else 1.0
+                is_known = drift.axes[axis].state == "unchanged"
+                for sign in (-1.0, 1.0):
+                    direction = sign * np.eye(6)[axis]
+                    tally.update(
+                        _outcome(own.judge(views, _SIZES[0][axis] * direction), axis, _SIZES[0][axis] * unit)
+                    )
+                    small = own.judge(views, _SIZES[1][axis] * direction)
+                    tally["small"] += small.state == "changed"
+                    if is_known:
+                        tally["claims"] += 1
+                        at = own.judge(views, drift.axes[axis].smallest / unit * direction)
+                        tally["held"] += at.state == "changed"
+            n = 2 * len(parts)
+            digits, scale, named = (2, 1.0, "deg") if IS_ROTATION[axis] else (0, 1000.0, "mm")
+            print_row(
+                name,
+                f"{label} {_SIZES[0][axis] * _UNIT[axis]:g} {named}",
+                f"{tally['seen']} of {n}",
+                tally["unknown"],
+                tally["below"],
+                tally["false"],
+                tally["right"],
+                f"{tally['small']} of {n}",
+                f"{scale * np.median(smallest):.{digits}f} {named}",
+                f"{tally['held']} of {tally['claims']}",
+            )
+
+
+def _outcome(drift: Drift, axis: int, size: float) -> list[str]:
+    """Name what became of a change of one axis (deg or m)."""
+    verdict = drift.axes[axis]
+    if drift.state == "changed":
+        named = {
+            name for each in drift.axes if each.state == "changed" for name in (each.axis, *each.instead)
+        }
+        return ["seen", "right"] if AXES[axis] in named else ["seen"]
+    if drift.state == "unknown":
+        return ["unknown"]
+    return ["below" if size < verdict.smallest else "false"]
+
+
+def _print_joint(watched: dict[str, _Watched], n_splits: int) -> None:
+    print("\nJoint maximum against the board calibration; cost\n")
+    print_head(
+        "set", "captures", "rotation x, y, z deg", "translation x, y, z mm", "rms of parts deg",
+        "rms of parts mm",
+        "from 1 deg, 4 cm off: within .3 deg, 3 cm", "from 3 deg, 10 cm", "edges and fields ms", "search ms",
+    )  # fmt: skip
+    for name, own in watched.items():
+        start = time.perf_counter()
+        drift = own.judge(own.views, np.zeros(6), is_joint=True)
+        search_ms = 1000 * (time.perf_counter() - start) / len(own.views)
+        T = own.calibration.T_cam_lidar
+        moved = difference(drift.T_best, T) * _UNIT
+        parts = [own.judge(views, np.zeros(6), is_joint=True) for views in own.parts(n_splits)]
+        rms = np.sqrt(np.mean([(difference(part.T_best, T) * _UNIT) ** 2 for part in parts], axis=0))
+        basins = [_basin(own, drift.T_best, *size) for size in ((1.0, 0.04), (3.0, 0.10))]
+        figures = (_figures(moved[3:], 2), _figures(moved[:3], 0), _figures(rms[3:], 2), _figures(rms[:3], 0))
+        print_row(name, len(own.views), *figures, *basins, f"{own.edges_ms:.0f}", f"{search_ms:.0f}")
+
+
+def _basin(own: _Watched, T_best: Array, angle_deg: float, shift_m: float) -> str:
+    """Start from extrinsics off in all axes and count how many searches end at the same place."""
+    rng = np.random.default_rng(1)
+    n_back, n_clear, n = 0, 0, 8
+    for _ in range(n):
+        direction = rng.standard_normal((2, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        tangent = np.concatenate([shift_m * direction[0], np.radians(angle_deg) * direction[1]])
+        drift = own.judge(own.views[:_PART], tangent, is_joint=True)
+        left = np.abs(difference(drift.T_best, T_best))
+        n_back += bool(np.linalg.norm(left[3:]) < np.radians(0.3) and np.linalg.norm(left[:3]) < 0.03)
+        n_clear += drift.state == "unchanged"
+    return f"{n_back} of {n}, {n_clear} all-clears"
+
+
+def _figures(values: Array, digits: int) -> str:
+    return ", ".join(f"{value:.{digits}f}" for value in values)
