@@ -258,6 +258,9 @@ def _tell(report: Any, session: Path, n_captures: int) -> None:
     """
     for text in report.notes:
         show.note(text)
+    for found in report.sizes.values():
+        tell = show.warn if found[0].severity == "error" else show.note
+        tell(f"{found[0].subject}: {show.counted(len(found), 'image')} of {sentence(found[0])}")
     for label, capture in report.duplicates.items():
         show.note(f"{label}: duplicate of {capture}, skipped")
     for label, refusal in report.refused.items():

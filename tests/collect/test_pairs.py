@@ -113,7 +113,8 @@ def test_pictures_of_another_size_are_said(tmp_path, folder, rig):
     cv2.imwrite(str(folder / "img" / "00002.png"), np.zeros((480, 640), np.uint8))
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, folder, rig)
-    assert any("cam:" in n and "640x480" in n and "640x360" in n for n in report.notes)
+    ((found,),) = report.sizes.values()
+    assert (found.code, found.severity, found.subject) == ("image.size_other", "error", "cam.frames")
 
 
 def test_progress_tells_of_every_pair(tmp_path, folder, rig):

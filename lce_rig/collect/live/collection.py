@@ -106,6 +106,8 @@ class _Search:
 _WAIT_S = 0.1
 _TURN_S = 0.0005
 _NOVEL_M, _NOVEL_DEG = 0.15, 10.0
+# A board that has not moved, as far as its pose is known.
+_SAME_M, _SAME_DEG = 0.02, 2.0
 
 
 def collect_live(
@@ -383,11 +385,9 @@ class _Loop:
 
     def _is_repeated(self, detection: BoardDetection) -> bool:
         """Check whether a board stands where the last capture has it, or was there within the hold."""
-        if self._find_gate().is_captured:
-            return True
         is_recent = time.monotonic() - self._captured_s < self._options.hold_s
-        places = Placements(_NOVEL_M, _NOVEL_DEG)
-        return is_recent and places.are_alike(self._asked[-1].boards, detection.images)
+        places = Placements(_NOVEL_M, _NOVEL_DEG) if is_recent else Placements(_SAME_M, _SAME_DEG)
+        return self._find_gate().is_captured or places.are_alike(self._asked[-1].boards, detection.images)
 
     def _find_ending(self, key: Key | TakeBack | None) -> Ending | None:
         options, elapsed_s = self._options, time.monotonic() - self._began_s

@@ -13,8 +13,10 @@ from lce_rig.collect.offline.stored_events import StoredEvents
 from lce_rig.collect.placement_dedupe import Placements, board_figures, capture_poses, known_placements
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.errors import LceRigError, SessionError, SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.core.losses import Losses
 from lce_rig.core.results import Refusal
+from lce_rig.detect.image.search import compare_size
 from lce_rig.recordings.joining import join_recordings, require_sensors
 from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording, PairFiles, Recording
 from lce_rig.rig import Rig
@@ -142,6 +144,7 @@ class CollectReport:
         refused: why something became no capture, by label.
         counts: what kept moments of a continuous recording from becoming captures.
         notes: what was chosen, assumed or left out, in words.
+        sizes: what was found of images of another size than the intrinsics, by stream and size.
         errors: recordings that could not be read to their end; what was captured before is kept.
         n_missing: captures short of the target.
         has_events: whether any recording held events, which make the board's motion wanted.
@@ -154,6 +157,7 @@ class CollectReport:
     refused: dict[str, Refusal] = field(default_factory=dict)
     counts: Losses = field(default_factory=Losses)
     notes: list[str] = field(default_factory=list)
+    sizes: dict[str, list[Finding]] = field(default_factory=dict)
     errors: list[SourceError] = field(default_factory=list)
     n_missing: int = 0
     has_events: bool = False
@@ -373,13 +377,10 @@ class _Collector:
 
     def _note_sizes(self, images: Iterable[Image]) -> None:
         for image in images:
-            height, width = image.pixels.shape[:2]
-            wanted = self._session.rig.cameras[image.sensor].resolution_px
-            if (width, height) != wanted:
-                size = f"{wanted[0]}x{wanted[1]}"
-                self.note(
-                    [f"camera {image.sensor}: pictures of {width}x{height} where the profile says {size}"]
-                )
+            found = compare_size(image, self._session.rig.cameras[image.sensor].to_intrinsics())
+            if found is not None:
+                size = f"{image.pixels.shape[1]}x{image.pixels.shape[0]}"
+                self.report.sizes.setdefault(f"{found.subject} {size}", []).append(found)
 
 
 def _until_torn(samples: Iterable[Sample], torn: list[SourceError]) -> Iterator[Sample]:

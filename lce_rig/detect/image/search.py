@@ -10,6 +10,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import ImageBoard, ImageQuality, Refusal
 from lce_rig.detect.image.corners import find_grid, order_corners, seen_grid
@@ -22,6 +23,7 @@ from lce_rig.detect.image.quality import (
 )
 from lce_rig.detect.image.saddle import Crossings, fit_crossings
 from lce_rig.solvers.pnp import PlanarPose, solve_planar_pose
+from lce_rig.words import describe, recommend
 
 Region = tuple[int, int, int, int]
 NOT_SEEN_AT_ONCE = Refusal("image.not_at_first_sight")
@@ -149,34 +151,45 @@ def region_around(found: ImageBoard, image: Image, margin: float = 0.5) -> Regio
     return int(u0), int(v0), int(u1), int(v1)
 
 
-def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:
-    """Return the grey image at the size of the intrinsics.
+def compare_size(image: Image, intrinsics: Intrinsics) -> Finding | None:
+    """Say what is done with an image of another size than that of the intrinsics; None for the same size.
 
-    Two harmless differences occur in recordings: a readout that ends a few lines early, and a canvas larger
-    than the sensor, blank beyond it (images reconstructed from events).
-
-    Raises:
-        ProfileError: any other size, naming both.
+    Two harmless differences occur in recordings: a readout that ends a few lines early ("image.size_cut"),
+    and a canvas larger than the sensor, blank beyond it ("image.size_canvas", images reconstructed from
+    events). Any other size ("image.size_other", an error) cannot be used.
     """
     height, width = image.pixels.shape[:2]
     wanted_width, wanted_height = intrinsics.width_px, intrinsics.height_px
     if (width, height) == (wanted_width, wanted_height):
-        return image.grey
+        return None
+    figures: dict[str, Figure] = {
+        "width_px": width,
+        "height_px": height,
+        "wanted_width_px": wanted_width,
+        "wanted_height_px": wanted_height,
+        "factor": width / wanted_width,
+    }
+    subject = f"{image.sensor}.{image.channel}"
     missing_u, missing_v = 1 - width / wanted_width, 1 - height / wanted_height
     if 0 <= missing_u <= _CUT_FRACTION and 0 <= missing_v <= _CUT_FRACTION:
-        return image.grey
-    if -_CANVAS_FRACTION <= missing_u <= 0 and -_CANVAS_FRACTION <= missing_v <= 0:
-        grey = image.grey
-        if _is_blank_beyond(grey, wanted_width, wanted_height):
-            return grey[:wanted_height, :wanted_width]
-    hint = "Use the intrinsics of this mode, or record in the mode of the intrinsics"
-    if abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width:
-        hint += f"; if the image is only scaled, multiply fx, fy, cx, cy by {width / wanted_width:.4g}"
-    raise ProfileError(
-        f"camera {image.sensor}, channel {image.channel}: the image is {width}x{height} px, the profile's "
-        f"intrinsics belong to {wanted_width}x{wanted_height} px",
-        hint,
-    )
+        return Finding("image.size_cut", "note", subject, figures)
+    is_canvas = -_CANVAS_FRACTION <= missing_u <= 0 and -_CANVAS_FRACTION <= missing_v <= 0
+    if is_canvas and _is_blank_beyond(image.grey, wanted_width, wanted_height):
+        return Finding("image.size_canvas", "note", subject, figures)
+    is_scaled = abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width
+    return Finding("image.size_other", "error", subject, figures, "scaled" if is_scaled else "")
+
+
+def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:
+    """Return the grey image at the size of the intrinsics, as far as it reaches; see `compare_size`.
+
+    Raises:
+        ProfileError: a size that cannot be used, naming both.
+    """
+    found = compare_size(image, intrinsics)
+    if found is not None and found.severity == "error":
+        raise ProfileError(f"{found.subject}: {describe(found)}", recommend(found))
+    return image.grey[: intrinsics.height_px, : intrinsics.width_px]
 
 
 def _is_blank_beyond(grey: NDArray[np.uint8], width_px: int, height_px: int) -> bool:
