@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -200,8 +200,9 @@ def calibrate(
     import lce_rig as lce
     from lce_rig.core.errors import UsageError
     from lce_rig.export.reference import read_reference
-    from lce_rig.pipeline.result_files import OVERLAYS
+    from lce_rig.pipeline.result_files import OVERLAYS, new_result_parts
 
+    new_result_parts(name)
     opened = lce.Session.open(session)
     rig = opened.rig
     require_sensors("camera", cameras, rig.cameras)
@@ -217,7 +218,7 @@ def calibrate(
             f"{reference}: T_cam_lidar names no sensors, but the rig has several: {', '.join(wanted)}",
             'Write {"pairs": [{"camera": ..., "lidar": ..., "T_cam_lidar": ...}, ...]}, or add --camera.',
         )
-    with _earlier_result_named(opened.path):
+    with _earlier_result_named(opened.path.joinpath(*new_result_parts(name))):
         with show.progress_bar("detecting") as progress:
             detections = lce.detect(opened, event_image=event_image, progress=progress)
         with show.progress_bar("calibrating") as progress:
@@ -254,17 +255,17 @@ def calibrate(
 
 
 @contextmanager
-def _earlier_result_named(session: Path) -> Iterator[None]:
+def _earlier_result_named(folder: Path) -> Iterator[None]:
     """Say that the files are those of an earlier run if this one ends without a result."""
     from lce_rig.core.errors import LceRigError
     from lce_rig.pipeline.result_files import RESULT
-    from lce_rig.session.session import CALIBRATION
 
     try:
         yield
     except LceRigError:
-        if (session / CALIBRATION / RESULT).exists():
-            show.note(f"{session / CALIBRATION} is unchanged, with the result of an earlier run")
+        with suppress(OSError):
+            if (folder / RESULT).exists():
+                show.note(f"{folder} is unchanged, with the result of an earlier run")
         raise
 
 

@@ -28,6 +28,7 @@ def captures(
     not take it again from the same recording. Restoring moves it back.
     """
     import lce_rig as lce
+    from lce_rig.pipeline.result_files import stored_results
 
     rejecting, restoring = list(map(_full, reject)), list(map(_full, restore))
     with lce.Session.open(session, writable=bool(rejecting or restoring)) as opened:
@@ -36,18 +37,19 @@ def captures(
             opened.reject(name, reason)
         for name in restoring:
             opened.restore(name)
-        records = _records(opened)
+        changed = {*rejecting, *restoring}
+        records = [each for each in _records(opened) if not changed or each["name"] in changed]
+        outdated = [each.name for each in stored_results(opened) if changed and each.is_outdated]
+        n_kept, n_rejected = len(opened.captures), len(opened.rejected)
     if as_json:
         show.print_json({"format_version": 1, "rig": opened.rig.name, "captures": records})
     else:
         show.print_table(_table(records))
-        n_rejected = sum(record["state"] == "rejected" for record in records)
-        counts = show.counted(len(records) - n_rejected, "capture")
+        counts = show.counted(n_kept, "capture")
         show.say(counts + (f", {n_rejected} rejected" if n_rejected else ""))
-    if any(record["state"] == "rejected" and record["used_by"] for record in records) or (
-        restoring and any(record["used_by"] for record in records)
-    ):
-        show.note("the captures have changed since the result was made: run `lce-rig calibrate` again")
+    if outdated:
+        names = ", ".join(outdated)
+        show.note(f"made from other captures: result {names}. Run `lce-rig calibrate` again")
 
 
 def _full(name: str) -> str:
@@ -73,6 +75,11 @@ def _require_there(session: "Session", rejecting: list[str], restoring: list[str
         *((name, there, aside, "rejected already") for name in rejecting),
         *((name, aside, there, "not rejected") for name in restoring),
     ):
+        if name in other and name in known:
+            raise UsageError(
+                f"{session.path}: capture {name} is in captures/ and in rejected/",
+                "Move one of the two out of the session.",
+            )
         if name in other:
             raise UsageError(f"{session.path}: capture {name} is {state}")
         if name not in known:
@@ -124,7 +131,7 @@ def _table(records: list[dict[str, Any]]) -> Any:
         table.add_row(
             record["name"],
             show.escape(", ".join(record["streams"])) or "[red]damaged[/]",
-            show.escape(record["source"]),
+            show.escape(record["damage"] or record["source"]),
             show.escape(", ".join(record["used_by"])) or "-",
             state,
         )

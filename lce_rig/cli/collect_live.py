@@ -200,8 +200,9 @@ def _tell(
     lost = {name: n for name, n in report.n_lost.items() if n}
     if lost:
         show.note("dropped: " + ", ".join(f"{name} {n}" for name, n in sorted(lost.items())))
-    if simulated is not None and simulated.pace.problem():
-        show.warn(f"the rig was {simulated.pace.problem()}")
+    slow = None if simulated is None else simulated.pace.problem()
+    if slow is not None:
+        show.warn(sentence(slow))
     show.note(f"ended: {_ending(report, n_captures, given)}")
     if report.error is not None:
         raise report.error

@@ -33,7 +33,8 @@ def results(session: Path, as_json: bool) -> None:
         show.print_json({"format_version": 1, "rig": opened.rig.name, "results": document})
         return
     if stored:
-        show.print_table(_table(stored))
+        for table in _tables(stored):
+            show.print_table(table)
     else:
         show.say(f"no results in {session}: run `lce-rig calibrate`")
     for each in stored:
@@ -43,26 +44,33 @@ def results(session: Path, as_json: bool) -> None:
             show.note(f"{each.name}: the profile or the captures that it used have changed since")
 
 
-def _table(stored: list["StoredResult"]) -> Any:
-    table = show.plain_table("", "result", "sensors", "method", "channels")
-    for heading in ("used", "deg", "mm", "px"):
-        table.add_column(heading, justify="right")
-    table.add_column("verdict")
-    table.add_column("written")
+def _tables(stored: list["StoredResult"]) -> list[Any]:
+    """List results by camera and LiDAR, a table each, and those that cannot be read."""
+    tables: dict[str, Any] = {}
     for each in stored:
         written = datetime.fromtimestamp(each.written_s).strftime("%Y-%m-%d %H:%M")
         name = show.escape(each.name)
         for calibration in () if each.saved is None else each.saved.pairs:
+            sensors = f"{calibration.camera} and {calibration.lidar}"
+            table = tables.setdefault(sensors, _empty_table(show.escape(sensors)))
             table.add_row(name, *_cells(calibration), written)
         if each.saved is None:
-            table.add_row(name, "-", "-", "-", "-", "-", "-", "-", "[red]unreadable[/]", written)
+            tables.setdefault("", show.plain_table("", "result", "")).add_row(name, "[red]unreadable[/]")
+    return list(tables.values())
+
+
+def _empty_table(title: str) -> Any:
+    table = show.plain_table(title, "result", "method", "channels")
+    for heading in ("used", "deg", "mm", "px"):
+        table.add_column(heading, justify="right")
+    table.add_column("verdict")
+    table.add_column("written")
     return table
 
 
 def _cells(c: "Calibration") -> list[str]:
     px = c.metrics.reprojection_px
     return [
-        show.escape(f"{c.camera}, {c.lidar}"),
         c.method,
         show.escape("+".join(c.channels)),
         f"{len(c.captures_used)}",

@@ -1,5 +1,6 @@
 """`lce-rig rigs`: list, show, check and derive rig profiles."""
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -251,31 +252,30 @@ def new_profile(
       lce-rig rigs new truck --lidar OS1-64 --camera front --intrinsics camera_info.yaml \\
                              --board 8x6,0.07,0.767x0.626
       lce-rig rigs new truck --from drive.bag --lidar OS1-64 --board 8x6,0.07,0.767x0.626
-      lce-rig rigs new mine --from rlfs --set board.square_m=0.08 --unset sync
+      lce-rig rigs new mine --from rlfs --set board.square_m=0.08 --unset nominal_extrinsics
     """
-    from lce_rig.core.errors import UsageError
-    from lce_rig.rig import edit_text, load_rig
+    from lce_rig.rig import edit_text, load_rig, shipped_profiles
 
     values = [_setting(text) for text in settings]
     path = Path(output or f"{name}.yaml")
     target = f"{name if output == '-' else path} (not written)"
+    _require_name(name)
     has_sensors = bool(lidar or cameras or intrinsics)
     bag = None if origin is None or not _is_bag(Path(origin)) else Path(origin)
     if bag is not None or (origin is None and has_sensors):
         text = _from_sensors(name, bag, lidar, cameras, intrinsics, board, target)
         text = edit_text(text, values, removed, target)
-    elif has_sensors:
-        raise UsageError(
-            f"--lidar, --camera and --intrinsics do not go with the profile --from {origin}",
-            "Change its sensors with --set, or leave --from away for a profile of your own sensors.",
-        )
     else:
-        text = _derived(name, origin or "rlfs", [*_board_settings(board), *values], removed, target)
+        parent = load_rig(origin or "rlfs")
+        values = [*_sensor_settings(parent, lidar, cameras, intrinsics), *_board_settings(board), *values]
+        text = _derived(name, origin or "rlfs", parent.name, values, removed, target)
     if output == "-":
         click.echo(text, nl=False)
         return
     _write_new(path, text)
     screen.note(f"wrote {path}; compare it with your rig, then: lce-rig rigs check {path}")
+    if name in shipped_profiles():
+        screen.warn(f"--rig {name} is the shipped profile: use --rig {path}")
     _print_warnings(load_rig(path))
 
 
@@ -289,12 +289,24 @@ def _setting(text: str) -> tuple[str, str]:
 
 
 def _is_bag(path: Path) -> bool:
-    """Tell a bag from a profile, by its suffix or what lies in the folder."""
+    """Tell a bag from a profile, by its suffix or what lies in the folder.
+
+    Raises:
+        SourceError: it would be a bag, and is not there; or a folder without one.
+    """
+    from lce_rig.core.errors import SourceError
     from lce_rig.recordings.ros.bag_file import SUFFIXES
 
-    return path.suffix in SUFFIXES or (
-        path.is_dir() and any(entry.suffix in SUFFIXES for entry in path.iterdir())
-    )
+    if path.is_dir():
+        if any(entry.suffix in SUFFIXES for entry in path.iterdir()):
+            return True
+        raise SourceError(
+            f"{path} holds no bag ({', '.join(SUFFIXES)})",
+            "Of a folder of images, give --lidar, --intrinsics and --board.",
+        )
+    if path.suffix in SUFFIXES and not path.exists():
+        raise SourceError(f"{path} does not exist")
+    return path.suffix in SUFFIXES
 
 
 def _from_sensors(
@@ -327,12 +339,50 @@ def _from_sensors(
 
 
 def _derived(
-    name: str, origin: str, values: list[tuple[str, str]], removed: tuple[str, ...], target: str
+    name: str,
+    origin: str,
+    parent: str,
+    values: list[tuple[str, str]],
+    removed: tuple[str, ...],
+    target: str,
 ) -> str:
-    from lce_rig.rig import derive_text, find_profile, load_rig, read_profile
+    from lce_rig.rig import derive_text, find_profile, read_profile
 
-    parent = load_rig(origin)
-    return derive_text(read_profile(find_profile(origin)), name, values, target, parent.name, removed)
+    return derive_text(read_profile(find_profile(origin)), name, values, target, parent, removed)
+
+
+def _require_name(name: str) -> None:
+    """Refuse a file where a rig's name is wanted."""
+    from lce_rig.core.errors import UsageError
+
+    stem = name.removesuffix(".yaml").removesuffix(".yml")
+    if stem != name:
+        raise UsageError(
+            f"{name} is a file, not the name of a rig", f"Write: lce-rig rigs new {stem} -o {name}"
+        )
+
+
+def _sensor_settings(
+    parent: "Rig", lidar: str | None, cameras: tuple[str, ...], intrinsics: tuple[str, ...]
+) -> list[tuple[str, str]]:
+    """Give what --lidar and --intrinsics change in the profile that is derived from."""
+    from lce_rig.cli.options import require_sensors
+    from lce_rig.core.errors import UsageError
+    from lce_rig.pipeline.new_profile import parse_intrinsics
+
+    require_sensors("camera", cameras, parent.cameras)
+    names = cameras or tuple(parent.cameras)[: len(intrinsics)]
+    if len(names) != len(intrinsics):
+        raise UsageError(
+            f"{len(intrinsics)} --intrinsics for {len(names)} cameras", "Give one for each --camera."
+        )
+    found = [] if lidar is None else [(f"lidars.{next(iter(parent.lidars))}.model", json.dumps(lidar))]
+    for name, text in zip(names, intrinsics, strict=True):
+        lens, block = parse_intrinsics(text), f"cameras.{name}.intrinsics"
+        found += [(f"cameras.{name}.resolution_px", f"[{lens.width_px}, {lens.height_px}]")]
+        found += [(f"{block}.model", lens.model), (f"{block}.distortion", f"{list(lens.distortion)}")]
+        found += [(f"{block}.{key}", f"{getattr(lens, key)}") for key in ("fx_px", "fy_px", "cx_px", "cy_px")]
+    return found
 
 
 def _board_settings(text: str | None) -> list[tuple[str, str]]:
@@ -343,10 +393,10 @@ def _board_settings(text: str | None) -> list[tuple[str, str]]:
     board = parse_board(text)
     return [
         ("board.inner_corners", f"[{board.cols}, {board.rows}]"),
-        ("board.square_m", f"{board.square_m:g}"),
-        ("board.width_m", f"{board.width_m:g}"),
-        ("board.height_m", f"{board.height_m:g}"),
-        ("board.pattern_offset_m", f"[{board.pattern_offset_m[0]:g}, {board.pattern_offset_m[1]:g}]"),
+        ("board.square_m", f"{board.square_m}"),
+        ("board.width_m", f"{board.width_m}"),
+        ("board.height_m", f"{board.height_m}"),
+        ("board.pattern_offset_m", f"{list(board.pattern_offset_m)}"),
     ]
 
 

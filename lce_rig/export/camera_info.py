@@ -8,7 +8,7 @@ import numpy as np
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError, ProfileError
-from lce_rig.core.limits import MAX_DOCUMENT_BYTES, describe, read_file
+from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
 from lce_rig.core.results import Calibration
 from lce_rig.export.files import header, numbers, quoted, reads_back
 from lce_rig.export.frames import choose_channels
@@ -98,8 +98,10 @@ def load_camera_info(path: Path) -> Intrinsics:
         return _intrinsics(data)
     except OSError as error:
         raise ProfileError(f"{path}: cannot be read: {error.strerror}") from None
-    except (KeyError, TypeError) as error:
-        raise ProfileError(f"{path}: not a camera_info file of ROS: {describe(str(error))}") from None
+    except KeyError as error:
+        raise ProfileError(f"{path}: not a camera_info file of ROS: it has no key {error.args[0]}") from None
+    except TypeError:
+        raise ProfileError(f"{path}: not a camera_info file of ROS: a block of it has no keys") from None
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise ProfileError(f"{path}: not a usable camera_info file: {' '.join(str(error).split())}") from None
 

@@ -66,7 +66,7 @@ def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
             raise UsageError(f"result {name} is given twice")
         if name not in stored:
             raise SessionError(f"{session.path} has no result {name!r}", listed)
-    chosen = list(names) or [name for name in stored if name != PREVIOUS]
+    chosen = list(names) or [name for name in stored if name.rpartition("/")[2] != PREVIOUS]
     if len(chosen) < 2:
         raise UsageError(
             f"{session.path} has no two results to compare",

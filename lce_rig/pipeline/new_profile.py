@@ -15,9 +15,15 @@ from lce_rig.rig.draft import CameraDraft, ChannelDraft, LidarDraft, draft_profi
 _UNKNOWN_MODEL = "other"
 _BOARD = re.compile(r"(\d+)x(\d+),([^,x]+),([^,x]+)x([^,x]+)(?:,([^,x]+),([^,x]+))?")
 _SIZE = re.compile(r"(\d{1,5})x(\d{1,5})")
+_FAMILIES: dict[str, Literal["radtan", "equidistant"]] = {
+    "radtan": "radtan",
+    "plumb_bob": "radtan",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+}
 BOARD_FORM = "COLSxROWS,SQUARE,WIDTHxHEIGHT[,RIGHT,UP], lengths in m, such as 8x6,0.07,0.767x0.626"
 _LENS_FORM = (
-    "MODEL,WIDTHxHEIGHT,FX,FY,CX,CY,K1,..., such as radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23"
+    "MODEL,WIDTHxHEIGHT,FX,FY,CX,CY,K1,..., such as radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0"
 )
 
 
@@ -61,7 +67,7 @@ def new_profile(
         groups = [[] for _ in cameras or ("cam",)]
         if len(intrinsics) != len(groups):
             raise UsageError(
-                f"{len(groups)} cameras and intrinsics of {len(intrinsics)}",
+                f"intrinsics of {len(intrinsics)} of {len(groups)} cameras given",
                 f"Give --intrinsics once for each --camera: a camera_info file, or {_LENS_FORM}.",
             )
     names = list(cameras) or _names(groups)
@@ -94,27 +100,31 @@ def parse_board(text: str) -> Board:
 
 
 def parse_intrinsics(text: str) -> Intrinsics:
-    """Read a camera_info file, or intrinsics as "radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23".
+    """Read a camera_info file, or intrinsics as "radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0".
 
     Raises:
         UsageError: it is neither.
         ProfileError: the file cannot be used.
     """
-    model, *values = text.replace(" ", "").split(",")
-    if len(values) < 5 or model not in ("radtan", "equidistant"):
-        if not Path(text).exists() and values:
-            raise UsageError(f"--intrinsics {text}: give a camera_info file, or {_LENS_FORM}")
-        return load_camera_info(Path(text))
+    model, *values = re.split(r"\s*,\s*|\s+", text.strip())
+    if len(values) < 5 and not (values and values[0] and model in _FAMILIES):
+        path = Path(text)
+        if not text or len(text) > 4000 or not path.exists():
+            raise UsageError(f"--intrinsics {text[:200]}: there is no such file", f"Or give {_LENS_FORM}.")
+        return load_camera_info(path)
     size = _SIZE.fullmatch(values[0])
     try:
-        if size is None:
+        if size is None or model not in _FAMILIES:
             raise ValueError
         fx, fy, cx, cy, *distortion = map(float, values[1:])
     except ValueError:
-        raise UsageError(f"--intrinsics {text}: give a camera_info file, or {_LENS_FORM}") from None
+        models = ", ".join(_FAMILIES)
+        raise UsageError(
+            f"--intrinsics {text}: neither a camera_info file nor intrinsics",
+            f"Give {_LENS_FORM}; models: {models}.",
+        ) from None
     width, height = map(int, size.groups())
-    family: Literal["radtan", "equidistant"] = "radtan" if model == "radtan" else "equidistant"
-    return Intrinsics(fx, fy, cx, cy, width, height, family, tuple(distortion))
+    return Intrinsics(fx, fy, cx, cy, width, height, _FAMILIES[model], tuple(distortion))
 
 
 def _lidars(topics: Sequence[SensorTopic], model: str | None) -> Iterator[LidarDraft]:

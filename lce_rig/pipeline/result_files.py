@@ -112,21 +112,32 @@ class WrittenResults:
 
 
 def result_parts(name: str | None) -> tuple[str, ...]:
-    """Return the path in a session of a named result; None for the main one, in calibration/.
+    """Give the path in a session of the result of a name; None is its main one, in calibration/.
+
+    The result before that of a name is `NAME/previous`.
 
     Raises:
-        UsageError: a name that cannot be a folder's, or is reserved.
+        UsageError: a name that no result can have.
     """
     if name is None or name == CURRENT:
         return (CALIBRATION,)
     if name == PREVIOUS:
         return (CALIBRATION, PREVIOUS)
-    if not SAFE_NAME.fullmatch(name) or len(name) > _LONGEST_NAME:
+    own, slash, rest = name.partition("/")
+    if not SAFE_NAME.fullmatch(own) or len(own) > _LONGEST_NAME or (slash and rest != PREVIOUS):
         raise UsageError(
             f"{name!r} cannot name a result",
             f"Use up to {_LONGEST_NAME} letters, digits, dots, dashes and underscores, such as `events-ml`.",
         )
-    return (RESULTS, name)
+    return (RESULTS, own, PREVIOUS) if slash else (RESULTS, own)
+
+
+def new_result_parts(name: str | None) -> tuple[str, ...]:
+    """Give the path in a session of a result that is to be written; raises as `result_parts`."""
+    parts = result_parts(name)
+    if name == CURRENT or parts[-1] == PREVIOUS:
+        raise UsageError(f"no new result can be named {name!r}", "Choose another name.")
+    return parts
 
 
 def write_results(
@@ -151,16 +162,16 @@ def write_results(
             unchanged.
         ResultRefusedError: a pose or covariance is not finite; the same.
     """
-    parts = result_parts(name)
-    if name in (CURRENT, PREVIOUS):
-        raise UsageError(f"no result can be named {name!r}", "That is a name of what is in calibration/.")
+    parts = new_result_parts(name)
     folder = session.path.joinpath(*parts)
     is_same = had_overlays = False
 
     def finish(earlier: Path, draft: Path) -> None:
         nonlocal is_same, had_overlays
         is_same = _keep_earlier_results(earlier, draft)
-        had_overlays = (earlier / OVERLAYS).is_dir() and not is_same
+        # Also those of the result before: a run that was killed had no time to draw them.
+        has_drawn = any((folder / OVERLAYS).is_dir() for folder in (earlier, earlier / PREVIOUS))
+        had_overlays = has_drawn and not (draft / OVERLAYS).is_dir()
 
     with session.replacing(*parts, finish=finish) as draft:
         names = _write_files(draft, session, calibrations, force=force)
@@ -293,22 +304,33 @@ class StoredResult:
 
 
 def stored_results(session: Session) -> list[StoredResult]:
-    """List a session's results: the current one, the one before it, and those with names in their order."""
+    """List a session's results: the current one and those with names, each followed by the one before it.
+
+    Raises:
+        SessionError: their folders cannot be read.
+    """
     named = session.path / RESULTS
-    names = sorted(entry.name for entry in named.iterdir()) if named.is_dir() else []
-    names = [CURRENT, PREVIOUS, *(name for name in names if SAFE_NAME.fullmatch(name))]
-    return [
-        _stored(session, name)
-        for name in names
-        if session.path.joinpath(*result_parts(name), RESULT).is_file()
-    ]
+    try:
+        own = sorted(entry.name for entry in named.iterdir()) if named.is_dir() else []
+    except OSError as error:
+        raise SessionError(f"{named} cannot be read: {error.strerror or error}") from error
+    names = [CURRENT, PREVIOUS]
+    for name in own:
+        if SAFE_NAME.fullmatch(name):
+            names += [name, f"{name}/{PREVIOUS}"]
+    return [found for name in names if (found := _stored(session, name)) is not None]
 
 
-def _stored(session: Session, name: str) -> StoredResult:
+def _stored(session: Session, name: str) -> StoredResult | None:
     from lce_rig.export.result import read_result
 
     folder = session.path.joinpath(*result_parts(name))
-    written_s = (folder / RESULT).stat().st_mtime
+    try:
+        written_s = (folder / RESULT).stat().st_mtime
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        return StoredResult(name, folder, None, f"{folder}: {error.strerror or error}", 0.0, False)
     try:
         saved = read_result(folder / RESULT)
     except LceRigError as error:

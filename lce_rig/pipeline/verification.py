@@ -12,7 +12,15 @@ from lce_rig.detect.events.search import EventImage
 from lce_rig.export.result import SavedResult, read_result
 from lce_rig.pipeline.calibration import clocks_of, match_sensors
 from lce_rig.pipeline.detect_session import Progress, detect, event_channels, event_picture, silent
-from lce_rig.pipeline.result_files import OVERLAYS, RESULT, Result, keep_foreign, result_content, result_parts
+from lce_rig.pipeline.result_files import (
+    OVERLAYS,
+    RESULT,
+    Result,
+    keep_foreign,
+    result_content,
+    result_parts,
+    stored_results,
+)
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.session.session import DEBUG
@@ -141,6 +149,9 @@ def _extrinsics(
 ) -> tuple[Sequence[Calibration], bytes | None]:
     """Return the extrinsics to check, and the content of the session's result.json if it holds them."""
     content = result_content(session, name)
+    if result is None and content is None and name is not None:
+        names = ", ".join(each.name for each in stored_results(session)) or "none"
+        raise SessionError(f"{session.path} has no result {name!r}", f"Its results: {names}.")
     if isinstance(result, Result):
         rig, calibrations = result.session.rig.name, result.pairs
         is_own = result.session.path.resolve() == session.path.resolve()

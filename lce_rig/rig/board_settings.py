@@ -50,8 +50,13 @@ class BoardSettings(Settings):
             f"the pattern of {cols + 1}x{rows + 1} squares of {1e3 * self.square_m:g} mm is "
             f"{width:.3g} x {height:.3g} m and does not fit on a plate {self.width_m:g} x {self.height_m:g} m"
         )
+        x, y = self.pattern_offset_m
+        if max(abs(x), abs(y)) > self.width_m + self.height_m:
+            raise problem(
+                f"{x:g}, {y:g} m is beside the plate; {x / 1e3:g}, {y / 1e3:g} if these are millimetres",
+                "pattern_offset_m",
+            )
         if offset_x or offset_y:
-            x, y = self.pattern_offset_m
             what += f" with its centre {x:g}, {y:g} m from the plate's"
         if width + offset_y <= self.height_m + 1e-3 and height + offset_x <= self.width_m + 1e-3:
             what += "; swap width_m and height_m, or inner_corners [cols, rows]"

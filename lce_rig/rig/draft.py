@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from lce_rig.core.board import Board
@@ -10,6 +10,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.rig.document import read_document
 from lce_rig.rig.editing import is_plain
 from lce_rig.rig.loading import rig_from_document
+from lce_rig.rig.sensors import VLP16_MODELS
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,10 @@ def draft_profile(
         "board:                            # measure it; do not rely on the CAD model",
         f"  inner_corners: [{board.cols}, {board.rows}]           "
         "# where four squares meet: [along the width, along the height]",
-        f"  square_m: {board.square_m:g}",
-        f"  width_m: {board.width_m:g}",
-        f"  height_m: {board.height_m:g}",
-        f"  pattern_offset_m: [{board.pattern_offset_m[0]:g}, {board.pattern_offset_m[1]:g}]"
+        f"  square_m: {board.square_m}",
+        f"  width_m: {board.width_m}",
+        f"  height_m: {board.height_m}",
+        f"  pattern_offset_m: [{board.pattern_offset_m[0]}, {board.pattern_offset_m[1]}]"
         "    # pattern's centre from the plate's centre: [right, up]",
         "",
         "lidars:",
@@ -100,7 +101,8 @@ def draft_profile(
     for camera in cameras:
         lines += _camera(camera)
     text = "\n".join(lines) + "\n"
-    rig_from_document(read_document(text, source))
+    # Nobody has seen the text yet: errors name keys, not its lines.
+    rig_from_document(replace(read_document(text, source), lines={}))
     return text
 
 
@@ -112,11 +114,20 @@ def _lidar(lidar: LidarDraft) -> list[str]:
         f"    frame: {lidar.frame or f'{lidar.name}_link'}",
         *([f"    topic: {lidar.topic}"] if lidar.topic else []),
         *([f"    rate_hz: {lidar.rate_hz:g}"] if lidar.rate_hz else []),
+        *(_VLP16_DEFAULTS if not lidar.model.upper().startswith(VLP16_MODELS) else []),
         "    timestamps:",
         "      clock: host                 # device, host or utc",
         "      reference: first_firing     # or last_firing, as some drivers timestamp",
         "      sync: none                  # hardware (shared pulse), ptp or none",
     ]
+
+
+_VLP16_DEFAULTS = [
+    "    laser_bias_sigma_m: 0.008     # these four are of a VLP-16: enter your LiDAR's",
+    "    range_offset_sigma_m: 0.005",
+    "    beam_aperture_m: 0.0127",
+    "    beam_divergence_rad: 0.003",
+]
 
 
 def _camera(camera: CameraDraft) -> list[str]:

@@ -43,7 +43,8 @@ def explain(error: ValidationError, document: Document) -> ProfileError:
         for path, problem in problems.items()
         if path not in meant
     ]
-    sentences = [f"{document.source}:{line}: {text}" for line, text in sorted(lines)]
+    places = {line: f"{document.source}:{line}" if document.lines else document.source for line, _ in lines}
+    sentences = [f"{places[line]}: {text}" for line, text in sorted(lines)]
     if len(sentences) == 1:
         return ProfileError(sentences[0])
     n_more = max(len(details) - _MOST_SHOWN, 0)

@@ -241,8 +241,7 @@ class Session:
             SessionError: there is no capture of that name, the session is open read-only, or the disk is.
         """
         self.capture(name)
-        self._move(name, CAPTURES, REJECTED)
-        self.journal("rejected", capture=name, reason=reason)
+        self._move(name, CAPTURES, REJECTED, "rejected", reason=reason)
 
     def restore(self, name: str) -> None:
         """Take a rejected capture back; raises as `reject`."""
@@ -251,15 +250,16 @@ class Session:
             raise SessionError(
                 f"{self.path} has no rejected capture {name!r}", f"Rejected captures: {names}."
             )
-        self._move(name, REJECTED, CAPTURES)
-        self.journal("restored", capture=name)
+        self._move(name, REJECTED, CAPTURES, "restored")
 
-    def _move(self, name: str, source: str, target: str) -> None:
-        """Move a capture's folder in one step, so that it is always in exactly one place."""
+    def _move(self, name: str, source: str, target: str, event: str, **fields: str) -> None:
+        """Move a capture's folder in one step: it is in one of the two places at any time."""
         self._require_lock()
         old, new = self.own(source, name), self.own(target, name)
         if new.exists():
             raise SessionError(f"{new} blocks capture {name}", f"Move {new} out of the session.")
+        # First, so that nothing moves where the disk is full.
+        self.journal(event, capture=name, **fields)
         try:
             new.parent.mkdir(exist_ok=True)
             old.rename(new)

@@ -289,7 +289,8 @@ _PROFILE: Mapping[str, Phrase] = {
     ),
     "profile.unknown_model": Phrase(
         "{subject}: the beams of {value} are not known: recordings can be calibrated, live guidance and "
-        "simulation need a VLP-16"
+        "simulation need a VLP-16",
+        "enter your LiDAR's noise and limits (docs/rig-profiles.md: for another LiDAR than a VLP-16)",
     ),
     "profile.other_driver": Phrase(
         "{subject}: {value} reads a VLP-16, and the model is {model}",

@@ -1,6 +1,7 @@
 """Results with names: kept beside the current one, listed, drawn and compared."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -96,3 +97,25 @@ def test_an_unreadable_result_is_listed_as_such(lce_rig, two_results):
     outcome = lce_rig("results", two_results)
     assert outcome.code == 0 and "ml" in outcome.out
     assert listed(lce_rig, two_results)["ml"]["problem"]
+
+
+def test_the_result_before_a_named_one_is_listed_and_drawn(lce_rig, two_results):
+    assert lce_rig("calibrate", two_results, "--method", "ml", "--seed", "9", "--name", "ml").code == 0
+    used = json.loads((two_results / "results/ml/result.json").read_text())["pairs"][0]["captures_used"]
+    assert lce_rig("captures", two_results, "--reject", used[0]).code == 0
+    assert lce_rig("calibrate", two_results, "--method", "ml", "--name", "ml").code == 0
+    found = listed(lce_rig, two_results)
+    assert "ml/previous" in found and found["ml/previous"]["is_outdated"] and not found["ml"]["is_outdated"]
+    assert lce_rig("verify", two_results, "--name", "nope").code == 4
+    assert lce_rig("calibrate", two_results, "--name", "ml/previous").code == 2
+
+
+def test_overlays_are_drawn_again_after_a_run_that_was_killed_before_it_could(lce_rig, calibrated):
+    folder = calibrated / "calibration"
+    assert lce_rig("verify", calibrated).code == 0
+    used = json.loads((folder / "result.json").read_text())["pairs"][0]["captures_used"]
+    assert lce_rig("captures", calibrated, "--reject", used[0]).code == 0
+    assert lce_rig("calibrate", calibrated).code == 0
+    shutil.rmtree(folder / "overlays")
+    assert lce_rig("calibrate", calibrated).code == 0
+    assert (folder / "overlays").is_dir()

@@ -73,3 +73,11 @@ def test_nothing_is_replaced_where_a_capture_is_to_go(session):
         session.restore("000000")
     assert (session.path / "captures" / "000000" / "mine.txt").read_text() == "a user's"
     assert names(session.rejected) == ["000000"]
+
+
+def test_nothing_moves_where_the_journal_cannot_be_written(session):
+    (session.path / "journal.jsonl").unlink()
+    (session.path / "journal.jsonl").mkdir()
+    with pytest.raises(SessionError):
+        session.reject("000000")
+    assert names(session.captures) == ["000000", "000001", "000002"] and not session.rejected
