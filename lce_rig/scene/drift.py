@@ -25,6 +25,9 @@ _MIN_EDGES = 60
 _MIN_PARTS = 6  # of the image, that carry edges
 _MIN_SCORE = 0.10  # mean log-likelihood ratio of a depth edge; 0 where edges do not belong together
 _NEARLY = 0.1  # An axis that scores so much less alone may be the one that changed.
+# Upright outlines hardly show pitch: without a slanted one the curve is nearly flat, its peak meaningless.
+_MIN_CONTRAST = 0.3  # of a peak above its curve's median, as a share of the peak
+_MIN_GAIN = 2.0  # significance of the score at a change above that of the deployed extrinsics
 _MIN_SIGNIFICANCE = 1.5  # of a peak above the rest of its curve
 _PRIOR = np.where(IS_ROTATION, np.radians(2.0), 0.10)  # of the joint maximum
 
@@ -162,11 +165,16 @@ def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment)
     reason = ""
     if abs(peak) > 0.95 * curve.offsets[-1]:
         reason = "scene.no_peak"
-    elif mean_score < _MIN_SCORE or curve.significance(peak) < _MIN_SIGNIFICANCE:
+    elif (
+        mean_score < _MIN_SCORE
+        or curve.significance(peak) < _MIN_SIGNIFICANCE
+        or np.median(curve.total) > (1 - _MIN_CONTRAST) * curve.total.max()
+    ):
         reason = "scene.flat"
-    elif smallest > _LARGEST[axis]:
+    is_beyond = abs(peak) > _THRESHOLD_SIGMAS * sigma
+    is_changed = is_beyond and not reason and curve.significance(peak, 0.0) > _MIN_GAIN
+    if not reason and (smallest > _LARGEST[axis] or is_beyond):
         reason = "scene.large_scatter"
-    is_changed = abs(peak) > _THRESHOLD_SIGMAS * sigma and reason in ("", "scene.large_scatter")
     state: State = "changed" if is_changed else "unknown" if reason else "unchanged"
     figures = (unit * peak, unit * sigma, unit * smallest)
     return AxisDrift(AXES[axis], state, *figures, "" if is_changed else reason)
