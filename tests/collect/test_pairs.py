@@ -110,7 +110,8 @@ def test_the_cap_is_kept_and_what_is_left_out_is_counted(tmp_path, folder, rig):
 
 
 def test_pictures_of_another_size_are_said(tmp_path, folder, rig):
-    cv2.imwrite(str(folder / "img" / "00002.png"), np.zeros((480, 640), np.uint8))
+    noise = np.random.default_rng(1).integers(0, 255, (480, 640), dtype=np.uint8)
+    cv2.imwrite(str(folder / "img" / "00002.png"), noise)
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, folder, rig)
     ((found,),) = report.sizes.values()
