@@ -265,7 +265,7 @@ PHRASES: dict[str, Phrase] = {
     "pair.elsewhere": Phrase(
         _candidates,
         "come closer or tilt the board more, so that both sensors see its tilt well",
-        {"hold_still": "hold the board still and clear of other things while capturing"},
+        {"hold_still": "hold the board still, and 20 cm or more clear of walls, pillars and other things"},
     ),
     "pair.two_places": Phrase(
         "{first} and {second} give different board positions in the scan", _REMOVE_OTHERS
