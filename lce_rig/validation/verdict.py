@@ -111,8 +111,8 @@ def _precision(estimate: CalibrationEstimate, cov: Array, rig: Rig) -> list[Find
                 **estimate.weakest.figures(),
             }
             is_fail = sigma > rig.verdict.fail_factor * goal
-            # The LiDAR's own errors beyond the target are not reached by any number of captures; but while the
-            # scatter between captures is the larger part, more captures help most.
+            # No number of captures helps against the LiDAR's own errors; before that, more captures help
+            # most as long as their scatter is the larger part.
             is_of_lidar = of_lidar_alone > goal and 2 * of_lidar_alone**2 > sigma**2
             action = "measure_ranges" if is_of_lidar else ""
             found.append(reason(code, figures, is_fail=is_fail, action=action))
