@@ -15,6 +15,7 @@ from lce_rig.core.geometry import transform
 from lce_rig.core.results import Calibration, ImageBoard, Refusal
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.detect.finder import BoardFinder
+from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.export.result import SavedResult, read_result
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import RESULT, result_parts
@@ -22,7 +23,7 @@ from lce_rig.recordings import open_recordings
 from lce_rig.recordings.protocol import PairedRecording
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.depth_edges import Beam, find_depth_edges
+from lce_rig.scene.depth_edges import find_depth_edges
 from lce_rig.scene.drift import AxisDrift, Drift, watch
 from lce_rig.scene.edge_field import build_edge_field
 from lce_rig.session import Session

@@ -7,27 +7,11 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array
+from lce_rig.detect.lidar.measurement import Beam
 
 _JUMP_M = 0.3
 _FULL_JUMP_M = 3.0  # Larger jumps count no more: what lies behind an edge does not sharpen it.
 _GAP_STEPS = 3.5  # Neighbours on a ring are at most so many azimuth steps apart.
-
-
-@dataclass(frozen=True)
-class Beam:
-    """Size of a LiDAR's beam.
-
-    Attributes:
-        aperture_m: diameter where it leaves the sensor.
-        divergence_rad: full opening.
-    """
-
-    aperture_m: float
-    divergence_rad: float
-
-    def radius_m(self, range_m: Array) -> Array:
-        """Half the beam's diameter at a range (N,)."""
-        return (self.aperture_m + self.divergence_rad * range_m) / 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +67,7 @@ def find_depth_edges(scan: Scan, beam: Beam) -> DepthEdges:
     inner = np.clip(near - side, 0, len(points) - 1)
     keep = (ring[inner] == ring[near]) & _is_continuous(range_m[inner], range_m[near])
     near, side, size = near[keep], side[keep], size[keep]
-    turn = side * (step_rad / 2 - beam.radius_m(range_m[near]) / range_m[near])
+    turn = side * (step_rad / 2 - beam.half_width_m(range_m[near]) / range_m[near])
     x, y, z = points[near].T
     turned = np.stack([np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y, z], axis=1)
     return DepthEdges(turned, np.sqrt(np.minimum(size, _FULL_JUMP_M)))

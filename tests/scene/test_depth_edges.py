@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from lce_rig.core.data import Scan
-from lce_rig.scene.depth_edges import Beam, find_depth_edges
+from lce_rig.detect.lidar.measurement import Beam
+from lce_rig.scene.depth_edges import find_depth_edges
 
 NEEDLE = Beam(0.0, 0.0)
 STEP = np.radians(0.2)

@@ -1,6 +1,7 @@
 """Measure a registered board for the calibration: plane, points, ring ends and size."""
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,6 +168,9 @@ BORDER_M = 0.06  # how bright the board is near its outline is asked of returns 
 SETTLED_M = 0.01  # an outline that moves less leaves the returns inside it, and so the plane, as they are
 
 
+Distance = TypeVar("Distance", float, Array)
+
+
 @dataclass(frozen=True)
 class Beam:
     """The light spot of a LiDAR: half of it reaches over an edge before the board's return is lost.
@@ -179,8 +183,8 @@ class Beam:
     aperture_m: float = 0.0127
     divergence_rad: float = 0.003
 
-    def half_width_m(self, distance_m: float) -> float:
-        """Compute half the width of the spot at a distance."""
+    def half_width_m(self, distance_m: Distance) -> Distance:
+        """Compute half the width of the spot at a distance, or at each of several."""
         return (self.aperture_m + self.divergence_rad * distance_m) / 2
 
 
