@@ -1,6 +1,6 @@
 """`lce-rig captures`: list the captures of a session, reject or restore them."""
 
-from contextlib import suppress
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +10,7 @@ from lce_rig.cli import show
 from lce_rig.cli.options import json_option, session_argument
 
 if TYPE_CHECKING:
+    from lce_rig.pipeline.result_files import StoredResult
     from lce_rig.session import Capture, Session
 
 
@@ -38,8 +39,9 @@ def captures(
         for name in restoring:
             opened.restore(name)
         changed = {*rejecting, *restoring}
-        records = [each for each in _records(opened) if not changed or each["name"] in changed]
-        outdated = [each.name for each in stored_results(opened) if changed and each.is_outdated]
+        stored = stored_results(opened)
+        records = [each for each in _records(opened, stored) if not changed or each["name"] in changed]
+        outdated = [each.name for each in stored if changed and each.is_outdated]
         n_kept, n_rejected = len(opened.captures), len(opened.rejected)
     if as_json:
         show.print_json({"format_version": 1, "rig": opened.rig.name, "captures": records})
@@ -88,8 +90,8 @@ def _require_there(session: "Session", rejecting: list[str], restoring: list[str
             )
 
 
-def _records(session: "Session") -> list[dict[str, Any]]:
-    used = _used(session)
+def _records(session: "Session", stored: Sequence["StoredResult"]) -> list[dict[str, Any]]:
+    used = _used(stored)
     states = [(each, "kept") for each in session.captures] + [(each, "rejected") for each in session.rejected]
     states.sort(key=lambda item: int(item[0].name))
     return [_record(capture, state, used.get(capture.name, [])) for capture, state in states]
@@ -109,16 +111,13 @@ def _record(capture: "Capture", state: str, used_by: list[str]) -> dict[str, Any
     return {**record, "streams": streams, "source": str(label), "damage": None}
 
 
-def _used(session: "Session") -> dict[str, list[str]]:
-    """Name the cameras whose result in calibration/ used each capture."""
-    import lce_rig as lce
-    from lce_rig.core.errors import LceRigError
-    from lce_rig.pipeline.result_files import RESULT
-    from lce_rig.session.session import CALIBRATION
+def _used(stored: Sequence["StoredResult"]) -> dict[str, list[str]]:
+    """Name the cameras whose current result used each capture."""
+    from lce_rig.pipeline.result_files import CURRENT
 
     used: dict[str, list[str]] = {}
-    with suppress(LceRigError):
-        for calibration in lce.read_result(session.path / CALIBRATION / RESULT).pairs:
+    for result in stored:
+        for calibration in result.saved.pairs if result.name == CURRENT and result.saved else ():
             for name in calibration.captures_used:
                 used.setdefault(name, []).append(calibration.camera)
     return used

@@ -254,7 +254,14 @@ def new_profile(
       lce-rig rigs new truck --from drive.bag --lidar OS1-64 --board 8x6,0.07,0.767x0.626
       lce-rig rigs new mine --from rlfs --set board.square_m=0.08 --unset nominal_extrinsics
     """
-    from lce_rig.rig import edit_text, load_rig, shipped_profiles
+    from lce_rig.rig import (
+        derive_text,
+        edit_text,
+        find_profile,
+        load_rig,
+        read_profile,
+        shipped_profiles,
+    )
 
     values = [_setting(text) for text in settings]
     path = Path(output or f"{name}.yaml")
@@ -266,9 +273,11 @@ def new_profile(
         text = _from_sensors(name, bag, lidar, cameras, intrinsics, board, target)
         text = edit_text(text, values, removed, target)
     else:
-        parent = load_rig(origin or "rlfs")
+        origin = origin or "rlfs"
+        parent = load_rig(origin)
         values = [*_sensor_settings(parent, lidar, cameras, intrinsics), *_board_settings(board), *values]
-        text = _derived(name, origin or "rlfs", parent.name, values, removed, target)
+        original = read_profile(find_profile(origin))
+        text = derive_text(original, name, values, target, parent.name, removed)
     if output == "-":
         click.echo(text, nl=False)
         return
@@ -295,10 +304,10 @@ def _is_bag(path: Path) -> bool:
         SourceError: it would be a bag, and is not there; or a folder without one.
     """
     from lce_rig.core.errors import SourceError
-    from lce_rig.recordings.ros.bag_file import SUFFIXES
+    from lce_rig.recordings.ros.bag_file import SUFFIXES, is_bag_file
 
     if path.is_dir():
-        if any(entry.suffix in SUFFIXES for entry in path.iterdir()):
+        if any(is_bag_file(entry) for entry in path.iterdir()):
             return True
         raise SourceError(
             f"{path} holds no bag ({', '.join(SUFFIXES)})",
@@ -336,19 +345,6 @@ def _from_sensors(
     for line in found:
         screen.note(line)
     return text
-
-
-def _derived(
-    name: str,
-    origin: str,
-    parent: str,
-    values: list[tuple[str, str]],
-    removed: tuple[str, ...],
-    target: str,
-) -> str:
-    from lce_rig.rig import derive_text, find_profile, read_profile
-
-    return derive_text(read_profile(find_profile(origin)), name, values, target, parent, removed)
 
 
 def _require_name(name: str) -> None:
