@@ -18,6 +18,7 @@ from lce_rig.solvers.pnp import solve_planar_pose
 
 # Noise of a corner per coordinate, as recordings of the rigs show it.
 _CORNER_SIGMA_PX = {"rlfs": 0.03, "rles": 0.05}
+_OTHER_CORNER_SIGMA_PX = 0.05
 _BEND_M = 0.005
 Rng = np.random.Generator
 
@@ -60,7 +61,8 @@ class _Photographer:
         pixels, is_valid = self.lens.project(transform(T_cam_board, self.corners))
         if not (is_valid.all() and self.lens.is_inside(pixels, 1.0).all()):
             return Refusal("image.near_border")
-        pixels = pixels + _CORNER_SIGMA_PX[self.rig.name] * self.rng.standard_normal(pixels.shape)
+        sigma_px = _CORNER_SIGMA_PX.get(self.rig.name, _OTHER_CORNER_SIGMA_PX)
+        pixels = pixels + sigma_px * self.rng.standard_normal(pixels.shape)
         solved = solve_planar_pose(pixels, self.rig.board.to_board().corners(), _lens(self.rig))
         if solved is None or solved.reprojection_px > self.rig.quality.max_reprojection_px:
             return Refusal("image.no_pose")
@@ -93,12 +95,18 @@ def wrong_plate(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
 
 def stale_intrinsics(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
     """The lens was exchanged: focal length 1 to 3 % other, centre 5 to 15 px, distortion up to 20 %."""
+    images = _Photographer.of(rig, rng, exchanged_lens(rig, rng)).take(scans.T_cam_board)
+    return Case(rig, images, scans.scans, scans.T_cam_lidar)
+
+
+def exchanged_lens(rig: Rig, rng: Rng) -> Intrinsics:
+    """Draw the lens that takes the pictures of `stale_intrinsics`."""
     lens = _lens(rig)
     factor = 1 + rng.choice([-1, 1]) * rng.uniform(0.01, 0.03)
     pixels_per_size = lens.width_px / 1280
     shift = rng.uniform(5, 15) * pixels_per_size * _direction(rng, 2)
     bend = rng.uniform(0.8, 1.2)
-    true = replace(
+    return replace(
         lens,
         fx_px=factor * lens.fx_px,
         fy_px=factor * lens.fy_px,
@@ -106,8 +114,6 @@ def stale_intrinsics(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
         cy_px=lens.cy_px + shift[1],
         distortion=tuple(bend * k for k in lens.distortion),
     )
-    images = _Photographer.of(rig, rng, true).take(scans.T_cam_board)
-    return Case(rig, images, scans.scans, scans.T_cam_lidar)
 
 
 def late_pictures(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:

@@ -1,0 +1,101 @@
+"""Ask the scene for its opinion on extrinsics that a board gave: its edges are no part of the evidence."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.errors import SessionError
+from lce_rig.core.geometry import transform
+from lce_rig.core.results import Calibration, ImageBoard
+from lce_rig.core.scene_opinion import AxisOpinion, OpinionState, SceneOpinion
+from lce_rig.detect.detection import Detections
+from lce_rig.pipeline.drift import build_view
+from lce_rig.scene.alignment import SceneView
+from lce_rig.scene.drift import AxisDrift, State, watch
+from lce_rig.session import Session
+
+_MAX_CAPTURES = 8  # More captures of one place add time and no information.
+_HOLDER_M = 1.0  # The board, and the person who holds it, are so near its middle.
+_SPLIT_SIGMAS = 3.0
+_STATES: dict[State, OpinionState] = {
+    "unchanged": "agrees",
+    "changed": "contradicts",
+    "unknown": "unknown",
+}
+
+
+def hear_scene(session: Session, detections: Detections, calibration: Calibration) -> SceneOpinion:
+    """Compare extrinsics with the edges of the scene in some captures of a session, spread over it.
+
+    Damaged captures are skipped. A camera without frames has no opinion.
+
+    Args:
+        session: any session of the rig.
+        detections: of this session, which tell where the board is.
+        calibration: the extrinsics and their covariance.
+    """
+    views = list(_views(session, detections, calibration))
+    return opinion_of(views, session.rig.cameras[calibration.camera].to_intrinsics(), calibration)
+
+
+def _views(session: Session, detections: Detections, c: Calibration) -> Iterator[SceneView]:
+    channel = session.rig.cameras[c.camera].first_channel("frames") or ""
+    boards = detections.images.get((c.camera, channel), {})
+    captures = [
+        each for each in session.captures if each.has_image(c.camera, channel) and c.lidar in each.lidars
+    ]
+    chosen = np.linspace(0, len(captures) - 1, min(len(captures), _MAX_CAPTURES)).round().astype(int)
+    for capture in (captures[k] for k in chosen):
+        with suppress(SessionError):
+            image, scan = capture.image(c.camera, channel), capture.scan(c.lidar)
+            view = build_view(session.rig, c, capture.name, image, scan)
+            yield without_holder(view, boards.get(capture.name), c)
+
+
+def without_holder(view: SceneView, board: object, calibration: Calibration) -> SceneView:
+    """Leave out the edges of the board and of the person who holds it, if the image shows a board.
+
+    Args:
+        view: of one capture.
+        board: what was detected in its image; anything but an `ImageBoard` leaves the view as it is.
+        calibration: the extrinsics.
+    """
+    if not isinstance(board, ImageBoard):
+        return view
+    points_cam = transform(calibration.T_cam_lidar, view.edges.points)
+    distance_m = np.linalg.norm(points_cam - board.T_cam_board[:3, 3], axis=1)
+    return replace(view, edges=view.edges.select(distance_m > _HOLDER_M))
+
+
+def opinion_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibration) -> SceneOpinion:
+    """Compare extrinsics with the edges of some captures, in the order of time."""
+    c = calibration
+    drift = watch(views, lens, c.T_cam_lidar, c.cov, is_joint=False)
+    if not drift.curves:
+        return SceneOpinion(drift.n_captures, drift.n_edges)
+    opinion = SceneOpinion(drift.n_captures, drift.n_edges, tuple(map(_of_axis, drift.axes)))
+    if opinion.strongest is None:
+        return opinion
+    return replace(opinion, is_split=_is_split(views, lens, c, opinion.strongest.axis))
+
+
+def _of_axis(drift: AxisDrift) -> AxisOpinion:
+    figures = float(drift.change), float(drift.sigma), float(drift.smallest)
+    return AxisOpinion(drift.axis, _STATES[drift.state], "deg" if drift.is_rotation else "m", *figures)
+
+
+def _is_split(views: Sequence[SceneView], lens: Intrinsics, c: Calibration, axis: str) -> bool:
+    """Return whether the halves of the captures put an axis at significantly different places."""
+    middle = len(views) // 2
+    drifts = [
+        watch(half, lens, c.T_cam_lidar, c.cov, is_joint=False) for half in (views[:middle], views[middle:])
+    ]
+    if not all(drift.curves for drift in drifts):
+        return False
+    curves = [drift.curves[axis] for drift in drifts]
+    # Both halves share the extrinsics and the bias of the scene: only their scatter counts.
+    sigma = float(np.hypot(curves[0].sigma(), curves[1].sigma()))
+    return abs(curves[0].peak - curves[1].peak) > _SPLIT_SIGMAS * sigma
