@@ -35,14 +35,11 @@ class SceneOpinion:
         n_captures: compared; 0 if none has an image of the camera's frames and a scan.
         n_edges: depth edges in or near their images.
         axes: one opinion each, order of a tangent; empty if there are too few edges to compare.
-        is_split: whether the first and the second half of the captures contradict each other in the axis that
-            contradicts most.
     """
 
     n_captures: int
     n_edges: int
     axes: tuple[AxisOpinion, ...] = ()
-    is_split: bool = False
 
     @property
     def state(self) -> OpinionState:
@@ -65,6 +62,5 @@ class SceneOpinion:
             "state": self.state,
             "n_captures": self.n_captures,
             "n_edges": self.n_edges,
-            "is_split": self.is_split,
             "axes": [asdict(axis) for axis in self.axes],
         }

@@ -173,14 +173,13 @@ class SceneRecord(_SavedRecord):
     state: Literal["agrees", "contradicts", "unknown"]
     n_captures: _Count
     n_edges: _Count
-    is_split: bool
     axes: list[AxisRecord]
 
     @property
     def opinion(self) -> SceneOpinion:
         """The opinion, whose state follows from its axes."""
         axes = tuple(AxisOpinion(**axis.model_dump()) for axis in self.axes)
-        return SceneOpinion(self.n_captures, self.n_edges, axes, self.is_split)
+        return SceneOpinion(self.n_captures, self.n_edges, axes)
 
 
 class PairRecord(_SavedRecord):

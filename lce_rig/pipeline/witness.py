@@ -19,7 +19,6 @@ from lce_rig.session import Session
 
 _MAX_CAPTURES = 8  # More captures of one place add time and no information.
 _HOLDER_M = 1.0  # The board, and the person who holds it, are so near its middle.
-_SPLIT_SIGMAS = 3.0
 _STATES: dict[State, OpinionState] = {
     "unchanged": "agrees",
     "changed": "contradicts",
@@ -71,31 +70,14 @@ def without_holder(view: SceneView, board: object, calibration: Calibration) -> 
 
 
 def opinion_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibration) -> SceneOpinion:
-    """Compare extrinsics with the edges of some captures, in the order of time."""
+    """Compare extrinsics with the edges of some captures."""
     c = calibration
     drift = watch(views, lens, c.T_cam_lidar, c.cov, is_joint=False)
     if not drift.curves:
         return SceneOpinion(drift.n_captures, drift.n_edges)
-    opinion = SceneOpinion(drift.n_captures, drift.n_edges, tuple(map(_of_axis, drift.axes)))
-    if opinion.strongest is None:
-        return opinion
-    return replace(opinion, is_split=_is_split(views, lens, c, opinion.strongest.axis))
+    return SceneOpinion(drift.n_captures, drift.n_edges, tuple(map(_of_axis, drift.axes)))
 
 
 def _of_axis(drift: AxisDrift) -> AxisOpinion:
     figures = float(drift.change), float(drift.sigma), float(drift.smallest)
     return AxisOpinion(drift.axis, _STATES[drift.state], "deg" if drift.is_rotation else "m", *figures)
-
-
-def _is_split(views: Sequence[SceneView], lens: Intrinsics, c: Calibration, axis: str) -> bool:
-    """Return whether the halves of the captures put an axis at significantly different places."""
-    middle = len(views) // 2
-    drifts = [
-        watch(half, lens, c.T_cam_lidar, c.cov, is_joint=False) for half in (views[:middle], views[middle:])
-    ]
-    if not all(drift.curves for drift in drifts):
-        return False
-    curves = [drift.curves[axis] for drift in drifts]
-    # Both halves share the extrinsics and the bias of the scene: only their scatter counts.
-    sigma = float(np.hypot(curves[0].sigma(), curves[1].sigma()))
-    return abs(curves[0].peak - curves[1].peak) > _SPLIT_SIGMAS * sigma

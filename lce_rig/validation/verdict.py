@@ -94,9 +94,7 @@ def scene_findings(opinion: SceneOpinion, calibration: Calibration, action: str 
     if worst is None:
         return []
     has_moving_boards = any(each.time_offset_s is not None for each in calibration.channel_results)
-    if opinion.is_split:
-        action = "moved"
-    elif not action and worst.axis == "translation_z":
+    if not action and worst.axis == "translation_z":
         action = "distances"
     elif not action and has_moving_boards:
         action = "times"

@@ -330,7 +330,6 @@ PHRASES: dict[str, Phrase] = {
         {
             "deployed": f"check whether a sensor has moved since. {_LOOK}",
             "distances": f"measure the squares and check the focal length. {_LOOK}",
-            "moved": f"fasten the sensors, one may have moved during the session, and collect again. {_LOOK}",
             "times": f"hold the board still and check the image-scan matching. {_LOOK}",
         },
     ),

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -35,6 +36,10 @@ _STILL = ("rlfs01", "rlfs02", "rlfs03", "sss_noise15mm", "acfr_vlp16", "os1_64")
 # Faults that leave the pictures of the scene as they are, or change them by a known map.
 _NOT_HERE = ("boards nearly parallel", "cameras swapped")
 _N_VIEWS, _N_SUBSETS, _N_DRAWS, _WRONG = 8, 20, 20, 3.0
+_FEW = 6
+
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +95,9 @@ def bench_witness(n_seeds: int, only: str = "") -> None:
     """Print what the scene says of results as they are, and of those of faulty sessions."""
     places = list(_places(only))
     _print_good(places)
-    _print_faults([place for place in places if place.name in _STILL], n_seeds, "recorded")
+    still = [place for place in places if place.name in _STILL]
+    for n_captures in (None, _FEW):
+        _print_faults(still, n_seeds, n_captures)
 
 
 def _places(only: str) -> Iterator[_Place]:
@@ -159,8 +166,10 @@ class _Outcome:
         return self.error > _WRONG
 
 
-def _print_faults(places: Sequence[_Place], n_seeds: int, title: str) -> None:
-    print(f"\nFaults in {title} sessions: what the boards say, and what the scene adds\n")
+def _print_faults(places: Sequence[_Place], n_seeds: int, n_captures: int | None) -> None:
+    print(
+        f"\nFaults in sessions of {n_captures or 'all'} captures: the boards' verdict, and what the scene adds\n"
+    )
     print_head(
         "fault", "results", "good", "of them pass", "contradicted", "refused",
         "wrong", "not failed by the boards", "of them pass", "contradicted", "refused",
@@ -173,7 +182,7 @@ def _print_faults(places: Sequence[_Place], n_seeds: int, title: str) -> None:
             outcome
             for place in places
             for seed in range(n_seeds)
-            if (outcome := _run(place, kind, number, seed)) is not None
+            if (outcome := _run(place, kind, number, seed, n_captures)) is not None
         ]
         _print_outcomes(kind, found)
         total += found
@@ -196,8 +205,10 @@ def _count(outcomes: Sequence[_Outcome], name: str, value: str) -> int:
     return sum(getattr(each, name) == value for each in outcomes)
 
 
-def _run(place: _Place, kind: str, number: int, seed: int) -> _Outcome | None:
+def _run(place: _Place, kind: str, number: int, seed: int, n_captures: int | None) -> _Outcome | None:
     """Calibrate a session with a fault and ask its scene; None where the boards give no result."""
+    if n_captures is not None:
+        place = _fewer(place, n_captures, np.random.default_rng(seed))
     case = KINDS[kind](place.scans, place.rig, np.random.default_rng([seed, number]))
     camera, lidar = place.good.camera, place.good.lidar
     detections = pipeline.Detections({(camera, "frames"): case.images}, {lidar: case.scans})
@@ -213,6 +224,23 @@ def _run(place: _Place, kind: str, number: int, seed: int) -> _Outcome | None:
     rotation_deg, translation_mm = compare(result.T_cam_lidar, case.T_cam_lidar)
     error = place.rig.calibration.in_targets(rotation_deg, translation_mm / 1000)
     return _Outcome(result.verdict, opinion.state, both.verdict, error)
+
+
+def _fewer(place: _Place, n_captures: int, rng: np.random.Generator) -> _Place:
+    """Choose some of the captures at random, in the order of time."""
+    names = [view.capture for view in place.views]
+    chosen = {names[k] for k in rng.choice(len(names), min(n_captures, len(names)), replace=False)}
+
+    def kept(items: Mapping[str, _T]) -> dict[str, _T]:
+        return {name: item for name, item in items.items() if name in chosen}
+
+    scans = replace(
+        place.scans,
+        T_cam_board=kept(place.scans.T_cam_board),
+        scans=kept(place.scans.scans),
+        resized={kind: kept(found) for kind, found in place.scans.resized.items()},
+    )
+    return replace(place, scans=scans, views=tuple(view for view in place.views if view.capture in chosen))
 
 
 def _faulty_views(place: _Place, kind: str, case: Case, rng: np.random.Generator) -> Sequence[SceneView]:
