@@ -1,5 +1,6 @@
 """The scene as a witness beside the boards: good results that it refuses, wrong ones that only it finds."""
 
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -167,9 +168,7 @@ class _Outcome:
 
 
 def _print_faults(places: Sequence[_Place], n_seeds: int, n_captures: int | None) -> None:
-    print(
-        f"\nFaults in sessions of {n_captures or 'all'} captures: the boards' verdict, and what the scene adds\n"
-    )
+    print(f"\nFaults in sessions of {n_captures or 'all'} captures: verdict of the boards, and of both\n")
     print_head(
         "fault", "results", "good", "of them pass", "contradicted", "refused",
         "wrong", "not failed by the boards", "of them pass", "contradicted", "refused",
@@ -223,6 +222,9 @@ def _run(place: _Place, kind: str, number: int, seed: int, n_captures: int | Non
     both = with_opinion(result, opinion)
     rotation_deg, translation_mm = compare(result.T_cam_lidar, case.T_cam_lidar)
     error = place.rig.calibration.in_targets(rotation_deg, translation_mm / 1000)
+    if opinion.strongest is not None:
+        told = f"{result.verdict}, error {error:.1f} targets: {opinion.strongest}"
+        print(f"{place.name}, {kind}, seed {seed}: {told}", file=sys.stderr, flush=True)
     return _Outcome(result.verdict, opinion.state, both.verdict, error)
 
 
