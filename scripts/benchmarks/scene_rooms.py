@@ -112,7 +112,7 @@ def furnished_room(
         folder: of sessions, see `kept_folder`.
     """
     rig, options = _small_rig(rig_name), _options(rig_name)
-    path = kept_folder(folder, rig, options) / f"{n_captures}-{seed:04d}"
+    path = kept_folder(folder, rig, options, is_detected=False) / f"{n_captures}-{seed:04d}"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = path.with_suffix(".part")
