@@ -329,10 +329,10 @@ class _Watcher:
     ) -> None:
         for c, kept in zip(self._pairs, self._kept, strict=True):
             scan = next((each for each in scans if each.sensor == c.lidar), None)
-            frames = self._rig.cameras[c.camera].first_channel("frames")
             own = [image for image in images if image.sensor == c.camera]
             # Frames before images that were made of events.
-            own.sort(key=lambda image, frames=frames: image.channel != frames)
+            frames = self._rig.cameras[c.camera].first_channel("frames")
+            own = [image for image in own if image.channel == frames] or own
             cut = next((each for each in events if each.sensor == c.camera), None)
             if scan is not None and (own or cut):
                 # Grey: colour is not used, and would hold three times the memory.
