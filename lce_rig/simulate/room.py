@@ -28,7 +28,8 @@ _WINDOW = Material((0.95, 0.90, 0.86), 0.0, "window", emission=1.0)
 # Room frame: x along the first camera's sight, y left, z up, origin on the floor below the LiDAR.
 _LOW = np.array([-4.6, -3.1, 0.0])
 _HIGH = np.array([9.0, 3.4, 3.1])
-_OBSTACLES: tuple[tuple[Array, Array], ...] = (  # (low, high) of what stands in the room, to keep the board out of it
+# (low, high) of what stands in the room, to keep the board out of it
+_OBSTACLES: tuple[tuple[Array, Array], ...] = (
     (np.array([4.9, 1.2, 0.0]), np.array([5.5, 1.8, 3.1])),
     (np.array([4.6, -3.1, 0.0]), np.array([6.3, -2.0, 1.3])),
     (np.array([1.9, 2.5, 0.0]), np.array([2.6, 3.4, 2.0])),
