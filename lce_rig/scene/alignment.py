@@ -8,7 +8,7 @@ import numpy as np
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, perturb, skew, transform
-from lce_rig.scene.depth_edges import DepthEdges
+from lce_rig.scene.depth_edges import CHANNELS, DepthEdges
 from lce_rig.scene.edge_field import EdgeField
 
 AXES = ("translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z")
@@ -58,7 +58,9 @@ class Alignment:
         ]
         column = np.clip(pixels[near, 0] / intrinsics.width_px * _COLUMNS, 0, _COLUMNS - 1).astype(np.intp)
         row = np.clip(pixels[near, 1] / intrinsics.height_px * _ROWS, 0, _ROWS - 1).astype(np.intp)
-        self._part, self._level = column * _ROWS + row, 0
+        # Each channel has its own parts: it is a witness of its own.
+        channel = np.concatenate([view.edges.channel for view in views])[near].astype(np.intp)
+        self._part, self._level = (channel * _COLUMNS + column) * _ROWS + row, 0
 
     def __len__(self) -> int:
         """Count the depth edges in or near the images."""
@@ -72,10 +74,11 @@ class Alignment:
     @property
     def weight_of_parts(self) -> Array:
         """Sum of weights of the parts of the image (columns, rows)."""
-        return self._by_part(self._weight).reshape(_COLUMNS, _ROWS)
+        by_part = self._by_part(self._weight).reshape(len(CHANNELS), _COLUMNS, _ROWS)
+        return np.asarray(by_part.sum(axis=0))
 
     def _by_part(self, values: Array) -> Array:
-        return np.asarray(np.bincount(self._part, values, _COLUMNS * _ROWS), dtype=np.float64)
+        return np.asarray(np.bincount(self._part, values, len(CHANNELS) * _COLUMNS * _ROWS), dtype=np.float64)
 
     def scores(self, tangent: Array) -> tuple[Array, Array]:
         """Score perturbed extrinsics.
@@ -84,7 +87,8 @@ class Alignment:
             tangent: (6,) (translation m, rotation rad), axes of the camera.
 
         Returns:
-            Sums over the parts of the image, and over the captures, both divided by the number of captures.
+            Sums over each channel's parts of the image, and over the captures, both divided by the number of
+            captures.
         """
         values = self.shares(perturb(self.T_cam_lidar, tangent))
         by_capture = np.bincount(self._of_view, values, self.n_captures)
