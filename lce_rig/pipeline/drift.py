@@ -71,6 +71,7 @@ class PairDrift:
             "axes": [_axis(axis) for axis in self.drift.axes],
             "T_cam_lidar": self.drift.T_cam_lidar.tolist(),
             "T_cam_lidar_best": self.drift.T_best.tolist(),
+            "covariance_best": None if self.drift.cov_best is None else self.drift.cov_best.tolist(),
             "findings": [as_json(finding) for finding in self.drift.findings],
         }
 
