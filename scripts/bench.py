@@ -42,7 +42,7 @@ PARTS = {
     "offline": 0,
     "usable": 20,
     "scene": 0,
-    "witness": 10,
+    "witness": 20,
     "speed": 0,
 }
 

@@ -74,14 +74,13 @@ def scene_texts(opinion: SceneOpinion) -> list[str]:
         f"{motion_words(axis.axis)}: {_size(axis, axis.change, '+')} +- {_size(axis, axis.sigma)}"
         for axis in opinion.of("contradicts")
     ]
-    if opinion.of("agrees"):
-        texts.append(f"would see changes {_by_kind(opinion.of('agrees'), with_size=True)}")
+    texts += [f"would see changes {kind}" for kind in _by_kind(opinion.of("agrees"), with_size=True)]
     if opinion.state != "unknown" and opinion.of("unknown"):
-        texts.append(f"cannot tell changes {_by_kind(opinion.of('unknown'))}")
+        texts.append(f"cannot tell changes {'; '.join(_by_kind(opinion.of('unknown')))}")
     return texts
 
 
-def _by_kind(axes: Sequence[AxisOpinion], *, with_size: bool = False) -> str:
+def _by_kind(axes: Sequence[AxisOpinion], *, with_size: bool = False) -> list[str]:
     """Name axes as rotations about and translations along x, y and z."""
     parts = []
     for unit, kind in (("deg", "about"), ("m", "along")):
@@ -89,7 +88,7 @@ def _by_kind(axes: Sequence[AxisOpinion], *, with_size: bool = False) -> str:
         names = [f"{axis.axis[-1]}{' ' + _size(axis, axis.smallest) if with_size else ''}" for axis in own]
         if own:
             parts.append(f"{kind} {', '.join(names)}")
-    return "; ".join(parts)
+    return parts
 
 
 def _size(axis: AxisOpinion, value: float, sign: str = "") -> str:

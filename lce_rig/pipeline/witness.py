@@ -2,23 +2,21 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SessionError
-from lce_rig.core.geometry import transform
-from lce_rig.core.results import Calibration, ImageBoard
+from lce_rig.core.results import Calibration
 from lce_rig.core.scene_opinion import AxisOpinion, OpinionState, SceneOpinion
 from lce_rig.detect.detection import Detections
-from lce_rig.pipeline.drift import build_view
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.drift import AxisDrift, State, watch
+from lce_rig.scene.views import build_view, without_holder
 from lce_rig.session import Session
 
-_MAX_CAPTURES = 8  # More captures of one place add time and no information.
-_HOLDER_M = 1.0  # The board, and the person who holds it, are so near its middle.
+MAX_CAPTURES = 6
+"""More captures of one place add time, mainly for decoding images, and no information."""
 _STATES: dict[State, OpinionState] = {
     "unchanged": "agrees",
     "changed": "contradicts",
@@ -46,27 +44,12 @@ def _views(session: Session, detections: Detections, c: Calibration) -> Iterator
     captures = [
         each for each in session.captures if each.has_image(c.camera, channel) and c.lidar in each.lidars
     ]
-    chosen = np.linspace(0, len(captures) - 1, min(len(captures), _MAX_CAPTURES)).round().astype(int)
+    chosen = np.linspace(0, len(captures) - 1, min(len(captures), MAX_CAPTURES)).round().astype(int)
     for capture in (captures[k] for k in chosen):
         with suppress(SessionError):
             image, scan = capture.image(c.camera, channel), capture.scan(c.lidar)
             view = build_view(session.rig, c, capture.name, image, scan)
             yield without_holder(view, boards.get(capture.name), c)
-
-
-def without_holder(view: SceneView, board: object, calibration: Calibration) -> SceneView:
-    """Leave out the edges of the board and of the person who holds it, if the image shows a board.
-
-    Args:
-        view: of one capture.
-        board: what was detected in its image; anything but an `ImageBoard` leaves the view as it is.
-        calibration: the extrinsics.
-    """
-    if not isinstance(board, ImageBoard):
-        return view
-    points_cam = transform(calibration.T_cam_lidar, view.edges.points)
-    distance_m = np.linalg.norm(points_cam - board.T_cam_board[:3, 3], axis=1)
-    return replace(view, edges=view.edges.select(distance_m > _HOLDER_M))
 
 
 def opinion_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibration) -> SceneOpinion:

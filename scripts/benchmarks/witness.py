@@ -14,29 +14,31 @@ import numpy as np
 from benchmarks.fault_kinds import KINDS, Case, exchanged_lens
 from benchmarks.fault_sessions import WRONG_PLATES_M, SimulatedScans, with_plate
 from benchmarks.recordings import RIGS, SETS, RecordedSet
+from benchmarks.scene_rooms import furnished_room
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig import pipeline
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.findings import worst
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import MOTIONS, Calibration, ImageBoard
 from lce_rig.core.scene_opinion import SceneOpinion
-from lce_rig.detect.detection import LidarDetection
+from lce_rig.detect.detection import ImageDetection, LidarDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.extrinsics import CalibrateOptions
-from lce_rig.pipeline.drift import build_view
-from lce_rig.pipeline.witness import opinion_of, without_holder
+from lce_rig.pipeline.witness import MAX_CAPTURES, opinion_of
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
+from lce_rig.scene.views import build_view, without_holder
 from lce_rig.session import Session
-from lce_rig.validation.verdict import with_opinion
+from lce_rig.validation.verdict import scene_findings, with_opinion
 
 _SETS = (*SETS, RecordedSet("os1_64", str(RIGS / "os1_64.yaml"), (("os1_64", "frames"),)))
 # A fault of boards that stand still; those of hand-held boards would need their times.
 _STILL = ("rlfs01", "rlfs02", "rlfs03", "sss_noise15mm", "acfr_vlp16", "os1_64")
 # Faults that leave the pictures of the scene as they are, or change them by a known map.
 _NOT_HERE = ("boards nearly parallel", "cameras swapped")
-_N_VIEWS, _N_SUBSETS, _N_DRAWS, _WRONG = 8, 20, 20, 3.0
+_N_SUBSETS, _N_DRAWS, _WRONG = 20, 20, 3.0
 _FEW = 6
 
 
@@ -66,7 +68,7 @@ class _Place:
     scans: SimulatedScans
 
     @property
-    def boards(self) -> Mapping[str, object]:
+    def boards(self) -> Mapping[str, ImageDetection]:
         """What was detected in the images, by capture."""
         return self.detections.images[self.good.camera, "frames"]
 
@@ -93,15 +95,28 @@ def _open(name: str, path: Path, T_true: Array | None) -> _Place:
 
 
 def bench_witness(n_seeds: int, only: str = "") -> None:
-    """Print what the scene says of results as they are, and of those of faulty sessions."""
-    places = list(_places(only))
-    _print_good(places)
-    still = [place for place in places if place.name in _STILL]
-    for n_captures in (None, _FEW):
-        _print_faults(still, n_seeds, n_captures)
+    """Print what the scene says of results as they are, and of those of faulty sessions.
+
+    Args:
+        n_seeds: furnished rooms, each with every fault once; a quarter of as many draws of each recorded set.
+        only: sets whose name contains this; the rooms are "rooms".
+    """
+    recorded = list(_recorded(only))
+    rooms = [_open("rooms", *_room(seed)) for seed in range(n_seeds if only in "rooms" else 0)]
+    _print_good(recorded, rooms)
+    still = [place for place in recorded if place.name in _STILL]
+    for places, what, n_draws in ((still, "recorded", -(-n_seeds // 4)), (rooms, "simulated", 1)):
+        for n_captures in (None, _FEW) if places else ():
+            print(f"\nFaults in {what} sessions of {n_captures or 'all'} captures\n")
+            _print_faults(places, n_draws, n_captures)
 
 
-def _places(only: str) -> Iterator[_Place]:
+def _room(seed: int) -> tuple[Path, Array]:
+    room = furnished_room("rlfs", seed, folder=Path(tempfile.gettempdir()) / "lce-rig-benchmarks" / "rooms")
+    return room.session.path, room.T_cam_lidar
+
+
+def _recorded(only: str) -> Iterator[_Place]:
     for recorded in _SETS:
         frames = tuple(each for each in recorded.folders if each[1] == "frames")
         recorded = replace(recorded, folders=frames)
@@ -111,27 +126,34 @@ def _places(only: str) -> Iterator[_Place]:
                 yield _open(recorded.name, Path(folder) / "session", None)
 
 
-def _print_good(places: Sequence[_Place]) -> None:
-    print(f"\nResults as they are; opinions of {_N_SUBSETS} random subsets of {_N_VIEWS} captures\n")
+def _print_good(recorded: Sequence[_Place], rooms: Sequence[_Place]) -> None:
+    print(f"\nResults as they are; opinions of {_N_SUBSETS} random subsets of {MAX_CAPTURES} captures\n")
     print_head(
-        "set",
-        "verdict of the boards",
-        "agrees",
-        "cannot tell",
-        "contradicts",
-        "axes told",
-        "would see (median)",
-    )
+        "set", "boards", "opinions", "agrees", "cannot tell", "contradicts", "refused",
+        "axes told", "would see (median)",
+    )  # fmt: skip
+    for place in recorded:
+        _print_opinions(place.name, [place], _N_SUBSETS)
+    if rooms:
+        _print_opinions("rooms", rooms, 1)
+
+
+def _print_opinions(name: str, places: Sequence[_Place], n_subsets: int) -> None:
+    opinions, refused = [], 0
     for place in places:
         rng = np.random.default_rng(0)
-        opinions = [_opinion(place, place.good, place.boards, rng) for _ in range(_N_SUBSETS)]
-        states = Counter(opinion.state for opinion in opinions)
-        known = [axis for opinion in opinions for axis in opinion.of("agrees")]
-        told = [_smallest([a.smallest for a in known if a.axis == name], name) for name in MOTIONS]
-        print_row(
-            place.name, place.good.verdict, states["agrees"], states["unknown"], states["contradicts"],
-            f"{len(known) / len(opinions):.1f}", ", ".join(filter(None, told)) or "-",
-        )  # fmt: skip
+        own = [_opinion(place, place.good, place.boards, rng) for _ in range(n_subsets)]
+        refused += sum(worst(scene_findings(each, place.good)) == "error" for each in own)
+        opinions += own
+    states = Counter(opinion.state for opinion in opinions)
+    known = [axis for opinion in opinions for axis in opinion.of("agrees")]
+    told = [_smallest([a.smallest for a in known if a.axis == motion], motion) for motion in MOTIONS]
+    verdicts = Counter(place.good.verdict for place in places)
+    print_row(
+        name, ", ".join(f"{n} {verdict}" for verdict, n in sorted(verdicts.items())), len(opinions),
+        states["agrees"], states["unknown"], states["contradicts"], refused,
+        f"{len(known) / len(opinions):.1f}", ", ".join(filter(None, told)) or "-",
+    )  # fmt: skip
 
 
 def _smallest(sizes: Sequence[float], axis: str) -> str:
@@ -144,12 +166,12 @@ def _smallest(sizes: Sequence[float], axis: str) -> str:
 def _opinion(
     place: _Place,
     calibration: Calibration,
-    boards: Mapping[str, object],
+    boards: Mapping[str, ImageDetection],
     rng: np.random.Generator,
     views: Sequence[SceneView] | None = None,
 ) -> SceneOpinion:
     views = place.views if views is None else views
-    chosen = np.sort(rng.choice(len(views), min(_N_VIEWS, len(views)), replace=False))
+    chosen = np.sort(rng.choice(len(views), min(MAX_CAPTURES, len(views)), replace=False))
     lens = place.rig.cameras[calibration.camera].to_intrinsics()
     own = [without_holder(views[k], boards.get(views[k].capture), calibration) for k in chosen]
     return opinion_of(own, lens, calibration)
@@ -168,7 +190,6 @@ class _Outcome:
 
 
 def _print_faults(places: Sequence[_Place], n_seeds: int, n_captures: int | None) -> None:
-    print(f"\nFaults in sessions of {n_captures or 'all'} captures: verdict of the boards, and of both\n")
     print_head(
         "fault", "results", "good", "of them pass", "contradicted", "refused",
         "wrong", "not failed by the boards", "of them pass", "contradicted", "refused",

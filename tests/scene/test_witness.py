@@ -11,7 +11,8 @@ from lce_rig.core.scene_opinion import SceneOpinion
 from lce_rig.export.result import read_result, write_result
 from lce_rig.pipeline.detect_session import detect
 from lce_rig.pipeline.verification import verify
-from lce_rig.pipeline.witness import hear_scene, without_holder
+from lce_rig.pipeline.witness import hear_scene
+from lce_rig.scene.views import without_holder
 from lce_rig.session import Session
 from lce_rig.validation.verdict import with_opinion
 
