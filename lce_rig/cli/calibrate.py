@@ -71,7 +71,8 @@ def scene_texts(opinion: SceneOpinion) -> list[str]:
         return [f"cannot tell: too few edges ({seen})"]
     texts = [f"{SCENE_STATES[opinion.state]} ({seen})"]
     texts += [
-        f"{motion_words(axis.axis)}: {_size(axis, axis.change, '+')} +- {_size(axis, axis.sigma)}"
+        f"{motion_words(axis.axis)}: {_value(axis, axis.change, '+')} +- {_value(axis, axis.sigma)} "
+        f"{_UNITS[axis.unit]}"
         for axis in opinion.of("contradicts")
     ]
     texts += [f"would see changes {kind}" for kind in _by_kind(opinion.of("agrees"), with_size=True)]
@@ -85,14 +86,19 @@ def _by_kind(axes: Sequence[AxisOpinion], *, with_size: bool = False) -> list[st
     parts = []
     for unit, kind in (("deg", "about"), ("m", "along")):
         own = [axis for axis in axes if axis.unit == unit]
-        names = [f"{axis.axis[-1]}{' ' + _size(axis, axis.smallest) if with_size else ''}" for axis in own]
+        names = [
+            f"{each.axis[-1]} {_value(each, each.smallest)}" if with_size else each.axis[-1] for each in own
+        ]
         if own:
-            parts.append(f"{kind} {', '.join(names)}")
+            parts.append(f"{kind} {', '.join(names)}{' ' + _UNITS[unit] if with_size else ''}")
     return parts
 
 
-def _size(axis: AxisOpinion, value: float, sign: str = "") -> str:
-    return f"{value:{sign}.2f} deg" if axis.unit == "deg" else f"{1000 * value:{sign}.0f} mm"
+_UNITS = {"deg": "deg", "m": "mm"}
+
+
+def _value(axis: AxisOpinion, value: float, sign: str = "") -> str:
+    return f"{value:{sign}.2f}" if axis.unit == "deg" else f"{1000 * value:{sign}.0f}"
 
 
 # The report of several cameras: their relative poses, and which of them has no result.

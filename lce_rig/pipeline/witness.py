@@ -31,7 +31,7 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
 
     Args:
         session: any session of the rig.
-        detections: of this session, which tell where the board is.
+        detections: of this session: its captures, and where the board is.
         calibration: the extrinsics and their covariance.
     """
     views = list(_views(session, detections, calibration))
@@ -41,15 +41,13 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
 def _views(session: Session, detections: Detections, c: Calibration) -> Iterator[SceneView]:
     channel = session.rig.cameras[c.camera].first_channel("frames") or ""
     boards = detections.images.get((c.camera, channel), {})
-    captures = [
-        each for each in session.captures if each.has_image(c.camera, channel) and c.lidar in each.lidars
-    ]
-    chosen = np.linspace(0, len(captures) - 1, min(len(captures), MAX_CAPTURES)).round().astype(int)
-    for capture in (captures[k] for k in chosen):
+    names = sorted(boards.keys() & detections.lidars[c.lidar].keys())
+    for k in np.linspace(0, len(names) - 1, min(len(names), MAX_CAPTURES)).round().astype(int):
         with suppress(SessionError):
+            capture = session.capture(names[k])
             image, scan = capture.image(c.camera, channel), capture.scan(c.lidar)
             view = build_view(session.rig, c, capture.name, image, scan)
-            yield without_holder(view, boards.get(capture.name), c)
+            yield without_holder(view, boards[capture.name], c)
 
 
 def opinion_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibration) -> SceneOpinion:
