@@ -104,7 +104,7 @@ def exchanged_lens(rig: Rig, rng: Rng) -> Intrinsics:
     lens = _lens(rig)
     factor = 1 + rng.choice([-1, 1]) * rng.uniform(0.01, 0.03)
     pixels_per_size = lens.width_px / 1280
-    shift = rng.uniform(5, 15) * pixels_per_size * _direction(rng, 2)
+    shift = rng.uniform(5, 15) * pixels_per_size * direction(rng, 2)
     bend = rng.uniform(0.8, 1.2)
     return replace(
         lens,
@@ -120,12 +120,12 @@ def late_pictures(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
     """A board is moved by hand and pictures are 20 to 100 ms late; every other time always the same way."""
     offset_s = rng.uniform(0.02, 0.1)
     is_one_way = rng.random() < 0.5
-    way = _direction(rng, 3)
+    way = direction(rng, 3)
     moved = {}
     for name, T in scans.T_cam_board.items():
         late_s = offset_s + rng.uniform(-0.025, 0.025)
-        velocity = rng.uniform(0.05, 0.3) * (way if is_one_way else _direction(rng, 3))
-        turn = np.radians(rng.uniform(0, 12)) * _direction(rng, 3)
+        velocity = rng.uniform(0.05, 0.3) * (way if is_one_way else direction(rng, 3))
+        turn = np.radians(rng.uniform(0, 12)) * direction(rng, 3)
         # The board turns about its own middle, whose place the translation gives.
         moved[name] = perturb(T, late_s * np.concatenate([velocity, turn]))
     return Case(rig, _Photographer.of(rig, rng).take(moved), scans.scans, scans.T_cam_lidar)
@@ -134,7 +134,7 @@ def late_pictures(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
 def nudged(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
     """The camera is nudged by 0.5 to 3 deg and 5 to 40 mm in the middle third; its last place counts."""
     tangent = np.concatenate(
-        [rng.uniform(0.005, 0.04) * _direction(rng, 3), np.radians(rng.uniform(0.5, 3)) * _direction(rng, 3)]
+        [rng.uniform(0.005, 0.04) * direction(rng, 3), np.radians(rng.uniform(0.5, 3)) * direction(rng, 3)]
     )
     # Seen from the camera everything else moves.
     T_after_before = perturb(np.eye(4), tangent)
@@ -160,8 +160,8 @@ def decoys(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
             continue
         centre = found[0].T_lidar_board[:3, 3]
         ray = centre / np.linalg.norm(centre)
-        shift = behind_m * ray if is_behind else rng.uniform(0.05, 1.0) * _direction(rng, 3)
-        turn = exp_so3(np.radians(rng.uniform(0, 10 if is_behind else 40)) * _direction(rng, 3))
+        shift = behind_m * ray if is_behind else rng.uniform(0.05, 1.0) * direction(rng, 3)
+        turn = exp_so3(np.radians(rng.uniform(0, 10 if is_behind else 40)) * direction(rng, 3))
         changed[name] = [_moved(found[0], pose(turn, centre + shift - turn @ centre))]
     images = _Photographer.of(rig, rng).take(scans.T_cam_board)
     return Case(rig, images, changed, scans.T_cam_lidar)
@@ -222,7 +222,8 @@ def swapped_cameras(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
     return Case(swapped, images, scans.scans, T_other_own @ scans.T_cam_lidar)
 
 
-def _direction(rng: Rng, n: int) -> Array:
+def direction(rng: Rng, n: int) -> Array:
+    """Draw a unit vector of n dimensions."""
     v = rng.standard_normal(n)
     return np.asarray(v / np.linalg.norm(v))
 

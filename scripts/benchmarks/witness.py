@@ -11,7 +11,7 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from benchmarks.fault_kinds import KINDS, Case, exchanged_lens
+from benchmarks.fault_kinds import KINDS, Case, direction, exchanged_lens
 from benchmarks.fault_sessions import WRONG_PLATES_M, SimulatedScans, with_plate
 from benchmarks.recordings import RIGS, SETS, RecordedSet
 from benchmarks.scene_rooms import furnished_room
@@ -20,18 +20,20 @@ from lce_rig import pipeline
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import worst
-from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.geometry import Array, invert, perturb, transform
 from lce_rig.core.results import MOTIONS, Calibration, ImageBoard
 from lce_rig.core.scene_opinion import SceneOpinion
 from lce_rig.detect.detection import ImageDetection, LidarDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.extrinsics import CalibrateOptions
+from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.witness import MAX_CAPTURES, opinion_of
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.views import build_view, without_holder
 from lce_rig.session import Session
 from lce_rig.validation.verdict import scene_findings, with_opinion
+from lce_rig.verify.session_check import check_session
 
 _SETS = (*SETS, RecordedSet("os1_64", str(RIGS / "os1_64.yaml"), (("os1_64", "frames"),)))
 # A fault of boards that stand still; those of hand-held boards would need their times.
@@ -104,6 +106,7 @@ def bench_witness(n_seeds: int, only: str = "") -> None:
     recorded = list(_recorded(only))
     rooms = [_open("rooms", *_room(seed)) for seed in range(n_seeds if only in "rooms" else 0)]
     _print_good(recorded, rooms)
+    _print_moved(recorded, rooms)
     still = [place for place in recorded if place.name in _STILL]
     for places, what, n_draws in ((still, "recorded", -(-n_seeds // 4)), (rooms, "simulated", 1)):
         for n_captures in (None, _FEW) if places else ():
@@ -175,6 +178,48 @@ def _opinion(
     lens = place.rig.cameras[calibration.camera].to_intrinsics()
     own = [without_holder(views[k], boards.get(views[k].capture), calibration) for k in chosen]
     return opinion_of(own, lens, calibration)
+
+
+# Changes since the calibration, drawn within these limits: rotation deg, translation m.
+_MOVED = {
+    "0.5 to 1 deg, 5 to 20 mm": ((0.5, 1.0), (0.005, 0.02)),
+    "1 to 3 deg, 5 to 40 mm": ((1.0, 3.0), (0.005, 0.04)),
+}
+
+
+def _print_moved(recorded: Sequence[_Place], rooms: Sequence[_Place]) -> None:
+    """Verify results of a rig that has changed since, on a session of the rig as it is."""
+    print("\n`verify` of results of a rig that has changed since\n")
+    print_head(
+        "sets", "changed by", "results", "boards refuse", "scene contradicts", "scene refuses",
+        "only the scene refuses", "neither refuses, scene contradicts", "scene agrees",
+    )  # fmt: skip
+    for places, what, n_draws in ((recorded, "recorded", _N_SUBSETS), (rooms, "rooms", 2)):
+        for title, (degrees, metres) in _MOVED.items() if places else ():
+            rng = np.random.default_rng(0)
+            found = []
+            for place in places:
+                for _ in range(n_draws):
+                    shift = rng.uniform(*metres) * direction(rng, 3)
+                    turn = np.radians(rng.uniform(*degrees)) * direction(rng, 3)
+                    found.append(_verified(place, np.concatenate([shift, turn]), rng))
+            n_both = [sum(each) for each in zip(*found, strict=True)]
+            print_row(what, title, len(found), *n_both)
+
+
+def _verified(place: _Place, tangent: Array, rng: np.random.Generator) -> tuple[bool, ...]:
+    """Verify extrinsics that are off by a tangent; the columns of `_print_moved`."""
+    c = replace(place.good, T_cam_lidar=perturb(place.T_cam_lidar, tangent), captures_used=())
+    opinion = _opinion(place, c, place.boards, rng)
+    clocks = clocks_of(place.rig, c.camera, c.lidar)
+    found = check_session(place.rig, place.detections, c, "frames", clocks, opinion).findings
+    by_scene = [each for each in found if each.code == "verdict.scene"]
+    by_boards = [each for each in found if each.code != "verdict.scene"]
+    has_refused = worst(by_scene) == "error"
+    return (
+        bool(by_boards), bool(by_scene), has_refused, has_refused and not by_boards,
+        bool(by_scene) and not (has_refused or by_boards), opinion.state == "agrees",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
