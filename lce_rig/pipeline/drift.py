@@ -26,7 +26,7 @@ from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.drift import AxisDrift, Drift, watch
-from lce_rig.scene.views import build_view, without_board
+from lce_rig.scene.views import build_view, without_board, without_movers
 from lce_rig.session import Capture, Session
 from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.rig_clock import RigClock
@@ -126,7 +126,8 @@ def drift(
             the same time, such as a pcap and the images' folder.
         result: the deployed extrinsics; None for the session's own result.
         rig: the profile of a recording; a session has its own.
-        ignore_board: leave out the edges at the board, where an image shows one.
+        ignore_board: leave out the edges at the board, where an image shows one, and what moves before a
+            standing rig.
         progress: called with (done, total) captures, or images and scans.
 
     Raises:
@@ -362,6 +363,8 @@ class _Watcher:
             views.append(view)
             if example is None or len(view.edges) > len(example[2].edges):
                 example = seen.name, seen.image, view
+        if self._ignore_board:
+            views = without_movers(views)
         judged = watch(views, lens, c.T_cam_lidar, c.cov)
         if not kept:
             lacking = Finding("scene.no_samples", "error", c.camera, {"lidar": c.lidar})

@@ -12,7 +12,7 @@ from lce_rig.core.scene_opinion import AxisOpinion, OpinionState, SceneOpinion
 from lce_rig.detect.detection import Detections
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.drift import AxisDrift, State, watch
-from lce_rig.scene.views import build_view, without_holder
+from lce_rig.scene.views import build_view, without_board, without_movers
 from lce_rig.session import Session
 
 MAX_CAPTURES = 6
@@ -47,13 +47,13 @@ def _views(session: Session, detections: Detections, c: Calibration) -> Iterator
             capture = session.capture(names[k])
             image, scan = capture.image(c.camera, channel), capture.scan(c.lidar)
             view = build_view(session.rig, c, capture.name, image, scan)
-            yield without_holder(view, boards[capture.name], c)
+            yield without_board(view, boards[capture.name], session.rig, c)
 
 
 def opinion_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibration) -> SceneOpinion:
-    """Compare extrinsics with the edges of some captures."""
+    """Compare extrinsics with the edges of some captures, without what moves before a standing rig."""
     c = calibration
-    drift = watch(views, lens, c.T_cam_lidar, c.cov, is_joint=False)
+    drift = watch(without_movers(views), lens, c.T_cam_lidar, c.cov, is_joint=False)
     if not drift.curves:
         return SceneOpinion(drift.n_captures, drift.n_edges)
     return SceneOpinion(drift.n_captures, drift.n_edges, tuple(map(_of_axis, drift.axes)))

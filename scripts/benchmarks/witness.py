@@ -30,7 +30,7 @@ from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.witness import MAX_CAPTURES, opinion_of
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.views import build_view, without_holder
+from lce_rig.scene.views import build_view, without_board
 from lce_rig.session import Session
 from lce_rig.validation.verdict import scene_findings, with_opinion
 from lce_rig.verify.session_check import check_session
@@ -176,7 +176,7 @@ def _opinion(
     views = place.views if views is None else views
     chosen = np.sort(rng.choice(len(views), min(MAX_CAPTURES, len(views)), replace=False))
     lens = place.rig.cameras[calibration.camera].to_intrinsics()
-    own = [without_holder(views[k], boards.get(views[k].capture), calibration) for k in chosen]
+    own = [without_board(views[k], boards[views[k].capture], place.rig, calibration) for k in chosen]
     return opinion_of(own, lens, calibration)
 
 
