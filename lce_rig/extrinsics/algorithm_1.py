@@ -82,7 +82,7 @@ _TIMES_MEDIAN = 3.0
 # A disagreement below this can be noise, however well the other captures agree.
 _FLOOR_M = 0.02
 _MAX_SHARE = 0.25
-# More captures are predicted in folds, and refused by as many at once as a fold has, so that the cost is linear.
+# More captures are predicted in folds of several, and as many are refused at once: the cost stays linear.
 _MAX_FOLDS = 60
 _SIGMA_FLOOR_M = 0.001
 
