@@ -176,6 +176,21 @@ def test_a_full_disk_is_one_clear_error_and_spares_the_captures(wire: Start, tmp
 
 
 @pytest.mark.long
+def test_a_recording_cut_by_a_full_disk_is_told_by_the_exit_code_and_spares_the_captures(
+    wire: Start, tmp_path: Path
+) -> None:
+    rig, session, streams = wire(), tmp_path / "session", tmp_path / "streams"
+    with Collecting(rig.profile, session, "--hold", "0", "--record", str(streams)) as collecting:
+        collecting.wait_for_captures(1)
+        # Captures fit below this limit, the packets of the LiDAR soon do not.
+        resource.prlimit(collecting.pid, resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
+        collecting.wait_for_captures(3)
+        assert collecting.end() == 4
+    assert len(errors(collecting.said)) == 1 and str(streams) in errors(collecting.said)[0]
+    assert len(check_whole(session)) >= 3
+
+
+@pytest.mark.long
 def test_guidance_goes_on_while_a_slow_disk_takes_a_capture(
     wire: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
