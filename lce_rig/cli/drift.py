@@ -1,19 +1,22 @@
 """`lce-rig drift`: compare deployed extrinsics with the edges of a scene, exit by what they say."""
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import json_option
+from lce_rig.cli.options import FiniteRange, json_option
 
 if TYPE_CHECKING:
-    from lce_rig.pipeline.drift import PairDrift
+    from lce_rig.export.result import SavedResult
+    from lce_rig.pipeline.drift import DriftReport, PairDrift
+    from lce_rig.rig import Rig
 
 
 @click.command()
-@click.argument("recording", type=click.Path(path_type=Path), default="session")
+@click.argument("recordings", nargs=-1, type=click.Path(path_type=Path), metavar="[RECORDING]...")
 @click.option(
     "--result",
     type=click.Path(path_type=Path),
@@ -24,37 +27,58 @@ if TYPE_CHECKING:
     "--rig",
     "rig_name",
     metavar="NAME|FILE",
-    help="Set the rig profile of a folder of images and point clouds; a session has its own.",
+    help="Set the rig profile of recordings or of attached sensors; a session has its own.",
+)
+@click.option(
+    "--seconds",
+    type=FiniteRange(1, 86400),
+    metavar="S",
+    help="Watch attached sensors for S seconds [default: until Ctrl-C].",
 )
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Write images into this folder."
 )
-@click.option("--ignore-board", is_flag=True, help="Leave out edges at the board, where an image shows one.")
+@click.option("--ignore-board", is_flag=True, help="Leave out edges at the board and at what moves.")
 @json_option
 def drift(
-    recording: Path,
+    recordings: tuple[Path, ...],
     result: Path | None,
     rig_name: str | None,
+    seconds: float | None,
     output: Path | None,
     ignore_board: bool,
     as_json: bool,
 ) -> None:
     """Check on RECORDING (default: session/), without a board, whether extrinsics still hold.
 
-    RECORDING is a session or, with --rig, a folder of images and point clouds. Depth edges of the scans are
+    RECORDING is a session or, with --rig, a folder of images and point clouds, a ROS 1 or ROS 2 bag, an mcap,
+    or several recordings of the same time, such as a pcap and a camera's file. With --rig and no RECORDING,
+    the attached sensors are watched; Ctrl-C ends this and judges what was seen. Depth edges of the scans are
     compared with edges of the images. Exits with 0 if no axis has changed, with 7 if one has, and with 6 if
-    the scene cannot tell.
+    the scene cannot tell; of several cameras the worst counts.
     """
-    from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError
+    from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
     from lce_rig.export.result import read_result
     from lce_rig.pipeline.drift import drift as watch_drift
     from lce_rig.rig import load_rig
     from lce_rig.words import as_line, describe, recommend
 
+    is_live = rig_name is not None and not recordings
+    if seconds is not None and not is_live:
+        raise UsageError("--seconds applies to attached sensors only", "Omit it, or give --rig alone.")
+    if is_live and result is None:
+        raise UsageError("attached sensors have no result", "Name one with --result FILE.")
     saved = None if result is None else read_result(result)
     rig = None if rig_name is None else load_rig(rig_name)
-    with show.progress_bar("reading") as progress:
-        report = watch_drift(recording, saved, rig=rig, ignore_board=ignore_board, progress=progress)
+    if is_live:
+        assert rig is not None and saved is not None
+        report = _watch_live(rig, saved, seconds, ignore_board)
+    else:
+        given = recordings or (Path("session"),)
+        with show.progress_bar("reading") as progress:
+            report = watch_drift(given, saved, rig=rig, ignore_board=ignore_board, progress=progress)
+    for text in report.notes:
+        show.note(text)
     files = [] if output is None else report.write(output)
     if as_json:
         pairs = [pair.document() for pair in report.pairs]
@@ -71,6 +95,27 @@ def drift(
             first = concerned[0].drift.findings[0]
             names = " and ".join(f"{pair.calibration.camera}, {pair.calibration.lidar}" for pair in concerned)
             raise error(f"{names}: {describe(first)}", as_line(recommend(first)))
+
+
+def _watch_live(rig: "Rig", saved: "SavedResult", seconds: float | None, ignore_board: bool) -> "DriftReport":
+    """Watch attached sensors until the time is over, or a signal or q asks to stop."""
+    from lce_rig.devices.opening import open_live
+    from lce_rig.pipeline.drift import drift_live
+    from lce_rig.screen.keys import controls
+
+    with show.progress_bar("watching, seconds") as progress, controls() as asked:
+        began_s: list[float] = []
+
+        def is_over(n_scans: int) -> bool:
+            if not began_s:
+                began_s.append(time.monotonic())
+                if seconds is None:
+                    show.note("watching; Ctrl-C ends and judges what was seen")
+            elapsed_s = time.monotonic() - began_s[0]
+            progress(int(elapsed_s), int(seconds or elapsed_s))
+            return asked() == "stop" or (seconds is not None and elapsed_s >= seconds)
+
+        return drift_live(rig, saved, open_live(rig), ignore_board=ignore_board, is_over=is_over)
 
 
 _STATES = {"unchanged": "no change seen", "changed": "[red]changed[/]", "unknown": "[yellow]cannot tell[/]"}

@@ -70,6 +70,10 @@ PHRASES = {
     "scene.few_edges": Phrase(
         "{n_edges} edges of the scene in {n_captures} captures are too few or too close together", _RECORD
     ),
+    "scene.no_samples": Phrase(
+        "no image or events of {subject} within the tolerance of a scan of {lidar}",
+        "check the topics and timestamps of the recording, or record this camera",
+    ),
     "scene.axis_unchanged": Phrase(_axis_unchanged),
     "scene.axis_changed": Phrase(_axis_changed),
     "scene.large_scatter": Phrase(_large_scatter, "record more places or more upright edges"),

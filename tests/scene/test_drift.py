@@ -8,6 +8,7 @@ import pytest
 from lce_rig.core.geometry import difference, perturb
 from lce_rig.core.results import Calibration
 from lce_rig.scene.alignment import AXES, Alignment
+from lce_rig.scene.depth_edges import CHANNELS
 from lce_rig.scene.drift import watch
 from lce_rig.scene.edge_field import build_edge_field
 
@@ -104,6 +105,19 @@ def test_one_capture_claims_no_more_than_all(seen) -> None:
     assert alone.state != "changed"
     for one, many in zip(alone.axes, all_of_them.axes, strict=True):
         assert one.state == "unknown" or one.smallest > 0.9 * many.smallest
+
+
+def test_changes_of_reflectivity_alone_show_pitch_and_yaw(seen) -> None:
+    lens = seen.rig.cameras["cam"].to_intrinsics()
+    is_painted = [view.edges.channel == CHANNELS.index("reflectivity") for view in seen.views]
+    views = [
+        replace(view, edges=view.edges.select(keep))
+        for view, keep in zip(seen.views, is_painted, strict=True)
+    ]
+    alignment = Alignment(views, lens, seen.truth.T_cam_lidar)
+    for axis in ("rotation_x", "rotation_y"):
+        curve = alignment.curve(AXES.index(axis), np.zeros(6))
+        assert abs(np.degrees(curve.peak)) < 0.15
 
 
 def test_too_few_edges_cannot_tell(seen) -> None:
