@@ -116,8 +116,8 @@ def test_losses_of_the_network_are_counted_and_shown_and_collection_goes_on(
     n_withheld = rig.stop()["withheld"]
     found = re.search(r"dropped: .*lidar (\d+)", collecting.said)
     assert n_withheld > 300 and found is not None
-    # Losses are counted by the azimuths between packets: a long gap may be one packet off. A busy computer may
-    # lose some itself.
+    # Losses are counted by the azimuths between packets: a long gap may be one packet off.
+    # A busy computer may lose some itself.
     assert 0.97 * n_withheld <= int(found[1]) < 1.2 * n_withheld
     assert journal_of(tmp_path / "session")[0]["lost"]["lidar"] == int(found[1])
     check_whole(tmp_path / "session")
