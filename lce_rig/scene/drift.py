@@ -123,7 +123,7 @@ def watch(
     axes, tangent = _decide(alignment, curves, sigma_deployed)
     T_best, cov_best = perturb(T_cam_lidar, tangent), None
     if is_joint:
-        best = estimate(views, intrinsics, T_best)
+        best = estimate(views, intrinsics, T_best, is_far=any(axis.state != "unchanged" for axis in axes))
         T_best, cov_best = best.T_cam_lidar, best.cov
     findings = (_summary(axes, len(views)), *map(_of_axis, axes), *missing)
     by_axis = dict(zip(AXES, curves, strict=True))
