@@ -195,6 +195,14 @@ class Curve:
         gains = self.at(offset) - reference
         return float(gains.sum() / max(np.sqrt(np.sum(gains**2)), 1e-12))
 
+    def smallest_significant(self, limit: float) -> float:
+        """Find how far from the peak, on either side, its significance exceeds a limit; inf if it never does."""
+        gains = self.at(self.peak) - self.by_part
+        significance = gains.sum(axis=1) / np.maximum(np.sqrt(np.sum(gains**2, axis=1)), 1e-12)
+        off = self.offsets - self.peak
+        beyond = [np.abs(off[(significance > limit) & (off * side > 0)]) for side in (-1, 1)]
+        return max(float(each.min(initial=np.inf)) for each in beyond)
+
 
 def _peaks(columns: Array, offsets: Array) -> Array:
     """Find the highest point of each column (K, N), between grid points by a parabola."""

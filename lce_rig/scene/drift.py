@@ -26,6 +26,7 @@ _NEARLY = 0.1  # An axis that scores so much less alone may be the one that chan
 # Upright outlines hardly show pitch: without a slanted one the curve is nearly flat, its peak meaningless.
 _MIN_CONTRAST = 0.3  # of a peak above its curve's median, as a share of the peak
 _MIN_GAIN = 2.0  # significance of the score at a change above that of the deployed extrinsics
+_GAIN_MARGIN = 0.2  # At the smallest change, the parts agree by so much more.
 _MIN_SIGNIFICANCE = 1.5  # of a peak above the rest of its curve
 
 
@@ -162,7 +163,9 @@ def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment)
     unit = float(np.degrees(1.0)) if IS_ROTATION[axis] else 1.0
     peak, scatter = curve.peak, curve.sigma()
     sigma = float(np.sqrt(scatter**2 + sigma_deployed**2 + BIAS[axis] ** 2))
-    smallest = (_THRESHOLD_SIGMAS + _POWER_SIGMAS) * sigma
+    smallest = max(
+        (_THRESHOLD_SIGMAS + _POWER_SIGMAS) * sigma, curve.smallest_significant(_MIN_GAIN + _GAIN_MARGIN)
+    )
     mean_score = float(curve.total.max() / alignment.weight_of_parts.sum() * alignment.n_captures)
     reason = ""
     if abs(peak) > 0.95 * curve.offsets[-1]:
