@@ -15,6 +15,7 @@
     scripts/bench.py usable      are captures that are taken usable? live sessions, --record, recordings
     scripts/bench.py uncertainty  the joint estimate: errors against their bound, truth of its claim
     scripts/bench.py scene       extrinsics checked without a board, on recordings by others
+    scripts/bench.py growth      calibrate after detection as sessions grow: time and memory
     scripts/bench.py speed       detection, Algorithm 1, the command line
 
 Simulated boards are kept, as long as neither simulator nor detectors change; random choices are seeded. Run
@@ -41,6 +42,7 @@ PARTS = {
     "offline": 0,
     "usable": 20,
     "scene": 0,
+    "growth": 0,
     "speed": 0,
 }
 
@@ -61,7 +63,7 @@ def main() -> None:
         "--output",
         type=Path,
         default=Path("build/paper"),
-        help="folder of `paper`, and of what `uncertainty` keeps",
+        help="folder of `paper`, and of what `uncertainty` and `growth` keep",
     )
     parser.add_argument(
         "--captures",
@@ -100,6 +102,8 @@ def main() -> None:
         bench(arguments.seeds or PARTS["faults"], n_sessions=arguments.scans)
     elif arguments.part == "scene":
         bench(min(arguments.splits, 2), arguments.only)
+    elif arguments.part == "growth":
+        bench(arguments.output)
     elif arguments.part == "corruptions":
         bench(arguments.only)
     elif arguments.part == "live":
