@@ -196,7 +196,7 @@ class Curve:
         return float(gains.sum() / max(np.sqrt(np.sum(gains**2)), 1e-12))
 
     def smallest_significant(self, limit: float) -> float:
-        """Find how far from the peak, on either side, its significance exceeds a limit; inf if it never does."""
+        """Find how far from the peak, on either side, its significance exceeds a limit; inf if never."""
         gains = self.at(self.peak) - self.by_part
         significance = gains.sum(axis=1) / np.maximum(np.sqrt(np.sum(gains**2, axis=1)), 1e-12)
         off = self.offsets - self.peak

@@ -126,7 +126,7 @@ def watch(
     if is_joint:
         best = estimate(views, intrinsics, T_best, is_far=any(axis.state != "unchanged" for axis in axes))
         T_best, cov_best = best.T_cam_lidar, best.cov
-    findings = (_summary(axes, len(views)), *map(_of_axis, axes), *missing)
+    findings = (_summary(axes, len(views)), *map(_of_axis, axes), *_open_axes(cov_best), *missing)
     by_axis = dict(zip(AXES, curves, strict=True))
     return Drift(axes, findings, T_cam_lidar, T_best, cov_best, by_axis, len(views), n_edges)
 
@@ -208,6 +208,15 @@ def _of_axis(axis: AxisDrift) -> Finding:
     if axis.state == "unchanged":
         return Finding("scene.axis_unchanged", "note", axis.axis, figures)
     return Finding(axis.reason, "warning", axis.axis, figures)
+
+
+def _open_axes(cov_best: Array | None) -> list[Finding]:
+    """Name the axes in which the best extrinsics are uncertain."""
+    if cov_best is None:
+        return []
+    is_open = np.sqrt(np.diag(cov_best)) > _LARGEST
+    axes = tuple(axis for axis, each in zip(AXES, is_open, strict=True) if each)
+    return [Finding("scene.best_uncertain", "warning", figures={"axes": axes})] if axes else []
 
 
 def _sides_without_edges(alignment: Alignment) -> list[Finding]:

@@ -25,7 +25,7 @@ _CHANCE = 2.0  # A direction needs a curvature of more than the root of so many 
 _N_WEAK, _OFFSETS = 2, (-1.4, -0.7, 0.7, 1.4)
 _LEAST_REACH = 0.3
 _SAME = 0.15  # Maxima so close are one.
-# A search from far off: starts tried at low resolution, those climbed from, and those climbed from to the end.
+# A search from far off: starts tried at low resolution, those climbed from there, and those to the end.
 _FAR = np.where(IS_ROTATION, np.radians(3.0), 0.2)
 _BESIDE_RAD = 0.12
 _N_SWEPT, _N_KEPT, _N_FINE = 2048, 16, 6
