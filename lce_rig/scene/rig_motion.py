@@ -1,0 +1,106 @@
+"""How a rig moves while it records: from two consecutive scans, for points seen before or after an image."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.data import Scan
+from lce_rig.core.geometry import Array, exp_so3, log_so3
+
+# Scans of a standing rig differ by less in a tenth of a second: noise, and people who pass by.
+_STILL_MPS, _STILL_RAD_S = 0.2, np.radians(1.5)
+_LONGEST_GAP_S = 0.5
+_VOXEL_M = 0.15
+_REACH_M = 0.6  # of the first round of matching
+_ROBUST_M = 0.1  # Residuals beyond this hardly count: people and cars move otherwise.
+_MIN_FITNESS = 0.5
+_NORMALS_M = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class RigMotion:
+    """Constant velocity of a LiDAR, in its own frame.
+
+    Attributes:
+        velocity_mps: (3,).
+        rate_rad_s: (3,) rotation.
+    """
+
+    velocity_mps: Array
+    rate_rad_s: Array
+
+    @property
+    def is_still(self) -> bool:
+        """Whether it is too slow to be told from none."""
+        return bool(
+            np.linalg.norm(self.velocity_mps) < _STILL_MPS and np.linalg.norm(self.rate_rad_s) < _STILL_RAD_S
+        )
+
+    def moved(self, points: Array, after_s: Array) -> Array:
+        """Give standing points as the LiDAR has them some time later.
+
+            p' = exp(w dt)^T (p - v dt)
+
+        Args:
+            points: (N, 3) m, frame lidar at the time that each was seen.
+            after_s: (N,) from then to the time wanted.
+        """
+        shifted = points - after_s[:, None] * self.velocity_mps
+        turns = exp_so3(-after_s[:, None] * self.rate_rad_s)
+        return np.asarray(np.einsum("nij,nj->ni", turns, shifted))
+
+
+def estimate_motion(previous: Scan, scan: Scan) -> RigMotion | None:
+    """Estimate a rig's motion from two consecutive scans: point-to-plane ICP with a robust loss.
+
+    A corridor does not tell how fast a rig moves along it.
+
+    Returns:
+        None where the scans have no timestamps, are not consecutive, or do not match.
+
+    References:
+        S. Rusinkiewicz and M. Levoy, Efficient variants of the ICP algorithm, 3DIM 2001.
+    """
+    if previous.stamp_ns is None or scan.stamp_ns is None:
+        return None
+    gap_s = 1e-9 * (scan.stamp_ns - previous.stamp_ns)
+    if not 0 < gap_s < _LONGEST_GAP_S:
+        return None
+    from lce_rig.core.interrupts import without_interrupt
+
+    with without_interrupt():
+        import open3d as o3d
+    register = o3d.pipelines.registration
+    target, source = (_cloud(each) for each in (previous, scan))
+    if min(len(target.points), len(source.points)) < 100:
+        return None
+    target.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(_NORMALS_M, 20))
+    loss = register.TransformationEstimationPointToPlane(register.TukeyLoss(_ROBUST_M))
+    T_previous_scan = np.eye(4)
+    for reach_m in (_REACH_M, 2 * _ROBUST_M):
+        found = register.registration_icp(
+            source, target, reach_m, T_previous_scan, loss, register.ICPConvergenceCriteria(1e-5, 1e-5, 20)
+        )
+        T_previous_scan = np.asarray(found.transformation)
+    if found.fitness < _MIN_FITNESS:
+        return None
+    return RigMotion(T_previous_scan[:3, 3] / gap_s, log_so3(T_previous_scan[:3, :3]) / gap_s)
+
+
+def _cloud(scan: Scan) -> object:
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(scan.points, dtype=np.float64)))
+    return cloud.voxel_down_sample(_VOXEL_M)
+
+
+def firing_times_s(scan: Scan, points: Array) -> Array | None:
+    """Tell when points (N, 3) at or beside returns of a scan were seen, s after its first firing; None if unknown."""
+    from scipy.spatial import cKDTree
+
+    if scan.offset_ns is None or not len(scan.points):
+        return None
+    _, nearest = cKDTree(scan.points).query(points)
+    chosen: NDArray[np.intp] = np.asarray(nearest, dtype=np.intp)
+    return np.asarray(1e-9 * scan.offset_ns[chosen], dtype=np.float64)
