@@ -40,6 +40,10 @@ class EdgeField:
         sampled = cv2.remap(self.values, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderValue=0.0)
         return np.asarray(sampled[0], dtype=np.float64)
 
+    def coarser(self) -> "EdgeField":
+        """Blur and halve the field."""
+        return EdgeField(np.asarray(cv2.pyrDown(self.values), dtype=np.float32), 2 * self.reduction)
+
 
 def build_edge_field(grey: NDArray[np.uint8], focal_px: float) -> EdgeField:
     """Turn an image into a field of its upright edges.

@@ -194,6 +194,15 @@ VLP16 = LidarModel(
     sequence_ns=55_296,
     period_ns=100_000_000,
 )
+# All lasers fire at once, 1024 times a revolution; elevations of an OS1-64 recording, 0.67 deg apart.
+OS1_64 = LidarModel(
+    name="os1-64",
+    elevations_rad=np.radians(np.linspace(21.4, -20.8, 64)),
+    vertical_offsets_m=np.zeros(64),
+    firing_ns=0,
+    sequence_ns=97_656,
+    period_ns=100_000_000,
+)
 
 
 @dataclass(frozen=True, eq=False)
