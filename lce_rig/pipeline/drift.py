@@ -32,10 +32,12 @@ from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.depth_edges import find_depth_edges, leave_standing
 from lce_rig.scene.drift import AxisDrift, Drift, watch
-from lce_rig.scene.edge_field import build_edge_field
+from lce_rig.scene.edge_field import build_edge_field, build_event_field
+from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
 from lce_rig.session import Capture, Session
 from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.rig_clock import RigClock
+from lce_rig.timing.rig_time import event_channel, rig_time_ns
 from lce_rig.timing.scan_pairing import Frame, pair_by_time
 from lce_rig.verify.drift_picture import draw_drift
 from lce_rig.verify.overlay_files import write_picture
@@ -45,6 +47,10 @@ MAX_CAPTURES = 60
 """More captures add time and memory but, of one place, no information: they are thinned out evenly."""
 _BOARD_MARGIN_RAD = 0.04  # Extrinsics may be off by as much.
 _LIVE_WAIT_S = 0.2
+# Of events this long about the time at which the LiDAR looks where the camera does.
+_EVENTS_NS = 20_000_000
+_EVENTS_NEAR_RAD = 0.06  # as far as the score is searched
+_MIN_MOVING = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,12 +192,19 @@ def drift_live(
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """One capture of one camera and LiDAR: an image, or else events about the scan."""
+    """One capture of one camera and LiDAR.
+
+    Attributes:
+        name: of the capture, or its time.
+        image: what the camera saw, or else events of 20 ms.
+        scan: of the LiDAR.
+        previous: the scan before, where the recording is continuous.
+    """
 
     name: str
-    image: Image | None
-    events: EventCut | None
+    image: Image | Events
     scan: Scan
+    previous: Scan | None
 
 
 _Item = TypeVar("_Item")
@@ -232,6 +245,8 @@ class _Watcher:
         self._pairs = result.pairs
         self._kept: list[_Thinned[_Seen]] = [_Thinned() for _ in result.pairs]
         self._notes: list[str] = []
+        self._last: dict[str, Scan] = {}
+        self._motions: dict[int, RigMotion | None] = {}
 
     def take_session(self, session: Session, progress: Progress) -> None:
         """Read the captures of a session; what is damaged is skipped."""
@@ -326,6 +341,7 @@ class _Watcher:
 
     def _take_frame(self, frame: Frame) -> None:
         self._take(f"{1e-9 * frame.time_ns:.2f} s", frame.images, frame.scans, frame.events)
+        self._last = {scan.sensor: scan for scan in frame.scans}
 
     def _take(
         self, name: str, images: Sequence[Image], scans: Sequence[Scan], events: Sequence[EventCut] = ()
@@ -336,11 +352,15 @@ class _Watcher:
             # Frames before images that were made of events.
             frames = self._rig.cameras[c.camera].first_channel("frames")
             own = [image for image in own if image.channel == frames] or own
-            cut = next((each for each in events if each.sensor == c.camera), None)
-            if scan is not None and (own or cut):
-                # Grey: colour is not used, and would hold three times the memory.
-                image = replace(own[0], pixels=own[0].grey) if own else None
-                kept.take(_Seen(name, image, None if own else cut, scan))
+            if scan is None:
+                continue
+            # Grey: colour is not used, and would hold three times the memory.
+            image: Image | Events | None = replace(own[0], pixels=own[0].grey) if own else None
+            if image is None:
+                cut = next((each for each in events if each.sensor == c.camera), None)
+                image = None if cut is None else _about_scan(cut, scan, self._rig, c)
+            if image is not None:
+                kept.take(_Seen(name, image, scan, self._last.get(c.lidar)))
 
     def finish(self) -> DriftReport:
         """Judge what was taken.
@@ -359,17 +379,24 @@ class _Watcher:
 
     def _judge(self, c: Calibration, kept: Sequence[_Seen]) -> PairDrift:
         lens = self._rig.cameras[c.camera].to_intrinsics()
+        finder = BoardFinder(self._rig)
         views: list[SceneView] = []
-        example: tuple[str, Image, SceneView] | None = None
+        moving: list[MovingView] = []
+        n_untimed = 0
         for seen in kept:
-            if seen.image is None:
-                continue
             view = build_view(self._rig, c, seen.name, seen.image, seen.scan)
-            if self._ignore_board:
-                view = without_board(view, BoardFinder(self._rig).image(seen.image), self._rig, c)
+            motion = self._motion(seen)
+            if motion is not None:
+                after_s = _after_s(view.edges.points, seen, self._rig, c)
+                if after_s is None:
+                    n_untimed += 1
+                    continue
+                points = motion.moved(view.edges.points, after_s)
+                view = replace(view, edges=replace(view.edges, points=points))
+                moving.append(MovingView(view, motion))
+            if self._ignore_board and isinstance(seen.image, Image):
+                view = without_board(view, finder.image(seen.image), self._rig, c)
             views.append(view)
-            if example is None or len(view.edges) > len(example[2].edges):
-                example = seen.name, seen.image, view
         if self._ignore_board:
             standing = leave_standing([view.edges for view in views])
             views = [replace(view, edges=edges) for view, edges in zip(views, standing, strict=True)]
@@ -377,14 +404,103 @@ class _Watcher:
         if not kept:
             lacking = Finding("scene.no_samples", "error", c.camera, {"lidar": c.lidar})
             judged = replace(judged, findings=(lacking,))
-        return PairDrift(c, judged, example)
+        elif n_untimed:
+            untimed = Finding("scene.no_firing_times", "warning", c.lidar, {"n_captures": n_untimed})
+            judged = replace(judged, findings=(*judged.findings, untimed))
+        if len(moving) >= _MIN_MOVING and judged.curves:
+            judged = _with_clocks(judged, clocks_apart_s(moving, lens, c.T_cam_lidar), c.camera)
+        return PairDrift(c, judged, _example(kept, views))
+
+    def _motion(self, seen: _Seen) -> RigMotion | None:
+        """Estimate the rig's motion at a capture; None where it stands, or nothing tells."""
+        if seen.previous is None:
+            return None
+        key = id(seen.scan)
+        if key not in self._motions:
+            motion = estimate_motion(seen.previous, seen.scan)
+            self._motions[key] = None if motion is None or motion.is_still else motion
+        return self._motions[key]
 
 
-def build_view(rig: Rig, calibration: Calibration, name: str, image: Image, scan: Scan) -> SceneView:
-    """Find the edges of one capture's scan and image."""
+def _example(kept: Sequence[_Seen], views: Sequence[SceneView]) -> tuple[str, Image, SceneView] | None:
+    """Choose the capture with most edges for the picture."""
+    if not views:
+        return None
+    view = max(views, key=lambda each: len(each.edges))
+    image = next(seen.image for seen in kept if seen.name == view.capture)
+    return view.capture, _picture_of(image) if isinstance(image, Events) else image, view
+
+
+def _picture_of(events: Events) -> Image:
+    """Draw the number of events of each pixel, dark on white."""
+    counts = np.zeros((events.height_px, events.width_px))
+    np.add.at(counts, (events.y, events.x), 1.0)
+    grey = np.asarray(np.clip(255 - 60 * counts, 0, 255), dtype=np.uint8)
+    return Image(events.sensor, "events", None, grey)
+
+
+def _about_scan(cut: EventCut, scan: Scan, rig: Rig, c: Calibration) -> Events | None:
+    """Copy the events of the time at which the LiDAR looks where the camera does; None if there are none."""
+    scan_ns = rig_time_ns(scan, rig)
+    if scan_ns is None or scan.offset_ns is None or not len(scan.points):
+        return None
+    pixels, is_valid = rig.cameras[c.camera].to_intrinsics().project(transform(c.T_cam_lidar, scan.points))
+    is_seen = is_valid & rig.cameras[c.camera].to_intrinsics().is_inside(pixels)
+    if not is_seen.any():
+        return None
+    offset_ns = cut.offset_ns + _own_offset_ns(c, event_channel(rig, c.camera) or "")
+    middle_ns = scan_ns + int(np.median(scan.offset_ns[is_seen])) - offset_ns
+    events = cut.events.between(middle_ns - _EVENTS_NS // 2, middle_ns + _EVENTS_NS // 2)
+    if not len(events):
+        return None
+    columns = {name: getattr(events, name).copy() for name in ("t_ns", "x", "y", "polarity")}
+    return replace(events, **columns)
+
+
+def _own_offset_ns(c: Calibration, channel: str) -> int:
+    """Return what the calibration adds to a channel's timestamps beyond the profile's expected offset."""
+    found = [each.time_offset_s for each in c.channel_results if each.channel == channel]
+    return round(1e9 * found[0]) if found and found[0] is not None else 0
+
+
+def _after_s(points: Array, seen: _Seen, rig: Rig, c: Calibration) -> Array | None:
+    """Tell how long after each edge (N, 3) the image was taken; None where times are unknown."""
+    image, scan_ns = seen.image, rig_time_ns(seen.scan, rig)
+    image_ns = rig_time_ns(image, rig)
+    fired_s = firing_times_s(seen.scan, points)
+    if scan_ns is None or image_ns is None or fired_s is None:
+        return None
+    channel = image.channel if isinstance(image, Image) else event_channel(rig, c.camera) or ""
+    # Events are cut about their middle.
+    middle_ns = _EVENTS_NS // 2 if isinstance(image, Events) else 0
+    return np.asarray(1e-9 * (image_ns + middle_ns + _own_offset_ns(c, channel) - scan_ns) - fired_s)
+
+
+def _with_clocks(judged: Drift, apart_s: float | None, camera: str) -> Drift:
+    """Give no all-clear where the images of a moving rig fit the scans of another time."""
+    if apart_s is None:
+        return judged
+    found = Finding("scene.clocks_apart", "warning", camera, {"apart_s": apart_s})
+    axes = tuple(
+        replace(axis, state="unknown", reason=found.code) if axis.state == "unchanged" else axis
+        for axis in judged.axes
+    )
+    first, *others = judged.findings
+    others = [each for each in others if each.code != "scene.axis_unchanged"]
+    is_named = judged.state == "changed"
+    return replace(judged, axes=axes, findings=(first, found, *others) if is_named else (found, *others))
+
+
+def build_view(rig: Rig, calibration: Calibration, name: str, image: Image | Events, scan: Scan) -> SceneView:
+    """Find the edges of one capture's scan, and of its image or of events about the scan."""
     lidar, lens = rig.lidars[calibration.lidar], rig.cameras[calibration.camera].to_intrinsics()
     edges = find_depth_edges(scan, Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad))
-    return SceneView(name, edges, build_edge_field(image.grey, lens.fx_px))
+    if isinstance(image, Image):
+        return SceneView(name, edges, build_edge_field(image.grey, lens.fx_px))
+    field = build_event_field(image, lens.fx_px)
+    # Edges without events about them stand still before a standing rig: they say nothing.
+    pixels, _ = lens.project(transform(calibration.T_cam_lidar, edges.points))
+    return SceneView(name, edges.select(field.has_edges_near(pixels, _EVENTS_NEAR_RAD * lens.fx_px)), field)
 
 
 def without_board(

@@ -17,6 +17,7 @@ _WINDOW_PX = (121.0, 31.0)  # along and across the direction searched
 _WEAKEST_GREY = 2.0  # An image whose strongest edges are weaker shows noise.
 _CLIP_PERCENTILE = 99
 _FLOOR = 0.005
+_CLEAR = 0.5  # log-likelihood ratio of an edge that stands out
 _OUTLIERS = 0.5  # share of depth edges that no image edge accompanies
 
 
@@ -39,6 +40,13 @@ class EdgeField:
         at = ((np.where(np.isfinite(pixels), pixels, -1e4) + 0.5) / self.reduction - 0.5).astype(np.float32)
         sampled = cv2.remap(self.values, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderValue=0.0)
         return np.asarray(sampled[0], dtype=np.float64)
+
+    def has_edges_near(self, pixels: Array, reach_px: float) -> NDArray[np.bool_]:
+        """Find which pixels (N, 2) of the image have an edge within a distance."""
+        side = 2 * round(reach_px / self.reduction) + 1
+        near = cv2.dilate((self.values > _CLEAR).astype(np.float32), np.ones((side, side)))
+        is_near = EdgeField(np.asarray(near, dtype=np.float32), self.reduction).sample(pixels) > 0
+        return np.asarray(is_near, dtype=np.bool_)
 
     def coarser(self) -> "EdgeField":
         """Blur and halve the field."""

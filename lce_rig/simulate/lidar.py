@@ -377,7 +377,7 @@ def _measure(
 def _beams(
     model: LidarModel, T_world_lidar: Array, laser: NDArray[np.intp], azimuth_rad: Array
 ) -> tuple[Array, Array]:
-    """Find where beams (N,) begin and where they go, (N, 3) each, world; T_world_lidar (4, 4) or (N, 4, 4)."""
+    """Find where beams (N,) begin and where they go, (N, 3) each, world; of one pose, or one each."""
     origins = np.zeros((len(laser), 3))
     origins[:, 2] = model.vertical_offsets_m[laser]
     elevation_rad = model.elevations_rad[laser]

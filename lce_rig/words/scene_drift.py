@@ -74,6 +74,14 @@ PHRASES = {
         "no image or events of {subject} within the tolerance of a scan of {lidar}",
         "check the topics and timestamps of the recording, or record this camera",
     ),
+    "scene.no_firing_times": Phrase(
+        "{n_captures} captures of a moving rig are not used: scans of {subject} or images have no times",
+        "record points with their firing times, or let the rig stand",
+    ),
+    "scene.clocks_apart": Phrase(
+        "while the rig moves, images of {subject} fit best {apart_s:+.2f} s from their timestamps",
+        "let the rig stand, or correct the clocks: `lce-rig doctor` measures them",
+    ),
     "scene.axis_unchanged": Phrase(_axis_unchanged),
     "scene.axis_changed": Phrase(_axis_changed),
     "scene.large_scatter": Phrase(_large_scatter, "record more places or more upright edges"),

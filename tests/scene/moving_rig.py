@@ -22,7 +22,7 @@ START_NS = 1_700_000_000_000_000_000
 
 @dataclass(frozen=True, eq=False)
 class MovingRig:
-    """Drives with a velocity (3,) m/s and turns at a rate (rad/s) about the vertical, both in its own frame."""
+    """Drives with a velocity (3,) m/s, and turns at a rate (rad/s) about the vertical."""
 
     stage: Stage
     velocity_mps: Array
