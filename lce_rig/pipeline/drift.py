@@ -1,55 +1,35 @@
 """Check deployed extrinsics on recordings without a board: the edges of the scene decide."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
-from lce_rig.core.data import Events, Image, Sample, Scan
-from lce_rig.core.errors import SessionError, SourceError
+from lce_rig.core.data import Events, Image
+from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, transform
-from lce_rig.core.losses import Losses
-from lce_rig.core.results import Calibration, ImageBoard, Refusal
-from lce_rig.detect.events.figures import outline_px
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Calibration
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.devices.opening import edge_cameras
-from lce_rig.devices.reading import AttachedSensors, LiveSource
+from lce_rig.devices.reading import LiveSource
 from lce_rig.export.result import SavedResult, read_result
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import RESULT, result_parts
-from lce_rig.recordings import open_recordings
-from lce_rig.recordings.joining import join_recordings, require_sensors
-from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording
+from lce_rig.pipeline.scene_captures import EVENTS_NS, SceneCaptures, Seen, own_offset_ns
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.depth_edges import find_depth_edges, leave_standing
+from lce_rig.scene.depth_edges import leave_standing
 from lce_rig.scene.drift import AxisDrift, Drift, watch
-from lce_rig.scene.edge_field import build_edge_field, build_event_field
 from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
-from lce_rig.session import Capture, Session
-from lce_rig.timing.event_buffer import EventCut
-from lce_rig.timing.rig_clock import RigClock
+from lce_rig.scene.views import build_view, without_board
+from lce_rig.session import Session
 from lce_rig.timing.rig_time import event_channel, rig_time_ns
-from lce_rig.timing.scan_pairing import Frame, pair_by_time
 from lce_rig.verify.drift_picture import draw_drift
 from lce_rig.verify.overlay_files import write_picture
-from lce_rig.words import as_json, describe
+from lce_rig.words import as_json
 
-MAX_CAPTURES = 60
-"""More captures add time and memory but, of one place, no information: they are thinned out evenly."""
-_BOARD_MARGIN_RAD = 0.04  # Extrinsics may be off by as much.
-_LIVE_WAIT_S = 0.2
-# Of events this long about the time at which the LiDAR looks where the camera does.
-_EVENTS_NS = 20_000_000
-_EVENTS_NEAR_RAD = 0.06  # as far as the score is searched
 _MIN_MOVING = 3
 
 
@@ -152,16 +132,17 @@ def drift(
         place = " and ".join(map(str, paths))
         if result is None:
             raise SessionError(f"{place}: a recording has no result", "Name one with --result FILE.")
-        watcher = _Watcher(rig, result, place, ignore_board)
-        watcher.take_recordings(paths, progress)
+        captures = SceneCaptures(rig, result, place)
+        captures.take_recordings(paths, progress)
     elif len(paths) != 1:
         raise SessionError("several recordings need the profile of their rig", "Name one with --rig.")
     else:
         session = Session.open(paths[0])
         result = result or read_result(session.path.joinpath(*result_parts(None), RESULT))
-        watcher = _Watcher(session.rig, result, str(session.path), ignore_board)
-        watcher.take_session(session, progress)
-    return watcher.finish()
+        rig = session.rig
+        captures = SceneCaptures(rig, result, str(session.path))
+        captures.take_session(session, progress)
+    return judge(rig, result, captures, ignore_board=ignore_board)
 
 
 def drift_live(
@@ -185,199 +166,33 @@ def drift_live(
         SessionError: the result belongs to another rig.
         SourceError: a sensor cannot be opened, or nothing came of any camera and LiDAR of the result.
     """
-    watcher = _Watcher(rig, result, f"the sensors of rig {rig.name}", ignore_board)
-    watcher.take_live(sources, is_over)
-    return watcher.finish()
+    captures = SceneCaptures(rig, result, f"the sensors of rig {rig.name}")
+    captures.take_live(sources, is_over)
+    return judge(rig, result, captures, ignore_board=ignore_board)
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """One capture of one camera and LiDAR.
-
-    Attributes:
-        name: of the capture, or its time.
-        image: what the camera saw, or else events of 20 ms.
-        scan: of the LiDAR.
-        previous: the scan before, where the recording is continuous.
-    """
-
-    name: str
-    image: Image | Events
-    scan: Scan
-    previous: Scan | None
-
-
-_Item = TypeVar("_Item")
-
-
-class _Thinned(list[_Item]):
-    """The items of a stream, every one at first, every second once there are too many, and so on."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._n_taken, self._stride = 0, 1
-
-    def take(self, item: _Item) -> None:
-        """Keep an item if it is its turn."""
-        if self._n_taken % self._stride == 0:
-            self.append(item)
-        self._n_taken += 1
-        if len(self) > MAX_CAPTURES:
-            self[:] = self[::2]
-            self._stride *= 2
-
-
-class _Watcher:
-    """Takes captures of all kinds of sources for every camera and LiDAR of a result.
+def judge(
+    rig: Rig, result: SavedResult, captures: SceneCaptures, *, ignore_board: bool = False
+) -> DriftReport:
+    """Judge a result by captures of a scene.
 
     Raises:
-        SessionError: the result belongs to another rig.
+        SourceError: there are none of any camera and LiDAR of the result.
     """
+    captures.require_any()
+    judging = _Judge(rig, ignore_board)
+    pairs = tuple(map(judging.pair, result.pairs, captures.kept))
+    return DriftReport(rig, pairs, tuple(dict.fromkeys(captures.notes)))
 
-    def __init__(self, rig: Rig, result: SavedResult, source: str, ignore_board: bool) -> None:
-        if result.rig != rig.name or not result.pairs:
-            what = f"the result belongs to rig {result.rig!r}" if result.pairs else "the result holds no pair"
-            raise SessionError(f"{what}; {source} belongs to rig {rig.name!r}")
-        for c in result.pairs:
-            if c.camera not in rig.cameras or c.lidar not in rig.lidars:
-                raise SessionError(f"the result names {c.camera} and {c.lidar}, which rig {rig.name!r} lacks")
-        self._rig, self._source, self._ignore_board = rig, source, ignore_board
-        self._pairs = result.pairs
-        self._kept: list[_Thinned[_Seen]] = [_Thinned() for _ in result.pairs]
-        self._notes: list[str] = []
-        self._last: dict[str, Scan] = {}
+
+class _Judge:
+    """Judges cameras and LiDARs in turn; the motion of a LiDAR is estimated once for all cameras."""
+
+    def __init__(self, rig: Rig, ignore_board: bool) -> None:
+        self._rig, self._ignore_board = rig, ignore_board
         self._motions: dict[int, RigMotion | None] = {}
 
-    def take_session(self, session: Session, progress: Progress) -> None:
-        """Read the captures of a session; what is damaged is skipped."""
-        captures = _evenly(session.captures, MAX_CAPTURES * len(self._pairs))
-        for done, capture in enumerate(captures, start=1):
-            with suppress(SessionError):
-                self._take_capture(capture)
-            progress(done, len(captures))
-
-    def _take_capture(self, capture: Capture) -> None:
-        cameras, lidars = {c.camera for c in self._pairs}, {c.lidar for c in self._pairs}
-        images: list[Image] = []
-        scans: list[Scan] = []
-        events: list[Events] = []
-        # A damaged file costs its own sensor only.
-        for key in capture.image_keys:
-            if key[0] in cameras:
-                with suppress(SessionError):
-                    images.append(capture.image(*key))
-        for lidar in capture.lidars:
-            if lidar in lidars:
-                with suppress(SessionError):
-                    scans.append(capture.scan(lidar))
-        for camera in capture.event_cameras:
-            if camera in cameras:
-                with suppress(SessionError):
-                    events.append(capture.events(camera))
-        self._take(capture.name, images, scans, [_whole(each) for each in events if len(each)])
-
-    def take_recordings(self, paths: Sequence[Path], progress: Progress) -> None:
-        """Read recordings: pairs of images and point clouds, or streams, whose scans are paired by time.
-
-        Raises:
-            SourceError: one cannot be read at all.
-        """
-        for recording in join_recordings(open_recordings(paths, self._rig), self._rig):
-            try:
-                if isinstance(recording, PairedRecording):
-                    self._take_pairs(recording, progress)
-                elif isinstance(recording, ContinuousRecording):
-                    self._take_stream(recording, progress)
-            except SourceError as error:
-                if not any(self._kept):
-                    raise
-                # What came before the damage is judged.
-                self._notes.append(f"not read to its end: {error.what}")
-            self._notes += recording.notes
-
-    def _take_pairs(self, recording: PairedRecording, progress: Progress) -> None:
-        pairs = _evenly(recording.pairs, MAX_CAPTURES * len(self._pairs))
-        failures: list[SourceError] = []
-        for done, files in enumerate(pairs, start=1):
-            try:
-                pair = files.read()
-                self._take(pair.label, pair.images, pair.scans)
-            except SourceError as error:
-                failures.append(error)
-            progress(done, len(pairs))
-        if failures and len(failures) == len(pairs):
-            raise failures[0]
-        self._notes += [f"skipped: {error.what}" for error in failures]
-
-    def _take_stream(self, recording: ContinuousRecording, progress: Progress) -> None:
-        require_sensors(recording)
-        losses = Losses()
-        samples = _counted(recording.samples(), recording.n_samples, progress)
-        for frame in pair_by_time(samples, self._rig, losses, are_events_enough=True):
-            self._take_frame(frame)
-        if not any(self._kept) and losses.counts():
-            (why, n), *_ = losses.counts()
-            raise SourceError(f"{recording.path}: {n} scans cannot be used: {describe(why)}")
-
-    def take_live(self, sources: Sequence[LiveSource], is_over: Callable[[int], bool]) -> None:
-        """Read attached sensors until it is over.
-
-        Raises:
-            SourceError: a sensor cannot be opened.
-        """
-        board = next((source for source in sources if isinstance(source, SyncTimes)), None)
-        clock = RigClock(self._rig, has_board=board is not None, edge_cameras=edge_cameras(self._rig))
-        n_frames = 0
-        with (
-            AttachedSensors(sources) as sensors,
-            FrameFeed(self._rig, sensors, clock, board, are_events_enough=True) as feed,
-        ):
-            while not is_over(n_frames):
-                frame = feed.take(_LIVE_WAIT_S)
-                if frame is not None:
-                    n_frames += 1
-                    self._take_frame(frame)
-            self._notes += [error.what for error, _ in sensors.lost().values()]
-
-    def _take_frame(self, frame: Frame) -> None:
-        self._take(f"{1e-9 * frame.time_ns:.2f} s", frame.images, frame.scans, frame.events)
-        self._last = {scan.sensor: scan for scan in frame.scans}
-
-    def _take(
-        self, name: str, images: Sequence[Image], scans: Sequence[Scan], events: Sequence[EventCut] = ()
-    ) -> None:
-        for c, kept in zip(self._pairs, self._kept, strict=True):
-            scan = next((each for each in scans if each.sensor == c.lidar), None)
-            own = [image for image in images if image.sensor == c.camera]
-            # Frames before images that were made of events.
-            frames = self._rig.cameras[c.camera].first_channel("frames")
-            own = [image for image in own if image.channel == frames] or own
-            if scan is None:
-                continue
-            # Grey: colour is not used, and would hold three times the memory.
-            image: Image | Events | None = replace(own[0], pixels=own[0].grey) if own else None
-            if image is None:
-                cut = next((each for each in events if each.sensor == c.camera), None)
-                image = None if cut is None else _about_scan(cut, scan, self._rig, c)
-            if image is not None:
-                kept.take(_Seen(name, image, scan, self._last.get(c.lidar)))
-
-    def finish(self) -> DriftReport:
-        """Judge what was taken.
-
-        Raises:
-            SourceError: nothing of any camera and LiDAR of the result was taken.
-        """
-        if not any(self._kept):
-            wanted = " or ".join(f"{c.camera} and {c.lidar}" for c in self._pairs)
-            raise SourceError(
-                f"{self._source} holds no images and scans of {wanted} at the same time",
-                "Check the profile's topics and timestamps; `lce-rig doctor` looks at attached sensors.",
-            )
-        pairs = tuple(map(self._judge, self._pairs, self._kept))
-        return DriftReport(self._rig, pairs, tuple(dict.fromkeys(self._notes)))
-
-    def _judge(self, c: Calibration, kept: Sequence[_Seen]) -> PairDrift:
+    def pair(self, c: Calibration, kept: Sequence[Seen]) -> PairDrift:
         lens = self._rig.cameras[c.camera].to_intrinsics()
         finder = BoardFinder(self._rig)
         views: list[SceneView] = []
@@ -407,11 +222,11 @@ class _Watcher:
         elif n_untimed:
             untimed = Finding("scene.no_firing_times", "warning", c.lidar, {"n_captures": n_untimed})
             judged = replace(judged, findings=(*judged.findings, untimed))
-        if len(moving) >= _MIN_MOVING and judged.curves:
+        if len(moving) >= _MIN_MOVING and judged.curves and judged.state != "changed":
             judged = _with_clocks(judged, clocks_apart_s(moving, lens, c.T_cam_lidar), c.camera)
         return PairDrift(c, judged, _example(kept, views))
 
-    def _motion(self, seen: _Seen) -> RigMotion | None:
+    def _motion(self, seen: Seen) -> RigMotion | None:
         """Estimate the rig's motion at a capture; None where it stands, or nothing tells."""
         if seen.previous is None:
             return None
@@ -422,7 +237,7 @@ class _Watcher:
         return self._motions[key]
 
 
-def _example(kept: Sequence[_Seen], views: Sequence[SceneView]) -> tuple[str, Image, SceneView] | None:
+def _example(kept: Sequence[Seen], views: Sequence[SceneView]) -> tuple[str, Image, SceneView] | None:
     """Choose the capture with most edges for the picture."""
     if not views:
         return None
@@ -439,31 +254,7 @@ def _picture_of(events: Events) -> Image:
     return Image(events.sensor, "events", None, grey)
 
 
-def _about_scan(cut: EventCut, scan: Scan, rig: Rig, c: Calibration) -> Events | None:
-    """Copy the events of the time at which the LiDAR looks where the camera does; None if there are none."""
-    scan_ns = rig_time_ns(scan, rig)
-    if scan_ns is None or scan.offset_ns is None or not len(scan.points):
-        return None
-    pixels, is_valid = rig.cameras[c.camera].to_intrinsics().project(transform(c.T_cam_lidar, scan.points))
-    is_seen = is_valid & rig.cameras[c.camera].to_intrinsics().is_inside(pixels)
-    if not is_seen.any():
-        return None
-    offset_ns = cut.offset_ns + _own_offset_ns(c, event_channel(rig, c.camera) or "")
-    middle_ns = scan_ns + int(np.median(scan.offset_ns[is_seen])) - offset_ns
-    events = cut.events.between(middle_ns - _EVENTS_NS // 2, middle_ns + _EVENTS_NS // 2)
-    if not len(events):
-        return None
-    columns = {name: getattr(events, name).copy() for name in ("t_ns", "x", "y", "polarity")}
-    return replace(events, **columns)
-
-
-def _own_offset_ns(c: Calibration, channel: str) -> int:
-    """Return what the calibration adds to a channel's timestamps beyond the profile's expected offset."""
-    found = [each.time_offset_s for each in c.channel_results if each.channel == channel]
-    return round(1e9 * found[0]) if found and found[0] is not None else 0
-
-
-def _after_s(points: Array, seen: _Seen, rig: Rig, c: Calibration) -> Array | None:
+def _after_s(points: Array, seen: Seen, rig: Rig, c: Calibration) -> Array | None:
     """Tell how long after each edge (N, 3) the image was taken; None where times are unknown."""
     image, scan_ns = seen.image, rig_time_ns(seen.scan, rig)
     image_ns = rig_time_ns(image, rig)
@@ -472,8 +263,8 @@ def _after_s(points: Array, seen: _Seen, rig: Rig, c: Calibration) -> Array | No
         return None
     channel = image.channel if isinstance(image, Image) else event_channel(rig, c.camera) or ""
     # Events are cut about their middle.
-    middle_ns = _EVENTS_NS // 2 if isinstance(image, Events) else 0
-    return np.asarray(1e-9 * (image_ns + middle_ns + _own_offset_ns(c, channel) - scan_ns) - fired_s)
+    middle_ns = EVENTS_NS // 2 if isinstance(image, Events) else 0
+    return np.asarray(1e-9 * (image_ns + middle_ns + own_offset_ns(c, channel) - scan_ns) - fired_s)
 
 
 def _with_clocks(judged: Drift, apart_s: float | None, camera: str) -> Drift:
@@ -485,63 +276,5 @@ def _with_clocks(judged: Drift, apart_s: float | None, camera: str) -> Drift:
         replace(axis, state="unknown", reason=found.code) if axis.state == "unchanged" else axis
         for axis in judged.axes
     )
-    first, *others = judged.findings
-    others = [each for each in others if each.code != "scene.axis_unchanged"]
-    is_named = judged.state == "changed"
-    return replace(judged, axes=axes, findings=(first, found, *others) if is_named else (found, *others))
-
-
-def build_view(rig: Rig, calibration: Calibration, name: str, image: Image | Events, scan: Scan) -> SceneView:
-    """Find the edges of one capture's scan, and of its image or of events about the scan."""
-    lidar, lens = rig.lidars[calibration.lidar], rig.cameras[calibration.camera].to_intrinsics()
-    edges = find_depth_edges(scan, Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad))
-    if isinstance(image, Image):
-        return SceneView(name, edges, build_edge_field(image.grey, lens.fx_px))
-    field = build_event_field(image, lens.fx_px)
-    # Edges without events about them stand still before a standing rig: they say nothing.
-    pixels, _ = lens.project(transform(calibration.T_cam_lidar, edges.points))
-    return SceneView(name, edges.select(field.has_edges_near(pixels, _EVENTS_NEAR_RAD * lens.fx_px)), field)
-
-
-def without_board(
-    view: SceneView, found: ImageBoard | Refusal, rig: Rig, calibration: Calibration
-) -> SceneView:
-    """Leave out the edges at and near the board, if the image shows one."""
-    return replace(
-        view, edges=view.edges.select(is_apart_from_board(view.edges.points, found, rig, calibration))
-    )
-
-
-def is_apart_from_board(
-    points: Array, found: ImageBoard | Refusal, rig: Rig, calibration: Calibration
-) -> NDArray[np.bool_]:
-    """Find which points (N, 3) of the LiDAR's frame lie apart from the board in an image; all without one."""
-    if isinstance(found, Refusal):
-        return np.ones(len(points), dtype=np.bool_)
-    lens = rig.cameras[calibration.camera].to_intrinsics()
-    outline = outline_px(found.T_cam_board, rig.board.to_board(), lens)
-    hull = cv2.convexHull(outline[np.isfinite(outline).all(axis=1)].astype(np.float32))
-    pixels, _ = lens.project(transform(calibration.T_cam_lidar, points))
-    margin_px = _BOARD_MARGIN_RAD * lens.fx_px
-    return np.array([cv2.pointPolygonTest(hull, p, True) < -margin_px for p in pixels.tolist()], dtype=bool)
-
-
-def _whole(events: Events) -> EventCut:
-    """Give all events of a capture as a cut."""
-    return EventCut(events, int(events.t_ns[0]), int(events.t_ns[-1]) + 1, 0, 0)
-
-
-def _counted(samples: Iterable[Sample], n_samples: int, progress: Progress) -> Iterator[Sample]:
-    done = 0
-    for sample in samples:
-        yield sample
-        if not isinstance(sample, Events):
-            done += 1
-            progress(done, n_samples)
-
-
-def _evenly(items: Sequence[_Item], n: int) -> list[_Item]:
-    """Choose n of the items or fewer."""
-    if len(items) <= n:
-        return list(items)
-    return [items[k] for k in np.linspace(0, len(items) - 1, n).round().astype(int)]
+    others = [each for each in judged.findings[1:] if each.code != "scene.axis_unchanged"]
+    return replace(judged, axes=axes, findings=(found, *others))
