@@ -16,6 +16,7 @@ from lce_rig.core.findings import Figure, Finding, Severity
 from lce_rig.core.geometry import FARTHEST_M
 from lce_rig.core.limits import describe
 from lce_rig.core.results import Calibration, ChannelResult, OtherCamera, PointUncertainty, Refusal
+from lce_rig.core.scene_opinion import AxisOpinion, SceneOpinion
 from lce_rig.export.files import MADE_BY
 from lce_rig.session.durable import write_atomically
 from lce_rig.words import as_json, is_renderable, refusal_as_json, sentence
@@ -155,6 +156,32 @@ class OtherCameraRecord(_SavedRecord):
     board_rms_m: _NotNegative
 
 
+class AxisRecord(_SavedRecord):
+    """The scene's opinion on one axis; figures in its unit."""
+
+    axis: str
+    state: Literal["agrees", "contradicts", "unknown"]
+    unit: Literal["deg", "m"]
+    change: _Figure
+    sigma: _NotNegative
+    smallest: _NotNegative
+
+
+class SceneRecord(_SavedRecord):
+    """The scene's opinion; no axes if there is too little to compare."""
+
+    state: Literal["agrees", "contradicts", "unknown"]
+    n_captures: _Count
+    n_edges: _Count
+    axes: list[AxisRecord]
+
+    @property
+    def opinion(self) -> SceneOpinion:
+        """The opinion, whose state follows from its axes."""
+        axes = tuple(AxisOpinion(**axis.model_dump()) for axis in self.axes)
+        return SceneOpinion(self.n_captures, self.n_edges, axes)
+
+
 class PairRecord(_SavedRecord):
     """One camera and one LiDAR; figures that could not be computed are null."""
 
@@ -185,6 +212,7 @@ class PairRecord(_SavedRecord):
     uncertainty: list[UncertaintyRecord] = Field(default_factory=list)
     estimated_with: list[str] = Field(default_factory=list)
     other_cameras: list[OtherCameraRecord] = Field(default_factory=list)
+    scene: SceneRecord | None = None
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "PairRecord":
@@ -279,6 +307,7 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
         "findings": [as_json(finding) for finding in calibration.findings],
         "reasons": [sentence(finding) for finding in calibration.findings],
         "diagnostics": calibration.diagnostics.figures(),
+        "scene": None if calibration.scene is None else calibration.scene.document(),
     }
     return {
         name: written[name]
@@ -406,6 +435,7 @@ def _calibration(pair: PairRecord) -> Calibration:
         uncertainty=tuple(PointUncertainty(**each.model_dump()) for each in pair.uncertainty),
         estimated_with=tuple(pair.estimated_with),
         other_cameras=tuple(_other(record) for record in pair.other_cameras),
+        scene=None if pair.scene is None else pair.scene.opinion,
     )
 
 

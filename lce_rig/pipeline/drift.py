@@ -20,10 +20,9 @@ from lce_rig.pipeline.result_files import RESULT, result_parts
 from lce_rig.pipeline.scene_captures import EVENTS_NS, SceneCaptures, Seen, own_offset_ns
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.depth_edges import leave_standing
 from lce_rig.scene.drift import AxisDrift, Drift, watch
 from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
-from lce_rig.scene.views import build_view, without_board
+from lce_rig.scene.views import build_view, without_board, without_movers
 from lce_rig.session import Session
 from lce_rig.timing.rig_time import event_channel, rig_time_ns
 from lce_rig.verify.drift_picture import draw_drift
@@ -213,8 +212,7 @@ class _Judge:
                 view = without_board(view, finder.image(seen.image), self._rig, c)
             views.append(view)
         if self._ignore_board:
-            standing = leave_standing([view.edges for view in views])
-            views = [replace(view, edges=edges) for view, edges in zip(views, standing, strict=True)]
+            views = without_movers(views)
         judged = watch(views, lens, c.T_cam_lidar, c.cov)
         if not kept:
             lacking = Finding("scene.no_samples", "error", c.camera, {"lidar": c.lidar})

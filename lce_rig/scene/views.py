@@ -1,5 +1,6 @@
 """What a scan and an image of one capture show of the scene's edges, with or without those at the board."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -13,7 +14,7 @@ from lce_rig.detect.events.figures import outline_px
 from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.depth_edges import find_depth_edges
+from lce_rig.scene.depth_edges import find_depth_edges, leave_standing
 from lce_rig.scene.edge_field import build_edge_field, build_event_field
 
 _BOARD_MARGIN_RAD = 0.04  # Extrinsics may be off by as much.
@@ -53,3 +54,9 @@ def is_apart_from_board(
     pixels, _ = lens.project(transform(calibration.T_cam_lidar, points))
     margin_px = _BOARD_MARGIN_RAD * lens.fx_px
     return np.array([cv2.pointPolygonTest(hull, p, True) < -margin_px for p in pixels.tolist()], dtype=bool)
+
+
+def without_movers(views: Sequence[SceneView]) -> list[SceneView]:
+    """Leave out the edges of what moves before a standing rig, such as who holds the board."""
+    standing = leave_standing([view.edges for view in views])
+    return [replace(view, edges=edges) for view, edges in zip(views, standing, strict=True)]
