@@ -1,4 +1,4 @@
-"""A rig that drives: its motion from consecutive scans, its edges at the images' time, its clocks compared."""
+"""A rig that drives: its motion from two scans, its edges at the images' time, its clocks compared."""
 
 from dataclasses import replace
 
