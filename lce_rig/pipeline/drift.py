@@ -9,18 +9,19 @@ import numpy as np
 
 from lce_rig.core.data import Events, Image
 from lce_rig.core.errors import SessionError
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Figure, Finding, Severity
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration
+from lce_rig.core.results import Calibration, ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.devices.reading import LiveSource
 from lce_rig.export.result import SavedResult, read_result
+from lce_rig.pipeline.board_drift import BoardDrift, board_finding, watch_boards
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import RESULT, result_parts
-from lce_rig.pipeline.scene_captures import EVENTS_NS, SceneCaptures, Seen, own_offset_ns
+from lce_rig.pipeline.scene_captures import EVENTS_NS, SceneCaptures, Seen, evenly, own_offset_ns
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.drift import AxisDrift, Drift, watch
+from lce_rig.scene.drift import AxisDrift, Drift, State, watch
 from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
 from lce_rig.scene.views import build_view, without_board, without_movers
 from lce_rig.session import Session
@@ -30,6 +31,8 @@ from lce_rig.verify.overlay_files import write_picture
 from lce_rig.words import as_json
 
 _MIN_MOVING = 3
+_MAX_BOARDS = 20
+_SEVERITIES: dict[State, Severity] = {"changed": "error", "unknown": "warning", "unchanged": "note"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,28 +41,88 @@ class PairDrift:
 
     Attributes:
         calibration: the deployed extrinsics.
-        drift: the verdict.
+        drift: the scene's opinion; where images show the board, without its edges.
+        board: the board's own; None where both sensors see it in fewer than three placements.
         example: the capture drawn by `write`; None without any.
     """
 
     calibration: Calibration
     drift: Drift
+    board: BoardDrift | None
     example: tuple[str, Image, SceneView] | None
+
+    @property
+    def states(self) -> dict[str, State]:
+        """Both opinions on each axis: changed if either says so, unchanged if either covers it."""
+        scene = {axis.axis: axis.state for axis in self.drift.axes}
+        if self.board is None:
+            return scene
+        return {axis.axis: _either(scene[axis.axis], axis.state) for axis in self.board.axes}
+
+    @property
+    def state(self) -> State:
+        """The verdict: changed if any axis is; unchanged only if no axis is unknown."""
+        states = set(self.states.values())
+        return "changed" if "changed" in states else "unknown" if "unknown" in states else "unchanged"
+
+    @property
+    def summary(self) -> Finding:
+        """The verdict as a finding."""
+        if self.board is None:
+            return self.drift.findings[0]
+        axes = {each: tuple(a for a, state in self.states.items() if state == each) for each in _SEVERITIES}
+        figures: dict[str, Figure] = {
+            "n_captures": self.drift.n_captures,
+            "n_boards": self.board.n_boards,
+            "changed": axes["changed"],
+            "unknown": axes["unknown"],
+        }
+        code = {
+            "changed": "scene.changed_with_board",
+            "unknown": "scene.unknown_with_board",
+            "unchanged": "scene.unchanged_with_board",
+        }
+        return Finding(code[self.state], _SEVERITIES[self.state], figures=figures)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """The verdict first, then the scene's opinion on each axis and what is missing, then the board's."""
+        if self.board is None:
+            return self.drift.findings
+        told = tuple(board_finding(axis) for axis in self.board.axes if axis.state != "unchanged")
+        return (self.summary, *self.drift.findings, *told)
 
     def document(self) -> dict[str, Any]:
         """List everything as plain types for JSON."""
         return {
             "camera": self.calibration.camera,
             "lidar": self.calibration.lidar,
-            "state": self.drift.state,
+            "state": self.state,
+            "states": self.states,
+            "scene_state": self.drift.state,
             "n_captures": self.drift.n_captures,
             "n_edges": self.drift.n_edges,
             "axes": [_axis(axis) for axis in self.drift.axes],
             "T_cam_lidar": self.drift.T_cam_lidar.tolist(),
             "T_cam_lidar_best": self.drift.T_best.tolist(),
             "covariance_best": None if self.drift.cov_best is None else self.drift.cov_best.tolist(),
-            "findings": [as_json(finding) for finding in self.drift.findings],
+            "board": None if self.board is None else _board(self.board),
+            "findings": [as_json(finding) for finding in self.findings],
         }
+
+
+def _either(first: State, second: State) -> State:
+    return next(state for state in ("changed", "unchanged", "unknown") if state in (first, second))
+
+
+def _board(board: BoardDrift) -> dict[str, Any]:
+    return {
+        "n_boards": board.n_boards,
+        "n_placements": board.n_placements,
+        "mpe_m": board.metrics.mpe_m,
+        "mee_m": board.metrics.mee_m,
+        "axes": [_axis(axis) for axis in board.axes],
+    }
 
 
 def _axis(axis: AxisDrift) -> dict[str, Any]:
@@ -106,7 +169,6 @@ def drift(
     result: SavedResult | None = None,
     *,
     rig: Rig | None = None,
-    ignore_board: bool = False,
     progress: Progress = silent,
 ) -> DriftReport:
     """Compare the extrinsics of a result with the scene of a session or of recordings.
@@ -118,7 +180,6 @@ def drift(
             the same time, such as a pcap and the images' folder.
         result: the deployed extrinsics; None for the session's own result.
         rig: the profile of a recording; a session has its own.
-        ignore_board: leave out the edges at the board, where an image shows one, and what moves before a
             standing rig.
         progress: called with (done, total) captures, or images and scans.
 
@@ -141,7 +202,7 @@ def drift(
         rig = session.rig
         captures = SceneCaptures(rig, result, str(session.path))
         captures.take_session(session, progress)
-    return judge(rig, result, captures, ignore_board=ignore_board)
+    return judge(rig, result, captures)
 
 
 def drift_live(
@@ -149,7 +210,6 @@ def drift_live(
     result: SavedResult,
     sources: Sequence[LiveSource],
     *,
-    ignore_board: bool = False,
     is_over: Callable[[int], bool],
 ) -> DriftReport:
     """Compare the extrinsics of a result with what attached sensors see.
@@ -158,7 +218,6 @@ def drift_live(
         rig: the profile.
         result: the deployed extrinsics.
         sources: of every sensor and of the sync board; not open yet.
-        ignore_board: as for `drift`.
         is_over: asked several times a second with the number of scans so far; True ends it.
 
     Raises:
@@ -167,19 +226,17 @@ def drift_live(
     """
     captures = SceneCaptures(rig, result, f"the sensors of rig {rig.name}")
     captures.take_live(sources, is_over)
-    return judge(rig, result, captures, ignore_board=ignore_board)
+    return judge(rig, result, captures)
 
 
-def judge(
-    rig: Rig, result: SavedResult, captures: SceneCaptures, *, ignore_board: bool = False
-) -> DriftReport:
+def judge(rig: Rig, result: SavedResult, captures: SceneCaptures) -> DriftReport:
     """Judge a result by captures of a scene.
 
     Raises:
         SourceError: there are none of any camera and LiDAR of the result.
     """
     captures.require_any()
-    judging = _Judge(rig, ignore_board)
+    judging = _Judge(rig)
     pairs = tuple(map(judging.pair, result.pairs, captures.kept))
     return DriftReport(rig, pairs, tuple(dict.fromkeys(captures.notes)))
 
@@ -187,14 +244,15 @@ def judge(
 class _Judge:
     """Judges cameras and LiDARs in turn; the motion of a LiDAR is estimated once for all cameras."""
 
-    def __init__(self, rig: Rig, ignore_board: bool) -> None:
-        self._rig, self._ignore_board = rig, ignore_board
+    def __init__(self, rig: Rig) -> None:
+        self._rig, self._finder = rig, BoardFinder(rig)
         self._motions: dict[int, RigMotion | None] = {}
 
     def pair(self, c: Calibration, kept: Sequence[Seen]) -> PairDrift:
         lens = self._rig.cameras[c.camera].to_intrinsics()
-        finder = BoardFinder(self._rig)
         views: list[SceneView] = []
+        whole: list[SceneView] = []
+        boards: list[tuple[Seen, ImageBoard]] = []
         moving: list[MovingView] = []
         n_untimed = 0
         for seen in kept:
@@ -208,10 +266,15 @@ class _Judge:
                 points = motion.moved(view.edges.points, after_s)
                 view = replace(view, edges=replace(view.edges, points=points))
                 moving.append(MovingView(view, motion))
-            if self._ignore_board and isinstance(seen.image, Image):
-                view = without_board(view, finder.image(seen.image), self._rig, c)
+            whole.append(view)
+            if isinstance(seen.image, Image):
+                board = self._finder.image(seen.image)
+                view = without_board(view, board, self._rig, c)
+                if motion is None and isinstance(board, ImageBoard):
+                    boards.append((seen, board))
             views.append(view)
-        if self._ignore_board:
+        if boards:
+            # Who holds the board moves with it.
             views = without_movers(views)
         judged = watch(views, lens, c.T_cam_lidar, c.cov)
         if not kept:
@@ -222,7 +285,20 @@ class _Judge:
             judged = replace(judged, findings=(*judged.findings, untimed))
         if len(moving) >= _MIN_MOVING and judged.curves and judged.state != "changed":
             judged = _with_clocks(judged, clocks_apart_s(moving, lens, c.T_cam_lidar), c.camera)
-        return PairDrift(c, judged, _example(kept, views))
+        return PairDrift(c, judged, self._boards(c, boards), _example(kept, whole))
+
+    def _boards(self, c: Calibration, boards: Sequence[tuple[Seen, ImageBoard]]) -> BoardDrift | None:
+        """Ask the boards, of at most 20 captures."""
+        images: dict[str, ImageBoard] = {}
+        scans: dict[str, list[LidarBoard]] = {}
+        for seen, board in evenly(boards, _MAX_BOARDS):
+            found = self._finder.scan(seen.scan)
+            if isinstance(found, list):
+                images[seen.name], scans[seen.name] = board, found
+        if not images:
+            return None
+        channel = boards[0][0].image.channel if isinstance(boards[0][0].image, Image) else ""
+        return watch_boards(self._rig, c, channel, images, scans)
 
     def _motion(self, seen: Seen) -> RigMotion | None:
         """Estimate the rig's motion at a capture; None where it stands, or nothing tells."""

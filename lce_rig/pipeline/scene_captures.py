@@ -106,7 +106,7 @@ class SceneCaptures:
 
     def take_session(self, session: Session, progress: Progress) -> None:
         """Read the captures of a session; what is damaged is skipped."""
-        captures = _evenly(session.captures, MAX_CAPTURES * len(self._pairs))
+        captures = evenly(session.captures, MAX_CAPTURES * len(self._pairs))
         for done, capture in enumerate(captures, start=1):
             with suppress(SessionError):
                 self._take_capture(capture)
@@ -152,7 +152,7 @@ class SceneCaptures:
             self.notes += recording.notes
 
     def _take_pairs(self, recording: PairedRecording, progress: Progress) -> None:
-        pairs = _evenly(recording.pairs, MAX_CAPTURES * len(self._pairs))
+        pairs = evenly(recording.pairs, MAX_CAPTURES * len(self._pairs))
         failures: list[SourceError] = []
         for done, files in enumerate(pairs, start=1):
             try:
@@ -272,7 +272,7 @@ def _counted(samples: Iterable[Sample], n_samples: int, progress: Progress) -> I
             progress(done, n_samples)
 
 
-def _evenly(items: Sequence[_Item], n: int) -> list[_Item]:
+def evenly(items: Sequence[_Item], n: int) -> list[_Item]:
     """Choose n of the items or fewer."""
     if len(items) <= n:
         return list(items)

@@ -132,7 +132,8 @@ def clocks_apart_s(views: Sequence[MovingView], intrinsics: Intrinsics, T_cam_li
     rows = []
     for after_s in _CLOCKS_S:
         later = [_later(each, float(after_s)) for each in views]
-        rows.append(Alignment(later, intrinsics, T_cam_lidar).scores(np.zeros(6)))
+        alignment = Alignment(later, intrinsics, T_cam_lidar)
+        rows.append(alignment.split(alignment.shares(T_cam_lidar)))
     curve = Curve(_CLOCKS_S, np.array([parts for parts, _ in rows]), np.array([each for _, each in rows]))
     peak_s = curve.peak
     is_apart = abs(peak_s) > max(_APART_S, _APART_SIGMAS * curve.sigma())
