@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Write images into this folder."
 )
-@click.option("--ignore-board", is_flag=True, help="Leave out edges at the board, where an image shows one.")
+@click.option("--ignore-board", is_flag=True, help="Leave out edges at the board and at what moves.")
 @json_option
 def drift(
     recordings: tuple[Path, ...],

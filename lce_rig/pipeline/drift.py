@@ -8,12 +8,13 @@ from typing import Any, TypeVar
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import transform
+from lce_rig.core.geometry import Array, transform
 from lce_rig.core.losses import Losses
 from lce_rig.core.results import Calibration, ImageBoard, Refusal
 from lce_rig.detect.events.figures import outline_px
@@ -29,7 +30,7 @@ from lce_rig.recordings.joining import join_recordings, require_sensors
 from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.depth_edges import find_depth_edges
+from lce_rig.scene.depth_edges import find_depth_edges, leave_standing
 from lce_rig.scene.drift import AxisDrift, Drift, watch
 from lce_rig.scene.edge_field import build_edge_field
 from lce_rig.session import Capture, Session
@@ -132,7 +133,8 @@ def drift(
             the same time, such as a pcap and the images' folder.
         result: the deployed extrinsics; None for the session's own result.
         rig: the profile of a recording; a session has its own.
-        ignore_board: leave out the edges at the board, where an image shows one.
+        ignore_board: leave out the edges at the board, where an image shows one, and what moves before a
+            standing rig.
         progress: called with (done, total) captures, or images and scans.
 
     Raises:
@@ -368,6 +370,9 @@ class _Watcher:
             views.append(view)
             if example is None or len(view.edges) > len(example[2].edges):
                 example = seen.name, seen.image, view
+        if self._ignore_board:
+            standing = leave_standing([view.edges for view in views])
+            views = [replace(view, edges=edges) for view, edges in zip(views, standing, strict=True)]
         judged = watch(views, lens, c.T_cam_lidar, c.cov)
         if not kept:
             lacking = Finding("scene.no_samples", "error", c.camera, {"lidar": c.lidar})
@@ -386,15 +391,23 @@ def without_board(
     view: SceneView, found: ImageBoard | Refusal, rig: Rig, calibration: Calibration
 ) -> SceneView:
     """Leave out the edges at and near the board, if the image shows one."""
+    return replace(
+        view, edges=view.edges.select(is_apart_from_board(view.edges.points, found, rig, calibration))
+    )
+
+
+def is_apart_from_board(
+    points: Array, found: ImageBoard | Refusal, rig: Rig, calibration: Calibration
+) -> NDArray[np.bool_]:
+    """Find which points (N, 3) of the LiDAR's frame lie apart from the board in an image; all without one."""
     if isinstance(found, Refusal):
-        return view
+        return np.ones(len(points), dtype=np.bool_)
     lens = rig.cameras[calibration.camera].to_intrinsics()
     outline = outline_px(found.T_cam_board, rig.board.to_board(), lens)
     hull = cv2.convexHull(outline[np.isfinite(outline).all(axis=1)].astype(np.float32))
-    pixels, _ = lens.project(transform(calibration.T_cam_lidar, view.edges.points))
+    pixels, _ = lens.project(transform(calibration.T_cam_lidar, points))
     margin_px = _BOARD_MARGIN_RAD * lens.fx_px
-    is_apart = [cv2.pointPolygonTest(hull, pixel, True) < -margin_px for pixel in pixels.tolist()]
-    return replace(view, edges=view.edges.select(np.array(is_apart, dtype=bool)))
+    return np.array([cv2.pointPolygonTest(hull, p, True) < -margin_px for p in pixels.tolist()], dtype=bool)
 
 
 def _whole(events: Events) -> EventCut:

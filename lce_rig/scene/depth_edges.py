@@ -1,5 +1,6 @@
 """Edges of a scan: outlines of near objects, and where a surface's reflectivity changes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,10 @@ _FAINT = 0.05  # Reflectivities below this hardly differ,
 _LEAST_CHANGE = 0.05  # nor do those that differ by less.
 _CHANGE_SIGMAS = 4.0  # of the scatter on either side
 
+_SAME_PLACE_M, _SAME_PLACE_RAD = 0.05, 0.01  # noise of ranges; azimuth steps
+_MAX_COMPARED = 10  # More captures of one place tell no more.
+_STANDING_SHARE = 0.5  # of all edges that recur before a standing rig
+
 
 @dataclass(frozen=True, eq=False)
 class DepthEdges:
@@ -44,6 +49,37 @@ class DepthEdges:
     def select(self, keep: NDArray[np.bool_]) -> "DepthEdges":
         """Keep the points of a mask (N,)."""
         return DepthEdges(self.points[keep], self.weight[keep], self.channel[keep])
+
+
+def leave_standing(captures: Sequence[DepthEdges]) -> list[DepthEdges]:
+    """Leave out what moves before a standing rig: who holds the board, its stand, passers-by.
+
+    An edge stays if a third of the other captures have one in its place; it may be hidden in the rest. Where
+    few edges stay, the rig itself moves, and all are kept.
+    """
+    keep = [_recurs(edges, [each for each in _evenly(captures) if each is not edges]) for edges in captures]
+    if not keep or np.mean(np.concatenate(keep)) < _STANDING_SHARE:
+        return list(captures)
+    return [edges.select(each) for edges, each in zip(captures, keep, strict=True)]
+
+
+def _evenly(captures: Sequence[DepthEdges]) -> list[DepthEdges]:
+    n = min(len(captures), _MAX_COMPARED)
+    return [captures[k] for k in np.linspace(0, len(captures) - 1, n).round().astype(int)]
+
+
+def _recurs(edges: DepthEdges, others: Sequence[DepthEdges]) -> NDArray[np.bool_]:
+    """Find which edges a third of the other captures, and one at least, have in the same place."""
+    from scipy.spatial import cKDTree
+
+    tolerance_m = _SAME_PLACE_M + _SAME_PLACE_RAD * np.linalg.norm(edges.points, axis=1)
+    count = np.zeros(len(edges))
+    for other in others:
+        for channel in range(len(CHANNELS)):
+            own = edges.channel == channel
+            tree = cKDTree(other.points[other.channel == channel])
+            count[own] += tree.query(edges.points[own])[0] < tolerance_m[own]
+    return np.asarray(count >= max(len(others) / 3, 1))
 
 
 @dataclass(frozen=True, eq=False)

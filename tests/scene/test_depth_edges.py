@@ -5,7 +5,7 @@ import pytest
 
 from lce_rig.core.data import Scan
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.scene.depth_edges import CHANNELS, find_depth_edges
+from lce_rig.scene.depth_edges import CHANNELS, DepthEdges, find_depth_edges, leave_standing
 
 NEEDLE = Beam(0.0, 0.0)
 STEP = np.radians(0.2)
@@ -88,3 +88,27 @@ def test_single_returns_between_two_surfaces_are_no_outline() -> None:
 def test_an_almost_empty_scan_has_no_outlines(n) -> None:
     empty = scan_of(pillar, [0]).select(np.arange(n))
     assert len(find_depth_edges(empty, NEEDLE)) == 0
+
+
+def test_the_board_and_its_stand_move_before_a_standing_rig_and_are_left_out(seen) -> None:
+    found = [view.edges for view in seen.views]
+    standing = leave_standing(found)
+    shares = []
+    for capture, before, after in zip(seen.captures, found, standing, strict=True):
+        middle = capture.T_lidar_board["lidar"][:3, 3]
+        n_near, n_left = (
+            np.count_nonzero(np.hypot(*(edges.points - middle)[:, :2].T) < 0.6) for edges in (before, after)
+        )
+        assert n_near > 15 and n_left < 0.2 * n_near
+        shares.append((len(after) - n_left) / (len(before) - n_near))
+    assert min(shares) > 0.8
+
+
+def test_a_rig_that_moves_keeps_its_edges(seen) -> None:
+    moving = [
+        DepthEdges(view.edges.points + [0.4 * k, 0, 0], view.edges.weight, view.edges.channel)
+        for k, view in enumerate(seen.views)
+    ]
+    assert list(map(len, leave_standing(moving))) == list(map(len, moving))
+    assert list(map(len, leave_standing(moving[:1]))) == [len(moving[0])]
+    assert leave_standing([]) == []
