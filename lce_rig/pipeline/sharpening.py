@@ -10,20 +10,20 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.core.geometry import difference, tangent_sizes, transform
-from lce_rig.core.results import Calibration, ImageBoard, SceneShare
+from lce_rig.core.geometry import difference, tangent_sizes
+from lce_rig.core.results import Calibration, SceneShare
 from lce_rig.detect.detection import Detections
 from lce_rig.extrinsics import CalibrationEstimate
 from lce_rig.extrinsics.metrics import capture_residual, summarise
 from lce_rig.extrinsics.observability import find_weakest
-from lce_rig.pipeline.drift import MAX_CAPTURES, build_view
+from lce_rig.pipeline.drift import MAX_CAPTURES, build_view, without_board
 from lce_rig.residuals.features import AS_MEASURED, extract_features
 from lce_rig.scene.alignment import SceneView
+from lce_rig.scene.depth_edges import leave_standing
 from lce_rig.scene.estimate import estimate
 from lce_rig.session import Session
 from lce_rig.validation.weighing import reason
 
-_HOLDER_M = 1.0  # The board, and whoever holds it, are so near its middle.
 _KNOWN_SHARE = 0.02  # of the boards' variance that the scene must remove in a direction to have a say in it
 _CHANCE = 0.01  # of a scene that agrees with the boards to be refused
 
@@ -44,7 +44,7 @@ def sharpen(session: Session, detections: Detections, calibration: Calibration) 
 
 
 def scene_views(session: Session, detections: Detections, calibration: Calibration) -> list[SceneView]:
-    """Find the edges of a session's scene, without those at the board and whoever holds it."""
+    """Find the edges of a session's scene, without the board and, if the rig stands, its holder."""
     camera, lidar = calibration.camera, calibration.lidar
     channel = session.rig.cameras[camera].first_channel("frames") or ""
     captures = [each for each in session.captures if each.has_image(camera, channel) and lidar in each.lidars]
@@ -55,15 +55,9 @@ def scene_views(session: Session, detections: Detections, calibration: Calibrati
         with suppress(SessionError):
             image, scan = capture.image(camera, channel), capture.scan(lidar)
             view = build_view(session.rig, calibration, capture.name, image, scan)
-            board = boards.get(capture.name)
-            views.append(_without_holder(view, board, calibration) if isinstance(board, ImageBoard) else view)
-    return views
-
-
-def _without_holder(view: SceneView, board: ImageBoard, calibration: Calibration) -> SceneView:
-    points_cam = transform(calibration.T_cam_lidar, view.edges.points)
-    is_apart = np.linalg.norm(points_cam - board.T_cam_board[:3, 3], axis=1) > _HOLDER_M
-    return replace(view, edges=view.edges.select(is_apart))
+            views.append(without_board(view, boards[capture.name], session.rig, calibration))
+    standing = leave_standing([view.edges for view in views])
+    return [replace(view, edges=edges) for view, edges in zip(views, standing, strict=True)]
 
 
 def share_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibration) -> SceneShare:
