@@ -44,7 +44,7 @@ def sharpen(session: Session, detections: Detections, calibration: Calibration) 
 
 
 def scene_views(session: Session, detections: Detections, calibration: Calibration) -> list[SceneView]:
-    """Find the edges of a session's scene, without the board and, if the rig stands, its holder."""
+    """Find the edges of a session's scene without those at the board."""
     camera, lidar = calibration.camera, calibration.lidar
     channel = session.rig.cameras[camera].first_channel("frames") or ""
     captures = [each for each in session.captures if each.has_image(camera, channel) and lidar in each.lidars]
@@ -56,8 +56,7 @@ def scene_views(session: Session, detections: Detections, calibration: Calibrati
             image, scan = capture.image(camera, channel), capture.scan(lidar)
             view = build_view(session.rig, calibration, capture.name, image, scan)
             views.append(without_board(view, boards[capture.name], session.rig, calibration))
-    standing = leave_standing([view.edges for view in views])
-    return [replace(view, edges=edges) for view, edges in zip(views, standing, strict=True)]
+    return views
 
 
 def share_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibration) -> SceneShare:
@@ -66,6 +65,8 @@ def share_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibrat
     The change d from the boards' extrinsics has the covariance P - P', with P that of the boards and P' that
     of both: d^T (P - P')^-1 d, over the directions in which the scene knows anything, is chi-squared.
 
+    What moves before a standing rig is left out, such as whoever holds the board.
+
     Args:
         views: of the scene, without the board.
         lens: of the camera.
@@ -73,6 +74,8 @@ def share_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibrat
     """
     from scipy.stats import chi2
 
+    standing = leave_standing([view.edges for view in views])
+    views = [replace(view, edges=edges) for view, edges in zip(views, standing, strict=True)]
     T_boards, cov_boards = calibration.T_cam_lidar, calibration.cov
     found = estimate(views, lens, T_boards, (T_boards, cov_boards))
     change = difference(found.T_cam_lidar, T_boards)
