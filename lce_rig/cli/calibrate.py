@@ -20,9 +20,10 @@ from lce_rig.cli.options import (
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.results import Calibration, OtherCamera
+from lce_rig.core.scene_opinion import AxisOpinion, SceneOpinion
 from lce_rig.detect.detection import Pair
 from lce_rig.words import not_enough, sentence
-from lce_rig.words.extrinsics import weakest_words
+from lce_rig.words.extrinsics import motion_words, weakest_words
 
 # The uncertainty in the report: by axis, and for points at several distances.
 
@@ -64,6 +65,48 @@ def _at_distances(c: Calibration) -> list[str]:
         f"  {title:<13}" + "".join(f"{cell:<20}" for cell in cells).rstrip()
         for title, cells in (("a point", columns), ("  in centre", centre), ("  in corner", corner))
     ]
+
+
+SCENE_STATES = {"agrees": "agrees", "contradicts": "[red]contradicts[/]", "unknown": "cannot tell"}
+
+
+def scene_texts(opinion: SceneOpinion) -> list[str]:
+    """State the scene's opinion: what contradicts, which changes it would see, and what it cannot tell."""
+    if not opinion.n_captures:
+        return ["cannot tell: no capture has a frame and a scan"]
+    seen = f"{show.counted(opinion.n_captures, 'capture')}, {opinion.n_edges} edges"
+    if not opinion.axes:
+        return [f"cannot tell: too few edges ({seen})"]
+    texts = [f"{SCENE_STATES[opinion.state]} ({seen})"]
+    texts += [
+        f"{motion_words(axis.axis)}: {_value(axis, axis.change, '+')} +- {_value(axis, axis.sigma)} "
+        f"{_UNITS[axis.unit]}"
+        for axis in opinion.of("contradicts")
+    ]
+    texts += [f"would see changes {kind}" for kind in _by_kind(opinion.of("agrees"), with_size=True)]
+    if opinion.state != "unknown" and opinion.of("unknown"):
+        texts.append(f"cannot tell changes {'; '.join(_by_kind(opinion.of('unknown')))}")
+    return texts
+
+
+def _by_kind(axes: Sequence[AxisOpinion], *, with_size: bool = False) -> list[str]:
+    """Name axes as rotations about and translations along x, y and z."""
+    parts = []
+    for unit, kind in (("deg", "about"), ("m", "along")):
+        own = [axis for axis in axes if axis.unit == unit]
+        names = [
+            f"{each.axis[-1]} {_value(each, each.smallest)}" if with_size else each.axis[-1] for each in own
+        ]
+        if own:
+            parts.append(f"{kind} {', '.join(names)}{' ' + _UNITS[unit] if with_size else ''}")
+    return parts
+
+
+_UNITS = {"deg": "deg", "m": "mm"}
+
+
+def _value(axis: AxisOpinion, value: float, sign: str = "") -> str:
+    return f"{value:{sign}.2f}" if axis.unit == "deg" else f"{1000 * value:{sign}.0f}"
 
 
 # The report of several cameras: their relative poses, and which of them has no result.
@@ -346,6 +389,8 @@ def _lines(calibration: Calibration) -> list[str]:
         lines.append(
             f"  reference    error {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
         )
+    for k, text in enumerate([] if c.scene is None else scene_texts(c.scene)):
+        lines.append(f"  {'scene' if k == 0 else '':<13}{text}")
     for name, why in c.captures_refused.items():
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {sentence(why)}')}[/]")
     lines += [f"  [{colour}]{show.escape(sentence(finding))}[/]" for finding in c.findings]

@@ -12,6 +12,7 @@ from lce_rig.core.diagnostics import NO_DIAGNOSTICS, Diagnostics
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, sigma_sizes
+from lce_rig.core.scene_opinion import SceneOpinion
 
 Stage = Literal["read", "image", "lidar", "pair", "calibrate"]
 STAGES: tuple[Stage, ...] = ("read", "image", "lidar", "pair", "calibrate")
@@ -448,6 +449,7 @@ class Calibration:
         estimated_with: cameras whose extrinsics were estimated together with this one.
         other_cameras: those that saw the same boards held still.
         scene_share: what the scene did to them; None if it was not asked.
+        scene: what the edges of the scene say of it; None if they were not compared.
         weakest: the least determined motion; None if it is read back.
         held_out_m: rms residual of captures where they were not fitted; NaN if no method knows it.
         residuals: of each capture used.
@@ -476,6 +478,7 @@ class Calibration:
     estimated_with: tuple[str, ...] = ()
     other_cameras: tuple[OtherCamera, ...] = ()
     scene_share: SceneShare | None = None
+    scene: SceneOpinion | None = None
     weakest: WeakestMotion | None = None
     held_out_m: float = float("nan")
     residuals: tuple[CaptureResidual, ...] = ()

@@ -23,6 +23,7 @@ from lce_rig.core.results import (
     Refusal,
     SceneShare,
 )
+from lce_rig.core.scene_opinion import AxisOpinion, SceneOpinion
 from lce_rig.export.files import MADE_BY
 from lce_rig.session.durable import write_atomically
 from lce_rig.words import as_json, is_renderable, refusal_as_json, sentence
@@ -178,6 +179,32 @@ class SceneShareRecord(_SavedRecord):
     n_directions: _Count
 
 
+class AxisRecord(_SavedRecord):
+    """The scene's opinion on one axis; figures in its unit."""
+
+    axis: str
+    state: Literal["agrees", "contradicts", "unknown"]
+    unit: Literal["deg", "m"]
+    change: _Figure
+    sigma: _NotNegative
+    smallest: _NotNegative
+
+
+class SceneRecord(_SavedRecord):
+    """The scene's opinion; no axes if there is too little to compare."""
+
+    state: Literal["agrees", "contradicts", "unknown"]
+    n_captures: _Count
+    n_edges: _Count
+    axes: list[AxisRecord]
+
+    @property
+    def opinion(self) -> SceneOpinion:
+        """The opinion, whose state follows from its axes."""
+        axes = tuple(AxisOpinion(**axis.model_dump()) for axis in self.axes)
+        return SceneOpinion(self.n_captures, self.n_edges, axes)
+
+
 class PairRecord(_SavedRecord):
     """One camera and one LiDAR; figures that could not be computed are null."""
 
@@ -209,6 +236,7 @@ class PairRecord(_SavedRecord):
     estimated_with: list[str] = Field(default_factory=list)
     other_cameras: list[OtherCameraRecord] = Field(default_factory=list)
     scene_share: SceneShareRecord | None = None
+    scene: SceneRecord | None = None
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "PairRecord":
@@ -303,6 +331,7 @@ def _pair(calibration: Calibration) -> dict[str, Any]:
         "findings": [as_json(finding) for finding in calibration.findings],
         "reasons": [sentence(finding) for finding in calibration.findings],
         "diagnostics": calibration.diagnostics.figures(),
+        "scene": None if calibration.scene is None else calibration.scene.document(),
     }
     return {
         name: written[name]
@@ -431,6 +460,7 @@ def _calibration(pair: PairRecord) -> Calibration:
         estimated_with=tuple(pair.estimated_with),
         other_cameras=tuple(_other(record) for record in pair.other_cameras),
         scene_share=None if pair.scene_share is None else _share(pair.scene_share),
+        scene=None if pair.scene is None else pair.scene.opinion,
     )
 
 

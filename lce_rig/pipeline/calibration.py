@@ -1,6 +1,7 @@
 """Estimate and judge the extrinsics of every camera with every LiDAR of a session.
 
-detections -> estimate of each camera with each LiDAR -> cameras of one LiDAR, together -> checks, verdict
+detections -> estimate of each camera with each LiDAR -> cameras of one LiDAR, together -> checks, verdict ->
+the scene's opinion
 """
 
 from collections import Counter
@@ -15,7 +16,7 @@ from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import invert, sigma_sizes, tangent_sizes
-from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, OtherCamera, Refusal, SceneShare
+from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal, SceneShare
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.extrinsics import (
@@ -26,20 +27,21 @@ from lce_rig.extrinsics import (
     EstimateSettings,
     calibrate_channels,
 )
-from lce_rig.extrinsics.consensus import find_consensus
 from lce_rig.extrinsics.likelihood.calibrate_together import TogetherEstimate, calibrate_together
 from lce_rig.extrinsics.metrics import error_to_reference
 from lce_rig.extrinsics.relative_pose import relative_pose
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import Progress, detect, silent
+from lce_rig.pipeline.matching import candidates_of
 from lce_rig.pipeline.result_files import Result
-from lce_rig.pipeline.sharpening import Sharpen, fuse, share_findings, sharpen
+from lce_rig.pipeline.sharpening import Sharpen, by_boards, fuse, share_findings, sharpen
+from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.validation.camera_pairs import CameraPair, camera_findings, relate
 from lce_rig.validation.reach import point_uncertainties
 from lce_rig.validation.validate import Validation, validate
-from lce_rig.validation.verdict import judge
+from lce_rig.validation.verdict import judge, with_opinion
 from lce_rig.words import not_enough, sentence
 
 
@@ -130,18 +132,19 @@ def calibrate(
             named.
         UsageError: no capture holds one of the channels.
     """
-    found = detect(session) if detections is None else detections
+    detections = detect(session) if detections is None else detections
     pairs, shortages = calibrate_detections(
         session.rig,
-        found,
+        detections,
         options,
         cameras=cameras,
         channels=channels,
         reference=reference,
-        scene=partial(sharpen, session, found) if use_scene else None,
+        scene=partial(sharpen, session, detections) if use_scene else None,
         progress=progress,
     )
-    return Result(session, tuple(pairs), tuple(shortages))
+    heard = [with_opinion(pair, hear_scene(session, detections, by_boards(pair))) for pair in pairs]
+    return Result(session, tuple(heard), tuple(shortages))
 
 
 def calibrate_detections(
@@ -256,7 +259,7 @@ def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: C
     refused: dict[str, Refusal] = {}
     shortages: list[Finding] = []
     for pair in pairs:
-        own, own_refused = _candidates(detections, pair)
+        own, own_refused = candidates_of(detections, pair)
         refused |= {name: why for name, why in own_refused.items() if name not in refused}
         if len(own) >= rig.quality.min_captures:
             candidates[pair.channel] = own
@@ -268,19 +271,6 @@ def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: C
     refused = {name: why for name, why in refused.items() if name not in found}
     settings = EstimateSettings.of(options, rig.lidars[pairs[0].lidar])
     return _Sensors(tuple(pairs), settings, candidates, refused)
-
-
-def _candidates(detections: Detections, pair: Pair) -> tuple[list[CaptureCandidates], dict[str, Refusal]]:
-    candidates, refused = [], {}
-    for name in detections.captures(pair):
-        image, lidar = detections.of(pair, name)
-        if isinstance(image, Refusal):
-            refused[name] = image
-        elif isinstance(lidar, Refusal):
-            refused[name] = lidar
-        else:
-            candidates.append(CaptureCandidates(name, image, lidar))
-    return candidates, refused
 
 
 def _few_detected(pair: Pair, n_detected: int, refused: Mapping[str, Refusal], n_needed: int) -> Finding:
@@ -473,29 +463,6 @@ def _compared(calibration: Calibration, reference: Reference | None) -> Calibrat
         return calibration
     rotation_deg, translation_m = error_to_reference(calibration.T_cam_lidar, truth)
     return replace(calibration, egt_rotation_deg=rotation_deg, egt_translation_m=translation_m)
-
-
-def refusals_of(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refusal]:
-    """State why captures of a pair are unusable: a sensor found no board, or both sensors disagree."""
-    return match_sensors(rig, detections, pair)[0]
-
-
-def match_sensors(
-    rig: Rig, detections: Detections, pair: Pair
-) -> tuple[dict[str, Refusal], dict[str, LidarBoard]]:
-    """Choose the LiDAR's candidates that agree with the images.
-
-    Returns:
-        As `refusals_of`; and capture -> the candidate that is the board, where three captures agree at least.
-    """
-    chosen: dict[str, LidarBoard] = {}
-    candidates, refused = _candidates(detections, pair)
-    if len(candidates) >= 3:
-        consensus = find_consensus(candidates, rig.board.to_board())
-        nowhere = Refusal("pair.no_agreement", figures={"n_captures": len(candidates)})
-        refused |= consensus.refused if consensus else {item.capture: nowhere for item in candidates}
-        chosen = {each.capture: each.lidar for each in consensus.observations} if consensus else {}
-    return dict(sorted(refused.items())), chosen
 
 
 def clocks_of(rig: Rig, camera: str, lidar: str) -> Clocks:

@@ -6,20 +6,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, transform
 from lce_rig.core.losses import Losses
-from lce_rig.core.results import Calibration, ImageBoard, Refusal
-from lce_rig.detect.events.figures import outline_px
+from lce_rig.core.results import Calibration
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.devices.opening import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.export.result import SavedResult, read_result
@@ -30,9 +25,8 @@ from lce_rig.recordings.joining import join_recordings, require_sensors
 from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.depth_edges import find_depth_edges, leave_standing
 from lce_rig.scene.drift import AxisDrift, Drift, watch
-from lce_rig.scene.edge_field import build_edge_field
+from lce_rig.scene.views import build_view, without_board, without_movers
 from lce_rig.session import Capture, Session
 from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.rig_clock import RigClock
@@ -43,7 +37,6 @@ from lce_rig.words import as_json, describe
 
 MAX_CAPTURES = 60
 """More captures add time and memory but, of one place, no information: they are thinned out evenly."""
-_BOARD_MARGIN_RAD = 0.04  # Extrinsics may be off by as much.
 _LIVE_WAIT_S = 0.2
 
 
@@ -371,43 +364,12 @@ class _Watcher:
             if example is None or len(view.edges) > len(example[2].edges):
                 example = seen.name, seen.image, view
         if self._ignore_board:
-            standing = leave_standing([view.edges for view in views])
-            views = [replace(view, edges=edges) for view, edges in zip(views, standing, strict=True)]
+            views = without_movers(views)
         judged = watch(views, lens, c.T_cam_lidar, c.cov)
         if not kept:
             lacking = Finding("scene.no_samples", "error", c.camera, {"lidar": c.lidar})
             judged = replace(judged, findings=(lacking,))
         return PairDrift(c, judged, example)
-
-
-def build_view(rig: Rig, calibration: Calibration, name: str, image: Image, scan: Scan) -> SceneView:
-    """Find the edges of one capture's scan and image."""
-    lidar, lens = rig.lidars[calibration.lidar], rig.cameras[calibration.camera].to_intrinsics()
-    edges = find_depth_edges(scan, Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad))
-    return SceneView(name, edges, build_edge_field(image.grey, lens.fx_px))
-
-
-def without_board(
-    view: SceneView, found: ImageBoard | Refusal, rig: Rig, calibration: Calibration
-) -> SceneView:
-    """Leave out the edges at and near the board, if the image shows one."""
-    return replace(
-        view, edges=view.edges.select(is_apart_from_board(view.edges.points, found, rig, calibration))
-    )
-
-
-def is_apart_from_board(
-    points: Array, found: ImageBoard | Refusal, rig: Rig, calibration: Calibration
-) -> NDArray[np.bool_]:
-    """Find which points (N, 3) of the LiDAR's frame lie apart from the board in an image; all without one."""
-    if isinstance(found, Refusal):
-        return np.ones(len(points), dtype=np.bool_)
-    lens = rig.cameras[calibration.camera].to_intrinsics()
-    outline = outline_px(found.T_cam_board, rig.board.to_board(), lens)
-    hull = cv2.convexHull(outline[np.isfinite(outline).all(axis=1)].astype(np.float32))
-    pixels, _ = lens.project(transform(calibration.T_cam_lidar, points))
-    margin_px = _BOARD_MARGIN_RAD * lens.fx_px
-    return np.array([cv2.pointPolygonTest(hull, p, True) < -margin_px for p in pixels.tolist()], dtype=bool)
 
 
 def _whole(events: Events) -> EventCut:

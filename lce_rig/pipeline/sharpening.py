@@ -1,14 +1,12 @@
 """Boards and scene in one estimate: the boards give the prior, the edges of the scene the likelihood."""
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import difference, tangent_sizes
 from lce_rig.core.results import Calibration, SceneShare
@@ -16,11 +14,12 @@ from lce_rig.detect.detection import Detections
 from lce_rig.extrinsics import CalibrationEstimate
 from lce_rig.extrinsics.metrics import capture_residual, summarise
 from lce_rig.extrinsics.observability import find_weakest
-from lce_rig.pipeline.drift import MAX_CAPTURES, build_view, without_board
+from lce_rig.pipeline.drift import MAX_CAPTURES
+from lce_rig.pipeline.witness import scene_views
 from lce_rig.residuals.features import AS_MEASURED, extract_features
 from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.depth_edges import leave_standing
 from lce_rig.scene.estimate import estimate
+from lce_rig.scene.views import without_movers
 from lce_rig.session import Session
 from lce_rig.validation.weighing import reason
 
@@ -40,23 +39,7 @@ def sharpen(session: Session, detections: Detections, calibration: Calibration) 
         calibration: by the boards alone.
     """
     lens = session.rig.cameras[calibration.camera].to_intrinsics()
-    return share_of(scene_views(session, detections, calibration), lens, calibration)
-
-
-def scene_views(session: Session, detections: Detections, calibration: Calibration) -> list[SceneView]:
-    """Find the edges of a session's scene without those at the board."""
-    camera, lidar = calibration.camera, calibration.lidar
-    channel = session.rig.cameras[camera].first_channel("frames") or ""
-    captures = [each for each in session.captures if each.has_image(camera, channel) and lidar in each.lidars]
-    chosen = np.linspace(0, len(captures) - 1, min(len(captures), MAX_CAPTURES)).round().astype(int)
-    boards = detections.images.get((camera, channel), {})
-    views = []
-    for capture in (captures[k] for k in chosen):
-        with suppress(SessionError):
-            image, scan = capture.image(camera, channel), capture.scan(lidar)
-            view = build_view(session.rig, calibration, capture.name, image, scan)
-            views.append(without_board(view, boards[capture.name], session.rig, calibration))
-    return views
+    return share_of(scene_views(session, detections, calibration, MAX_CAPTURES), lens, calibration)
 
 
 def share_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibration) -> SceneShare:
@@ -74,8 +57,7 @@ def share_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibrat
     """
     from scipy.stats import chi2
 
-    standing = leave_standing([view.edges for view in views])
-    views = [replace(view, edges=edges) for view, edges in zip(views, standing, strict=True)]
+    views = without_movers(views)
     T_boards, cov_boards = calibration.T_cam_lidar, calibration.cov
     found = estimate(views, lens, T_boards, (T_boards, cov_boards))
     change = difference(found.T_cam_lidar, T_boards)
@@ -125,6 +107,14 @@ def fuse(by_boards: CalibrationEstimate, share: SceneShare, board: Board) -> Cal
         metrics=summarise(residuals),
         weakest=find_weakest(share.cov, features),
     )
+
+
+def by_boards(calibration: Calibration) -> Calibration:
+    """Give the extrinsics of the boards alone, of which the scene is independent."""
+    share = calibration.scene_share
+    if share is None:
+        return calibration
+    return replace(calibration, T_cam_lidar=share.T_cam_lidar_boards, cov=share.cov_boards)
 
 
 def share_findings(share: SceneShare) -> list[Finding]:

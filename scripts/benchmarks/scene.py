@@ -15,9 +15,9 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, difference, perturb
 from lce_rig.core.results import Calibration
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.pipeline.drift import build_view, without_board
 from lce_rig.scene.alignment import AXES, IS_ROTATION, SceneView
 from lce_rig.scene.drift import Drift, watch
+from lce_rig.scene.views import build_view, without_board
 from lce_rig.session import Session
 
 _NAMES = ("rlfs01", "rlfs02", "acfr_vlp16", "os1_64")

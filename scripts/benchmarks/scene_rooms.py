@@ -15,10 +15,10 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Calibration
 from lce_rig.detect.detection import Detections
-from lce_rig.pipeline.drift import build_view, without_board
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.nominal import NominalExtrinsic
 from lce_rig.scene.alignment import SceneView
+from lce_rig.scene.views import build_view, without_board
 from lce_rig.session import Session
 from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrinsics
 

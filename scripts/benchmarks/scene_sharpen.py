@@ -15,7 +15,8 @@ from lce_rig import pipeline
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference, perturb, sigma_sizes, tangent_sizes
 from lce_rig.core.results import Calibration, SceneShare
-from lce_rig.pipeline.sharpening import scene_views, share_of
+from lce_rig.pipeline.sharpening import share_of
+from lce_rig.pipeline.witness import scene_views
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.session import Session
@@ -76,7 +77,7 @@ def _bench_rooms(name: str, n_rooms: int, folder: Path) -> None:
     drawn: dict[str, list[_Trial]] = {kind: [] for kind in _DRAWN}
     for seed in range(n_rooms):
         room = furnished_room(name, seed, n_captures, folder)
-        views = scene_views(room.session, room.detections, room.calibrate(room.names))
+        views = scene_views(room.session, room.detections, room.calibrate(room.names), 60)
         for size, calibration in _calibrated(room, sizes):
             share = share_of(views[:size], room.lens, calibration)
             by_size[size].append(_Trial.of(share, room.T_cam_lidar))
@@ -135,7 +136,7 @@ def _bench_recording(recorded: RecordedSet, n_splits: int) -> None:
         rig = with_few(session.rig)
         (every,), _ = pipeline.calibrate_detections(rig, detections)
         lens = rig.cameras[every.camera].to_intrinsics()
-        views = scene_views(session, detections, every)
+        views = scene_views(session, detections, every, 60)
         whole = share_of(views, lens, every)
         print(f"\n{recorded.name}: all {len(views)} captures\n")
         print_head("boards alone claim", "with scene", "moved by", "surprise", "directions", "state")

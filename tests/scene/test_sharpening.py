@@ -9,7 +9,8 @@ from lce_rig import pipeline
 from lce_rig.core.geometry import Array, difference, invert, perturb, transform
 from lce_rig.core.results import Calibration, SceneShare
 from lce_rig.export.result import read_result, write_result
-from lce_rig.pipeline.sharpening import scene_views, share_of
+from lce_rig.pipeline.sharpening import share_of
+from lce_rig.pipeline.witness import scene_views
 from lce_rig.scene.alignment import SceneView
 from lce_rig.session import Session
 
@@ -65,7 +66,7 @@ def test_without_edges_the_boards_decide(seen: Seen) -> None:
 
 def test_the_board_is_left_out(seen: Seen, room: Path) -> None:
     session = Session.open(room)
-    views = scene_views(session, pipeline.detect(session), seen.truth)
+    views = scene_views(session, pipeline.detect(session), seen.truth, 60)
     assert [view.capture for view in views] == [capture.name for capture in session.captures]
     size_m = np.array([seen.rig.board.width_m, seen.rig.board.height_m])
     for view, capture in zip(views, seen.captures, strict=True):
