@@ -131,4 +131,5 @@ def share_findings(share: SceneShare) -> list[Finding]:
     }
     if share.state == "contradicts":
         return [reason("verdict.scene_not_used", figures, is_fail=False)]
-    return [Finding(f"verdict.scene_{share.state}", "note", figures=figures)]
+    code = "verdict.scene_used" if share.state == "used" else "verdict.scene_unknown"
+    return [Finding(code, "note", figures=figures)]
