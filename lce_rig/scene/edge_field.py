@@ -32,12 +32,13 @@ class EdgeField:
     reduction: int
 
     def sample(self, pixels: Array) -> Array:
-        """Interpolate the field at pixels (N, 2) of the image; 0 outside."""
-        if not len(pixels):
-            return np.zeros(0)
+        """Interpolate the field at pixels (..., N, 2) of the image; 0 outside."""
+        if not pixels.size:
+            return np.zeros(pixels.shape[:-1])
         at = ((np.where(np.isfinite(pixels), pixels, -1e4) + 0.5) / self.reduction - 0.5).astype(np.float32)
-        sampled = cv2.remap(self.values, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderValue=0.0)
-        return np.asarray(sampled[0], dtype=np.float64)
+        rows = at.reshape(-1, pixels.shape[-2], 2)
+        sampled = cv2.remap(self.values, rows[..., 0], rows[..., 1], cv2.INTER_LINEAR, borderValue=0.0)
+        return np.asarray(sampled.reshape(pixels.shape[:-1]), dtype=np.float64)
 
     def coarser(self) -> "EdgeField":
         """Blur and halve the field."""

@@ -36,6 +36,11 @@ def _unknown(finding: Finding) -> str:
     return f"the edges of the scene cannot tell: {_motions(finding, 'unknown')}"
 
 
+def _best_uncertain(finding: Finding) -> str:
+    """The search in all axes leaves {axes} open."""
+    return f"the best extrinsics in all axes together are uncertain: {_motions(finding, 'axes')}"
+
+
 def _axis_unchanged(finding: Finding) -> str:
     """No change of {smallest_m} or {smallest_deg}; {change_m}, {change_deg}, {sigma_m}, {sigma_deg}."""
     return f"{motion_words(finding.subject)}: no change of {_figure(finding, 'smallest')} or more"
@@ -74,6 +79,7 @@ PHRASES = {
         "no image or events of {subject} within the tolerance of a scan of {lidar}",
         "check the topics and timestamps of the recording, or record this camera",
     ),
+    "scene.best_uncertain": Phrase(_best_uncertain, _BOARD),
     "scene.axis_unchanged": Phrase(_axis_unchanged),
     "scene.axis_changed": Phrase(_axis_changed),
     "scene.large_scatter": Phrase(_large_scatter, "record more places or more upright edges"),
