@@ -20,9 +20,10 @@ from lce_rig.cli.options import (
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.results import Calibration, OtherCamera
+from lce_rig.core.scene_opinion import AxisOpinion, SceneOpinion
 from lce_rig.detect.detection import Pair
 from lce_rig.words import not_enough, sentence
-from lce_rig.words.extrinsics import weakest_words
+from lce_rig.words.extrinsics import motion_words, weakest_words
 
 # The uncertainty in the report: by axis, and for points at several distances.
 
@@ -37,9 +38,17 @@ def uncertainty_lines(calibration: Calibration) -> list[str]:
         f"  uncertainty  {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
         f"               about {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
         f"               along {_by_axis(1000 * sigmas[:3], '.1f')} mm",
+        *_boards_alone(c),
         *([f"  weakest: {weakest_words(c.weakest)}"] if c.weakest else []),
         *_at_distances(c),
     ]
+
+
+def _boards_alone(c: Calibration) -> list[str]:
+    if c.scene_share is None or c.scene_share.state != "used":
+        return []
+    sigma_deg, sigma_m = sigma_sizes(c.scene_share.cov_boards)
+    return [f"               of the boards alone {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm"]
 
 
 def _by_axis(values: Array, digits: str) -> str:
@@ -56,6 +65,50 @@ def _at_distances(c: Calibration) -> list[str]:
         f"  {title:<13}" + "".join(f"{cell:<20}" for cell in cells).rstrip()
         for title, cells in (("a point", columns), ("  in centre", centre), ("  in corner", corner))
     ]
+
+
+SCENE_STATES = {"agrees": "agrees", "contradicts": "[red]contradicts[/]", "unknown": "cannot tell"}
+
+
+def scene_texts(opinion: SceneOpinion) -> list[str]:
+    """State the scene's opinion: what contradicts, which changes it would see, and what it cannot tell."""
+    if not opinion.n_captures:
+        return ["cannot tell: no capture has a frame and a scan"]
+    seen = f"{show.counted(opinion.n_captures, 'capture')}, {opinion.n_edges} edges"
+    if not opinion.axes:
+        return [f"cannot tell: too few edges ({seen})"]
+    texts = [f"{SCENE_STATES[opinion.state]} ({seen})"]
+    texts += [
+        f"{motion_words(axis.axis)}: {_value(axis, axis.change, '+')} +- {_value(axis, axis.sigma)} "
+        f"{_UNITS[axis.unit]}"
+        for axis in opinion.of("contradicts")
+    ]
+    texts += [f"would see changes {kind}" for kind in _by_kind(opinion.of("agrees"), with_size=True)]
+    if opinion.state != "unknown" and opinion.of("unknown"):
+        texts.append(f"cannot tell changes {'; '.join(_by_kind(opinion.of('unknown')))}")
+    return texts
+
+
+def _by_kind(axes: Sequence[AxisOpinion], *, with_size: bool = False) -> list[str]:
+    """Name axes as rotations about and translations along x, y and z."""
+    parts = []
+    for unit, kind in (("deg", "about"), ("m", "along")):
+        own = [axis for axis in axes if axis.unit == unit]
+        names = [
+            f"{each.axis[-1]} {_value(each, each.smallest)}" if with_size else each.axis[-1] for each in own
+        ]
+        if own:
+            parts.append(f"{kind} {', '.join(names)}{' ' + _UNITS[unit] if with_size else ''}")
+    return parts
+
+
+_UNITS = {"deg": "deg", "m": "mm"}
+
+
+def _value(axis: AxisOpinion, value: float | None, sign: str = "") -> str:
+    if value is None:
+        return "?"
+    return f"{value:{sign}.2f}" if axis.unit == "deg" else f"{1000 * value:{sign}.0f}"
 
 
 # The report of several cameras: their relative poses, and which of them has no result.
@@ -158,6 +211,9 @@ if TYPE_CHECKING:
     help="Estimate with Algorithm 1 of LCE-Calib (paper), or refine its result by maximum likelihood (ml).",
 )
 @click.option(
+    "--use-scene", is_flag=True, help="Estimate from the edges of the scene too, not from the board alone."
+)
+@click.option(
     "--name",
     metavar="NAME",
     help="Write the result to SESSION/results/NAME/ and leave SESSION/calibration/ unchanged.",
@@ -181,6 +237,7 @@ def calibrate(
     cameras: tuple[str, ...],
     channels: list[str] | None,
     event_image: Any,
+    use_scene: bool,
     name: str | None,
     as_json: bool,
     force: bool,
@@ -229,6 +286,7 @@ def calibrate(
                 cameras=cameras or None,
                 channels=channels,
                 reference=truth,
+                use_scene=use_scene,
                 progress=progress,
             )
         for shortage in result.shortages:
@@ -333,6 +391,8 @@ def _lines(calibration: Calibration) -> list[str]:
         lines.append(
             f"  reference    error {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
         )
+    for k, text in enumerate([] if c.scene is None else scene_texts(c.scene)):
+        lines.append(f"  {'scene' if k == 0 else '':<13}{text}")
     for name, why in c.captures_refused.items():
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {sentence(why)}')}[/]")
     lines += [f"  [{colour}]{show.escape(sentence(finding))}[/]" for finding in c.findings]

@@ -64,11 +64,14 @@ def _empty_table(title: str) -> Any:
     for heading in ("used", "deg", "mm", "px"):
         table.add_column(heading, justify="right")
     table.add_column("verdict")
+    table.add_column("scene")
     table.add_column("written")
     return table
 
 
 def _cells(c: "Calibration") -> list[str]:
+    from lce_rig.cli.calibrate import SCENE_STATES
+
     px = c.metrics.reprojection_px
     return [
         c.method,
@@ -78,6 +81,7 @@ def _cells(c: "Calibration") -> list[str]:
         f"{1000 * c.sigma_translation_m:.1f}",
         f"{px:.2f}" if math.isfinite(px) else "-",
         f"[{show.COLOURS[c.verdict]}]{c.verdict}[/]",
+        "-" if c.scene is None else SCENE_STATES[c.scene.state],
     ]
 
 
@@ -104,4 +108,5 @@ def _pair(c: "Calibration") -> dict[str, Any]:
         "sigma_translation_m": c.sigma_translation_m,
         "reprojection_px": px if math.isfinite(px) else None,
         "verdict": c.verdict,
+        "scene": None if c.scene is None else c.scene.state,
     }

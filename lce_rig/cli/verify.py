@@ -45,6 +45,7 @@ def verify(
     import lce_rig as lce
     from lce_rig.cli.calibrate import exit_by_verdict
     from lce_rig.core.errors import ResultRefusedError, UsageError
+    from lce_rig.core.findings import worst
     from lce_rig.detect.detection import Pair
 
     if result is not None and name is not None:
@@ -66,7 +67,7 @@ def verify(
     for c in verification.unchecked:
         show.warn(f"{session} holds no captures of {Pair.of(c)}: not checked")
     exit_by_verdict(verification.calibrations)
-    contradicted = [checked for checked in checks if checked.findings]
+    contradicted = [checked for checked in checks if worst(checked.findings) == "error"]
     if contradicted:
         raise ResultRefusedError(
             f"the captures of {session} contradict the extrinsics of "
@@ -91,6 +92,8 @@ def _table(checked: Any) -> Any:
 
 
 def _summary(checked: Any) -> list[str]:
+    from lce_rig.cli.calibrate import scene_texts
+
     lines = []
     if checked.metrics is not None:
         m = checked.metrics
@@ -98,6 +101,7 @@ def _summary(checked: Any) -> list[str]:
             f"mean over captures: planes {1000 * m.mpe_m:.1f} mm, edges {1000 * m.mee_m:.1f} mm, "
             f"together {1000 * m.mge_m:.1f} mm; corners {m.reprojection_px:.2f} px"
         )
+    lines.append(f"scene: {'; '.join(scene_texts(checked.scene))}")
     lines.append(f"verdict of the calibration: {checked.calibration.verdict}")
     lines.append(f"these captures: {'; '.join(map(describe, checked.findings)) or 'agree'}")
     if checked.contact_sheets:

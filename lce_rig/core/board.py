@@ -79,10 +79,24 @@ class Board:
         Returns:
             (...): 0 bottom, 1 right, 2 top, 3 left.
         """
-        x, y = xy_m[..., 0], xy_m[..., 1]
-        beyond_x, beyond_y = np.abs(x) - self.width_m / 2, np.abs(y) - self.height_m / 2
-        is_side = (beyond_y < 0) & (beyond_x > beyond_y)
-        return np.where(is_side, np.where(x > 0, 1, 3), np.where(y > 0, 2, 0)).astype(np.intp)
+        inside_x, inside_y = self._inside(xy_m)
+        right_or_left = 3 - 2 * (xy_m[..., 0] > 0).astype(np.int8)
+        top_or_bottom = 2 * (xy_m[..., 1] > 0).astype(np.int8)
+        is_side = (inside_y > 0) & (inside_x < inside_y)
+        return np.where(is_side, right_or_left, top_or_bottom).astype(np.intp)
+
+    def inside_nearest_edge(self, xy_m: Array) -> Array:
+        """Measure how far points lie inside the edge that is nearest, by `nearest_edge`, m.
+
+        Args:
+            xy_m: (..., 2) x and y, frame board; further coordinates are ignored.
+        """
+        inside_x, inside_y = self._inside(xy_m)
+        return np.where((inside_y > 0) & (inside_x < inside_y), inside_x, inside_y)
+
+    def _inside(self, xy_m: Array) -> tuple[Array, Array]:
+        """Measure how far points lie inside the left or right edge, and inside the lower or upper one, m."""
+        return self.width_m / 2 - np.abs(xy_m[..., 0]), self.height_m / 2 - np.abs(xy_m[..., 1])
 
     def outline_distance(self, xy_m: Array) -> Array:
         """Measure how far points of the board's plane lie from the nearest point on the outline, m.

@@ -82,6 +82,8 @@ _TIMES_MEDIAN = 3.0
 # A disagreement below this can be noise, however well the other captures agree.
 _FLOOR_M = 0.02
 _MAX_SHARE = 0.25
+# More captures are predicted in folds of several, and as many are refused at once: the cost stays linear.
+_MAX_FOLDS = 60
 _SIGMA_FLOOR_M = 0.001
 
 
@@ -102,18 +104,20 @@ def reject_outliers(
     kept = np.arange(problem.n_captures)
     refusals: dict[str, Refusal] = {}
     while True:
-        selection = np.zeros((len(kept), problem.n_captures))
-        selection[:, kept] = 1
-        selection[np.arange(len(kept)), kept] = 0
+        # Each capture is predicted without its fold; of few captures, each is a fold.
+        fold = np.arange(len(kept)) % _MAX_FOLDS
+        selection = np.zeros((fold.max() + 1, problem.n_captures))
+        selection[:, kept] = fold != np.arange(len(selection))[:, None]
         solutions = problem.solve(selection, T_start, parts.n_rounds)
-        plane, edge = (error[np.arange(len(kept)), kept] for error in problem.errors(solutions.x))
+        plane, edge = (error[fold, kept] for error in problem.errors(solutions.x))
         excess = np.maximum(_excess(plane), _excess(edge))
-        worst = int(np.argmax(excess))
+        at_once = -(-len(kept) // _MAX_FOLDS)
+        worst = [int(k) for k in np.argsort(-excess, kind="stable")[:at_once] if excess[k] > 1]
         n_refused = problem.n_captures - len(kept)
-        is_done = not parts.reject_outliers or excess[worst] <= 1 or len(kept) <= 4
+        is_done = not parts.reject_outliers or not worst or len(kept) <= 4
         if is_done or n_refused >= _MAX_SHARE * problem.n_captures:
             return refusals, (_typical(plane), _typical(edge))
-        refusals[features[kept[worst]].capture] = _refusal(plane, edge, worst)
+        refusals |= {features[kept[k]].capture: _refusal(plane, edge, k) for k in worst}
         kept = np.delete(kept, worst)
 
 
@@ -144,7 +148,10 @@ def _refusal(plane: Array, edge: Array, k: int) -> Refusal:
 # Second phase of Algorithm 1: many refinements on random subsets, judged on held-out captures.
 
 MIN_SUBSET = 3
-_CHUNK = 1000
+# Of more captures, sizes are drawn at equal distances.
+_MAX_SIZES = 40
+# Subsets at once, and ring ends in all of them, which bounds the memory.
+_CHUNK, _CHUNK_ENDS = 1000, 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +188,7 @@ def draw_subsets(
     seed: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> Draws | None:
-    """Solve `n_draws` random subsets of each size 3..F-1.
+    """Solve `n_draws` random subsets of each size 3..F-1, of many captures of 40 sizes.
 
     Each candidate is judged on the captures it was not fitted to, as fitted noise would bias the judgement.
     Every capture counts equally, however often it was held out.
@@ -199,6 +206,8 @@ def draw_subsets(
     """
     n = problem.n_captures
     sizes = np.arange(MIN_SUBSET, n)
+    if len(sizes) > _MAX_SIZES:
+        sizes = np.linspace(MIN_SUBSET, n - 1, _MAX_SIZES).astype(np.int_)
     if len(sizes) == 0 or n_draws == 0:
         return None
     rng = np.random.default_rng(seed)
@@ -206,8 +215,9 @@ def draw_subsets(
     # A capture takes part if its rank in the shuffled order is below the subset's size.
     selection = (order < np.repeat(sizes, n_draws)[:, None]).astype(np.float64)
     T, errors, certified = [], [], []
-    for start in range(0, len(selection), _CHUNK):
-        part = selection[start : start + _CHUNK]
+    chunk = max(min(_CHUNK, _CHUNK_ENDS // max(len(problem.edge_capture), 1)), 1)
+    for start in range(0, len(selection), chunk):
+        part = selection[start : start + chunk]
         solutions = problem.solve(part, T_start, n_rounds)
         plane, edge = problem.errors(solutions.x)
         T.append(solutions.T)

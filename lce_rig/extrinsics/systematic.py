@@ -6,6 +6,7 @@ in each capture: it causes no scatter, but moves the extrinsics.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ from lce_rig.solvers.covariance import symmetric_inverse
 
 # Of the order of the errors themselves, so that the difference quotient represents their effect.
 STEP_M = 0.005
+# Captures whose rings are shifted at once: few, as each counts as often as it has rings.
+_CHUNK = 16
 
 
 def ring_sensitivities(
@@ -58,16 +61,22 @@ def ring_sensitivities(
     seen = [np.union1d(lidar.ring, lidar.edge_ring) for lidar in boards]
     capture = np.repeat(np.arange(len(boards)), [len(rings) for rings in seen])
     ring, column = np.unique(np.concatenate(seen), return_inverse=True)
-    shifted: list[CaptureFeatures] = []
-    for observation, rings in zip(observations, seen, strict=True):
-        for lidar in shift_rings(observation.lidar, rings, STEP_M):
-            shifted.append(extract_features(replace(observation, lidar=lidar), board, settings))
-    keep = None if problem.keep is None else [problem.keep[int(k)] for k in capture]
-    ids = [edge_ids[problem.edge_capture == k] for k in capture]
     gradients = problem.quadratics(x, edge_ids).gradients
-    moved = Problem(shifted, board, problem.weights, keep).quadratics(x, np.concatenate(ids)).gradients
+    starts = np.searchsorted(problem.edge_capture, np.arange(len(boards) + 1))
+    own_ids = [edge_ids[first:last] for first, last in pairwise(starts)]
+    moved = []
+    for start in range(0, len(boards), _CHUNK):
+        shifted: list[CaptureFeatures] = []
+        part = range(start, min(start + _CHUNK, len(boards)))
+        for k in part:
+            for lidar in shift_rings(boards[k], seen[k], STEP_M):
+                shifted.append(extract_features(replace(observations[k], lidar=lidar), board, settings))
+        repeated = [k for k in part for _ in seen[k]]
+        keep = None if problem.keep is None else [problem.keep[k] for k in repeated]
+        ids = np.concatenate([own_ids[k] for k in repeated])
+        moved.append(Problem(shifted, board, problem.weights, keep).quadratics(x, ids).gradients)
     change = np.zeros((len(ring), len(information)))
-    np.add.at(change, column, (moved - gradients[capture]) / STEP_M)
+    np.add.at(change, column, (np.concatenate(moved) - gradients[capture]) / STEP_M)
     return np.asarray(-symmetric_inverse(information) @ change.T)
 
 

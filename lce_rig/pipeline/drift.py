@@ -1,39 +1,38 @@
 """Check deployed extrinsics on recordings without a board: the edges of the scene decide."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from lce_rig.core.data import Image, Scan
-from lce_rig.core.errors import SessionError, SourceError
-from lce_rig.core.geometry import transform
-from lce_rig.core.results import Calibration, ImageBoard, Refusal
-from lce_rig.detect.events.figures import outline_px
+from lce_rig.core.data import Events, Image
+from lce_rig.core.errors import SessionError
+from lce_rig.core.findings import Figure, Finding, Severity
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Calibration, ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.detect.lidar.measurement import Beam
+from lce_rig.devices.reading import LiveSource
 from lce_rig.export.result import SavedResult, read_result
+from lce_rig.pipeline.board_drift import BoardDrift, board_finding, watch_boards
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import RESULT, result_parts
-from lce_rig.recordings import open_recordings
-from lce_rig.recordings.protocol import PairedRecording
+from lce_rig.pipeline.scene_captures import EVENTS_NS, SceneCaptures, Seen, evenly, own_offset_ns
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.depth_edges import find_depth_edges
-from lce_rig.scene.drift import AxisDrift, Drift, watch
-from lce_rig.scene.edge_field import build_edge_field
+from lce_rig.scene.drift import AxisDrift, Drift, State, watch
+from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
+from lce_rig.scene.views import build_view, without_board, without_movers
 from lce_rig.session import Session
+from lce_rig.timing.rig_time import event_channel, rig_time_ns
 from lce_rig.verify.drift_picture import draw_drift
 from lce_rig.verify.overlay_files import write_picture
 from lce_rig.words import as_json
 
-MAX_CAPTURES = 60
-"""More captures add time and memory but, of one place, no information: they are thinned out evenly."""
-_BOARD_MARGIN_RAD = 0.04  # Extrinsics may be off by as much.
+_MIN_MOVING = 3
+_MAX_BOARDS = 20
+_SEVERITIES: dict[State, Severity] = {"changed": "error", "unknown": "warning", "unchanged": "note"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,27 +41,88 @@ class PairDrift:
 
     Attributes:
         calibration: the deployed extrinsics.
-        drift: the verdict.
+        drift: the scene's opinion; where images show the board, without its edges.
+        board: the board's own; None where both sensors see it in fewer than three placements.
         example: the capture drawn by `write`; None without any.
     """
 
     calibration: Calibration
     drift: Drift
+    board: BoardDrift | None
     example: tuple[str, Image, SceneView] | None
+
+    @property
+    def states(self) -> dict[str, State]:
+        """Both opinions on each axis: changed if either says so, unchanged if either covers it."""
+        scene = {axis.axis: axis.state for axis in self.drift.axes}
+        if self.board is None:
+            return scene
+        return {axis.axis: _either(scene[axis.axis], axis.state) for axis in self.board.axes}
+
+    @property
+    def state(self) -> State:
+        """The verdict: changed if any axis is; unchanged only if no axis is unknown."""
+        states = set(self.states.values())
+        return "changed" if "changed" in states else "unknown" if "unknown" in states else "unchanged"
+
+    @property
+    def summary(self) -> Finding:
+        """The verdict as a finding."""
+        if self.board is None:
+            return self.drift.findings[0]
+        axes = {each: tuple(a for a, state in self.states.items() if state == each) for each in _SEVERITIES}
+        figures: dict[str, Figure] = {
+            "n_captures": self.drift.n_captures,
+            "n_boards": self.board.n_boards,
+            "changed": axes["changed"],
+            "unknown": axes["unknown"],
+        }
+        code = {
+            "changed": "scene.changed_with_board",
+            "unknown": "scene.unknown_with_board",
+            "unchanged": "scene.unchanged_with_board",
+        }
+        return Finding(code[self.state], _SEVERITIES[self.state], figures=figures)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """The verdict first, then the scene's opinion on each axis and what is missing, then the board's."""
+        if self.board is None:
+            return self.drift.findings
+        told = tuple(board_finding(axis) for axis in self.board.axes if axis.state != "unchanged")
+        return (self.summary, *self.drift.findings, *told)
 
     def document(self) -> dict[str, Any]:
         """List everything as plain types for JSON."""
         return {
             "camera": self.calibration.camera,
             "lidar": self.calibration.lidar,
-            "state": self.drift.state,
+            "state": self.state,
+            "states": self.states,
+            "scene_state": self.drift.state,
             "n_captures": self.drift.n_captures,
             "n_edges": self.drift.n_edges,
             "axes": [_axis(axis) for axis in self.drift.axes],
             "T_cam_lidar": self.drift.T_cam_lidar.tolist(),
             "T_cam_lidar_best": self.drift.T_best.tolist(),
-            "findings": [as_json(finding) for finding in self.drift.findings],
+            "covariance_best": None if self.drift.cov_best is None else self.drift.cov_best.tolist(),
+            "board": None if self.board is None else _board(self.board),
+            "findings": [as_json(finding) for finding in self.findings],
         }
+
+
+def _either(first: State, second: State) -> State:
+    return next(state for state in ("changed", "unchanged", "unknown") if state in (first, second))
+
+
+def _board(board: BoardDrift) -> dict[str, Any]:
+    return {
+        "n_boards": board.n_boards,
+        "n_placements": board.n_placements,
+        "mpe_m": board.metrics.mpe_m,
+        "mee_m": board.metrics.mee_m,
+        "axes": [_axis(axis) for axis in board.axes],
+    }
 
 
 def _axis(axis: AxisDrift) -> dict[str, Any]:
@@ -79,12 +139,14 @@ class DriftReport:
     Attributes:
         rig: the profile.
         pairs: one for each camera and LiDAR of the result.
+        notes: what was chosen, assumed or could not be read, in words.
     """
 
     rig: Rig
     pairs: tuple[PairDrift, ...]
+    notes: tuple[str, ...] = ()
 
-    def write(self, folder: Path) -> list[Path]:
+    def write(self, folder: Path | str) -> list[Path]:
         """Draw each pair: edges under the deployed and the best extrinsics, and the score along each axis.
 
         Raises:
@@ -98,138 +160,195 @@ class DriftReport:
             c = pair.calibration
             lens = self.rig.cameras[c.camera].to_intrinsics()
             picture = draw_drift(pair.drift, image, view.edges, lens, f"{c.camera}, {c.lidar}  {name}")
-            files.append(write_picture(folder / f"drift_{c.camera}_{c.lidar}.png", picture))
+            files.append(write_picture(Path(folder) / f"drift_{c.camera}_{c.lidar}.png", picture))
         return files
 
 
 def drift(
-    source: Path,
+    source: Path | str | Sequence[Path | str],
     result: SavedResult | None = None,
     *,
     rig: Rig | None = None,
-    ignore_board: bool = False,
     progress: Progress = silent,
 ) -> DriftReport:
-    """Compare the extrinsics of a result with the scene of a session or of a recording.
+    """Compare the extrinsics of a result with the scene of a session or of recordings.
+
+    Memory does not grow with the length of a recording: of each camera and LiDAR, 60 captures are kept.
 
     Args:
-        source: a session, or a recording of pairs of images and scans.
+        source: a session; or with `rig` a folder of images and point clouds, a bag, or several recordings of
+            the same time, such as a pcap and the images' folder.
         result: the deployed extrinsics; None for the session's own result.
         rig: the profile of a recording; a session has its own.
-        ignore_board: leave out the edges at the board of a session, where its images show one.
-        progress: called with (done, total) captures.
+            standing rig.
+        progress: called with (done, total) captures, or images and scans.
 
     Raises:
         SessionError: there is no result, it belongs to another rig, or the session cannot be read.
-        SourceError: the recording cannot be read, or holds no pairs of images and scans.
+        SourceError: a recording cannot be read, or holds nothing of any camera and LiDAR of the result.
     """
-    session = Session.open(source) if rig is None else None
-    rig = rig or (session.rig if session else None)
-    assert rig is not None
-    if result is None:
-        if session is None:
-            raise SessionError(f"{source} is not a session and has no result", "Name one with --result FILE.")
-        result = read_result(session.path.joinpath(*result_parts(None), RESULT))
-    if result.rig != rig.name or not result.pairs:
-        what = f"the result belongs to rig {result.rig!r}" if result.pairs else "the result holds no pair"
-        raise SessionError(f"{what}; {source} belongs to rig {rig.name!r}")
-    pairs = []
-    for calibration in result.pairs:
-        if rig.cameras[calibration.camera].first_channel("frames") is None:
-            raise SourceError(
-                f"camera {calibration.camera} has no channel of frames", "`drift` does not use events yet."
-            )
-        pairs.append(_watch_pair(rig, session, source, calibration, ignore_board, progress))
-    return DriftReport(rig, tuple(pairs))
+    paths = [Path(each) for each in ([source] if isinstance(source, str | Path) else source)]
+    if rig is not None:
+        place = " and ".join(map(str, paths))
+        if result is None:
+            raise SessionError(f"{place}: a recording has no result", "Name one with --result FILE.")
+        captures = SceneCaptures(rig, result, place)
+        captures.take_recordings(paths, progress)
+    elif len(paths) != 1:
+        raise SessionError("several recordings need the profile of their rig", "Name one with --rig.")
+    else:
+        session = Session.open(paths[0])
+        result = result or read_result(session.path.joinpath(*result_parts(None), RESULT))
+        rig = session.rig
+        captures = SceneCaptures(rig, result, str(session.path))
+        captures.take_session(session, progress)
+    return judge(rig, result, captures)
 
 
-def _watch_pair(
+def drift_live(
     rig: Rig,
-    session: Session | None,
-    source: Path,
-    calibration: Calibration,
-    ignore_board: bool,
-    progress: Progress,
-) -> PairDrift:
-    lens = rig.cameras[calibration.camera].to_intrinsics()
-    views: list[SceneView] = []
-    example: tuple[str, Image, SceneView] | None = None
-    samples = (
-        _session_samples(session, calibration, progress)
-        if session is not None
-        else _recorded_samples(source, rig, calibration, progress)
-    )
-    for name, image, scan in samples:
-        view = build_view(rig, calibration, name, image, scan)
-        if ignore_board:
-            view = without_board(view, BoardFinder(rig).image(image), rig, calibration)
-        views.append(view)
-        if example is None or len(view.edges) > len(example[2].edges):
-            example = name, image, view
-    return PairDrift(calibration, watch(views, lens, calibration.T_cam_lidar, calibration.cov), example)
+    result: SavedResult,
+    sources: Sequence[LiveSource],
+    *,
+    is_over: Callable[[int], bool],
+) -> DriftReport:
+    """Compare the extrinsics of a result with what attached sensors see.
 
-
-def build_view(rig: Rig, calibration: Calibration, name: str, image: Image, scan: Scan) -> SceneView:
-    """Find the edges of one capture's scan and image."""
-    lidar, lens = rig.lidars[calibration.lidar], rig.cameras[calibration.camera].to_intrinsics()
-    edges = find_depth_edges(scan, Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad))
-    return SceneView(name, edges, build_edge_field(image.grey, lens.fx_px))
-
-
-def without_board(
-    view: SceneView, found: ImageBoard | Refusal, rig: Rig, calibration: Calibration
-) -> SceneView:
-    """Leave out the edges at and near the board, if the image shows one."""
-    if isinstance(found, Refusal):
-        return view
-    lens = rig.cameras[calibration.camera].to_intrinsics()
-    outline = outline_px(found.T_cam_board, rig.board.to_board(), lens)
-    hull = cv2.convexHull(outline[np.isfinite(outline).all(axis=1)].astype(np.float32))
-    pixels, _ = lens.project(transform(calibration.T_cam_lidar, view.edges.points))
-    margin_px = _BOARD_MARGIN_RAD * lens.fx_px
-    is_apart = [cv2.pointPolygonTest(hull, pixel, True) < -margin_px for pixel in pixels.tolist()]
-    return replace(view, edges=view.edges.select(np.array(is_apart, dtype=bool)))
-
-
-def _session_samples(
-    session: Session, calibration: Calibration, progress: Progress
-) -> Iterator[tuple[str, Image, Scan]]:
-    """Read the image and the scan of the captures that have both; damaged ones are skipped."""
-    camera, lidar = calibration.camera, calibration.lidar
-    channel = session.rig.cameras[camera].first_channel("frames") or ""
-    captures = [c for c in session.captures if c.has_image(camera, channel) and lidar in c.lidars]
-    chosen = _thinned(captures)
-    for done, capture in enumerate(chosen, start=1):
-        with suppress(SessionError):
-            sample = capture.name, capture.image(camera, channel), capture.scan(lidar)
-            yield sample
-        progress(done, len(chosen))
-
-
-def _recorded_samples(
-    source: Path, rig: Rig, calibration: Calibration, progress: Progress
-) -> Iterator[tuple[str, Image, Scan]]:
-    """Read the pairs of a folder of images and point clouds.
+    Args:
+        rig: the profile.
+        result: the deployed extrinsics.
+        sources: of every sensor and of the sync board; not open yet.
+        is_over: asked several times a second with the number of scans so far; True ends it.
 
     Raises:
-        SourceError: there are none, or one cannot be read.
+        SessionError: the result belongs to another rig.
+        SourceError: a sensor cannot be opened, or nothing came of any camera and LiDAR of the result.
     """
-    recordings = [each for each in open_recordings([source], rig) if isinstance(each, PairedRecording)]
-    pairs = _thinned([pair for recording in recordings for pair in recording.pairs])
-    if not pairs:
-        raise SourceError(
-            f"{source} holds no pairs of images and scans", "Build a session from it with `lce-rig collect`."
-        )
-    for done, files in enumerate(pairs, start=1):
-        pair = files.read()
-        images = [image for image in pair.images if image.sensor == calibration.camera]
-        scans = [scan for scan in pair.scans if scan.sensor == calibration.lidar]
-        if images and scans:
-            yield pair.label, images[0], scans[0]
-        progress(done, len(pairs))
+    captures = SceneCaptures(rig, result, f"the sensors of rig {rig.name}")
+    captures.take_live(sources, is_over)
+    return judge(rig, result, captures)
 
 
-def _thinned(items: Sequence[Any]) -> list[Any]:
-    if len(items) <= MAX_CAPTURES:
-        return list(items)
-    return [items[k] for k in np.linspace(0, len(items) - 1, MAX_CAPTURES).round().astype(int)]
+def judge(rig: Rig, result: SavedResult, captures: SceneCaptures) -> DriftReport:
+    """Judge a result by captures of a scene.
+
+    Raises:
+        SourceError: there are none of any camera and LiDAR of the result.
+    """
+    captures.require_any()
+    judging = _Judge(rig)
+    pairs = tuple(map(judging.pair, result.pairs, captures.kept))
+    return DriftReport(rig, pairs, tuple(dict.fromkeys(captures.notes)))
+
+
+class _Judge:
+    """Judges cameras and LiDARs in turn; the motion of a LiDAR is estimated once for all cameras."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig, self._finder = rig, BoardFinder(rig)
+        self._motions: dict[int, RigMotion | None] = {}
+
+    def pair(self, c: Calibration, kept: Sequence[Seen]) -> PairDrift:
+        lens = self._rig.cameras[c.camera].to_intrinsics()
+        views: list[SceneView] = []
+        whole: list[SceneView] = []
+        boards: list[tuple[Seen, ImageBoard]] = []
+        moving: list[MovingView] = []
+        n_untimed = 0
+        for seen in kept:
+            view = build_view(self._rig, c, seen.name, seen.image, seen.scan)
+            motion = self._motion(seen)
+            if motion is not None:
+                after_s = _after_s(view.edges.points, seen, self._rig, c)
+                if after_s is None:
+                    n_untimed += 1
+                    continue
+                points = motion.moved(view.edges.points, after_s)
+                view = replace(view, edges=replace(view.edges, points=points))
+                moving.append(MovingView(view, motion))
+            whole.append(view)
+            if isinstance(seen.image, Image):
+                board = self._finder.image(seen.image)
+                view = without_board(view, board, self._rig, c)
+                if motion is None and isinstance(board, ImageBoard):
+                    boards.append((seen, board))
+            views.append(view)
+        if boards:
+            # Who holds the board moves with it.
+            views = without_movers(views)
+        judged = watch(views, lens, c.T_cam_lidar, c.cov)
+        if not kept:
+            lacking = Finding("scene.no_samples", "error", c.camera, {"lidar": c.lidar})
+            judged = replace(judged, findings=(lacking,))
+        elif n_untimed:
+            untimed = Finding("scene.no_firing_times", "warning", c.lidar, {"n_captures": n_untimed})
+            judged = replace(judged, findings=(*judged.findings, untimed))
+        if len(moving) >= _MIN_MOVING and judged.curves and judged.state != "changed":
+            judged = _with_clocks(judged, clocks_apart_s(moving, lens, c.T_cam_lidar), c.camera)
+        return PairDrift(c, judged, self._boards(c, boards), _example(kept, whole))
+
+    def _boards(self, c: Calibration, boards: Sequence[tuple[Seen, ImageBoard]]) -> BoardDrift | None:
+        """Ask the boards, of at most 20 captures."""
+        images: dict[str, ImageBoard] = {}
+        scans: dict[str, list[LidarBoard]] = {}
+        for seen, board in evenly(boards, _MAX_BOARDS):
+            found = self._finder.scan(seen.scan)
+            if isinstance(found, list):
+                images[seen.name], scans[seen.name] = board, found
+        if not images:
+            return None
+        channel = boards[0][0].image.channel if isinstance(boards[0][0].image, Image) else ""
+        return watch_boards(self._rig, c, channel, images, scans)
+
+    def _motion(self, seen: Seen) -> RigMotion | None:
+        """Estimate the rig's motion at a capture; None where it stands, or nothing tells."""
+        if seen.previous is None:
+            return None
+        key = id(seen.scan)
+        if key not in self._motions:
+            motion = estimate_motion(seen.previous, seen.scan)
+            self._motions[key] = None if motion is None or motion.is_still else motion
+        return self._motions[key]
+
+
+def _example(kept: Sequence[Seen], views: Sequence[SceneView]) -> tuple[str, Image, SceneView] | None:
+    """Choose the capture with most edges for the picture."""
+    if not views:
+        return None
+    view = max(views, key=lambda each: len(each.edges))
+    image = next(seen.image for seen in kept if seen.name == view.capture)
+    return view.capture, _picture_of(image) if isinstance(image, Events) else image, view
+
+
+def _picture_of(events: Events) -> Image:
+    """Draw the number of events of each pixel, dark on white."""
+    counts = np.zeros((events.height_px, events.width_px))
+    np.add.at(counts, (events.y, events.x), 1.0)
+    grey = np.asarray(np.clip(255 - 60 * counts, 0, 255), dtype=np.uint8)
+    return Image(events.sensor, "events", None, grey)
+
+
+def _after_s(points: Array, seen: Seen, rig: Rig, c: Calibration) -> Array | None:
+    """Tell how long after each edge (N, 3) the image was taken; None where times are unknown."""
+    image, scan_ns = seen.image, rig_time_ns(seen.scan, rig)
+    image_ns = rig_time_ns(image, rig)
+    fired_s = firing_times_s(seen.scan, points)
+    if scan_ns is None or image_ns is None or fired_s is None:
+        return None
+    channel = image.channel if isinstance(image, Image) else event_channel(rig, c.camera) or ""
+    # Events are cut about their middle.
+    middle_ns = EVENTS_NS // 2 if isinstance(image, Events) else 0
+    return np.asarray(1e-9 * (image_ns + middle_ns + own_offset_ns(c, channel) - scan_ns) - fired_s)
+
+
+def _with_clocks(judged: Drift, apart_s: float | None, camera: str) -> Drift:
+    """Give no all-clear where the images of a moving rig fit the scans of another time."""
+    if apart_s is None:
+        return judged
+    found = Finding("scene.clocks_apart", "warning", camera, {"apart_s": apart_s})
+    axes = tuple(
+        replace(axis, state="unknown", reason=found.code) if axis.state == "unchanged" else axis
+        for axis in judged.axes
+    )
+    others = [each for each in judged.findings[1:] if each.code != "scene.axis_unchanged"]
+    return replace(judged, axes=axes, findings=(found, *others))

@@ -214,7 +214,12 @@ def inputs_sha256(session: Session, calibrations: Sequence[Calibration]) -> dict
     """
     used = sorted({name for calibration in calibrations for name in calibration.captures_used})
     profile = hashlib.sha256(read_file(session.path / PROFILE)).hexdigest()
-    manifests = {f"{CAPTURES}/{name}/{MANIFEST}": session.capture(name).manifest_sha256 for name in used}
+    held = {capture.name: capture for capture in session.captures}
+    # `Session.capture` raises where one is missing; it lists the folder each time.
+    manifests = {
+        f"{CAPTURES}/{name}/{MANIFEST}": (held.get(name) or session.capture(name)).manifest_sha256
+        for name in used
+    }
     return {PROFILE: profile, **manifests}
 
 

@@ -10,8 +10,9 @@ from lce_rig.core.results import Calibration, LidarBoard, Refusal
 from lce_rig.detect.detection import Detections, LidarDetection, Pair
 from lce_rig.detect.events.search import EventImage
 from lce_rig.export.result import SavedResult, read_result
-from lce_rig.pipeline.calibration import clocks_of, match_sensors
+from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import Progress, detect, event_channels, event_picture, silent
+from lce_rig.pipeline.matching import match_sensors
 from lce_rig.pipeline.result_files import (
     OVERLAYS,
     RESULT,
@@ -21,6 +22,7 @@ from lce_rig.pipeline.result_files import (
     result_parts,
     stored_results,
 )
+from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.session.session import DEBUG
@@ -132,8 +134,16 @@ def verify(
     """
     calibrations, own_result = _extrinsics(session, result, name)
     detections = detections or detect(session, event_image=event_image, progress=progress)
+    scenes = {(c.camera, c.lidar): hear_scene(session, detections, c) for c in calibrations}
     checks = tuple(
-        check_session(session.rig, detections, c, channel, clocks_of(session.rig, c.camera, c.lidar))
+        check_session(
+            session.rig,
+            detections,
+            c,
+            channel,
+            clocks_of(session.rig, c.camera, c.lidar),
+            scenes[c.camera, c.lidar],
+        )
         for c in calibrations
         for channel in sorted(c.channels)
         if Pair(c.camera, channel, c.lidar) in detections.pairs

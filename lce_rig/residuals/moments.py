@@ -103,10 +103,14 @@ class Problem:
         counts = [len(f.edge_points) for f in features]
         self.edge_capture = np.repeat(np.arange(len(features)), counts)
         self._edge_weight = 1.0 / np.maximum(np.array(counts), 1)[self.edge_capture]
-        self._edge_rows = np.concatenate([self._rows_of_edges(f) for f in features])
+        # Ring ends are sorted by capture: the first of each, and the captures that have any.
+        self._first_end = np.flatnonzero(np.diff(self.edge_capture, prepend=-1))
+        edge_rows = np.concatenate([self._rows_of_edges(f) for f in features])
         self._to_board = np.concatenate([_board_coordinates(f, self.size) for f in features])
-        outer = self._edge_rows[..., self._upper[0]] * self._edge_rows[..., self._upper[1]]
-        self.edge = outer * self._edge_weight[:, None, None]
+        # In place: with hundreds of captures, this is the largest array of a calibration.
+        self.edge = edge_rows[..., self._upper[0]]
+        self.edge *= edge_rows[..., self._upper[1]]
+        self.edge *= self._edge_weight[:, None, None]
         self.weights = weights
 
     def _plane_moments(self, f: CaptureFeatures, mask: NDArray[np.bool_]) -> Array:
@@ -127,8 +131,18 @@ class Problem:
         Returns:
             (B, n), as `Board.nearest_edge`.
         """
-        xy_m = np.stack([x @ self._to_board[:, 0].T, x @ self._to_board[:, 1].T], axis=-1)
-        return self._board.nearest_edge(xy_m).astype(np.int8)
+        return self._board.nearest_edge(self._on_board(x)).astype(np.int8)
+
+    def _on_board(self, x: Array) -> Array:
+        """Compute board coordinates (B, n, 2) of the ring ends, each coordinate in a block of its own."""
+        return np.moveaxis(np.stack([x @ self._to_board[:, 0].T, x @ self._to_board[:, 1].T]), 0, -1)
+
+    def _by_capture(self, values: Array) -> Array:
+        """Sum values (n, ...) of ring ends by capture: (F, ...)."""
+        sums = np.zeros((self.n_captures, *values.shape[1:]))
+        if len(values):
+            sums[self.edge_capture[self._first_end]] = np.add.reduceat(values, self._first_end, axis=0)
+        return sums
 
     def moments(self, selection: Array, edge_ids: NDArray[np.int8], weights: Weights | None = None) -> Array:
         """Sum (1) over sets of captures.
@@ -145,9 +159,7 @@ class Problem:
         # Most sets agree on most edges: sum those of the first set for all, then exchange what differs.
         common = edge_ids[0]
         chosen = self.edge[np.arange(len(common)), common]
-        per_capture = np.zeros((self.n_captures, len(self._upper[0])))
-        np.add.at(per_capture, self.edge_capture, chosen)
-        total = selection @ (w.plane * self.plane + w.edge * per_capture)
+        total = selection @ (w.plane * self.plane + w.edge * self._by_capture(chosen))
         sets, ends = np.nonzero((edge_ids != common) & (selection[:, self.edge_capture] != 0))
         for start in range(0, len(sets), _EDGE_CHUNK):
             b, j = sets[start : start + _EDGE_CHUNK], ends[start : start + _EDGE_CHUNK]
@@ -201,11 +213,8 @@ class Problem:
             weights: other weights than the problem's.
         """
         w = weights or self.weights
-        M = self.moments(
-            np.eye(self.n_captures),
-            np.repeat(edge_ids[None], self.n_captures, axis=0),
-            Weights(w.plane, w.edge, None if w.shift_prior is None else 0.0),
-        )
+        ends = self.edge[np.arange(len(edge_ids)), edge_ids]
+        M = self._unpack(w.plane * self.plane + w.edge * self._by_capture(ends))
         J = tangent_basis(x[:9].reshape(3, 3).T, self.n_shift)
         prior = np.zeros((6 + self.n_shift, 6 + self.n_shift))
         if w.shift_prior is not None:
@@ -225,11 +234,9 @@ class Problem:
         products = x[:, self._upper[0]] * x[:, self._upper[1]]
         products[:, self._upper[0] != self._upper[1]] *= 2
         plane = np.maximum(products @ self.plane.T, 0)
-        edge = np.zeros((len(x), self.n_captures))
-        ids = self.associate(x)
-        residuals = np.moveaxis(x @ np.swapaxes(self._edge_rows, 1, 2), 1, 0)
-        chosen = np.take_along_axis(residuals, ids[..., None], axis=2)[..., 0]
-        np.add.at(edge.T, self.edge_capture, (chosen**2 * self._edge_weight).T)
+        shift_m = x[:, 12:-1].sum(axis=1, keepdims=True)
+        inside_m = self._board.inside_nearest_edge(self._on_board(x)) + shift_m
+        edge = self._by_capture((inside_m**2 * self._edge_weight).T).T
         return np.sqrt(plane), np.sqrt(edge)
 
 

@@ -22,18 +22,17 @@ def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
     Returns:
         (F,) numbers from 0.
     """
+    T = np.array([observation.image.T_cam_board for observation in observations]).reshape(-1, 4, 4)
     numbers = np.zeros(len(observations), dtype=np.intp)
-    firsts: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
-    for k, observation in enumerate(observations):
-        T = observation.image.T_cam_board
-        for number, (centre, normal) in enumerate(firsts):
-            is_near = np.linalg.norm(T[:3, 3] - centre) < SAME_PLACE_M
-            if is_near and np.linalg.norm(T[:3, 2] - normal) < SAME_TURN_RAD:
-                numbers[k] = number
-                break
+    firsts: list[int] = []
+    for k, own in enumerate(T):
+        apart = np.linalg.norm(T[firsts] - own, axis=1)
+        is_same = (apart[:, 3] < SAME_PLACE_M) & (apart[:, 2] < SAME_TURN_RAD)
+        if is_same.any():
+            numbers[k] = np.argmax(is_same)
         else:
             numbers[k] = len(firsts)
-            firsts.append((T[:3, 3], T[:3, 2]))
+            firsts.append(k)
     return numbers
 
 

@@ -1,13 +1,14 @@
 """How well extrinsics bring a scene's depth edges onto its image edges, by part of the scene."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import Array, exp_so3, pose, transform
-from lce_rig.scene.depth_edges import DepthEdges
+from lce_rig.core.geometry import Array, perturb, skew, transform
+from lce_rig.scene.depth_edges import CHANNELS, DepthEdges
 from lce_rig.scene.edge_field import EdgeField
 
 AXES = ("translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z")
@@ -15,7 +16,9 @@ AXES = ("translation_x", "translation_y", "translation_z", "rotation_x", "rotati
 IS_ROTATION = np.array([False, False, False, True, True, True])
 
 _COLUMNS, _ROWS = 8, 3  # parts of the image
-_BESIDE_RAD = 0.05  # Edges so far outside the image count: other extrinsics bring them in.
+BESIDE_RAD = 0.05
+"""Edges so far outside the image count by default: other extrinsics bring them in."""
+_SCALE_RAD = 0.003  # of derivatives: about the field's blur
 _REACH = np.where(IS_ROTATION, np.radians(3.0), 0.3)
 _STEPS = np.linspace(-1.0, 1.0, 61)
 
@@ -38,13 +41,20 @@ class Alignment:
         views: at least one.
         intrinsics: of the camera.
         T_cam_lidar: (4, 4) that perturbations start from.
+        beside_rad: edges so far outside the image count: other extrinsics bring them in.
     """
 
-    def __init__(self, views: Sequence[SceneView], intrinsics: Intrinsics, T_cam_lidar: Array) -> None:
+    def __init__(
+        self,
+        views: Sequence[SceneView],
+        intrinsics: Intrinsics,
+        T_cam_lidar: Array,
+        beside_rad: float = BESIDE_RAD,
+    ) -> None:
         self._intrinsics, self.T_cam_lidar = intrinsics, T_cam_lidar
         points = np.concatenate([view.edges.points for view in views])
         pixels, _ = intrinsics.project(transform(T_cam_lidar, points))
-        margin_px = -_BESIDE_RAD * intrinsics.fx_px
+        margin_px = -beside_rad * intrinsics.fx_px
         near = intrinsics.is_inside(pixels, margin_px)
         of_view = np.repeat(np.arange(len(views)), [len(view.edges) for view in views])
         self._points, self.n_captures = points[near], len(views)
@@ -56,48 +66,82 @@ class Alignment:
         ]
         column = np.clip(pixels[near, 0] / intrinsics.width_px * _COLUMNS, 0, _COLUMNS - 1).astype(np.intp)
         row = np.clip(pixels[near, 1] / intrinsics.height_px * _ROWS, 0, _ROWS - 1).astype(np.intp)
-        self._part = column * _ROWS + row
+        # Each channel has its own parts: it is a witness of its own.
+        channel = np.concatenate([view.edges.channel for view in views])[near].astype(np.intp)
+        self._part, self._level = (channel * _COLUMNS + column) * _ROWS + row, 0
 
     def __len__(self) -> int:
         """Count the depth edges in or near the images."""
         return len(self._points)
 
     @property
+    def points(self) -> Array:
+        """The depth edges in or near the images, (N, 3) m, frame lidar."""
+        return self._points
+
+    @property
     def weight_of_parts(self) -> Array:
         """Sum of weights of the parts of the image (columns, rows)."""
-        return self._by_part(self._weight).reshape(_COLUMNS, _ROWS)
+        by_part = self._by_part(self._weight).reshape(len(CHANNELS), _COLUMNS, _ROWS)
+        return np.asarray(by_part.sum(axis=0))
 
     def _by_part(self, values: Array) -> Array:
-        return np.asarray(np.bincount(self._part, values, _COLUMNS * _ROWS), dtype=np.float64)
+        return np.asarray(np.bincount(self._part, values, len(CHANNELS) * _COLUMNS * _ROWS), dtype=np.float64)
 
-    def scores(self, tangent: Array) -> tuple[Array, Array]:
-        """Score perturbed extrinsics.
+    def _sample(self, pixels: Array) -> Array:
+        values = np.empty(pixels.shape[:-1])
+        for field, chosen in zip(self._fields, self._slices, strict=True):
+            values[..., chosen] = field.sample(pixels[..., chosen, :])
+        return values
+
+    def shares(self, T_cam_lidar: Array) -> Array:
+        """Score extrinsics (..., 4, 4): each edge's share (..., N), divided by the number of captures."""
+        pixels, _ = self._intrinsics.project(transform(T_cam_lidar, self._points))
+        return self._weight / self.n_captures * self._sample(pixels)
+
+    def expand(self, T_cam_lidar: Array) -> tuple[Array, Array]:
+        """Differentiate each depth edge's share of the score, at the scale of the field's blur.
 
         Args:
-            tangent: (6,) (translation m, rotation rad), axes of the camera.
+            T_cam_lidar: (4, 4).
 
         Returns:
-            Sums over the parts of the image, and over the captures, both divided by the number of captures.
+            Gradients (N, 6) and second derivatives (N, 6, 6) by the tangent, curvature of the field only.
         """
-        T = self.perturbed(tangent)
-        pixels, _ = self._intrinsics.project(transform(T, self._points))
-        values = np.empty(len(self._points))
-        for field, chosen in zip(self._fields, self._slices, strict=True):
-            values[chosen] = field.sample(pixels[chosen])
-        values *= self._weight / self.n_captures
-        by_capture = np.bincount(self._of_view, values, self.n_captures)
-        return self._by_part(values), np.asarray(by_capture, dtype=np.float64)
+        points = transform(T_cam_lidar, self._points)
+        pixels, is_valid = self._intrinsics.project(points)
+        h = _SCALE_RAD * self._intrinsics.fx_px * 2**self._level
+        shifts = h * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)])
+        at, right, left, down, up, rd, ru, ld, lu = self._sample(pixels + shifts[:, None])
+        slope = np.stack([right - left, down - up], axis=-1) / (2 * h)
+        mixed = (rd - ru - ld + lu) / 4
+        bend = np.stack([right - 2 * at + left, mixed, mixed, down - 2 * at + up], axis=-1) / h**2
+        scale = np.where(is_valid, self._weight / self.n_captures, 0.0)
+        by_tangent = np.concatenate(
+            [np.broadcast_to(np.eye(3), (len(points), 3, 3)), -skew(points - T_cam_lidar[:3, 3])], axis=2
+        )
+        jacobian = np.where(is_valid[:, None, None], self._intrinsics.differentiate(points) @ by_tangent, 0.0)
+        gradients = (scale[:, None] * slope)[:, None] @ jacobian
+        bends = (scale[:, None] * bend).reshape(-1, 2, 2)
+        return gradients[:, 0], np.swapaxes(jacobian, 1, 2) @ bends @ jacobian
 
-    def perturbed(self, tangent: Array) -> Array:
-        """Apply a tangent (6,) to the extrinsics, (4, 4)."""
-        T = self.T_cam_lidar
-        return pose(exp_so3(tangent[3:]) @ T[:3, :3], T[:3, 3] + tangent[:3])
+    def coarser(self) -> "Alignment":
+        """Halve the resolution of the fields: a wider basin about a blunter maximum."""
+        coarse = copy(self)
+        coarse._fields, coarse._level = [field.coarser() for field in self._fields], self._level + 1
+        return coarse
 
     def curve(self, axis: int, start: Array) -> "Curve":
         """Score extrinsics along one axis of the tangent, the others as in `start` (6,)."""
         offsets = _STEPS * _REACH[axis]
-        rows = [self.scores(start + offset * np.eye(6)[axis]) for offset in offsets]
-        return Curve(offsets, np.array([parts for parts, _ in rows]), np.array([each for _, each in rows]))
+        shares = self.shares(perturb(self.T_cam_lidar, start + offsets[:, None] * np.eye(6)[axis]))
+        by_part, by_capture = zip(*map(self.split, shares), strict=True)
+        return Curve(offsets, np.array(by_part), np.array(by_capture))
+
+    def split(self, shares: Array) -> tuple[Array, Array]:
+        """Sum shares (N,) over each channel's parts of the image, (P,), and over the captures, (C,)."""
+        by_capture = np.bincount(self._of_view, shares, self.n_captures)
+        return self._by_part(shares), np.asarray(by_capture, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +198,14 @@ class Curve:
             reference = self.at(other)
         gains = self.at(offset) - reference
         return float(gains.sum() / max(np.sqrt(np.sum(gains**2)), 1e-12))
+
+    def smallest_significant(self, limit: float) -> float:
+        """Find how far from the peak, on either side, its significance exceeds a limit; inf if never."""
+        gains = self.at(self.peak) - self.by_part
+        significance = gains.sum(axis=1) / np.maximum(np.sqrt(np.sum(gains**2, axis=1)), 1e-12)
+        off = self.offsets - self.peak
+        beyond = [np.abs(off[(significance > limit) & (off * side > 0)]) for side in (-1, 1)]
+        return max(float(each.min(initial=np.inf)) for each in beyond)
 
 
 def _peaks(columns: Array, offsets: Array) -> Array:

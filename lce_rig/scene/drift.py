@@ -5,20 +5,18 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, perturb
 from lce_rig.scene.alignment import AXES, IS_ROTATION, Alignment, Curve, SceneView
+from lce_rig.scene.estimate import BIAS, estimate
 
 State = Literal["unchanged", "changed", "unknown"]
 
 # Tuned on rlfs01 (docs/drift.md); the other recordings were only measured.
 _THRESHOLD_SIGMAS = 3.0
 _POWER_SIGMAS = 1.645  # At the smallest change, 95 % of the trials exceed the threshold.
-# What one scene's peak is off by, beyond the scatter of its parts: m and rad, order of AXES.
-_BIAS = np.array([0.005, 0.005, 0.015, *np.radians([0.10, 0.05, 0.15])])
 # A witness that sees only larger changes cannot tell.
 _LARGEST = np.where(IS_ROTATION, np.radians(1.5), 0.10)
 _MIN_EDGES = 60
@@ -28,8 +26,8 @@ _NEARLY = 0.1  # An axis that scores so much less alone may be the one that chan
 # Upright outlines hardly show pitch: without a slanted one the curve is nearly flat, its peak meaningless.
 _MIN_CONTRAST = 0.3  # of a peak above its curve's median, as a share of the peak
 _MIN_GAIN = 2.0  # significance of the score at a change above that of the deployed extrinsics
+_GAIN_MARGIN = 0.2  # At the smallest change, the parts agree by so much more.
 _MIN_SIGNIFICANCE = 1.5  # of a peak above the rest of its curve
-_PRIOR = np.where(IS_ROTATION, np.radians(2.0), 0.10)  # of the joint maximum
 
 
 @dataclass(frozen=True)
@@ -69,6 +67,7 @@ class Drift:
         findings: the summary first, then one of each axis and what is missing.
         T_cam_lidar: (4, 4) deployed.
         T_best: (4, 4) where all six axes together fit best; the deployed where nothing could be compared.
+        cov_best: (6, 6) of its tangent; None where it was not searched.
         curves: the score along each axis about the deployed extrinsics; empty where nothing was compared.
         n_captures, n_edges: compared.
     """
@@ -77,6 +76,7 @@ class Drift:
     findings: tuple[Finding, ...]
     T_cam_lidar: Array
     T_best: Array
+    cov_best: Array | None
     curves: Mapping[str, Curve]
     n_captures: int
     n_edges: int
@@ -117,15 +117,18 @@ def watch(
         figures: dict[str, Figure] = {"n_edges": n_edges, "n_captures": len(views)}
         few = Finding("scene.few_edges", "error", figures=figures)
         axes = tuple(AxisDrift(axis, "unknown", 0.0, np.inf, np.inf, "scene.few_edges") for axis in AXES)
-        return Drift(axes, (few, *missing), T_cam_lidar, T_cam_lidar, {}, len(views), n_edges)
+        return Drift(axes, (few, *missing), T_cam_lidar, T_cam_lidar, None, {}, len(views), n_edges)
 
     sigma_deployed = np.sqrt(np.diag(cov))
     curves = [alignment.curve(axis, np.zeros(6)) for axis in range(6)]
     axes, tangent = _decide(alignment, curves, sigma_deployed)
-    best = _maximise(alignment, tangent) if is_joint else tangent
-    findings = (_summary(axes, len(views)), *map(_of_axis, axes), *missing)
+    T_best, cov_best = perturb(T_cam_lidar, tangent), None
+    if is_joint:
+        best = estimate(views, intrinsics, T_best, is_far=any(axis.state != "unchanged" for axis in axes))
+        T_best, cov_best = best.T_cam_lidar, best.cov
+    findings = (_summary(axes, len(views)), *map(_of_axis, axes), *_open_axes(cov_best), *missing)
     by_axis = dict(zip(AXES, curves, strict=True))
-    return Drift(axes, findings, T_cam_lidar, alignment.perturbed(best), by_axis, len(views), n_edges)
+    return Drift(axes, findings, T_cam_lidar, T_best, cov_best, by_axis, len(views), n_edges)
 
 
 def _n_parts(alignment: Alignment) -> int:
@@ -159,8 +162,10 @@ def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment)
     """Decide one axis from the score along it."""
     unit = float(np.degrees(1.0)) if IS_ROTATION[axis] else 1.0
     peak, scatter = curve.peak, curve.sigma()
-    sigma = float(np.sqrt(scatter**2 + sigma_deployed**2 + _BIAS[axis] ** 2))
-    smallest = (_THRESHOLD_SIGMAS + _POWER_SIGMAS) * sigma
+    sigma = float(np.sqrt(scatter**2 + sigma_deployed**2 + BIAS[axis] ** 2))
+    smallest = max(
+        (_THRESHOLD_SIGMAS + _POWER_SIGMAS) * sigma, curve.smallest_significant(_MIN_GAIN + _GAIN_MARGIN)
+    )
     mean_score = float(curve.total.max() / alignment.weight_of_parts.sum() * alignment.n_captures)
     reason = ""
     if abs(peak) > 0.95 * curve.offsets[-1]:
@@ -178,19 +183,6 @@ def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment)
     state: State = "changed" if is_changed else "unknown" if reason else "unchanged"
     figures = (unit * peak, unit * sigma, unit * smallest)
     return AxisDrift(AXES[axis], state, *figures, "" if is_changed else reason)
-
-
-def _maximise(alignment: Alignment, start: Array) -> Array:
-    """Find the tangent (6,) with the highest score in all axes together, held weakly to the deployed one."""
-    from scipy.optimize import minimize
-
-    def cost(scaled: NDArray[np.float64]) -> float:
-        score = alignment.scores(scaled * _PRIOR)[0].sum()
-        return float(0.5 * scaled @ scaled - score)
-
-    options = {"xtol": 0.01, "ftol": 1e-4, "maxiter": 6}
-    found = minimize(cost, start / _PRIOR, method="Powell", options=options)
-    return np.asarray(found.x * _PRIOR)
 
 
 def _summary(axes: tuple[AxisDrift, ...], n_captures: int) -> Finding:
@@ -216,6 +208,15 @@ def _of_axis(axis: AxisDrift) -> Finding:
     if axis.state == "unchanged":
         return Finding("scene.axis_unchanged", "note", axis.axis, figures)
     return Finding(axis.reason, "warning", axis.axis, figures)
+
+
+def _open_axes(cov_best: Array | None) -> list[Finding]:
+    """Name the axes in which the best extrinsics are uncertain."""
+    if cov_best is None:
+        return []
+    is_open = np.sqrt(np.diag(cov_best)) > _LARGEST
+    axes = tuple(axis for axis, each in zip(AXES, is_open, strict=True) if each)
+    return [Finding("scene.best_uncertain", "warning", figures={"axes": axes})] if axes else []
 
 
 def _sides_without_edges(alignment: Alignment) -> list[Finding]:

@@ -14,7 +14,7 @@ _RUBBER = Material((0.03, 0.03, 0.03), 0.08)
 _SKIN = Material((0.30, 0.42, 0.62), 0.6)
 _HAIR = Material((0.02, 0.02, 0.025), 0.12)
 _TROUSERS = Material((0.16, 0.13, 0.11), 0.35, "cloth")
-_SHIRTS = (
+SHIRTS = (
     Material((0.20, 0.10, 0.07), 0.55, "cloth"),
     Material((0.12, 0.12, 0.30), 0.45, "cloth"),
     Material((0.10, 0.20, 0.09), 0.5, "cloth"),
@@ -89,17 +89,17 @@ def _person(board: Board, T_world_board: Array, rng: np.random.Generator) -> lis
     T[:3, :3] = np.stack([back, side, [0.0, 0.0, 1.0]], axis=1)
     T[:3, 3] = [centre[0], centre[1], 0.0]
     T[:3, 3] += rng.uniform(-0.06, 0.06) * side
-    body = _body(size)
+    body = build_body(size)
     vertices = np.concatenate([mesh.moved(T).vertices for mesh, _ in body.values()])
     T[:3, 3] += _clearance(vertices, board, T_world_board, rng.uniform(0.04, 0.15)) * back
-    shirt = _SHIRTS[rng.integers(len(_SHIRTS))]
+    shirt = SHIRTS[rng.integers(len(SHIRTS))]
     shoulders = transform(T, np.array([[0.0, s * 0.19, 1.40] for s in (-1.0, 1.0)]) * size)
     arms, hands = _arms(board, T_world_board, shoulders, back)
     surfaces = [Surface(name, mesh.moved(T), material or shirt, T) for name, (mesh, material) in body.items()]
     return [*surfaces, Surface("sleeves", arms, shirt, T), Surface("hands", hands, _SKIN, T)]
 
 
-def _body(size: float) -> dict[str, tuple[Mesh, Material | None]]:
+def build_body(size: float) -> dict[str, tuple[Mesh, Material | None]]:
     """Build torso, head and legs, x backwards, standing on the origin; None takes the shirt's material."""
     s = size
     torso = [

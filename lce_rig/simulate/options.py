@@ -164,6 +164,7 @@ class SimulationOptions:
         tilt_deg: largest tilt of the board out of the direction to the camera.
         roll_deg: mean and half-width of the board's turn in its plane, 0 = upright, 45 = a diamond.
         has_decoy_plate: whether a blank plate of the board's size stands in the room.
+        is_furnished: whether each seed has a room of its own, with other furniture, instead of one for all.
         truth_rotation_deg, truth_translation_m: how far the true extrinsics lie from the profile's nominal
             ones at most; never more than 0.8 of the tolerances that the profile gives.
         mounting_seed: of the true extrinsics and of the sensors' own errors; None for the session's seed.
@@ -189,6 +190,7 @@ class SimulationOptions:
     tilt_deg: float = 40.0
     roll_deg: tuple[float, float] = (45.0, 15.0)
     has_decoy_plate: bool = False
+    is_furnished: bool = False
     truth_rotation_deg: float = 2.0
     truth_translation_m: float = 0.02
     mounting_seed: int | None = None

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, pose, transform
+from lce_rig.simulate.furniture import draw_furniture
 from lce_rig.simulate.materials import Material
 from lce_rig.simulate.scene import PLATE, Raycaster, Surface
 from lce_rig.simulate.shapes import Mesh, box, cone, inside_box, merge, rectangle
@@ -27,7 +28,8 @@ _WINDOW = Material((0.95, 0.90, 0.86), 0.0, "window", emission=1.0)
 # Room frame: x along the first camera's sight, y left, z up, origin on the floor below the LiDAR.
 _LOW = np.array([-4.6, -3.1, 0.0])
 _HIGH = np.array([9.0, 3.4, 3.1])
-_OBSTACLES = (  # (low, high) of what stands in the room, to keep the board out of it
+# (low, high) of what stands in the room, to keep the board out of it
+_OBSTACLES: tuple[tuple[Array, Array], ...] = (
     (np.array([4.9, 1.2, 0.0]), np.array([5.5, 1.8, 3.1])),
     (np.array([4.6, -3.1, 0.0]), np.array([6.3, -2.0, 1.3])),
     (np.array([1.9, 2.5, 0.0]), np.array([2.6, 3.4, 2.0])),
@@ -43,19 +45,24 @@ class Room:
         T_world_room: (4, 4); world has the LiDAR's heading, z up, origin on the floor below the LiDAR.
         raycaster: of all surfaces.
         lamps: (P, 3) m, world.
+        low, high: (3,) corners, m, frame room.
+        obstacles: (low, high) of what stands in it, m, frame room.
         T_world_decoy: (4, 4) pose of the blank decoy plate; None without.
     """
 
     T_world_room: Array
     raycaster: Raycaster
     lamps: Array
+    low: Array
+    high: Array
+    obstacles: tuple[tuple[Array, Array], ...]
     T_world_decoy: Array | None = None
 
     def is_free(self, points_world: Array, margin_m: float = 0.1) -> NDArray[np.bool_]:
         """Find which points (N, 3) lie in the room, at least `margin_m` from everything in it."""
         points = transform(invert(self.T_world_room), points_world)
-        free = np.all((points > _LOW + margin_m) & (points < _HIGH - margin_m), axis=1)
-        for low, high in _OBSTACLES:
+        free = np.all((points > self.low + margin_m) & (points < self.high - margin_m), axis=1)
+        for low, high in self.obstacles:
             free &= ~np.all((points > low - margin_m) & (points < high + margin_m), axis=1)
         if self.T_world_decoy is not None:
             away = np.linalg.norm((points_world - self.T_world_decoy[:3, 3])[:, :2], axis=1)
@@ -64,30 +71,46 @@ class Room:
 
 
 def build_room(
-    heading_rad: float, rng: np.random.Generator, decoy: Board | None = None, lidar_height_m: float = 1.0
+    heading_rad: float,
+    rng: np.random.Generator,
+    decoy: Board | None = None,
+    lidar_height_m: float = 1.0,
+    *,
+    is_furnished: bool = False,
 ) -> Room:
     """Build the room around the rig.
 
     Args:
         heading_rad: azimuth that the first camera looks along, world.
-        rng: source of the room's turn against the rig and of the decoy's place.
+        rng: source of the room's turn against the rig, of the decoy's place and of drawn furniture.
         decoy: a blank plate of this board's size stands at the side; None for none.
         lidar_height_m: height of the LiDAR, about which the decoy hangs.
+        is_furnished: whether the room's size and furniture are drawn, instead of one room for all.
     """
     turn_rad = heading_rad + np.radians(rng.uniform(-6.0, 6.0))
     T_world_room = pose(_turn_z(turn_rad), np.zeros(3))
-    parts = [*_shell(), *_furniture(), *_posters()]
+    low, high, obstacles = _LOW, _HIGH, _OBSTACLES
     T_room_decoy = None
     if decoy is not None:
         T_room_decoy = _decoy_pose(rng, lidar_height_m)
+    if is_furnished:
+        low, high = (
+            low + rng.uniform([-1, -1, 0], [1, 0.6, 0]),
+            high + rng.uniform([-1, -0.6, -0.5], [3, 1, 0.6]),
+        )
+        furnishing = draw_furniture(low, high, rng)
+        parts, obstacles = [*_shell(low, high), *furnishing.parts], tuple(furnishing.obstacles)
+    else:
+        parts = [*_shell(low, high), *_furniture(), *_posters()]
+    if decoy is not None and T_room_decoy is not None:
         parts += _decoy(decoy, T_room_decoy)
     surfaces = [
         Surface(name, mesh.moved(T_world_room), material, T_world_room @ T_room_surface)
         for name, mesh, material, T_room_surface in parts
     ]
-    lamps = transform(T_world_room, np.array([[x, y, _HIGH[2] - 0.05] for x, y in _LAMP_SPOTS]))
+    lamps = transform(T_world_room, np.array([[x, y, high[2] - 0.05] for x, y in _LAMP_SPOTS]))
     T_world_decoy = None if T_room_decoy is None else T_world_room @ T_room_decoy
-    return Room(T_world_room, Raycaster(surfaces), lamps, T_world_decoy)
+    return Room(T_world_room, Raycaster(surfaces), lamps, low, high, obstacles, T_world_decoy)
 
 
 _Part = tuple[str, Mesh, Material, Array]
@@ -109,8 +132,8 @@ def _on_wall(name: str, size_m: tuple[float, float], at: Array, facing: Array, m
     return name, rectangle(*size_m).moved(T), material, T
 
 
-def _shell() -> list[_Part]:
-    size, middle = _HIGH - _LOW, (_HIGH + _LOW) / 2
+def _shell(low: Array, high: Array) -> list[_Part]:
+    size, middle = high - low, (high + low) / 2
     walls = inside_box(size, middle)
     # Faces come in the order -x +x -y +y -z +z, two triangles and four vertices each.
     faces = [
@@ -119,11 +142,9 @@ def _shell() -> list[_Part]:
     ]
     thick = 0.02
     skirting = [
-        box((size[0], thick, 0.12), (middle[0], y, 0.06)) for y in (_LOW[1] + thick / 2, _HIGH[1] - thick / 2)
-    ] + [
-        box((thick, size[1], 0.12), (x, middle[1], 0.06)) for x in (_LOW[0] + thick / 2, _HIGH[0] - thick / 2)
-    ]
-    lamps = [box((1.2, 0.3, 0.04), (x, y, _HIGH[2] - 0.02)) for x, y in _LAMP_SPOTS]
+        box((size[0], thick, 0.12), (middle[0], y, 0.06)) for y in (low[1] + thick / 2, high[1] - thick / 2)
+    ] + [box((thick, size[1], 0.12), (x, middle[1], 0.06)) for x in (low[0] + thick / 2, high[0] - thick / 2)]
+    lamps = [box((1.2, 0.3, 0.04), (x, y, high[2] - 0.02)) for x, y in _LAMP_SPOTS]
     return [
         *(_part("wall", face, _WALL) for face in faces[:4]),
         _part("floor", faces[4], _FLOOR),

@@ -47,7 +47,7 @@ def rectangle(width_m: float, height_m: float) -> Mesh:
     return Mesh(vertices, np.tile([0.0, 0.0, 1.0], (4, 1)), triangles)
 
 
-def box(size_m: Sequence[float], centre: Sequence[float] | Array = (0.0, 0.0, 0.0)) -> Mesh:
+def box(size_m: Sequence[float] | Array, centre: Sequence[float] | Array = (0.0, 0.0, 0.0)) -> Mesh:
     """Build a box along the axes, flat-shaded, facing outwards."""
     half = np.asarray(size_m, dtype=np.float64) / 2
     faces = []
@@ -64,13 +64,13 @@ def box(size_m: Sequence[float], centre: Sequence[float] | Array = (0.0, 0.0, 0.
     return Mesh(mesh.vertices + np.asarray(centre), mesh.normals, mesh.triangles)
 
 
-def inside_box(size_m: Sequence[float], centre: Sequence[float] | Array) -> Mesh:
+def inside_box(size_m: Sequence[float] | Array, centre: Sequence[float] | Array) -> Mesh:
     """Build a box whose faces look inwards: the walls of a room."""
     mesh = box(size_m, centre)
     return Mesh(mesh.vertices, -mesh.normals, mesh.triangles[:, ::-1].copy())
 
 
-def ellipsoid(centre: Sequence[float] | Array, radii_m: Sequence[float]) -> Mesh:
+def ellipsoid(centre: Sequence[float] | Array, radii_m: Sequence[float] | Array) -> Mesh:
     """Build an ellipsoid along the axes."""
     n_around, n_up = 24, 16
     polar, azimuth = np.meshgrid(

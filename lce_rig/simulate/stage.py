@@ -13,12 +13,12 @@ from lce_rig.core.geometry import Array, invert, perturb, pose
 from lce_rig.rig import Rig
 from lce_rig.simulate.backdrop import Backdrop, build_backdrop
 from lce_rig.simulate.event_camera import EventPixels, draw_pixels
-from lce_rig.simulate.lidar import VLP16, LidarModel, Sweep, measure_sweep
+from lce_rig.simulate.lidar import OS1_64, VLP16, LidarModel, Sweep, measure_sweep
 from lce_rig.simulate.options import SimulationOptions
 from lce_rig.simulate.poses import CameraView, place_board
 from lce_rig.simulate.room import Room, build_room
 
-LIDAR_MODELS = {"vlp16": VLP16}
+LIDAR_MODELS = {"vlp16": VLP16, "os164": OS1_64}
 
 # Independent streams of random numbers, so that more captures or another camera change nothing else.
 # Streams of a session are [seed, OF_SESSION, stream, ...], those of a capture [seed, index, stream, ...].
@@ -139,6 +139,7 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
         np.random.default_rng([seed, OF_SESSION, ROOM]),
         rig.board.to_board() if options.has_decoy_plate else None,
         options.lidar_height_m,
+        is_furnished=options.is_furnished,
     )
     lenses = {name: rig.cameras[name].to_intrinsics() for name in cameras}
     models = {name: _lidar_model(rig, name) for name in rig.lidars}

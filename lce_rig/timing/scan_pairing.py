@@ -36,7 +36,12 @@ class Frame:
 
 
 def pair_by_time(
-    samples: Iterable[Sample], rig: Rig, losses: Losses, events_wait_ns: int = IN_BAGS_NS
+    samples: Iterable[Sample],
+    rig: Rig,
+    losses: Losses,
+    events_wait_ns: int = IN_BAGS_NS,
+    *,
+    are_events_enough: bool = False,
 ) -> Iterator[Frame]:
     """Give each scan of the first LiDAR heard the nearest image of each camera channel, and its events.
 
@@ -48,8 +53,9 @@ def pair_by_time(
         rig: says what to add to timestamps, and how far pairs may lie apart.
         losses: receives the scans without an image within the tolerance, and how near the nearest was.
         events_wait_ns: how long events are kept for scans that wait or come late.
+        are_events_enough: whether a scan without an image, but with events, is a frame, too.
     """
-    pairing = _Pairing(rig, losses, BEFORE_NS + AFTER_NS + events_wait_ns)
+    pairing = _Pairing(rig, losses, BEFORE_NS + AFTER_NS + events_wait_ns, are_events_enough)
     for sample in samples:
         pairing.take(sample)
         yield from pairing.due_frames()
@@ -59,8 +65,9 @@ def pair_by_time(
 class _Pairing:
     """Scans that wait, and what has come of the other sensors."""
 
-    def __init__(self, rig: Rig, losses: Losses, kept_ns: int) -> None:
+    def __init__(self, rig: Rig, losses: Losses, kept_ns: int, are_events_enough: bool) -> None:
         self._rig = rig
+        self._are_events_enough = are_events_enough
         self._losses = losses
         self._kept_ns = kept_ns
         self._nearest_ns: int | None = None
@@ -136,8 +143,10 @@ class _Pairing:
                 images.append(sample)
             else:
                 scans.append(sample)
-        if images:
+        events: tuple[EventCut, ...] = ()
+        if images or self._are_events_enough:
             events = self._events.cut(time_ns - half_ns - BEFORE_NS, time_ns + half_ns + AFTER_NS)
+        if images or events:
             yield Frame(time_ns, tuple(images), tuple(scans), events)
         else:
             self._count_alone(nearest_ns)

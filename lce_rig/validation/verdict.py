@@ -1,13 +1,15 @@
 """The verdict on extrinsics: each finding is a reason with its figures and an action."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Figure, Finding, ranked
 from lce_rig.core.geometry import Array, rotation_angle, tangent_sizes
-from lce_rig.core.results import Metrics
+from lce_rig.core.results import Calibration, Metrics
+from lce_rig.core.scene_opinion import SceneOpinion
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 from lce_rig.validation.intrinsics_check import explain
@@ -19,6 +21,8 @@ from lce_rig.validation.weighing import SURPRISING_CHI2, Verdict, reason, verdic
 
 # A side of the plate counts as measured below this standard deviation; 5 % of it exceeds the beam's spot.
 PLATE_KNOWN_M, PLATE_FAIL = 0.03, 0.05
+# A contradiction of the scene by so many standard deviations fails; from three it is told.
+SCENE_FAILS = 5.0
 
 
 def judge(
@@ -28,7 +32,7 @@ def judge(
     camera: str,
     lidar: str,
     n_captures: int,
-    between_cameras: Sequence[Finding] = (),
+    others: Sequence[Finding] = (),
 ) -> tuple[Verdict, tuple[Finding, ...]]:
     """Judge extrinsics by all checks.
 
@@ -39,7 +43,7 @@ def judge(
         camera: name of the camera.
         lidar: name of the LiDAR.
         n_captures: number of captures, including those without a board.
-        between_cameras: contradictions between this camera and others.
+        others: of other evidence: contradictions between cameras, what the scene did to the result.
 
     Returns:
         The verdict, and the reasons for anything but a pass: worst first, causes before symptoms. A note on
@@ -51,7 +55,7 @@ def judge(
         *_plate(estimate, rig.board.to_board()),
         *_shared(examination, rig, lidar),
         *split_findings(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
-        *between_cameras,
+        *others,
         *_motion(estimate, rig.verdict.max_plane_misfit_m),
         *_channels(estimate, rig),
         *_residuals(estimate, rig),
@@ -65,6 +69,45 @@ def judge(
     if examination.remark is not None:
         findings.append(examination.remark)
     return verdict_of(findings), ranked(findings)
+
+
+def with_opinion(calibration: Calibration, opinion: SceneOpinion) -> Calibration:
+    """Add the scene's opinion to judged extrinsics; only a contradiction changes the verdict.
+
+    Args:
+        calibration: judged by its boards.
+        opinion: of the scene without the board.
+    """
+    findings = ranked([*calibration.findings, *scene_findings(opinion, calibration)])
+    return replace(calibration, scene=opinion, findings=findings, verdict=verdict_of(findings))
+
+
+def scene_findings(opinion: SceneOpinion, calibration: Calibration, action: str = "") -> list[Finding]:
+    """List the scene's contradiction of extrinsics, if there is one, with the likely cause as its action.
+
+    Args:
+        opinion: of the scene.
+        calibration: the extrinsics.
+        action: where it is known already.
+    """
+    worst = opinion.strongest
+    if worst is None:
+        return []
+    has_moving_boards = any(each.time_offset_s is not None for each in calibration.channel_results)
+    if not action and worst.axis == "translation_z":
+        action = "distances"
+    elif not action and has_moving_boards:
+        action = "times"
+    sigmas = abs(worst.change) / worst.sigma
+    figures: dict[str, Figure] = {
+        "axis": worst.axis,
+        f"change_{worst.unit}": worst.change,
+        f"sigma_{worst.unit}": worst.sigma,
+        "sigmas": sigmas,
+        "n_captures": opinion.n_captures,
+        "n_axes": len(opinion.of("contradicts")),
+    }
+    return [reason("verdict.scene", figures, is_fail=sigmas > SCENE_FAILS, action=action)]
 
 
 def _intrinsics(examination: Validation, rig: Rig) -> list[Finding]:

@@ -15,6 +15,7 @@ from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import Calibration, CaptureResidual, ImageBoard, LidarBoard, Metrics, Observation
+from lce_rig.core.scene_opinion import SceneOpinion
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.extrinsics import Clocks
 from lce_rig.extrinsics.board_motion import fit_motions
@@ -24,7 +25,7 @@ from lce_rig.extrinsics.shared_scans import SharedScan, sample_scans
 from lce_rig.extrinsics.time_offsets import at_scan_time, deskew_points
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
-from lce_rig.validation.verdict import residuals_beyond
+from lce_rig.validation.verdict import residuals_beyond, scene_findings
 from lce_rig.verify.event_picture import ImageWithEvents
 from lce_rig.verify.overlay import camera_part, draw_overlay, range_limits
 from lce_rig.verify.overlay_files import Overlay, SheetHead, write_overlays
@@ -165,6 +166,7 @@ class SessionCheck:
         findings: why these captures contradict it; empty if they agree.
         residuals: of each capture in which both sensors see the board.
         metrics: their summary; None without any.
+        scene: what the edges of the scene say of the extrinsics.
         meetings: by capture, the boards of the residuals.
         pictures: one per capture, once they are drawn.
         contact_sheets: all of them, on one sheet or more.
@@ -175,6 +177,7 @@ class SessionCheck:
     findings: tuple[Finding, ...]
     residuals: tuple[CaptureResidual, ...]
     metrics: Metrics | None
+    scene: SceneOpinion
     meetings: Mapping[str, Meeting]
     pictures: tuple[Path, ...] = ()
     contact_sheets: tuple[Path, ...] = ()
@@ -199,6 +202,7 @@ class SessionCheck:
             "metrics": None
             if self.metrics is None
             else {**asdict(self.metrics), "mge_m": self.metrics.mge_m},
+            "scene": self.scene.document(),
             "captures": {r.capture: _figures(r, self.calibration.captures_used) for r in self.residuals},
             "pictures": [str(path) for path in self.pictures],
             "contact_sheets": [str(path) for path in self.contact_sheets],
@@ -211,7 +215,12 @@ def _figures(residual: CaptureResidual, used: tuple[str, ...]) -> dict[str, Any]
 
 
 def check_session(
-    rig: Rig, detections: Detections, calibration: Calibration, channel: str, clocks: Clocks
+    rig: Rig,
+    detections: Detections,
+    calibration: Calibration,
+    channel: str,
+    clocks: Clocks,
+    scene: SceneOpinion,
 ) -> SessionCheck:
     """Measure the residuals of extrinsics for one channel and the LiDAR on every capture of a session.
 
@@ -223,10 +232,11 @@ def check_session(
         calibration: the extrinsics; they may come from another session of the same rig.
         channel: of the calibration's channels.
         clocks: the profile's settings of the two sensors' times.
+        scene: the opinion of this session's scene.
     """
     pair = Pair(calibration.camera, channel, calibration.lidar)
     board = rig.board.to_board()
-    meetings = _meetings(rig, detections, channel, calibration, clocks)
+    meetings = find_meetings(rig, detections, channel, calibration, clocks)
     residuals = [
         capture_residual(calibration.T_cam_lidar, meeting.at_scan_time, board)
         for meeting in meetings.values()
@@ -234,7 +244,10 @@ def check_session(
     metrics = summarise(residuals) if residuals else None
     n_seen = sum(_sees_board(detections, pair, name) for name in detections.captures(pair))
     findings = contradictions(metrics, rig, n_seen - len(residuals), n_seen)
-    return SessionCheck(pair, calibration, findings, tuple(residuals), metrics, meetings)
+    # A result of this session has been judged by its scene; that of another may have been deployed since.
+    action = "" if calibration.captures_used else "deployed"
+    findings = (*findings, *scene_findings(scene, calibration, action))
+    return SessionCheck(pair, calibration, findings, tuple(residuals), metrics, scene, meetings)
 
 
 def draw_check(
@@ -335,10 +348,21 @@ def _sees_board(detections: Detections, pair: Pair, name: str) -> bool:
     return isinstance(image, ImageBoard) and isinstance(lidar, list)
 
 
-def _meetings(
+def find_meetings(
     rig: Rig, detections: Detections, channel: str, calibration: Calibration, clocks: Clocks
 ) -> dict[str, Meeting]:
-    """Match both sensors' boards in each capture of a channel in which they agree."""
+    """Match both sensors' boards in each capture of a channel in which they agree.
+
+    Args:
+        rig: the profile.
+        detections: of the captures.
+        channel: of the camera.
+        calibration: the extrinsics.
+        clocks: the profile's settings of the two sensors' times.
+
+    Returns:
+        By name of the capture.
+    """
     observations = {}
     for name in calibration.channels:
         pair = Pair(calibration.camera, name, calibration.lidar)

@@ -15,6 +15,7 @@ _RANGES = (
 _LENS = "check that the intrinsics belong to this lens and that the board is flat"
 _CORNERS_TOO = "collect captures with the board in all four corners of the image, tilted by 30 to 45 deg"
 _SAVE = "Write a profile with the session's intrinsics: `lce-rig intrinsics --save-profile FILE`"
+_LOOK = "`lce-rig drift SESSION -o FOLDER` draws the edges"
 _WAYS = {
     "bootstrap": "bootstrap samples",
     "left_out": "leave-one-out results",
@@ -196,6 +197,41 @@ def _agree(finding: Finding) -> str:
     )
 
 
+def _scene_change(finding: Finding) -> str:
+    sizes = [finding.figure(name) for name in ("rotation_deg", "rotation_sigma_deg")]
+    sizes += [1000 * finding.figure(name) for name in ("translation_m", "translation_sigma_m")]
+    return f"{sizes[0]:.2f} deg, {sizes[2]:.0f} mm (expected {sizes[1]:.2f} deg, {sizes[3]:.0f} mm)"
+
+
+def _scene_used(finding: Finding) -> str:
+    """The scene moved the boards' extrinsics by {rotation_deg}, {translation_m}; {n_captures}, {n_edges}.
+
+    Expected: {rotation_sigma_deg}, {translation_sigma_m}.
+    """
+    return f"the scene moved the boards' extrinsics by {_scene_change(finding)}"
+
+
+def _scene_not_used(finding: Finding) -> str:
+    """The scene would move the extrinsics by {rotation_deg}, {translation_m}; {n_captures}, {n_edges}.
+
+    Expected: {rotation_sigma_deg}, {translation_sigma_m}.
+    """
+    return f"the scene contradicts the boards and is not used: it would move them by {_scene_change(finding)}"
+
+
+def _scene(finding: Finding) -> str:
+    """The scene contradicts {axis} by {change_deg} or {change_m}; {sigma_deg}, {sigma_m}, {sigmas}.
+
+    In {n_captures} captures, {n_axes} axes contradict.
+    """
+    q = finding.figures
+    if "change_deg" in q:
+        change = f"{finding.figure('change_deg'):+.2f} +- {finding.figure('sigma_deg'):.2f} deg"
+    else:
+        change = f"{1000 * finding.figure('change_m'):+.0f} +- {1000 * finding.figure('sigma_m'):.0f} mm"
+    return f"the edges of the scene contradict the extrinsics: {motion_words(str(q['axis']))} by {change}"
+
+
 PHRASES: dict[str, Phrase] = {
     "verdict.text": Phrase("{text}", "{advice}"),
     "verdict.no_certificate": Phrase(
@@ -309,7 +345,24 @@ PHRASES: dict[str, Phrase] = {
         "relative poses from extrinsics and images by " + _APART,
         "check whether a camera has moved, and the intrinsics",
     ),
+    "verdict.scene_used": Phrase(_scene_used),
+    "verdict.scene_unknown": Phrase(
+        "the scene shows nothing that the boards do not show better; {n_edges} edges, {n_captures} captures",
+    ),
+    "verdict.scene_not_used": Phrase(
+        _scene_not_used,
+        "check the intrinsics and the board's size. `lce-rig drift SESSION -o FOLDER` draws the edges",
+    ),
     "verdict.widened": Phrase(_widened),
+    "verdict.scene": Phrase(
+        _scene,
+        f"check the intrinsics, squares and plate. {_LOOK}",
+        {
+            "deployed": f"check whether a sensor has moved since. {_LOOK}",
+            "distances": f"measure the squares and check the focal length. {_LOOK}",
+            "times": f"hold the board still and check the image-scan matching. {_LOOK}",
+        },
+    ),
     "verify.elsewhere": Phrase(
         "in {n_elsewhere} of {n_captures} captures the scan has no surface where the extrinsics place the "
         "board"

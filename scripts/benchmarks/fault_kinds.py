@@ -18,6 +18,7 @@ from lce_rig.solvers.pnp import solve_planar_pose
 
 # Noise of a corner per coordinate, as recordings of the rigs show it.
 _CORNER_SIGMA_PX = {"rlfs": 0.03, "rles": 0.05}
+_OTHER_CORNER_SIGMA_PX = 0.05
 _BEND_M = 0.005
 Rng = np.random.Generator
 
@@ -60,7 +61,8 @@ class _Photographer:
         pixels, is_valid = self.lens.project(transform(T_cam_board, self.corners))
         if not (is_valid.all() and self.lens.is_inside(pixels, 1.0).all()):
             return Refusal("image.near_border")
-        pixels = pixels + _CORNER_SIGMA_PX[self.rig.name] * self.rng.standard_normal(pixels.shape)
+        sigma_px = _CORNER_SIGMA_PX.get(self.rig.name, _OTHER_CORNER_SIGMA_PX)
+        pixels = pixels + sigma_px * self.rng.standard_normal(pixels.shape)
         solved = solve_planar_pose(pixels, self.rig.board.to_board().corners(), _lens(self.rig))
         if solved is None or solved.reprojection_px > self.rig.quality.max_reprojection_px:
             return Refusal("image.no_pose")
@@ -93,12 +95,18 @@ def wrong_plate(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
 
 def stale_intrinsics(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
     """The lens was exchanged: focal length 1 to 3 % other, centre 5 to 15 px, distortion up to 20 %."""
+    images = _Photographer.of(rig, rng, exchanged_lens(rig, rng)).take(scans.T_cam_board)
+    return Case(rig, images, scans.scans, scans.T_cam_lidar)
+
+
+def exchanged_lens(rig: Rig, rng: Rng) -> Intrinsics:
+    """Draw the lens that takes the pictures of `stale_intrinsics`."""
     lens = _lens(rig)
     factor = 1 + rng.choice([-1, 1]) * rng.uniform(0.01, 0.03)
     pixels_per_size = lens.width_px / 1280
-    shift = rng.uniform(5, 15) * pixels_per_size * _direction(rng, 2)
+    shift = rng.uniform(5, 15) * pixels_per_size * direction(rng, 2)
     bend = rng.uniform(0.8, 1.2)
-    true = replace(
+    return replace(
         lens,
         fx_px=factor * lens.fx_px,
         fy_px=factor * lens.fy_px,
@@ -106,20 +114,18 @@ def stale_intrinsics(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
         cy_px=lens.cy_px + shift[1],
         distortion=tuple(bend * k for k in lens.distortion),
     )
-    images = _Photographer.of(rig, rng, true).take(scans.T_cam_board)
-    return Case(rig, images, scans.scans, scans.T_cam_lidar)
 
 
 def late_pictures(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
     """A board is moved by hand and pictures are 20 to 100 ms late; every other time always the same way."""
     offset_s = rng.uniform(0.02, 0.1)
     is_one_way = rng.random() < 0.5
-    way = _direction(rng, 3)
+    way = direction(rng, 3)
     moved = {}
     for name, T in scans.T_cam_board.items():
         late_s = offset_s + rng.uniform(-0.025, 0.025)
-        velocity = rng.uniform(0.05, 0.3) * (way if is_one_way else _direction(rng, 3))
-        turn = np.radians(rng.uniform(0, 12)) * _direction(rng, 3)
+        velocity = rng.uniform(0.05, 0.3) * (way if is_one_way else direction(rng, 3))
+        turn = np.radians(rng.uniform(0, 12)) * direction(rng, 3)
         # The board turns about its own middle, whose place the translation gives.
         moved[name] = perturb(T, late_s * np.concatenate([velocity, turn]))
     return Case(rig, _Photographer.of(rig, rng).take(moved), scans.scans, scans.T_cam_lidar)
@@ -128,7 +134,7 @@ def late_pictures(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
 def nudged(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
     """The camera is nudged by 0.5 to 3 deg and 5 to 40 mm in the middle third; its last place counts."""
     tangent = np.concatenate(
-        [rng.uniform(0.005, 0.04) * _direction(rng, 3), np.radians(rng.uniform(0.5, 3)) * _direction(rng, 3)]
+        [rng.uniform(0.005, 0.04) * direction(rng, 3), np.radians(rng.uniform(0.5, 3)) * direction(rng, 3)]
     )
     # Seen from the camera everything else moves.
     T_after_before = perturb(np.eye(4), tangent)
@@ -154,8 +160,8 @@ def decoys(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
             continue
         centre = found[0].T_lidar_board[:3, 3]
         ray = centre / np.linalg.norm(centre)
-        shift = behind_m * ray if is_behind else rng.uniform(0.05, 1.0) * _direction(rng, 3)
-        turn = exp_so3(np.radians(rng.uniform(0, 10 if is_behind else 40)) * _direction(rng, 3))
+        shift = behind_m * ray if is_behind else rng.uniform(0.05, 1.0) * direction(rng, 3)
+        turn = exp_so3(np.radians(rng.uniform(0, 10 if is_behind else 40)) * direction(rng, 3))
         changed[name] = [_moved(found[0], pose(turn, centre + shift - turn @ centre))]
     images = _Photographer.of(rig, rng).take(scans.T_cam_board)
     return Case(rig, images, changed, scans.T_cam_lidar)
@@ -216,7 +222,8 @@ def swapped_cameras(scans: SimulatedScans, rig: Rig, rng: Rng) -> Case:
     return Case(swapped, images, scans.scans, T_other_own @ scans.T_cam_lidar)
 
 
-def _direction(rng: Rng, n: int) -> Array:
+def direction(rng: Rng, n: int) -> Array:
+    """Draw a unit vector of n dimensions."""
     v = rng.standard_normal(n)
     return np.asarray(v / np.linalg.norm(v))
 

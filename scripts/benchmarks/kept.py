@@ -8,17 +8,26 @@ from lce_rig import pipeline
 from lce_rig.rig import Rig
 
 
-def kept_folder(folder: Path, rig: Rig, what: object = "", packages: tuple[str, ...] = ("simulate",)) -> Path:
-    """Name a folder after everything that what was detected depends on: other code has another folder.
+def kept_folder(
+    folder: Path,
+    rig: Rig,
+    what: object = "",
+    packages: tuple[str, ...] = ("simulate",),
+    *,
+    is_detected: bool = True,
+) -> Path:
+    """Name a folder after everything that its content depends on: other code has another folder.
 
     Args:
         folder: that it lies in.
         rig: the profile.
         what: whatever else decides, such as the options of the simulation; its repr counts.
         packages: of lce_rig that make the sessions.
+        is_detected: whether the content depends on the detectors.
     """
-    digest = hashlib.sha256(f"{pipeline.detection_digest(rig)} {what!r}".encode())
+    source = pipeline.detection_digest(rig) if is_detected else rig.model_dump_json()
+    digest = hashlib.sha256(f"{source} {what!r}".encode())
     for package in packages:
-        for source in sorted((Path(lce_rig.__file__).parent / package).rglob("*.py")):
-            digest.update(source.read_bytes())
+        for file in sorted((Path(lce_rig.__file__).parent / package).rglob("*.py")):
+            digest.update(file.read_bytes())
     return folder / f"{rig.name}-{digest.hexdigest()[:12]}"

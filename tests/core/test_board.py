@@ -34,6 +34,15 @@ def test_a_pattern_looks_the_same_turned_when_its_squares_add_up_to_an_even_numb
     assert not Board(9, 6, 0.068, 0.8, 0.6).is_symmetric
 
 
+def test_the_distance_inside_the_nearest_edge_is_that_to_its_line():
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, (500, 2))
+    middles, normals = BOARD.edges()
+    edge = BOARD.nearest_edge(points)
+    expected = np.sum((middles[edge, :2] - points) * normals[edge, :2], axis=1)
+    np.testing.assert_allclose(BOARD.inside_nearest_edge(points), expected, atol=1e-12)
+    assert set(edge) == {0, 1, 2, 3}
+
+
 def test_the_distance_from_the_outline_counts_inside_outside_and_beyond_a_corner():
     w, h = BOARD.width_m / 2, BOARD.height_m / 2
     points = np.array(

@@ -124,13 +124,29 @@ def test_draws_judge_the_result_and_do_not_change_it(draws):
     assert np.array_equal(T, T_drawn)
 
 
+def spoil(captures, numbers):
+    """Move the board by 6 cm between the sensors in the captures of these numbers."""
+    spoilt = list(captures)
+    for k in numbers:
+        seen = captures[k].lidar[0]
+        shift = np.array([0.06, 0.0, 0.0])
+        plane = seen.plane - np.append(np.zeros(3), seen.plane[:3] @ shift)
+        lidar = replace(seen, points=seen.points + shift, edge_points=seen.edge_points + shift, plane=plane)
+        spoilt[k] = replace(captures[k], lidar=[lidar])
+    return spoilt
+
+
+def test_of_many_captures_those_whose_board_moved_are_refused_too():
+    numbers = (2, 3, 50, 62, 90)
+    estimate = fit_extrinsic(spoil(simulate(100, 9), numbers), BOARD, replace(FAST, n_draws=2))
+    assert set(estimate.refused) == {f"{k:06d}" for k in numbers}
+    assert error_to_reference(estimate.T_cam_lidar, T_FORWARD)[0] < 0.1
+    # Sizes of random subsets are limited to 40, twice three rounds each.
+    assert estimate.diagnostics.n_solved == 40 * 2 * 3
+
+
 def test_a_board_that_moved_between_the_sensors_is_refused_with_its_figures():
-    captures = simulate(15, 9)
-    moved = captures[4].lidar[0]
-    shift = np.array([0.06, 0.0, 0.0])
-    plane = moved.plane - np.append(np.zeros(3), moved.plane[:3] @ shift)
-    lidar = replace(moved, points=moved.points + shift, edge_points=moved.edge_points + shift, plane=plane)
-    spoilt = [replace(item, lidar=[lidar]) if k == 4 else item for k, item in enumerate(captures)]
+    spoilt = spoil(simulate(15, 9), [4])
     estimate = fit_extrinsic(spoilt, BOARD, FAST)
     assert set(estimate.refused) == {"000004"}
     refusal = estimate.refused["000004"]

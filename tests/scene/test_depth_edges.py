@@ -1,25 +1,26 @@
-"""Outlines of near objects, found at their true azimuth and height."""
+"""Outlines of near objects and changes of reflectivity, found at their true azimuth and height."""
 
 import numpy as np
 import pytest
 
 from lce_rig.core.data import Scan
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.scene.depth_edges import find_depth_edges
+from lce_rig.scene.depth_edges import CHANNELS, DepthEdges, find_depth_edges, leave_standing
 
 NEEDLE = Beam(0.0, 0.0)
 STEP = np.radians(0.2)
 AZIMUTHS = np.arange(-0.6, 0.6, STEP)
 
 
-def scan_of(range_at, elevations_deg):
-    """Measure a scene given as range over (azimuth, elevation), rad."""
+def scan_of(range_at, elevations_deg, intensity_at=None):
+    """Measure a scene given as range, and intensity, over (azimuth, elevation), rad."""
     az, el = np.meshgrid(AZIMUTHS, np.radians(elevations_deg))
     r = range_at(az, el)
     points = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=-1) * r[..., None]
     ring = np.broadcast_to(np.arange(len(elevations_deg))[:, None], az.shape)
     flat = points.reshape(-1, 3).astype(np.float32)
-    return Scan("lidar", 0, flat, np.zeros(len(flat), np.float32), ring.ravel().astype(np.int16))
+    intensity = np.zeros(len(flat)) if intensity_at is None else intensity_at(az, el).ravel()
+    return Scan("lidar", 0, flat, intensity.astype(np.float32), ring.ravel().astype(np.int16))
 
 
 def pillar(az, el):
@@ -47,6 +48,35 @@ def test_a_floor_has_no_outlines_though_its_rings_lie_far_apart() -> None:
     assert len(find_depth_edges(floor, NEEDLE)) == 0
 
 
+def test_a_wall_seen_at_a_grazing_angle_has_no_outline_though_its_steps_are_large() -> None:
+    wall = scan_of(lambda az, el: 0.4 / np.sin(np.maximum(np.abs(az), 0.02)), [0])
+    assert np.abs(np.diff(np.linalg.norm(wall.points, axis=1))).max() > 1.0
+    assert len(find_depth_edges(wall, NEEDLE)) == 0
+
+
+def stripe(az, el):
+    """A dark stripe that leans: its middle lies at the azimuth of half the elevation."""
+    return np.where(np.abs(az - el / 2) < 0.05, 10.0, 60.0)
+
+
+def test_changes_of_reflectivity_lie_on_the_borders_of_a_stripe() -> None:
+    edges = find_depth_edges(scan_of(lambda az, el: 4.0 + 0 * az, range(-15, 16, 2), stripe), NEEDLE)
+    azimuth = np.arctan2(edges.points[:, 1], edges.points[:, 0])
+    elevation = np.arcsin(edges.points[:, 2] / 4.0)
+    assert len(edges) == 2 * 16 and set(edges.channel) == {CHANNELS.index("reflectivity")}
+    assert np.abs(np.abs(azimuth - elevation / 2) - 0.05).max() < 0.51 * STEP
+
+
+def test_reflectivity_of_other_surfaces_and_noise_are_no_changes() -> None:
+    rng = np.random.default_rng(0)
+
+    def noisy(az, el):
+        return np.where(np.abs(az) < 0.1, 20.0, 60.0) + rng.normal(0, 3.0, az.shape)
+
+    edges = find_depth_edges(scan_of(pillar, range(-15, 16, 2), noisy), NEEDLE)
+    assert set(edges.channel) == {CHANNELS.index("depth")}
+
+
 def test_single_returns_between_two_surfaces_are_no_outline() -> None:
     def mixed(az, el):
         return np.where(np.abs(az) < STEP / 2, 4.0, 6.0)
@@ -58,3 +88,27 @@ def test_single_returns_between_two_surfaces_are_no_outline() -> None:
 def test_an_almost_empty_scan_has_no_outlines(n) -> None:
     empty = scan_of(pillar, [0]).select(np.arange(n))
     assert len(find_depth_edges(empty, NEEDLE)) == 0
+
+
+def test_the_board_and_its_stand_move_before_a_standing_rig_and_are_left_out(seen) -> None:
+    found = [view.edges for view in seen.views]
+    standing = leave_standing(found)
+    shares = []
+    for capture, before, after in zip(seen.captures, found, standing, strict=True):
+        middle = capture.T_lidar_board["lidar"][:3, 3]
+        n_near, n_left = (
+            np.count_nonzero(np.hypot(*(edges.points - middle)[:, :2].T) < 0.6) for edges in (before, after)
+        )
+        assert n_near > 15 and n_left < 0.2 * n_near
+        shares.append((len(after) - n_left) / (len(before) - n_near))
+    assert min(shares) > 0.8
+
+
+def test_a_rig_that_moves_keeps_its_edges(seen) -> None:
+    moving = [
+        DepthEdges(view.edges.points + [0.4 * k, 0, 0], view.edges.weight, view.edges.channel)
+        for k, view in enumerate(seen.views)
+    ]
+    assert list(map(len, leave_standing(moving))) == list(map(len, moving))
+    assert list(map(len, leave_standing(moving[:1]))) == [len(moving[0])]
+    assert leave_standing([]) == []

@@ -8,6 +8,7 @@ import pytest
 from lce_rig.core.geometry import difference, perturb
 from lce_rig.core.results import Calibration
 from lce_rig.scene.alignment import AXES, Alignment
+from lce_rig.scene.depth_edges import CHANNELS
 from lce_rig.scene.drift import watch
 from lce_rig.scene.edge_field import build_edge_field
 
@@ -67,6 +68,17 @@ def test_changes_of_two_axes_are_both_seen(seen) -> None:
     assert np.degrees(np.linalg.norm(left[3:])) < 0.5
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_best_extrinsics_are_found_from_3_deg_and_20_cm_off_or_reported_uncertain(seen, seed) -> None:
+    shift, turn = np.random.default_rng(seed).standard_normal((2, 3))
+    start = (*0.2 * shift / np.linalg.norm(shift), *np.radians(3.0) * turn / np.linalg.norm(turn))
+    drift = judge(seen, start, is_joint=True)
+    assert drift.state != "unchanged"
+    error = difference(drift.T_best, seen.truth.T_cam_lidar)
+    is_uncertain = "scene.best_uncertain" in [finding.code for finding in drift.findings]
+    assert is_uncertain or float(error @ np.linalg.solve(drift.cov_best, error)) < 16.8
+
+
 @pytest.mark.parametrize("size_deg", [4.0, 8.0, -15.0])
 def test_a_change_beyond_the_range_is_never_an_all_clear(seen, size_deg) -> None:
     assert judge(seen, along("rotation_y", np.radians(size_deg))).state != "unchanged"
@@ -104,6 +116,19 @@ def test_one_capture_claims_no_more_than_all(seen) -> None:
     assert alone.state != "changed"
     for one, many in zip(alone.axes, all_of_them.axes, strict=True):
         assert one.state == "unknown" or one.smallest > 0.9 * many.smallest
+
+
+def test_changes_of_reflectivity_alone_show_pitch_and_yaw(seen) -> None:
+    lens = seen.rig.cameras["cam"].to_intrinsics()
+    is_painted = [view.edges.channel == CHANNELS.index("reflectivity") for view in seen.views]
+    views = [
+        replace(view, edges=view.edges.select(keep))
+        for view, keep in zip(seen.views, is_painted, strict=True)
+    ]
+    alignment = Alignment(views, lens, seen.truth.T_cam_lidar)
+    for axis in ("rotation_x", "rotation_y"):
+        curve = alignment.curve(AXES.index(axis), np.zeros(6))
+        assert abs(np.degrees(curve.peak)) < 0.15
 
 
 def test_too_few_edges_cannot_tell(seen) -> None:

@@ -202,9 +202,17 @@ def test_a_lidar_at_twenty_hertz_takes_half_the_time_and_half_the_points(
     assert len(scan.points) == pytest.approx(len(captures[0].scans[0].points) / 2, rel=0.05)
 
 
+def test_an_os1_64_scans_64_rings_of_1024_columns() -> None:
+    scan = next(
+        simulate_captures(make_rig(lidars={"lidar": {"model": "OS1-64"}}), n_captures=1, seed=1)
+    ).scans[0]
+    assert scan.ring is not None and set(scan.ring.tolist()) == set(range(64))
+    assert np.bincount(scan.ring).max() == 1024 and len(scan.points) > 60_000
+
+
 def test_a_lidar_nobody_can_simulate_is_named(rig: Rig) -> None:
-    odd = make_rig(lidars={"lidar": {"model": "OS1-64"}})
-    with pytest.raises(ProfileError, match=r"lidars\.lidar\.model: OS1-64"):
+    odd = make_rig(lidars={"lidar": {"model": "HDL-32E"}})
+    with pytest.raises(ProfileError, match=r"lidars\.lidar\.model: HDL-32E"):
         next(simulate_captures(odd, n_captures=1, seed=0))
     assert "vlp16" in LIDAR_MODELS
 

@@ -58,6 +58,8 @@ class FrameFeed:
         clock: RigClock,
         board: SyncTimes | None,
         record: Callable[[Sample], None] | None = None,
+        *,
+        are_events_enough: bool = False,
     ) -> None:
         """Prepare.
 
@@ -67,6 +69,7 @@ class FrameFeed:
             clock: ties the timestamps.
             board: the sync board; None where there is none.
             record: takes every sample too, as it came but for its time; must not block.
+            are_events_enough: whether events need no image made of them.
         """
         self.losses = Losses()
         self._rig = rig
@@ -74,6 +77,7 @@ class FrameFeed:
         self._clock = clock
         self._board = board
         self._record = record
+        self._are_events_enough = are_events_enough
         self._refreshed_s = -1e9
         self._is_slow = False
         self._frames: Mailbox[Frame] = Mailbox(1)
@@ -109,7 +113,10 @@ class FrameFeed:
 
     def _run(self) -> None:
         try:
-            for frame in pair_by_time(self._with_pictures(), self._rig, self.losses, LIVE_NS):
+            samples = self._samples() if self._are_events_enough else self._with_pictures()
+            for frame in pair_by_time(
+                samples, self._rig, self.losses, LIVE_NS, are_events_enough=self._are_events_enough
+            ):
                 self._frames.put(frame)
         except BaseException as error:  # The taker of frames learns of bugs as well.
             self._failure = error

@@ -1,0 +1,161 @@
+"""Furnished simulated rooms: sessions with exact truth, in which scene and boards are both seen.
+
+Pictures have half the resolution, which renders in a quarter of the time.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from benchmarks.kept import kept_folder
+from benchmarks.recordings import RIGS
+from lce_rig import pipeline
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Calibration
+from lce_rig.detect.detection import Detections
+from lce_rig.rig import Rig, load_rig
+from lce_rig.rig.nominal import NominalExtrinsic
+from lce_rig.scene.alignment import SceneView
+from lce_rig.scene.views import build_view, without_board
+from lce_rig.session import Session
+from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrinsics
+
+ROOMS = Path("build/rooms")
+N_CAPTURES = 10
+RIG_NAMES = ("rlfs", "rles", "os1_64")
+
+
+@dataclass(frozen=True, eq=False)
+class FurnishedRoom:
+    """A session of one camera and one LiDAR in a room of its own.
+
+    Attributes:
+        session: all captures.
+        T_cam_lidar: (4, 4) the truth.
+    """
+
+    session: Session
+    T_cam_lidar: Array
+
+    @property
+    def rig(self) -> Rig:
+        """The profile, with small pictures."""
+        return self.session.rig
+
+    @property
+    def camera(self) -> str:
+        """The camera's name."""
+        return next(iter(self.rig.cameras))
+
+    @property
+    def lens(self) -> Intrinsics:
+        """The camera's intrinsics."""
+        return self.rig.cameras[self.camera].to_intrinsics()
+
+    @property
+    def names(self) -> list[str]:
+        """The captures."""
+        return [capture.name for capture in self.session.captures]
+
+    @cached_property
+    def detections(self) -> Detections:
+        """The boards of all captures."""
+        return pipeline.detect(self.session, n_threads=1)
+
+    def calibrate(self, names: Sequence[str]) -> Calibration:
+        """Calibrate on the boards of some captures alone, three at least.
+
+        Raises:
+            NotEnoughDataError: they are too few.
+        """
+        (calibration,), _ = pipeline.calibrate_detections(with_few(self.rig), only(self.detections, names))
+        return calibration
+
+    def views(
+        self, names: Sequence[str], calibration: Calibration, *, ignore_board: bool = False
+    ) -> list[SceneView]:
+        """Find the edges of some captures, without those at the board if it is to be ignored."""
+        views = []
+        for capture in self.session.captures:
+            if capture.name in names:
+                image, scan = capture.image(self.camera, "frames"), capture.scan(calibration.lidar)
+                view = build_view(self.rig, calibration, capture.name, image, scan)
+                if ignore_board:
+                    found = self.detections.images[self.camera, "frames"][capture.name]
+                    view = without_board(view, found, self.rig, calibration)
+                views.append(view)
+        return views
+
+
+def with_few(rig: Rig) -> Rig:
+    """Accept three captures."""
+    return rig.model_copy(update={"quality": rig.quality.model_copy(update={"min_captures": 3})})
+
+
+def only(every: Detections, names: Sequence[str]) -> Detections:
+    """Keep the detections of some captures."""
+    return replace(
+        every,
+        images={key: {k: v for k, v in of.items() if k in names} for key, of in every.images.items()},
+        lidars={key: {k: v for k, v in of.items() if k in names} for key, of in every.lidars.items()},
+    )
+
+
+def furnished_room(
+    rig_name: str, seed: int, n_captures: int = N_CAPTURES, folder: Path = ROOMS
+) -> FurnishedRoom:
+    """Read a session from a folder, or simulate it and keep it there.
+
+    Args:
+        rig_name: one of RIG_NAMES.
+        seed: of room, furniture, truth, placements and noise.
+        n_captures: placements of the board.
+        folder: of sessions, see `kept_folder`.
+    """
+    rig, options = _small_rig(rig_name), _options(rig_name)
+    path = kept_folder(folder, rig, options, is_detected=False) / f"{n_captures}-{seed:04d}"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_suffix(".part")
+        with Session.create(unfinished, rig) as session:
+            for capture in simulate_captures(rig, n_captures=n_captures, seed=seed, options=options):
+                session.add_capture(capture.images, capture.scans, {})
+        unfinished.rename(path)
+    (truth,) = truth_extrinsics(rig, seed, options).values()
+    return FurnishedRoom(Session.open(path), truth)
+
+
+def _options(rig_name: str) -> SimulationOptions:
+    options = replace(SimulationOptions.for_rig(rig_name), is_furnished=True)
+    # Like the recording: far boards, held upright.
+    return replace(options, distance_m=(2.6, 3.6), roll_deg=(0.0, 15.0)) if rig_name == "os1_64" else options
+
+
+def _small_rig(rig_name: str) -> Rig:
+    rig = load_rig(str(RIGS / "os1_64.yaml") if rig_name == "os1_64" else rig_name)
+    (name,) = rig.cameras
+    camera, lens = rig.cameras[name], rig.cameras[name].intrinsics
+    if camera.resolution_px[0] >= 1000:
+        scaled = {key: getattr(lens, key) / 2 for key in ("fx_px", "fy_px")}
+        scaled |= {key: (getattr(lens, key) - 0.5) / 2 for key in ("cx_px", "cy_px")}
+        size = tuple(length // 2 for length in camera.resolution_px)
+        camera = camera.model_copy(
+            update={"resolution_px": size, "intrinsics": lens.model_copy(update=scaled)}
+        )
+    changes = {"cameras": {name: camera}, "nominal_extrinsics": rig.nominal_extrinsics or _above(name)}
+    return rig.model_copy(update=changes)
+
+
+def _above(camera: str) -> tuple[NominalExtrinsic, ...]:
+    """Mount the LiDAR 0.4 m above a camera that looks along its x axis."""
+    return (
+        NominalExtrinsic(
+            camera=camera,
+            lidar="lidar",
+            quaternion_wxyz=(0.5, 0.5, -0.5, 0.5),
+            translation_m=(0.0, -0.4, -0.05),
+            source="typical",
+        ),
+    )
