@@ -16,6 +16,7 @@
     scripts/bench.py uncertainty  the joint estimate: errors against their bound, truth of its claim
     scripts/bench.py scene       extrinsics checked without a board, on recordings by others
     scripts/bench.py scene_methods  the scene's score compared with published ones, on the same recordings
+    scripts/bench.py scene_sharpen  boards and scene in one estimate: simulated rooms, recordings
     scripts/bench.py witness     the scene beside the boards: good results refused, wrong ones found
     scripts/bench.py growth      calibrate after detection as sessions grow: time and memory
     scripts/bench.py speed       detection, Algorithm 1, the command line
@@ -45,6 +46,7 @@ PARTS = {
     "usable": 20,
     "scene": 0,
     "scene_methods": 0,
+    "scene_sharpen": 100,
     "witness": 20,
     "growth": 0,
     "speed": 0,
@@ -106,6 +108,9 @@ def main() -> None:
         bench(arguments.seeds or PARTS["faults"], n_sessions=arguments.scans)
     elif arguments.part in ("scene", "scene_methods"):
         bench(min(arguments.splits, 2), arguments.only)
+    elif arguments.part == "scene_sharpen":
+        seeds = arguments.seeds or PARTS["scene_sharpen"]
+        bench(seeds, min(arguments.splits, 10), arguments.only)
     elif arguments.part == "witness":
         bench(arguments.seeds or PARTS["witness"], arguments.only)
     elif arguments.part == "growth":
