@@ -65,7 +65,8 @@ def calibrate_by_likelihood(
 
 def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
     """Read the priors of constant errors and noise from the options."""
-    priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=EDGE_SHIFT_SIGMA_M)
+    offset_m = max(options.range_offset_sigma_m, _EXACT_M)
+    priors = Priors(offset_m=offset_m, shift_m=EDGE_SHIFT_SIGMA_M, known=options.known)
     return priors, Levels(laser_m=options.laser_bias_sigma_m)
 
 

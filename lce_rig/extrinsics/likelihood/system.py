@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, perturb
@@ -197,6 +198,7 @@ class Terms:
         image_rows: linearised, of each camera.
         constants: z of the state.
         trust: (F,) weight of each capture.
+        rings: (L,) ring numbers.
     """
 
     ranges: RangeSums
@@ -205,6 +207,7 @@ class Terms:
     image_rows: tuple[Array, ...]
     constants: Array
     trust: Array
+    rings: NDArray[np.int16]
 
     @property
     def n_rings(self) -> int:
@@ -234,6 +237,7 @@ def linearise(
         ),
         state.constants,
         np.ones(scans.n_captures) if trust is None else trust,
+        scans.rings,
     )
 
 
@@ -343,36 +347,53 @@ def _eliminate(M: Array, terms: Terms, levels: Levels, priors: Priors, log_volum
     steps = np.linalg.solve(of_boards, rest)
     reduced = M[:, 6:, 6:] - np.swapaxes(rest, 1, 2) @ steps
     hessians, gradients, costs = reduced[:, :-1, :-1], reduced[:, :-1, -1], reduced[:, -1, -1]
-    prior, log_prior_volume = _prior(terms, levels, priors)
-    summed = Quadratics(gradients, hessians, prior, prior @ terms.constants, np.arange(len(M)))
+    prior, mean, log_prior_volume = _prior(terms, levels, priors)
+    off = terms.constants - mean
+    summed = Quadratics(gradients, hessians, prior, prior @ off, np.arange(len(M)))
     information, gradient = summed.information, gradients.sum(axis=0) + summed.prior_gradient
-    least = costs.sum() + terms.constants @ summed.prior_gradient
+    least = costs.sum() + off @ summed.prior_gradient
     least -= gradient @ np.linalg.solve(information, gradient)
     log_volume += np.linalg.slogdet(of_boards)[1].sum() + np.linalg.slogdet(information)[1]
     evidence = float(least + log_volume + log_prior_volume)
     return Reduced(summed, np.asarray(steps), evidence)
 
 
-def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, float]:
-    """Build the information (G, G) of the priors and the log of their covariance's determinant.
+def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, float]:
+    """Build the priors' information (G, G), their mean (G,) and the log of their covariance's determinant.
 
     Range offsets of L rings have the covariance sigma_laser^2 (I - 1 1^T / L) + sigma_offset^2 1 1^T.
     """
     L, C = terms.n_rings, len(terms.images)
-    prior = np.zeros((len(terms.constants), len(terms.constants)))
+    prior, mean = np.zeros((len(terms.constants), len(terms.constants))), np.zeros(len(terms.constants))
     scale = PER_CAMERA * np.arange(C) + 6
     prior[scale, scale] = 1 / priors.scale**2
     ring = PER_CAMERA * C + np.arange(L)
-    about_mean, log_volume = np.eye(L) - 1 / L, 0.0
+    log_volume = 0.0
     of_lasers = (
         (levels.laser_m, priors.offset_m),
         (priors.azimuth_rad, 0.0),
         (priors.elevation_rad, 0.0),
     )
+    lens_sigma = np.array([priors.lateral_m, priors.vertical_m])
+    known = priors.known
     for k, (own, common) in enumerate(of_lasers):
-        cov = own**2 * about_mean + common**2 + _MEAN_FLOOR**2 * np.eye(L)
+        cov = own**2 * (np.eye(L) - 1 / L)
+        if known is not None:
+            at, which = _places(terms.rings, known.rings)
+            cov = own**2 * np.eye(L)
+            cov[at, at] = known.lasers_sigma[k, which] ** 2
+            mean[ring[at] + k * L] = known.lasers[k, which]
+        cov = cov + common**2 + _MEAN_FLOOR**2 * np.eye(L)
         prior[(ring + k * L)[:, None], ring + k * L] = np.linalg.inv(cov)
         log_volume += float(np.linalg.slogdet(cov)[1])
     last = np.arange(PER_CAMERA * C + N_OF_LASER * L, len(prior))
-    prior[last, last] = np.concatenate([[priors.lateral_m, priors.vertical_m], priors.shifts]) ** -2.0
-    return prior, log_volume
+    if known is not None:
+        mean[last[:N_FIELDS]], lens_sigma = known.lens, known.lens_sigma
+    prior[last, last] = np.concatenate([lens_sigma, priors.shifts]) ** -2.0
+    return prior, mean, log_volume
+
+
+def _places(rings: NDArray[np.int16], known: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Find the rings that are known: their indices among those seen, and among those known."""
+    _, seen, which = np.intersect1d(rings, known, return_indices=True)
+    return seen, which
