@@ -105,7 +105,9 @@ def _by_kind(axes: Sequence[AxisOpinion], *, with_size: bool = False) -> list[st
 _UNITS = {"deg": "deg", "m": "mm"}
 
 
-def _value(axis: AxisOpinion, value: float, sign: str = "") -> str:
+def _value(axis: AxisOpinion, value: float | None, sign: str = "") -> str:
+    if value is None:
+        return "?"
     return f"{value:{sign}.2f}" if axis.unit == "deg" else f"{1000 * value:{sign}.0f}"
 
 
