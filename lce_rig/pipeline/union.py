@@ -121,8 +121,8 @@ def require_unit(sessions: Sequence[Session]) -> dict[str, Session]:
         if keys:
             raise SessionError(
                 f"{first_name} and {name} differ in board or sensors: {'; '.join(map(str, keys[:4]))}",
-                "One estimate requires one board and one set of sensors. Correct rig.yaml of the wrong session, "
-                "or calibrate each alone and compare them with `lce-rig repeat`.",
+                "One estimate requires one board and one set of sensors. Correct the wrong rig.yaml, or "
+                "calibrate each session alone and compare them with `lce-rig repeat`.",
             )
     require_independent(named)
     return named
