@@ -189,6 +189,7 @@ def _tell(
 
     Raises:
         SourceError: a sensor was lost permanently; the captures are kept.
+        SessionError: the recording ended early, for example on a full disk; the captures are kept.
         NotEnoughDataError: there is no capture, or too few when the new placements are exhausted.
     """
     from lce_rig.core.errors import NotEnoughDataError
@@ -210,6 +211,8 @@ def _tell(
         raise click.exceptions.Exit(130)
     if n_captures == 0:
         raise NotEnoughDataError("nothing was captured", _remedy(report, simulated))
+    if report.recording_error is not None:
+        raise report.recording_error
     if report.ending == "exhausted" and not report.is_enough:
         raise NotEnoughDataError(
             f"{show.counted(n_captures, 'capture')} are not enough: the target is not predicted to be met",

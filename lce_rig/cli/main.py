@@ -30,6 +30,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "verify": ("lce_rig.cli.verify", "Project the point clouds into the images and print residuals."),
     "drift": ("lce_rig.cli.drift", "Check without a board whether extrinsics still hold."),
     "results": ("lce_rig.cli.results", "List the results of a session with figures and verdicts."),
+    "export": ("lce_rig.cli.export", "Write a result for other programs, or into a robot's URDF."),
     "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of sessions, or the results of one."),
 }
 EXIT_BUG = 70

@@ -166,5 +166,6 @@ class DiskWriter:
             sink.failure = sink.failure or error
         except Exception as error:  # Nothing that goes wrong with one sink may end the thread.
             cause = getattr(error, "strerror", None) or repr(error)
-            sink.failure = sink.failure or SessionError(f"{sink.path} cannot be written: {cause}")
+            what, hint = f"{sink.path} cannot be written: {cause}", "Free space there, or use another disk."
+            sink.failure = sink.failure or SessionError(what, hint)
         return sink.failure is None

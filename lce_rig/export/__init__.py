@@ -68,11 +68,7 @@ def export(
         require_known(calibration, rig)
     exporters = [load_exporter(name) for name in (EXPORTS if formats is None else formats)]
     remove_exports(folder)
-    failed = [c for c in calibrations if c.verdict == "fail"]
-    if failed and not is_forced:
-        pairs = ", ".join(f"{c.camera}/{c.channel} and {c.lidar}" for c in failed)
-        reasons = "; ".join(sentence(finding) for c in failed for finding in c.findings)
-        raise ResultRefusedError(f"not exported: the calibration of {pairs} failed", reasons)
+    require_usable(calibrations, is_forced=is_forced)
     paths: list[Path] = []
     try:
         for exporter in exporters:
@@ -81,6 +77,19 @@ def export(
         remove_exports(folder)
         raise
     return paths
+
+
+def require_usable(calibrations: Sequence[Calibration], *, is_forced: bool = False) -> None:
+    """Check that no calibration failed, unless forced.
+
+    Raises:
+        ResultRefusedError: a verdict is "fail".
+    """
+    failed = [c for c in calibrations if c.verdict == "fail"]
+    if failed and not is_forced:
+        pairs = ", ".join(f"{c.camera}/{c.channel} and {c.lidar}" for c in failed)
+        reasons = "; ".join(sentence(finding) for c in failed for finding in c.findings)
+        raise ResultRefusedError(f"not exported: the calibration of {pairs} failed", reasons)
 
 
 def remove_exports(folder: Path) -> None:

@@ -47,8 +47,9 @@ class FrameTree:
 
 
 def build_trees(calibrations: Sequence[Calibration], rig: Rig) -> list[FrameTree]:
-    """Connect all calibrated sensors to the rig's base frame; unconnected ones form other trees.
+    """Connect all calibrated sensors to the rig's root frame; unconnected ones form other trees.
 
+    The tree that holds the sensor of the profile's `mount` hangs from the robot's frame.
     Each camera has one pose; of several channels the one from `choose_channels` is used.
 
     Raises:
@@ -58,7 +59,7 @@ def build_trees(calibrations: Sequence[Calibration], rig: Rig) -> list[FrameTree
     bodies = {name: lidar.frame for name, lidar in rig.lidars.items()}
     bodies |= {name: camera.frame for name, camera in rig.cameras.items()}
     used = [name for name in bodies if any(name in (c.camera, c.lidar) for c in chosen)]
-    used.sort(key=lambda name: bodies[name] != rig.base_frame)
+    used.sort(key=lambda name: bodies[name] != rig.root_frame)
     optical = {camera.frame: camera.optical_frame for camera in rig.cameras.values()}
     trees: list[FrameTree] = []
     placed: set[str] = set()
@@ -67,7 +68,11 @@ def build_trees(calibrations: Sequence[Calibration], rig: Rig) -> list[FrameTree
             joints = _grow(name, chosen, bodies, placed)
             frames = [bodies[name], *(joint.child for joint in joints)]
             joints += [Joint(f, optical[f], T_BODY_OPTICAL, is_optical=True) for f in frames if f in optical]
-            trees.append(FrameTree(bodies[name], tuple(joints)))
+            root = bodies[name]
+            if rig.mount is not None and rig.mount.of == root:
+                joints.insert(0, Joint(rig.mount.parent, root, rig.mount.to_matrix()))
+                root = rig.mount.parent
+            trees.append(FrameTree(root, tuple(joints)))
     return trees
 
 

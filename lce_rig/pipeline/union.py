@@ -42,6 +42,7 @@ def calibrate(
     cameras: Sequence[str] | None = None,
     channels: Sequence[str] | None = None,
     reference: Reference | None = None,
+    use_scene: bool = False,
     progress: Progress = silent,
 ) -> Result:
     """Estimate and judge the extrinsics of every camera with every LiDAR; nothing is written.
@@ -54,6 +55,7 @@ def calibrate(
         cameras: the cameras to calibrate, as if the session held no others; None for all.
         channels: the cameras' channels to use; None for all that the session holds.
         reference: extrinsics to report errors against; they never enter the estimate or the verdict.
+        use_scene: estimate from the edges of the scene too; of one session only.
         progress: called with (done, total) for each camera and LiDAR in turn.
 
     Raises:
@@ -61,7 +63,7 @@ def calibrate(
             named. Of several sessions, one has too few to tell whether its sensors were moved.
         ResultRefusedError: sessions disagree: the sensors were moved in between.
         SessionError: sessions are not of one rig, board and intrinsics, or share captures.
-        UsageError: no capture holds one of the channels; or a session is given twice.
+        UsageError: no capture holds one of the channels; a session is given twice, or several with the scene.
     """
     if isinstance(session, Session) or len(session) == 1:
         return calibrate_one(
@@ -71,7 +73,12 @@ def calibrate(
             cameras=cameras,
             channels=channels,
             reference=reference,
+            use_scene=use_scene,
             progress=progress,
+        )
+    if use_scene:
+        raise UsageError(
+            "the scene of several sessions is not used", "Omit --use-scene, or give one session."
         )
     named = require_unit(session)
     given = [detect(each) for each in session] if detections is None else detections

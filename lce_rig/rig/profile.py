@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from lce_rig.core.findings import Finding
 from lce_rig.rig.board_settings import BoardSettings
+from lce_rig.rig.mount import Mount
 from lce_rig.rig.nominal import NominalExtrinsic
 from lce_rig.rig.sensors import (
     CAMERA_DRIVERS,
@@ -30,7 +31,9 @@ class Rig(Settings):
         format_version: version of this schema.
         name: name of the rig; a session belongs to one rig by name.
         description: one line for `lce-rig rigs`.
-        base_frame: a LiDAR's or camera's frame, root of the URDF; the first LiDAR's by default.
+        base_frame: a LiDAR's or camera's frame, root of the URDF; by default that of `mount`, or the first
+            LiDAR's.
+        mount: the pose of one sensor on the robot; the root is then a frame of the robot.
         lidars: settings by the LiDAR's name.
         cameras: settings by the camera's name.
         nominal_extrinsics: the CAD model's values, a sanity check only.
@@ -41,6 +44,7 @@ class Rig(Settings):
     name: RigName
     description: Text = ""
     base_frame: FrameName | None = None
+    mount: Mount | None = None
     board: BoardSettings
     lidars: Annotated[dict[Name, LidarSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
     cameras: Annotated[dict[Name, CameraSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
@@ -61,7 +65,22 @@ class Rig(Settings):
         roots = [frame for key, frame in self._frames() if not key.endswith("optical_frame")]
         if self.base_frame is not None and self.base_frame not in roots:
             raise problem(f"no sensor has frame {self.base_frame}; there is {', '.join(roots)}", "base_frame")
+        if self.mount is not None:
+            if self.mount.of not in roots:
+                raise problem(f"no sensor has frame {self.mount.of}; there is {', '.join(roots)}", "mount.of")
+            if self.mount.parent in seen:
+                what = f"{self.mount.parent} is the frame of {seen[self.mount.parent]}, not of the robot"
+                raise problem(what, "mount.parent")
+            if self.base_frame not in (None, self.mount.of):
+                what = f"differs from mount.of, {self.mount.of}, which would give it two parents; remove it"
+                raise problem(what, "base_frame")
         return self
+
+    @property
+    def root_frame(self) -> str:
+        """The frame of a sensor from which the others hang: `mount.of`, `base_frame` or the first LiDAR's."""
+        first = next(iter(self.lidars.values())).frame
+        return self.mount.of if self.mount is not None else self.base_frame or first
 
     @model_validator(mode="after")
     def _sensors_are_known(self) -> "Rig":

@@ -16,7 +16,8 @@ AXES = ("translation_x", "translation_y", "translation_z", "rotation_x", "rotati
 IS_ROTATION = np.array([False, False, False, True, True, True])
 
 _COLUMNS, _ROWS = 8, 3  # parts of the image
-_BESIDE_RAD = 0.05  # Edges so far outside the image count: other extrinsics bring them in.
+BESIDE_RAD = 0.05
+"""Edges so far outside the image count by default: other extrinsics bring them in."""
 _SCALE_RAD = 0.003  # of derivatives: about the field's blur
 _REACH = np.where(IS_ROTATION, np.radians(3.0), 0.3)
 _STEPS = np.linspace(-1.0, 1.0, 61)
@@ -40,13 +41,20 @@ class Alignment:
         views: at least one.
         intrinsics: of the camera.
         T_cam_lidar: (4, 4) that perturbations start from.
+        beside_rad: edges so far outside the image count: other extrinsics bring them in.
     """
 
-    def __init__(self, views: Sequence[SceneView], intrinsics: Intrinsics, T_cam_lidar: Array) -> None:
+    def __init__(
+        self,
+        views: Sequence[SceneView],
+        intrinsics: Intrinsics,
+        T_cam_lidar: Array,
+        beside_rad: float = BESIDE_RAD,
+    ) -> None:
         self._intrinsics, self.T_cam_lidar = intrinsics, T_cam_lidar
         points = np.concatenate([view.edges.points for view in views])
         pixels, _ = intrinsics.project(transform(T_cam_lidar, points))
-        margin_px = -_BESIDE_RAD * intrinsics.fx_px
+        margin_px = -beside_rad * intrinsics.fx_px
         near = intrinsics.is_inside(pixels, margin_px)
         of_view = np.repeat(np.arange(len(views)), [len(view.edges) for view in views])
         self._points, self.n_captures = points[near], len(views)
@@ -80,28 +88,14 @@ class Alignment:
     def _by_part(self, values: Array) -> Array:
         return np.asarray(np.bincount(self._part, values, len(CHANNELS) * _COLUMNS * _ROWS), dtype=np.float64)
 
-    def scores(self, tangent: Array) -> tuple[Array, Array]:
-        """Score perturbed extrinsics.
-
-        Args:
-            tangent: (6,) (translation m, rotation rad), axes of the camera.
-
-        Returns:
-            Sums over each channel's parts of the image, and over the captures, both divided by the number of
-            captures.
-        """
-        values = self.shares(perturb(self.T_cam_lidar, tangent))
-        by_capture = np.bincount(self._of_view, values, self.n_captures)
-        return self._by_part(values), np.asarray(by_capture, dtype=np.float64)
-
     def _sample(self, pixels: Array) -> Array:
-        values = np.empty(len(pixels))
+        values = np.empty(pixels.shape[:-1])
         for field, chosen in zip(self._fields, self._slices, strict=True):
-            values[chosen] = field.sample(pixels[chosen])
+            values[..., chosen] = field.sample(pixels[..., chosen, :])
         return values
 
     def shares(self, T_cam_lidar: Array) -> Array:
-        """Score extrinsics (4, 4): each depth edge's share (N,), divided by the number of captures."""
+        """Score extrinsics (..., 4, 4): each edge's share (..., N), divided by the number of captures."""
         pixels, _ = self._intrinsics.project(transform(T_cam_lidar, self._points))
         return self._weight / self.n_captures * self._sample(pixels)
 
@@ -118,7 +112,7 @@ class Alignment:
         pixels, is_valid = self._intrinsics.project(points)
         h = _SCALE_RAD * self._intrinsics.fx_px * 2**self._level
         shifts = h * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)])
-        at, right, left, down, up, rd, ru, ld, lu = (self._sample(pixels + shift) for shift in shifts)
+        at, right, left, down, up, rd, ru, ld, lu = self._sample(pixels + shifts[:, None])
         slope = np.stack([right - left, down - up], axis=-1) / (2 * h)
         mixed = (rd - ru - ld + lu) / 4
         bend = np.stack([right - 2 * at + left, mixed, mixed, down - 2 * at + up], axis=-1) / h**2
@@ -127,11 +121,9 @@ class Alignment:
             [np.broadcast_to(np.eye(3), (len(points), 3, 3)), -skew(points - T_cam_lidar[:3, 3])], axis=2
         )
         jacobian = np.where(is_valid[:, None, None], self._intrinsics.differentiate(points) @ by_tangent, 0.0)
-        gradients = np.einsum("ni,nia,n->na", slope, jacobian, scale)
-        curvatures = np.einsum(
-            "nia,nij,njb,n->nab", jacobian, bend.reshape(-1, 2, 2), jacobian, scale, optimize=True
-        )
-        return gradients, curvatures
+        gradients = (scale[:, None] * slope)[:, None] @ jacobian
+        bends = (scale[:, None] * bend).reshape(-1, 2, 2)
+        return gradients[:, 0], np.swapaxes(jacobian, 1, 2) @ bends @ jacobian
 
     def coarser(self) -> "Alignment":
         """Halve the resolution of the fields: a wider basin about a blunter maximum."""
@@ -142,8 +134,14 @@ class Alignment:
     def curve(self, axis: int, start: Array) -> "Curve":
         """Score extrinsics along one axis of the tangent, the others as in `start` (6,)."""
         offsets = _STEPS * _REACH[axis]
-        rows = [self.scores(start + offset * np.eye(6)[axis]) for offset in offsets]
-        return Curve(offsets, np.array([parts for parts, _ in rows]), np.array([each for _, each in rows]))
+        shares = self.shares(perturb(self.T_cam_lidar, start + offsets[:, None] * np.eye(6)[axis]))
+        by_part, by_capture = zip(*map(self.split, shares), strict=True)
+        return Curve(offsets, np.array(by_part), np.array(by_capture))
+
+    def split(self, shares: Array) -> tuple[Array, Array]:
+        """Sum shares (N,) over each channel's parts of the image, (P,), and over the captures, (C,)."""
+        by_capture = np.bincount(self._of_view, shares, self.n_captures)
+        return self._by_part(shares), np.asarray(by_capture, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +198,14 @@ class Curve:
             reference = self.at(other)
         gains = self.at(offset) - reference
         return float(gains.sum() / max(np.sqrt(np.sum(gains**2)), 1e-12))
+
+    def smallest_significant(self, limit: float) -> float:
+        """Find how far from the peak, on either side, its significance exceeds a limit; inf if never."""
+        gains = self.at(self.peak) - self.by_part
+        significance = gains.sum(axis=1) / np.maximum(np.sqrt(np.sum(gains**2, axis=1)), 1e-12)
+        off = self.offsets - self.peak
+        beyond = [np.abs(off[(significance > limit) & (off * side > 0)]) for side in (-1, 1)]
+        return max(float(each.min(initial=np.inf)) for each in beyond)
 
 
 def _peaks(columns: Array, offsets: Array) -> Array:

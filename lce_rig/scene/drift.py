@@ -26,6 +26,7 @@ _NEARLY = 0.1  # An axis that scores so much less alone may be the one that chan
 # Upright outlines hardly show pitch: without a slanted one the curve is nearly flat, its peak meaningless.
 _MIN_CONTRAST = 0.3  # of a peak above its curve's median, as a share of the peak
 _MIN_GAIN = 2.0  # significance of the score at a change above that of the deployed extrinsics
+_GAIN_MARGIN = 0.2  # At the smallest change, the parts agree by so much more.
 _MIN_SIGNIFICANCE = 1.5  # of a peak above the rest of its curve
 
 
@@ -123,9 +124,9 @@ def watch(
     axes, tangent = _decide(alignment, curves, sigma_deployed)
     T_best, cov_best = perturb(T_cam_lidar, tangent), None
     if is_joint:
-        best = estimate(views, intrinsics, T_best)
+        best = estimate(views, intrinsics, T_best, is_far=any(axis.state != "unchanged" for axis in axes))
         T_best, cov_best = best.T_cam_lidar, best.cov
-    findings = (_summary(axes, len(views)), *map(_of_axis, axes), *missing)
+    findings = (_summary(axes, len(views)), *map(_of_axis, axes), *_open_axes(cov_best), *missing)
     by_axis = dict(zip(AXES, curves, strict=True))
     return Drift(axes, findings, T_cam_lidar, T_best, cov_best, by_axis, len(views), n_edges)
 
@@ -162,7 +163,9 @@ def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment)
     unit = float(np.degrees(1.0)) if IS_ROTATION[axis] else 1.0
     peak, scatter = curve.peak, curve.sigma()
     sigma = float(np.sqrt(scatter**2 + sigma_deployed**2 + BIAS[axis] ** 2))
-    smallest = (_THRESHOLD_SIGMAS + _POWER_SIGMAS) * sigma
+    smallest = max(
+        (_THRESHOLD_SIGMAS + _POWER_SIGMAS) * sigma, curve.smallest_significant(_MIN_GAIN + _GAIN_MARGIN)
+    )
     mean_score = float(curve.total.max() / alignment.weight_of_parts.sum() * alignment.n_captures)
     reason = ""
     if abs(peak) > 0.95 * curve.offsets[-1]:
@@ -205,6 +208,15 @@ def _of_axis(axis: AxisDrift) -> Finding:
     if axis.state == "unchanged":
         return Finding("scene.axis_unchanged", "note", axis.axis, figures)
     return Finding(axis.reason, "warning", axis.axis, figures)
+
+
+def _open_axes(cov_best: Array | None) -> list[Finding]:
+    """Name the axes in which the best extrinsics are uncertain."""
+    if cov_best is None:
+        return []
+    is_open = np.sqrt(np.diag(cov_best)) > _LARGEST
+    axes = tuple(axis for axis, each in zip(AXES, is_open, strict=True) if each)
+    return [Finding("scene.best_uncertain", "warning", figures={"axes": axes})] if axes else []
 
 
 def _sides_without_edges(alignment: Alignment) -> list[Finding]:

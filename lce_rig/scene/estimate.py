@@ -1,7 +1,7 @@
 """Extrinsics from a scene's edges in all six axes, with a covariance, and with a prior such as a board's."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 
 import numpy as np
@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, difference, perturb
-from lce_rig.scene.alignment import IS_ROTATION, Alignment, SceneView
+from lce_rig.scene.alignment import BESIDE_RAD, IS_ROTATION, Alignment, SceneView
 
-BIAS = np.array([0.005, 0.005, 0.015, *np.radians([0.10, 0.05, 0.15])])
+BIAS = np.array([0.005, 0.005, 0.010, *np.radians([0.10, 0.05, 0.15])])
 """What one scene's maximum is off by beyond the scatter of its parts (standard deviations, order of AXES)."""
 
 _UNIT = np.where(IS_ROTATION, np.radians(1.0), 0.03)  # Either moves an edge 2 m away by about as much.
 _ANYWHERE = np.where(IS_ROTATION, np.radians(3.0), 0.15)  # of extrinsics of which nothing else is known
-_MAX_STEPS = 20
+_MAX_STEPS, _LEAST_GAIN = 20, 0.01
 _CELL_RAD, _CELL_LOG = 0.1, 0.15  # A part of the scene: an upright object, by azimuth and logarithm of range.
 _SHIFTS = (0.0, 0.25, 0.5, 0.75)  # of the grids of cells, in cells
 _MAX_LEVERAGE = 0.9  # A part that decides a direction alone counts with at most ten times its gradient.
@@ -25,6 +25,11 @@ _CHANCE = 2.0  # A direction needs a curvature of more than the root of so many 
 _N_WEAK, _OFFSETS = 2, (-1.4, -0.7, 0.7, 1.4)
 _LEAST_REACH = 0.3
 _SAME = 0.15  # Maxima so close are one.
+# A search from far off: starts tried at low resolution, those climbed from there, and those to the end.
+_FAR = np.where(IS_ROTATION, np.radians(3.0), 0.2)
+_BESIDE_RAD = 0.12
+_N_SWEPT, _N_KEPT, _N_FINE = 2048, 16, 6
+_SWEPT_CAPTURES, _SWEPT_EDGES = 5, 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +54,8 @@ def estimate(
     intrinsics: Intrinsics,
     T_start: Array,
     prior: tuple[Array, Array] | None = None,
+    *,
+    is_far: bool = False,
 ) -> SceneEstimate:
     """Estimate extrinsics from the edges of a scene.
 
@@ -63,13 +70,15 @@ def estimate(
         T_start: (4, 4) where the search starts.
         prior: (4, 4) extrinsics and the (6, 6) covariance of their tangent; None for a wide one about
             `T_start`, of 3 deg and 0.15 m.
+        is_far: whether the start may be off by 3 deg and 0.2 m: many starts about it are tried.
     """
     T_prior, cov_prior = (T_start, np.diag(_ANYWHERE**2)) if prior is None else prior
     if not any(len(view.edges) for view in views):
         return SceneEstimate(T_prior, cov_prior, np.zeros((6, 6)))
     held = np.linalg.inv(cov_prior / np.outer(_UNIT, _UNIT))
-    alignment = Alignment(views, intrinsics, T_start)
-    maxima = _search(alignment, T_start, T_prior, held)
+    alignment = Alignment(views, intrinsics, T_start, _BESIDE_RAD if is_far else BESIDE_RAD)
+    starts = _sweep(views, intrinsics, T_start) if is_far else []
+    maxima = _search(alignment, [T_start, *starts], T_prior, held)
     cells = [_cells(alignment.points, shift) for shift in _SHIFTS]
     T, information = _balance(alignment, cells, maxima[0], T_prior, held)
     cov = np.linalg.inv(information + held) + _rivalry(alignment, cells, maxima)
@@ -77,14 +86,32 @@ def estimate(
     return SceneEstimate(T, unit * cov, information / unit)
 
 
-def _search(alignment: Alignment, T_start: Array, T_prior: Array, held: Array) -> list[Array]:
+def _sweep(views: Sequence[SceneView], intrinsics: Intrinsics, T_start: Array) -> list[Array]:
+    """Score many extrinsics about a start at low resolution, on a few captures; the best of them."""
+    chosen = views[:: -(-len(views) // _SWEPT_CAPTURES)]
+    thinned = [
+        replace(view, edges=view.edges.select(np.arange(len(view.edges)) % stride == 0))
+        for view in chosen
+        for stride in (1 + len(view.edges) // _SWEPT_EDGES,)
+    ]
+    alignment = Alignment(thinned, intrinsics, T_start, _BESIDE_RAD).coarser().coarser()
+    # A sequence of low discrepancy: multiples of powers of the root of x^7 = x + 1 (Roberts 2018).
+    powers = 1.1127756842787055 ** -np.arange(1.0, 7.0)
+    tangents = (np.outer(np.arange(1, _N_SWEPT + 1), powers) % 1 * 2 - 1) * _FAR
+    T = perturb(T_start, tangents)
+    scores = np.concatenate([alignment.shares(batch).sum(axis=1) for batch in np.split(T, _N_SWEPT // 64)])
+    return list(T[np.argsort(-scores)[:_N_KEPT]])
+
+
+def _search(alignment: Alignment, starts: list[Array], T_prior: Array, held: Array) -> list[Array]:
     """Find maxima of the score and the prior, the highest first."""
-    found = [_climb(alignment, T_start, T_prior, held)]
     coarse = alignment.coarser()
-    T = T_start
-    for level in (coarse.coarser(), coarse, alignment):
-        T, value = _climb(level, T, T_prior, held)
-    found.append((T, value))
+    coarsest = coarse.coarser()
+    blunt = sorted((_climb(coarsest, T, T_prior, held) for T in starts), key=lambda each: -each[1])
+    found = [_climb(alignment, starts[0], T_prior, held)]
+    for T, _ in blunt[:_N_FINE]:
+        T, _ = _climb(coarse, T, T_prior, held)
+        found.append(_climb(alignment, T, T_prior, held))
     T = max(found, key=lambda each: each[1])[0]
     _, curvatures = alignment.expand(T)
     bend = _positive(-curvatures.sum(axis=0) * np.outer(_UNIT, _UNIT)) + held
@@ -131,7 +158,7 @@ def _climb(alignment: Alignment, T: Array, T_prior: Array, held: Array) -> tuple
                 T, best, damping = tried, best + gain, max(damping / 4, 1e-3)
                 break
             damping *= 4
-        if gain < 1e-3:
+        if gain < _LEAST_GAIN:
             break
     return T, best
 

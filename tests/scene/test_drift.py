@@ -68,6 +68,17 @@ def test_changes_of_two_axes_are_both_seen(seen) -> None:
     assert np.degrees(np.linalg.norm(left[3:])) < 0.5
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_best_extrinsics_are_found_from_3_deg_and_20_cm_off_or_reported_uncertain(seen, seed) -> None:
+    shift, turn = np.random.default_rng(seed).standard_normal((2, 3))
+    start = (*0.2 * shift / np.linalg.norm(shift), *np.radians(3.0) * turn / np.linalg.norm(turn))
+    drift = judge(seen, start, is_joint=True)
+    assert drift.state != "unchanged"
+    error = difference(drift.T_best, seen.truth.T_cam_lidar)
+    is_uncertain = "scene.best_uncertain" in [finding.code for finding in drift.findings]
+    assert is_uncertain or float(error @ np.linalg.solve(drift.cov_best, error)) < 16.8
+
+
 @pytest.mark.parametrize("size_deg", [4.0, 8.0, -15.0])
 def test_a_change_beyond_the_range_is_never_an_all_clear(seen, size_deg) -> None:
     assert judge(seen, along("rotation_y", np.radians(size_deg))).state != "unchanged"

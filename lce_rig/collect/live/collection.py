@@ -155,7 +155,7 @@ def collect_live(
             loop.take_kept()
             report = loop.close_books()
     if recorded is not None:
-        report.n_recorded = recorded.n_written
+        report.n_recorded, report.recording_error = recorded.n_written, recorded.failure
         report.notes += [sentence(each) for each in recorded.findings()]
     return report
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.collect.guidance import Coverage
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
 
@@ -80,6 +80,7 @@ class LiveReport:
         notes: what else was odd.
         predicted: the predicted standard deviations, for each camera and LiDAR of which they are known.
         n_recorded: samples of the raw streams on the disk; None where they were not recorded.
+        recording_error: why the recording ended before the collection; None where it did not.
     """
 
     ending: Ending = "stopped"
@@ -95,6 +96,7 @@ class LiveReport:
     notes: list[str] = field(default_factory=list)
     predicted: list[Finding] = field(default_factory=list)
     n_recorded: int | None = None
+    recording_error: LceRigError | None = None
 
 
 Phase = Literal["starting", "searching", "moving", "holding", "saving", "refused", "enough", "lost", "ended"]

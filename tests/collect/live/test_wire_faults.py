@@ -116,8 +116,9 @@ def test_losses_of_the_network_are_counted_and_shown_and_collection_goes_on(
     n_withheld = rig.stop()["withheld"]
     found = re.search(r"dropped: .*lidar (\d+)", collecting.said)
     assert n_withheld > 300 and found is not None
+    # Losses are counted by the azimuths between packets: a long gap may be one packet off.
     # A busy computer may lose some itself.
-    assert n_withheld <= int(found[1]) < 1.2 * n_withheld
+    assert 0.97 * n_withheld <= int(found[1]) < 1.2 * n_withheld
     assert journal_of(tmp_path / "session")[0]["lost"]["lidar"] == int(found[1])
     check_whole(tmp_path / "session")
 
@@ -173,6 +174,21 @@ def test_a_full_disk_is_one_clear_error_and_spares_the_captures(wire: Start, tmp
     with Collecting(rig.profile, session, "--hold", "0", "--frames", str(n_safe + 1)) as again:
         assert again.wait() == 0
     assert len(check_whole(session)) == n_safe + 1
+
+
+@pytest.mark.long
+def test_a_recording_cut_by_a_full_disk_is_told_by_the_exit_code_and_spares_the_captures(
+    wire: Start, tmp_path: Path
+) -> None:
+    rig, session, streams = wire(), tmp_path / "session", tmp_path / "streams"
+    with Collecting(rig.profile, session, "--hold", "0", "--record", str(streams)) as collecting:
+        collecting.wait_for_captures(1)
+        # Captures fit below this limit, the packets of the LiDAR soon do not.
+        resource.prlimit(collecting.pid, resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
+        collecting.wait_for_captures(3)
+        assert collecting.end() == 4
+    assert len(errors(collecting.said)) == 1 and str(streams) in errors(collecting.said)[0]
+    assert len(check_whole(session)) >= 3
 
 
 @pytest.mark.long

@@ -1,0 +1,88 @@
+"""`lce-rig export`: write a result for other programs, and into a robot's own URDF."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from lce_rig.cli import show
+from lce_rig.cli.options import session_argument, split_names
+
+if TYPE_CHECKING:
+    from lce_rig.export.robot_tree import JointChange
+
+
+@click.command()
+@session_argument
+@click.option("--name", metavar="NAME", help="Export this result of SESSION (see `lce-rig results`).")
+@click.option(
+    "--formats",
+    callback=split_names,
+    metavar="LIST",
+    help="Write only these formats, separated by commas: extrinsics, urdf, camera_info, static_tf, kalibr, "
+    "autoware [default: all].",
+)
+@click.option(
+    "--into",
+    type=click.Path(path_type=Path),
+    metavar="URDF",
+    help="Set the sensors' joints in this URDF of the robot, in place of writing files; its earlier text "
+    "stays beside it.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Write the files into this folder.",
+)
+@click.option("--force", is_flag=True, help="Export a failed result, too.")
+def export(
+    session: Path,
+    name: str | None,
+    formats: list[str] | None,
+    into: Path | None,
+    output: Path | None,
+    force: bool,
+) -> None:
+    """Write the result of SESSION (default: session/) for other programs.
+
+    `calibrate` has written all formats into SESSION/calibration/ already. With --into the sensor that is
+    nearest to the root of the robot's tree stays where it is. Each other one keeps its parent, and the origin
+    of its joint changes; one that the robot lacks is added. The rest of the file stays as it is.
+    """
+    from datetime import datetime
+
+    import lce_rig as lce
+    from lce_rig.core.errors import UsageError
+    from lce_rig.pipeline.result_files import RESULT, result_parts
+
+    if (into is None) == (output is None) or (into is not None and formats is not None):
+        raise UsageError(
+            "where to is not clear",
+            "Give --output FOLDER (and --formats) for files, or --into URDF for the robot's own.",
+        )
+    opened = lce.Session.open(session)
+    pairs = lce.read_result(opened.path.joinpath(*result_parts(name), RESULT)).pairs
+    if output is not None:
+        output.mkdir(parents=True, exist_ok=True)
+        files = lce.export(pairs, opened.rig, output, formats=formats, is_forced=force)
+        for file in files:
+            show.say(str(file))
+        return
+    from lce_rig.export import require_usable
+    from lce_rig.export.robot_urdf import write_into_urdf
+
+    assert into is not None
+    require_usable(pairs, is_forced=force)
+    update = write_into_urdf(into, pairs, opened.rig, datetime.now())
+    for change in update.changes:
+        show.say(f"{change.joint.parent} to {change.joint.child}: {_told(change)}")
+    show.say(f"{into}: nothing to change" if update.backup is None else f"earlier text: {update.backup}")
+
+
+def _told(change: "JointChange") -> str:
+    if change.moved is None:
+        return "added"
+    angle_deg, distance_m = change.moved
+    return f"moved by {angle_deg:.2f} deg, {1000 * distance_m:.1f} mm"

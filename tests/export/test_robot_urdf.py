@@ -1,0 +1,137 @@
+"""Calibrations in a robot's own tree of frames: its parents, comments and order stay."""
+
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from yourdfpy import URDF
+
+from lce_rig.core.errors import SessionError
+from lce_rig.core.geometry import Array, exp_so3, invert, pose
+from lce_rig.core.results import Calibration
+from lce_rig.export import export
+from lce_rig.export.frames import T_BODY_OPTICAL
+from lce_rig.export.robot_tree import fit_tree
+from lce_rig.export.robot_urdf import read_robot_urdf, write_into_urdf
+from lce_rig.export.urdf import read_urdf
+from lce_rig.rig import Rig
+from lce_rig.rig.mount import Mount
+
+Make = Callable[..., Calibration]
+NOW = datetime(2026, 5, 4, 10, 15)
+HEAD = '<?xml version="1.0"?>\n<!-- the robot <joint> of hall 3 -->\n<robot name="cart">\n'
+BASE = '  <link name="base_link"/>\n  <link name="velodyne"/> <!-- on the mast -->\n'
+MAST = """  <joint name="mast" type="fixed">
+    <child link="velodyne"/>
+    <!-- <origin xyz="9 9 9" rpy="0 0 0"/> before the crash -->
+    <origin rpy="0 0 0.1"
+            xyz="0.2 0 0.9"></origin>
+    <parent link="base_link"/>
+  </joint>
+"""
+CAMERA = """  <link name="davis_link"><inertial><origin xyz="1 2 3"/></inertial></link>
+  <joint name="bracket" type="{kind}"><parent link="base_link"/><child link="davis_link"/></joint>
+"""
+OPTICAL = """  <link name="davis_optical_frame"/>
+  <joint name="eye" type="fixed"><parent link="davis_link"/><child link="davis_optical_frame"/>
+    <origin xyz="0.01 0 0" rpy="-1.5707963267948966 0 -1.5707963267948966"/></joint>
+"""
+
+
+def found(path: Path, rig: Rig) -> Array:
+    """Read T_cam_lidar as another program does."""
+    robot = URDF.load(str(path), load_meshes=False)
+    return np.asarray(robot.get_transform("velodyne", "davis_optical_frame"))
+
+
+@pytest.mark.parametrize("has_camera", [False, True])
+@pytest.mark.parametrize("has_optical", [False, True])
+def test_a_camera_is_moved_below_its_own_parent_or_added_below_the_lidar(
+    rles: Rig, make: Make, tmp_path: Path, has_camera: bool, has_optical: bool
+) -> None:
+    path, calibration = tmp_path / "cart.urdf", make()
+    text = HEAD + BASE + MAST + (CAMERA.format(kind="fixed") if has_camera else "")
+    text += (OPTICAL if has_camera and has_optical else "") + "</robot>\n<!-- end -->\n"
+    path.write_text(text)
+    update = write_into_urdf(path, [calibration], rles, NOW)
+    np.testing.assert_allclose(found(path, rles), calibration.T_cam_lidar, atol=1e-9)
+    assert update.backup == tmp_path / "cart.urdf.2026-05-04T101500.bak"
+    assert update.backup.read_text() == text
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cart.urdf", update.backup.name]
+    tree = read_robot_urdf(path)
+    assert tree.above["davis_link"].parent == ("base_link" if has_camera else "velodyne")
+    if has_optical and has_camera:
+        np.testing.assert_allclose(tree.above["davis_optical_frame"].T_parent_child[0, 3], 0.01)
+    # All lines but those of the changed joint are as they were, in their order.
+    lines = iter(path.read_text().splitlines())
+    kept = [line for line in text.splitlines() if "bracket" not in line and line != "</robot>"]
+    assert all(line in lines for line in kept)
+    assert write_into_urdf(path, [calibration], rles, NOW).backup is None
+
+
+def test_a_lidar_is_moved_where_the_camera_is_nearer_to_the_root(
+    rles: Rig, make: Make, tmp_path: Path
+) -> None:
+    path, calibration = tmp_path / "cart.urdf", make()
+    mast = MAST.replace('"base_link"', '"davis_link"')
+    path.write_text(HEAD + BASE + CAMERA.format(kind="fixed") + mast + OPTICAL + "</robot>\n")
+    update = write_into_urdf(path, [calibration], rles, NOW)
+    assert [change.joint.child for change in update.changes] == ["velodyne"]
+    np.testing.assert_allclose(found(path, rles), calibration.T_cam_lidar, atol=1e-9)
+    assert "9 9 9" in path.read_text() and 'xyz="0.2 0 0.9"' not in path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        (HEAD + BASE + MAST + CAMERA.format(kind="revolute") + "</robot>", "moves"),
+        (HEAD + '<link name="base_link"/></robot>', "none of the sensors' frames"),
+        (HEAD + BASE + MAST + MAST.replace("mast", "other") + "</robot>", "two parents"),
+        (HEAD + BASE + MAST + OPTICAL.replace("davis_link", "base_link") + "</robot>", "is not below"),
+        (HEAD + "<xacro:include/>" + BASE + MAST + "</robot>", "xacro"),
+        (HEAD + BASE, "not a URDF"),
+        ("", "not a URDF"),
+    ],
+)
+def test_what_does_not_fit_is_refused_and_stays_as_it_was(
+    rles: Rig, make: Make, tmp_path: Path, text: str, what: str
+) -> None:
+    path = tmp_path / "cart.urdf"
+    path.write_text(text)
+    with pytest.raises(SessionError) as error:
+        write_into_urdf(path, [make()], rles, NOW)
+    assert what in error.value.what and str(path) in error.value.what
+    assert path.read_text() == text
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_several_sensors_fit_with_the_one_nearest_to_the_root_standing(
+    three_sensor_rig: Rig, make: Make, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(0)
+    poses = [pose(exp_so3(rng.normal(size=3)), rng.normal(size=3)) for _ in range(3)]
+    pairs = [("davis", "front"), ("davis", "back"), ("left", "back")]
+    calibrations = [make(T, camera=c, lidar=lidar) for T, (c, lidar) in zip(poses, pairs, strict=True)]
+    path = tmp_path / "cart.urdf"
+    path.write_text(HEAD + BASE + MAST + CAMERA.format(kind="fixed") + "</robot>")
+    tree, changes = fit_tree(read_robot_urdf(path), calibrations, three_sensor_rig)
+    assert [change.before is None for change in changes].count(False) == 1
+    for calibration, T in zip(calibrations, poses, strict=True):
+        optical = three_sensor_rig.cameras[calibration.camera].optical_frame
+        lidar = three_sensor_rig.lidars[calibration.lidar].frame
+        np.testing.assert_allclose(tree.find_pose(optical, lidar), T, atol=1e-12)
+
+
+def test_with_a_mount_all_outputs_hang_from_the_robots_frame(rles: Rig, make: Make, tmp_path: Path) -> None:
+    mount = Mount(parent="base_link", of="davis_link", xyz_m=(0.1, 0.2, 0.3), rpy_deg=(10.0, 20.0, 30.0))
+    rig = rles.model_copy(update={"mount": mount})
+    export([make()], rig, tmp_path)
+    poses = read_urdf(tmp_path / f"{rig.name}.urdf")
+    assert next(iter(poses)) == "base_link"
+    np.testing.assert_allclose(poses["davis_link"], mount.to_matrix())
+    np.testing.assert_allclose(
+        invert(poses["davis_link"] @ T_BODY_OPTICAL) @ poses["velodyne"], make().T_cam_lidar
+    )
+    assert "base_link davis_link" in (tmp_path / "static_transforms.txt").read_text()
