@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from lce_rig.pipeline.collect_recordings import collect_from
     from lce_rig.pipeline.comparison import Repeat, repeat
     from lce_rig.pipeline.detect_session import detect
+    from lce_rig.pipeline.drift import DriftReport, drift
     from lce_rig.pipeline.result_files import Result
     from lce_rig.pipeline.verification import Verification, verify
     from lce_rig.recordings.protocol import SourceOptions
@@ -52,6 +53,7 @@ __all__ = [
     "Calibration",
     "CollectOptions",
     "Detections",
+    "DriftReport",
     "Events",
     "Finding",
     "Image",
@@ -76,6 +78,7 @@ __all__ = [
     "collect_from",
     "describe",
     "detect",
+    "drift",
     "export",
     "load_rig",
     "read_reference",
@@ -107,6 +110,7 @@ _HOMES = {
     "lce_rig.pipeline.calibration": ("calibrate",),
     "lce_rig.pipeline.collect_recordings": ("collect_from",),
     "lce_rig.pipeline.detect_session": ("detect",),
+    "lce_rig.pipeline.drift": ("DriftReport", "drift"),
     "lce_rig.pipeline.comparison": ("Repeat", "repeat"),
     "lce_rig.pipeline.result_files": ("Result",),
     "lce_rig.pipeline.verification": ("Verification", "verify"),

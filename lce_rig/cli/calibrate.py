@@ -67,7 +67,7 @@ def _at_distances(c: Calibration) -> list[str]:
     ]
 
 
-SCENE_STATES = {"agrees": "agrees", "contradicts": "[red]contradicts[/]", "unknown": "cannot tell"}
+_OPINIONS = {"agrees": "agrees", "contradicts": "[red]contradicts[/]", "unknown": "cannot tell"}
 
 
 def scene_texts(opinion: SceneOpinion) -> list[str]:
@@ -77,7 +77,7 @@ def scene_texts(opinion: SceneOpinion) -> list[str]:
     seen = f"{show.counted(opinion.n_captures, 'capture')}, {opinion.n_edges} edges"
     if not opinion.axes:
         return [f"cannot tell: too few edges ({seen})"]
-    texts = [f"{SCENE_STATES[opinion.state]} ({seen})"]
+    texts = [f"{_OPINIONS[opinion.state]} ({seen})"]
     texts += [
         f"{motion_words(axis.axis)}: {_value(axis, axis.change, '+')} +- {_value(axis, axis.sigma)} "
         f"{_UNITS[axis.unit]}"
@@ -105,7 +105,9 @@ def _by_kind(axes: Sequence[AxisOpinion], *, with_size: bool = False) -> list[st
 _UNITS = {"deg": "deg", "m": "mm"}
 
 
-def _value(axis: AxisOpinion, value: float, sign: str = "") -> str:
+def _value(axis: AxisOpinion, value: float | None, sign: str = "") -> str:
+    if value is None:
+        return "?"
     return f"{value:{sign}.2f}" if axis.unit == "deg" else f"{1000 * value:{sign}.0f}"
 
 

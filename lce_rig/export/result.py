@@ -187,7 +187,7 @@ class AxisRecord(_SavedRecord):
     unit: Literal["deg", "m"]
     change: _Figure
     sigma: _NotNegative
-    smallest: _NotNegative
+    smallest: _NotNegative | None
 
 
 class SceneRecord(_SavedRecord):
