@@ -229,11 +229,12 @@ class LidarBoard:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One board placement seen by one camera channel and one LiDAR."""
+    """One board placement seen by one camera channel and one LiDAR; of several sessions, also its session."""
 
     capture: str
     image: ImageBoard
     lidar: LidarBoard
+    session: str = ""
 
 
 @dataclass(frozen=True)

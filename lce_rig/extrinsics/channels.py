@@ -106,19 +106,15 @@ class _Mover:
         kept = [k for k, scan in enumerate(self.scans) if only is None or only in scan.images]
         scans = [self.scans[k] for k in kept]
         if self.offsets is None:
-            return [_still_observation(scan, only) for scan in scans]
+            return [scan.observation(only) for scan in scans]
         motions = fit_motions(self.samples.select(kept), self.offsets.offset_s, only)
-        still = [_still_observation(scan, only) for scan in scans]
+        still = [scan.observation(only) for scan in scans]
         return deskew_points(at_scan_time(still, motions, self.sweep_s), motions, self.T_cam_lidar)
 
     @property
     def is_motion_own(self) -> bool:
         """Whether a channel alone shows motion, so that channels can be compared."""
         return bool(np.mean(self.samples.is_followed.any(axis=1)) > 0.5)
-
-
-def _still_observation(scan: SharedScan, only: str | None) -> Observation:
-    return scan.observation() if only is None else Observation(scan.capture, scan.images[only], scan.lidar)
 
 
 def _agree(candidates: Mapping[str, Sequence[CaptureCandidates]], board: Board) -> dict[str, Consensus]:

@@ -25,11 +25,13 @@ class CaptureCandidates:
         capture: its name.
         image: the board in the image, with its second pose if there is one.
         lidar: places in the scan where the board may be, best first.
+        session: where captures are of several.
     """
 
     capture: str
     image: ImageBoard
     lidar: Sequence[LidarBoard]
+    session: str = ""
 
 
 @dataclass(frozen=True)

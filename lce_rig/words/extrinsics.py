@@ -388,6 +388,12 @@ PHRASES: dict[str, Phrase] = {
         "do not use any of them until the cause is known",
         {"odd_one": "find the fault in {odd_one}, without it the others agree"},
     ),
+    "union.moved": Phrase(
+        "the extrinsics of {camera} and {lidar} from {first} and {second} differ by {rotation_deg:3deg} and "
+        "{translation_m:1mm}, more than their uncertainties allow (chance {p:.2g})",
+        "the sensors were moved in between, or one of the sessions is wrong: calibrate them separately",
+        {"odd_one": "leave out {odd_one}: the sensors were moved, or the session is wrong; the others agree"},
+    ),
     "repeat.failed": Phrase(
         "the calibration of {subject} ({camera} and {lidar}) failed",
         "run `lce-rig calibrate` for its reasons",
