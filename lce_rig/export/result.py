@@ -18,6 +18,7 @@ from lce_rig.core.limits import describe
 from lce_rig.core.results import (
     Calibration,
     ChannelResult,
+    Contribution,
     OtherCamera,
     PointUncertainty,
     Refusal,
@@ -163,6 +164,14 @@ class OtherCameraRecord(_SavedRecord):
     board_rms_m: _NotNegative
 
 
+class ContributionRecord(_SavedRecord):
+    """One cause of the standard deviations; the squares of all add up."""
+
+    source: str
+    sigma_rotation_deg: _NotNegative | None
+    sigma_translation_m: _NotNegative | None
+
+
 class SceneShareRecord(_SavedRecord):
     """The boards' own extrinsics, and what the scene did to them."""
 
@@ -235,6 +244,8 @@ class PairRecord(_SavedRecord):
     uncertainty: list[UncertaintyRecord] = Field(default_factory=list)
     estimated_with: list[str] = Field(default_factory=list)
     other_cameras: list[OtherCameraRecord] = Field(default_factory=list)
+    cov_shared: _Cov = Field(default_factory=lambda: np.zeros((6, 6)).tolist())
+    contributions: list[ContributionRecord] = Field(default_factory=list)
     scene_share: SceneShareRecord | None = None
     scene: SceneRecord | None = None
 
@@ -467,6 +478,11 @@ def _calibration(pair: PairRecord) -> Calibration:
         uncertainty=tuple(PointUncertainty(**each.model_dump()) for each in pair.uncertainty),
         estimated_with=tuple(pair.estimated_with),
         other_cameras=tuple(_other(record) for record in pair.other_cameras),
+        cov_shared=np.array(pair.cov_shared, dtype=np.float64),
+        contributions=tuple(
+            Contribution(each.source, figure(each.sigma_rotation_deg), figure(each.sigma_translation_m))
+            for each in pair.contributions
+        ),
         scene_share=None if pair.scene_share is None else _share(pair.scene_share),
         scene=None if pair.scene is None else pair.scene.opinion,
     )

@@ -135,7 +135,9 @@ def _agree(candidates: Mapping[str, Sequence[CaptureCandidates]], board: Board) 
 def _alone(consensus: Consensus, board: Board, options: EstimateSettings) -> CalibrationEstimate:
     """Calibrate one channel by Algorithm 1 as if boards stood still, without draws."""
     return calibrate_observations(
-        consensus.observations, board, replace(options, method="paper", estimator=None, n_draws=0)
+        consensus.observations,
+        board,
+        replace(options, method="paper", estimator=None, n_draws=0, tolerances=None),
     )
 
 
@@ -144,7 +146,8 @@ def _alone_moved(
 ) -> CalibrationEstimate:
     only = channel if len(mover.samples.channels) > 1 else None
     return _widened(
-        calibrate_observations(mover.observations(only), board, replace(options, n_draws=0)), offsets
+        calibrate_observations(mover.observations(only), board, replace(options, n_draws=0, tolerances=None)),
+        offsets,
     )
 
 
@@ -236,7 +239,7 @@ def _difference(
     first, second = results
     if mover.offsets is None or mover.is_motion_own:
         return difference(first.T_cam_lidar, second.T_cam_lidar), first.cov + second.cov
-    fast = replace(options, n_draws=0)
+    fast = replace(options, n_draws=0, tolerances=None)
     seen = [mover.observations(result.channel) for result in results]
     rng = np.random.default_rng(options.seed)
     ways: list[tuple[float, Array, Array]] = []

@@ -7,6 +7,7 @@ from typing import Literal
 from lce_rig.core.board import Board
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.extrinsics.estimate import CalibrationEstimate
+from lce_rig.extrinsics.tolerances import Tolerances
 from lce_rig.residuals.features import AS_FITTED, FeatureSettings
 from lce_rig.rig import LidarSettings
 
@@ -84,23 +85,28 @@ class EstimateSettings(CalibrateOptions):
     Attributes:
         laser_bias_sigma_m: standard deviation a priori of the lasers' range offsets about their mean.
         range_offset_sigma_m: standard deviation a priori of that mean, the offset common to all ranges.
+        tolerances: of the profile's lens and board; None does not compute their effect.
         parts: of Algorithm 1.
         estimator: replaces the method.
     """
 
     laser_bias_sigma_m: float = 0.0
     range_offset_sigma_m: float = 0.0
+    tolerances: Tolerances | None = None
     parts: Algorithm1Parts = Algorithm1Parts()
     estimator: "Estimator | None" = None
 
     @classmethod
-    def of(cls, options: CalibrateOptions, lidar: LidarSettings) -> "EstimateSettings":
-        """Add the profile's settings of a LiDAR to a user's options."""
+    def of(
+        cls, options: CalibrateOptions, lidar: LidarSettings, tolerances: Tolerances | None = None
+    ) -> "EstimateSettings":
+        """Add what the profile says of a LiDAR, and of lens and board, to a user's options."""
         settings = options if isinstance(options, cls) else cls(**vars(options))
         return replace(
             settings,
             laser_bias_sigma_m=lidar.laser_bias_sigma_m,
             range_offset_sigma_m=lidar.range_offset_sigma_m,
+            tolerances=tolerances,
         )
 
 
