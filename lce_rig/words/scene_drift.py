@@ -88,6 +88,8 @@ def _axis_changed(finding: Finding) -> str:
 
 def _large_scatter(finding: Finding) -> str:
     """Parts of the scene disagree; {smallest_m} or {smallest_deg} would be seen."""
+    if "inf" in _figure(finding, "smallest"):
+        return f"{motion_words(finding.subject)}: parts of the scene do not agree on any change"
     return f"{motion_words(finding.subject)}: changes below {_figure(finding, 'smallest')} would not be seen"
 
 
