@@ -11,6 +11,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.extrinsics.estimate import CalibrationEstimate
+from lce_rig.extrinsics.tolerances import Tolerances
 from lce_rig.residuals.features import AS_FITTED, FeatureSettings
 from lce_rig.rig import LidarIntrinsicsSettings, LidarSettings
 
@@ -29,11 +30,13 @@ class CaptureCandidates:
         capture: its name.
         image: the board in the image, with its second pose if there is one.
         lidar: places in the scan where the board may be, best first.
+        session: where captures are of several.
     """
 
     capture: str
     image: ImageBoard
     lidar: Sequence[LidarBoard]
+    session: str = ""
 
 
 @dataclass(frozen=True)
@@ -125,6 +128,7 @@ class EstimateSettings(CalibrateOptions):
         laser_bias_sigma_m: standard deviation a priori of the lasers' range offsets about their mean.
         range_offset_sigma_m: standard deviation a priori of that mean, the offset common to all ranges.
         known: constant errors of the LiDAR that were measured before; None if there are none.
+        tolerances: of the profile's lens and board; None does not compute their effect.
         parts: of Algorithm 1.
         estimator: replaces the method.
     """
@@ -132,18 +136,22 @@ class EstimateSettings(CalibrateOptions):
     laser_bias_sigma_m: float = 0.0
     range_offset_sigma_m: float = 0.0
     known: KnownLidar | None = None
+    tolerances: Tolerances | None = None
     parts: Algorithm1Parts = Algorithm1Parts()
     estimator: "Estimator | None" = None
 
     @classmethod
-    def of(cls, options: CalibrateOptions, lidar: LidarSettings) -> "EstimateSettings":
-        """Add the profile's settings of a LiDAR to a user's options."""
+    def of(
+        cls, options: CalibrateOptions, lidar: LidarSettings, tolerances: Tolerances | None = None
+    ) -> "EstimateSettings":
+        """Add what the profile says of a LiDAR, and of lens and board, to a user's options."""
         settings = options if isinstance(options, cls) else cls(**vars(options))
         return replace(
             settings,
             laser_bias_sigma_m=lidar.laser_bias_sigma_m,
             range_offset_sigma_m=lidar.range_offset_sigma_m,
             known=KnownLidar.of(lidar.intrinsics),
+            tolerances=tolerances,
         )
 
 

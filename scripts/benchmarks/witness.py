@@ -41,7 +41,7 @@ _STILL = ("rlfs01", "rlfs02", "rlfs03", "sss_noise15mm", "acfr_vlp16", "os1_64")
 _OF_ONE_RIG = {"rlfs01": "rlfs02", "rlfs02": "rlfs01"}
 # Faults that leave the pictures of the scene as they are, or change them by a known map.
 _NOT_HERE = ("boards nearly parallel", "cameras swapped")
-_N_SUBSETS, _N_DRAWS, _WRONG = 20, 20, 3.0
+_N_SUBSETS, _N_MOVED, _N_DRAWS, _WRONG = 20, 10, 20, 3.0
 _FEW = 6
 
 
@@ -200,7 +200,7 @@ def _print_moved(recorded: Sequence[_Place], rooms: Sequence[_Place]) -> None:
         "sets", "changed by", "results", "boards refuse", "scene contradicts", "scene refuses",
         "only the scene refuses", "neither refuses, scene contradicts", "scene agrees",
     )  # fmt: skip
-    for places, what, n_draws in ((recorded, "recorded", _N_SUBSETS), (rooms, "rooms", 2)):
+    for places, what, n_draws in ((recorded, "recorded", _N_MOVED), (rooms, "rooms", 2)):
         for title, (degrees, metres) in _MOVED.items() if places else ():
             rng = np.random.default_rng(0)
             found = []

@@ -110,6 +110,8 @@ class JointEstimate:
         trust: (F,) weight of each capture, by name.
         levels: of the noise.
         cost: of the F captures at the optimum, in the unknowns z of `system`.
+        state: all unknowns at the optimum.
+        priors: of the constants.
     """
 
     T_cam_lidar: Array
@@ -125,6 +127,8 @@ class JointEstimate:
     trust: Array
     levels: Levels
     cost: Quadratics
+    state: State
+    priors: Priors
 
 
 def refine(
@@ -284,7 +288,29 @@ def _summarise(
         trust=terms.trust,
         levels=levels,
         cost=cost,
+        state=state,
+        priors=priors,
     )
+
+
+def move_under(joint: JointEstimate, observations: Sequence[Observation], board: Board) -> Array:
+    """Compute how far other observations of the same captures move one camera's extrinsics, to first order.
+
+    Args:
+        joint: of one camera.
+        observations: of the F captures, as they would be with some error.
+        board: that is assumed.
+
+    Returns:
+        (6,) tangent (translation m, rotation rad).
+    """
+    seen = sorted(observations, key=lambda o: o.capture)
+    scans = stack_scans([interior(o.lidar, board) for o in seen])
+    images = (_stack_images(seen, {o.capture: k for k, o in enumerate(seen)}),)
+    terms = linearise(scans, images, board, joint.state, joint.trust)
+    moved = assemble(terms, joint.levels, joint.priors).cost
+    change = (moved.gradients - joint.cost.gradients).sum(axis=0)
+    return np.asarray(-joint.to_extrinsics[0] @ np.linalg.solve(joint.cost.information, change))
 
 
 # Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.
