@@ -23,6 +23,7 @@ from lce_rig.extrinsics.likelihood.system import (
     assemble,
     linearise,
     of_the_lidar,
+    scale_places,
 )
 from lce_rig.residuals.along_rays import (
     N_FIELDS,
@@ -100,6 +101,8 @@ class JointEstimate:
         T_cam_lidar: (C, 4, 4).
         T_lidar_board: (F, 4, 4).
         cov: (C, 6, 6) of each result, everything else marginalised, tangent (translation m, rotation rad).
+        cov_scatter, cov_constants: (G, G) of the unknowns z of `system`: the part that differs between
+            sessions, and that of constant errors.
         to_extrinsics: (C, 6, G) derivative of each result's tangent by the unknowns z of `system`.
         rings: (L,) ring numbers.
         lasers: (3, L) errors of each ring, `along_rays.ERRORS_OF_LASER`; positive for ranges too long.
@@ -117,6 +120,8 @@ class JointEstimate:
     T_cam_lidar: Array
     T_lidar_board: Array
     cov: Array
+    cov_scatter: Array
+    cov_constants: Array
     to_extrinsics: Array
     rings: NDArray[np.int16]
     lasers: Array
@@ -271,19 +276,22 @@ def _summarise(
 ) -> JointEstimate:
     cost = assemble(terms, levels, priors).cost
     C, constants = len(state.T_cam_lidar), state.constants
-    cov = cost.covariance()
+    scatter, of_constants = _covariance_parts(cost, priors, C)
+    cov = scatter + of_constants
     J = _to_extrinsics(state).reshape(C, 6, -1)
     lasers, lens, shifts = of_the_lidar(constants[PER_CAMERA * C :])
     return JointEstimate(
         T_cam_lidar=perturb(state.T_cam_lidar, J @ constants),
         T_lidar_board=state.T_lidar_board,
         cov=J @ cov @ np.swapaxes(J, 1, 2),
+        cov_scatter=scatter,
+        cov_constants=of_constants,
         to_extrinsics=J,
         rings=rings,
         lasers=lasers,
         lens_m=lens,
         shifts=shifts,
-        scale=constants[PER_CAMERA * np.arange(C) + 6],
+        scale=constants[scale_places(C)],
         constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
         trust=terms.trust,
         levels=levels,
@@ -291,6 +299,18 @@ def _summarise(
         state=state,
         priors=priors,
     )
+
+
+def _covariance_parts(cost: Quadratics, priors: Priors, n_cameras: int) -> tuple[Array, Array]:
+    """Split the covariance (G, G) by its causes: noise of the captures, and constant errors.
+
+    With information H = sum_k H_k + P, H^-1 = H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1.
+    """
+    inverse, claimed = cost.covariance(), cost.prior
+    if not priors.scale_is_claimed:
+        claimed, scale = claimed.copy(), scale_places(n_cameras)
+        claimed[scale, scale] = 0.0
+    return inverse @ cost.hessians.sum(axis=0) @ inverse, inverse @ claimed @ inverse
 
 
 def move_under(joint: JointEstimate, observations: Sequence[Observation], board: Board) -> Array:

@@ -159,6 +159,11 @@ PER_CAMERA = 7
 _MEAN_FLOOR = 1e-6
 
 
+def scale_places(n_cameras: int) -> NDArray[np.intp]:
+    """Return the place (C,) of each camera's scale in z."""
+    return PER_CAMERA * np.arange(n_cameras) + 6
+
+
 @dataclass(frozen=True, eq=False)
 class State:
     """Values of all unknowns.
@@ -365,7 +370,7 @@ def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, 
     """
     L, C = terms.n_rings, len(terms.images)
     prior, mean = np.zeros((len(terms.constants), len(terms.constants))), np.zeros(len(terms.constants))
-    scale = PER_CAMERA * np.arange(C) + 6
+    scale = scale_places(C)
     prior[scale, scale] = 1 / priors.scale**2
     ring = PER_CAMERA * C + np.arange(L)
     log_volume = 0.0
