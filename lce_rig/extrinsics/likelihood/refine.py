@@ -44,7 +44,6 @@ from lce_rig.solvers.covariance import symmetric_inverse
 # not mistaken for small noise. The terms stay linearised: an evaluation involves small matrices only, no
 # points.
 
-_STEP = 1e-3
 # Levels lie within these factors of the typical value, e^-4.6 and e^3.
 _BELOW, _ABOVE = -4.6, 3.0
 
@@ -69,14 +68,17 @@ def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, n_rou
     def levels_at(logs: Array) -> Levels:
         return replace(usual, **dict(zip(names, np.exp(logs).tolist(), strict=True)))
 
-    def cost(logs: Array) -> float:
-        unlikely = float(np.sum(((logs - middle) / sigma) ** 2))
-        return assembly.at(levels_at(logs)).minus_2_log_evidence + unlikely
+    def cost(logs: Array) -> tuple[float, Array]:
+        evidence, slopes = assembly.evidence(levels_at(logs), names)
+        off = (logs - middle) / sigma
+        return evidence + float(off @ off), slopes + 2 * off / sigma
 
     highest = np.where(np.array(names) == "lost_share", np.log(MOST_LOST), middle + _ABOVE)
     bounds = list(zip(middle + _BELOW, highest, strict=True))
-    options = {"maxiter": n_rounds, "eps": _STEP, "ftol": 1e-6}
-    return levels_at(minimize(cost, _logs(start, names), method="L-BFGS-B", bounds=bounds, options=options).x)
+    options = {"maxiter": n_rounds, "ftol": 1e-6}
+    first = _logs(start, names)
+    found = minimize(cost, first, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return levels_at(found.x)
 
 
 def _logs(levels: Levels, names: list[str]) -> Array:
