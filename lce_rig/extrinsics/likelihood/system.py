@@ -284,7 +284,7 @@ class Reduced:
         found = v[:, :, None] * v[:, None, :]
         found[:, :-1, :-1] += by_z @ np.linalg.inv(self.cost.information) @ np.swapaxes(by_z, 1, 2)
         found[:, :6, :6] += np.linalg.inv(self.of_boards)
-        return found
+        return np.asarray(found)
 
 
 def assemble(terms: Terms, levels: Levels, priors: Priors) -> Reduced:
