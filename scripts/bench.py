@@ -15,6 +15,7 @@
     scripts/bench.py usable      are captures that are taken usable? live sessions, --record, recordings
     scripts/bench.py uncertainty  the joint estimate: errors against their bound, truth of its claim
     scripts/bench.py scene       extrinsics checked without a board, on recordings by others
+    scripts/bench.py scene_sharpen  boards and scene in one estimate: simulated rooms, recordings
     scripts/bench.py witness     the scene beside the boards: good results refused, wrong ones found
     scripts/bench.py growth      calibrate after detection as sessions grow: time and memory
     scripts/bench.py speed       detection, Algorithm 1, the command line
@@ -43,6 +44,7 @@ PARTS = {
     "offline": 0,
     "usable": 20,
     "scene": 0,
+    "scene_sharpen": 100,
     "witness": 20,
     "growth": 0,
     "speed": 0,
@@ -104,6 +106,9 @@ def main() -> None:
         bench(arguments.seeds or PARTS["faults"], n_sessions=arguments.scans)
     elif arguments.part == "scene":
         bench(min(arguments.splits, 2), arguments.only)
+    elif arguments.part == "scene_sharpen":
+        seeds = arguments.seeds or PARTS["scene_sharpen"]
+        bench(seeds, min(arguments.splits, 10), arguments.only)
     elif arguments.part == "witness":
         bench(arguments.seeds or PARTS["witness"], arguments.only)
     elif arguments.part == "growth":

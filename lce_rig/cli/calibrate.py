@@ -38,9 +38,17 @@ def uncertainty_lines(calibration: Calibration) -> list[str]:
         f"  uncertainty  {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
         f"               about {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
         f"               along {_by_axis(1000 * sigmas[:3], '.1f')} mm",
+        *_boards_alone(c),
         *([f"  weakest: {weakest_words(c.weakest)}"] if c.weakest else []),
         *_at_distances(c),
     ]
+
+
+def _boards_alone(c: Calibration) -> list[str]:
+    if c.scene_share is None or c.scene_share.state != "used":
+        return []
+    sigma_deg, sigma_m = sigma_sizes(c.scene_share.cov_boards)
+    return [f"               of the boards alone {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm"]
 
 
 def _by_axis(values: Array, digits: str) -> str:
@@ -201,6 +209,9 @@ if TYPE_CHECKING:
     help="Estimate with Algorithm 1 of LCE-Calib (paper), or refine its result by maximum likelihood (ml).",
 )
 @click.option(
+    "--use-scene", is_flag=True, help="Estimate from the edges of the scene too, not from the board alone."
+)
+@click.option(
     "--name",
     metavar="NAME",
     help="Write the result to SESSION/results/NAME/ and leave SESSION/calibration/ unchanged.",
@@ -224,6 +235,7 @@ def calibrate(
     cameras: tuple[str, ...],
     channels: list[str] | None,
     event_image: Any,
+    use_scene: bool,
     name: str | None,
     as_json: bool,
     force: bool,
@@ -272,6 +284,7 @@ def calibrate(
                 cameras=cameras or None,
                 channels=channels,
                 reference=truth,
+                use_scene=use_scene,
                 progress=progress,
             )
         for shortage in result.shortages:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from lce_rig.export.result import SavedResult
     from lce_rig.pipeline.drift import DriftReport, PairDrift
     from lce_rig.rig import Rig
+    from lce_rig.scene.drift import AxisDrift
 
 
 @click.command()
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Write images into this folder."
 )
-@click.option("--ignore-board", is_flag=True, help="Leave out edges at the board and at what moves.")
 @json_option
 def drift(
     recordings: tuple[Path, ...],
@@ -46,7 +46,6 @@ def drift(
     rig_name: str | None,
     seconds: float | None,
     output: Path | None,
-    ignore_board: bool,
     as_json: bool,
 ) -> None:
     """Check on RECORDING (default: session/), without a board, whether extrinsics still hold.
@@ -54,7 +53,8 @@ def drift(
     RECORDING is a session or, with --rig, a folder of images and point clouds, a ROS 1 or ROS 2 bag, an mcap,
     or several recordings of the same time, such as a pcap and a camera's file. With --rig and no RECORDING,
     the attached sensors are watched; Ctrl-C ends this and judges what was seen. Depth edges of the scans are
-    compared with edges of the images. Exits with 0 if no axis has changed, with 7 if one has, and with 6 if
+    compared with edges of the images; where the board is in view, it is asked as well, and both opinions are
+    shown. Exits with 0 if no axis has changed, with 7 if one has, and with 6 if
     the scene cannot tell; of several cameras the worst counts.
     """
     from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
@@ -72,11 +72,11 @@ def drift(
     rig = None if rig_name is None else load_rig(rig_name)
     if is_live:
         assert rig is not None and saved is not None
-        report = _watch_live(rig, saved, seconds, ignore_board)
+        report = _watch_live(rig, saved, seconds)
     else:
         given = recordings or (Path("session"),)
         with show.progress_bar("reading") as progress:
-            report = watch_drift(given, saved, rig=rig, ignore_board=ignore_board, progress=progress)
+            report = watch_drift(given, saved, rig=rig, progress=progress)
     for text in report.notes:
         show.note(text)
     files = [] if output is None else report.write(output)
@@ -90,14 +90,14 @@ def drift(
         for file in files:
             show.say(f"image: {file}")
     for state, error in (("changed", ResultRefusedError), ("unknown", NotEnoughDataError)):
-        concerned = [pair for pair in report.pairs if pair.drift.state == state]
+        concerned = [pair for pair in report.pairs if pair.state == state]
         if concerned:
-            first = concerned[0].drift.findings[0]
+            first = concerned[0].summary
             names = " and ".join(f"{pair.calibration.camera}, {pair.calibration.lidar}" for pair in concerned)
             raise error(f"{names}: {describe(first)}", as_line(recommend(first)))
 
 
-def _watch_live(rig: "Rig", saved: "SavedResult", seconds: float | None, ignore_board: bool) -> "DriftReport":
+def _watch_live(rig: "Rig", saved: "SavedResult", seconds: float | None) -> "DriftReport":
     """Watch attached sensors until the time is over, or a signal or q asks to stop."""
     from lce_rig.devices.opening import open_live
     from lce_rig.pipeline.drift import drift_live
@@ -115,7 +115,7 @@ def _watch_live(rig: "Rig", saved: "SavedResult", seconds: float | None, ignore_
             progress(int(elapsed_s), int(seconds or elapsed_s))
             return asked() == "stop" or (seconds is not None and elapsed_s >= seconds)
 
-        return drift_live(rig, saved, open_live(rig), ignore_board=ignore_board, is_over=is_over)
+        return drift_live(rig, saved, open_live(rig), is_over=is_over)
 
 
 _STATES = {"unchanged": "no change seen", "changed": "[red]changed[/]", "unknown": "[yellow]cannot tell[/]"}
@@ -124,24 +124,43 @@ _STATES = {"unchanged": "no change seen", "changed": "[red]changed[/]", "unknown
 def _table(pair: "PairDrift") -> Any:
     from lce_rig.words.extrinsics import motion_words
 
+    opinions = [("scene", pair.drift.axes if pair.drift.curves else None)]
+    if pair.board is not None:
+        opinions.append(("board", pair.board.axes))
     table = show.plain_table(f"{pair.calibration.camera}, {pair.calibration.lidar}", "axis of the camera", "")
-    for title in ("best fit at", "+-", "would have seen"):
-        table.add_column(title, justify="right")
-    for axis in pair.drift.axes:
-        scale, unit, digits = (1.0, "deg", 2) if axis.is_rotation else (1000.0, "mm", 0)
+    for name, _ in opinions:
+        for title in (f"{name}: best fit at", "+-", "would have seen"):
+            table.add_column(title, justify="right")
+    for index, axis in enumerate(pair.drift.axes):
         figures = [
-            f"{scale * value:{sign}.{digits}f} {unit}"
-            for value, sign in ((axis.change, "+"), (axis.sigma, ""), (axis.smallest, ""))
+            figure
+            for _, axes in opinions
+            for figure in (("-", "-", "-") if axes is None else _figures(axes[index]))
         ]
-        if not pair.drift.curves:
-            figures = ["-", "-", "-"]
-        table.add_row(motion_words(axis.axis), _STATES[axis.state], *figures)
+        table.add_row(motion_words(axis.axis), _STATES[pair.states[axis.axis]], *figures)
     return table
+
+
+def _figures(axis: "AxisDrift") -> tuple[str, ...]:
+    scale, unit, digits = (1.0, "deg", 2) if axis.is_rotation else (1000.0, "mm", 0)
+    return tuple(
+        f"{scale * value:{sign}.{digits}f} {unit}"
+        for value, sign in ((axis.change, "+"), (axis.sigma, ""), (axis.smallest, ""))
+    )
 
 
 def _summary(pair: "PairDrift") -> list[str]:
     from lce_rig.words import as_line, describe
 
     seen = f"{show.counted(pair.drift.n_captures, 'capture')}, {pair.drift.n_edges} edges"
-    told = [f for f in pair.drift.findings if f.code != "scene.axis_unchanged"]
+    if pair.board is not None:
+        seen += (
+            f"; {show.counted(pair.board.n_boards, 'board')} at {pair.board.n_placements} places, residuals: "
+            f"planes {1000 * pair.board.metrics.mpe_m:.1f} mm, edges {1000 * pair.board.metrics.mee_m:.1f} mm"
+        )
+    # With a board, the verdict on both stands for the scene's own.
+    untold = {"scene.axis_unchanged", "scene.board_unsure"}
+    if pair.board is not None:
+        untold |= {"scene.unchanged", "scene.changed", "scene.unknown"}
+    told = [finding for finding in pair.findings if finding.code not in untold]
     return [seen, *(show.escape(as_line(describe(finding))) for finding in told)]

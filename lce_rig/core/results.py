@@ -399,6 +399,35 @@ class WeakestMotion:
 
 
 @dataclass(frozen=True, eq=False)
+class SceneShare:
+    """What the edges of the scene did to extrinsics that boards gave.
+
+    Attributes:
+        state: "used", or why the extrinsics are those of the boards alone: the scene "contradicts" them
+            beyond what both claim, or is "unknown", showing nothing that the boards do not show better.
+        n_captures, n_edges: of the scene.
+        T_cam_lidar, cov: (4, 4), (6, 6) by boards and scene, used or not.
+        T_cam_lidar_boards, cov_boards: by the boards alone.
+        change: (6,) tangent from the boards' extrinsics to those of both, m and rad, axes of the camera.
+        change_sigma: (6,) standard deviation that it should have.
+        surprise: its square in units of that, over `n_directions`: chi-squared if both are right.
+        n_directions: in which the scene knows anything, of six.
+    """
+
+    state: Literal["used", "contradicts", "unknown"]
+    n_captures: int
+    n_edges: int
+    T_cam_lidar: Array
+    cov: Array
+    T_cam_lidar_boards: Array
+    cov_boards: Array
+    change: Array
+    change_sigma: Array
+    surprise: float
+    n_directions: int
+
+
+@dataclass(frozen=True, eq=False)
 class Calibration:
     """The extrinsics of one camera and one LiDAR, with everything needed to judge it.
 
@@ -419,6 +448,7 @@ class Calibration:
         uncertainty: what `cov` means for points at several distances; empty if no lens was at hand.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         other_cameras: those that saw the same boards held still.
+        scene_share: what the scene did to them; None if it was not asked.
         scene: what the edges of the scene say of it; None if they were not compared.
         weakest: the least determined motion; None if it is read back.
         held_out_m: rms residual of captures where they were not fitted; NaN if no method knows it.
@@ -447,6 +477,7 @@ class Calibration:
     uncertainty: tuple[PointUncertainty, ...] = ()
     estimated_with: tuple[str, ...] = ()
     other_cameras: tuple[OtherCamera, ...] = ()
+    scene_share: SceneShare | None = None
     scene: SceneOpinion | None = None
     weakest: WeakestMotion | None = None
     held_out_m: float = float("nan")

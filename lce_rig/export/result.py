@@ -15,7 +15,14 @@ from lce_rig.core.errors import ResultRefusedError, SessionError, reading
 from lce_rig.core.findings import Figure, Finding, Severity
 from lce_rig.core.geometry import FARTHEST_M
 from lce_rig.core.limits import describe
-from lce_rig.core.results import Calibration, ChannelResult, OtherCamera, PointUncertainty, Refusal
+from lce_rig.core.results import (
+    Calibration,
+    ChannelResult,
+    OtherCamera,
+    PointUncertainty,
+    Refusal,
+    SceneShare,
+)
 from lce_rig.core.scene_opinion import AxisOpinion, SceneOpinion
 from lce_rig.export.files import MADE_BY
 from lce_rig.session.durable import write_atomically
@@ -156,6 +163,22 @@ class OtherCameraRecord(_SavedRecord):
     board_rms_m: _NotNegative
 
 
+class SceneShareRecord(_SavedRecord):
+    """The boards' own extrinsics, and what the scene did to them."""
+
+    state: Literal["used", "contradicts", "unknown"]
+    n_captures: _Count
+    n_edges: _Count
+    T_cam_lidar: _Pose
+    cov: _Cov
+    T_cam_lidar_boards: _Pose
+    cov_boards: _Cov
+    change: _Row6
+    change_sigma: _Row6
+    surprise: _NotNegative
+    n_directions: _Count
+
+
 class AxisRecord(_SavedRecord):
     """The scene's opinion on one axis; figures in its unit."""
 
@@ -212,6 +235,7 @@ class PairRecord(_SavedRecord):
     uncertainty: list[UncertaintyRecord] = Field(default_factory=list)
     estimated_with: list[str] = Field(default_factory=list)
     other_cameras: list[OtherCameraRecord] = Field(default_factory=list)
+    scene_share: SceneShareRecord | None = None
     scene: SceneRecord | None = None
 
     @model_validator(mode="after")
@@ -435,6 +459,7 @@ def _calibration(pair: PairRecord) -> Calibration:
         uncertainty=tuple(PointUncertainty(**each.model_dump()) for each in pair.uncertainty),
         estimated_with=tuple(pair.estimated_with),
         other_cameras=tuple(_other(record) for record in pair.other_cameras),
+        scene_share=None if pair.scene_share is None else _share(pair.scene_share),
         scene=None if pair.scene is None else pair.scene.opinion,
     )
 
@@ -460,3 +485,10 @@ def _other(record: OtherCameraRecord) -> OtherCamera:
     for name in ("T_cam_other", "cov", "T_cam_other_pictures"):
         figures[name] = None if figures[name] is None else np.array(figures[name], dtype=np.float64)
     return OtherCamera(**figures)
+
+
+def _share(record: SceneShareRecord) -> SceneShare:
+    figures = record.model_dump()
+    for name, value in figures.items():
+        figures[name] = np.array(value, dtype=np.float64) if isinstance(value, list) else value
+    return SceneShare(**figures)

@@ -7,6 +7,7 @@ the scene's opinion
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -15,7 +16,7 @@ from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import invert, sigma_sizes, tangent_sizes
-from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal
+from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal, SceneShare
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.extrinsics import (
@@ -33,6 +34,7 @@ from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.matching import candidates_of
 from lce_rig.pipeline.result_files import Result
+from lce_rig.pipeline.sharpening import Sharpen, by_boards, fuse, share_findings, sharpen
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import Rig
 from lce_rig.session import Session
@@ -77,12 +79,14 @@ class _Solved:
         estimate: of the extrinsics.
         validation: of the estimate on the camera's own captures and images.
         together: the estimate of several cameras that it is part of; None where it stands alone.
+        share: what the scene did to the extrinsics; None where it was not asked.
     """
 
     sensors: _Sensors
     estimate: CalibrationEstimate
     validation: Validation
     together: TogetherEstimate | None = None
+    share: SceneShare | None = None
 
     @property
     def is_still(self) -> bool:
@@ -108,6 +112,7 @@ def calibrate(
     cameras: Sequence[str] | None = None,
     channels: Sequence[str] | None = None,
     reference: Reference | None = None,
+    use_scene: bool = False,
     progress: Progress = silent,
 ) -> Result:
     """Estimate and judge the extrinsics of every camera with every LiDAR of a session; nothing is written.
@@ -119,6 +124,7 @@ def calibrate(
         cameras: the cameras to calibrate, as if the session held no others; None for all.
         channels: the cameras' channels to use; None for all that the session holds.
         reference: extrinsics to report errors against; they never enter the estimate or the verdict.
+        use_scene: estimate each frame camera from the edges of the scene, too.
         progress: called with (done, total) for each camera and LiDAR in turn.
 
     Raises:
@@ -134,9 +140,10 @@ def calibrate(
         cameras=cameras,
         channels=channels,
         reference=reference,
+        scene=partial(sharpen, session, detections) if use_scene else None,
         progress=progress,
     )
-    heard = [with_opinion(pair, hear_scene(session, detections, pair)) for pair in pairs]
+    heard = [with_opinion(pair, hear_scene(session, detections, by_boards(pair))) for pair in pairs]
     return Result(session, tuple(heard), tuple(shortages))
 
 
@@ -148,6 +155,7 @@ def calibrate_detections(
     cameras: Sequence[str] | None = None,
     channels: Sequence[str] | None = None,
     reference: Reference | None = None,
+    scene: Sharpen | None = None,
     progress: Progress = silent,
 ) -> tuple[list[Calibration], list[Finding]]:
     """Estimate and judge the extrinsics of every camera with every LiDAR from their detections.
@@ -159,6 +167,7 @@ def calibrate_detections(
         rig: thresholds, targets and nominal extrinsics.
         detections: of one session.
         options, cameras, channels, reference, progress: as of `calibrate`.
+        scene: asks the scene about the boards' extrinsics; None for the boards alone.
 
     Returns:
         The calibrated sensors, and for each other pair the cause.
@@ -180,6 +189,9 @@ def calibrate_detections(
     links = list(_links(rig, alone))
     solved = _solve_together(rig, detections, alone, links)
     calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
+    if scene is not None:
+        solved = [_with_scene(rig, each, scene(own)) for each, own in zip(solved, calibrations, strict=True)]
+        calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
     return [_compared(calibration, reference) for calibration in calibrations], shortages
 
 
@@ -332,6 +344,15 @@ def _part_of(together: TogetherEstimate, rig: Rig, detections: Detections, alone
     return _Solved(alone.sensors, estimate, _examine(rig, detections, alone.sensors, estimate), together)
 
 
+def _with_scene(rig: Rig, solved: _Solved, share: SceneShare) -> _Solved:
+    """Take the extrinsics of boards and scene; the checks on the boards' own result stay as they are."""
+    if share.state != "used":
+        return replace(solved, share=share)
+    estimate = fuse(solved.estimate, share, rig.board.to_board())
+    validation = replace(solved.validation, cov=share.cov)
+    return _Solved(solved.sensors, estimate, validation, share=share)
+
+
 def _other_camera(solved: Sequence[_Solved], link: _Link, k: int) -> OtherCamera:
     """State the pose of the other camera of a link relative to the camera of index k."""
     pair, is_second = link.pair, k == link.second
@@ -380,9 +401,12 @@ def _judged(
     sensors, estimate, validation = solved[k].sensors, solved[k].estimate, solved[k].validation
     camera, lidar = sensors.camera, sensors.lidar
     mine = [link for link in links if k in (link.first, link.second)]
-    contradictions = [finding for link in mine for finding in link.findings]
+    others = [finding for link in mine for finding in link.findings]
+    share = solved[k].share
+    if share is not None:
+        others += share_findings(share)
     n_captures = len({name for pair in sensors.pairs for name in detections.captures(pair)})
-    verdict, findings = judge(estimate, validation, rig, camera, lidar, n_captures, contradictions)
+    verdict, findings = judge(estimate, validation, rig, camera, lidar, n_captures, others)
     lens = rig.cameras[camera].to_intrinsics()
     return Calibration(
         camera=camera,
@@ -404,6 +428,7 @@ def _judged(
         uncertainty=point_uncertainties(estimate.T_cam_lidar, validation.cov, lens),
         estimated_with=estimate.estimated_with,
         other_cameras=tuple(_other_camera(solved, link, k) for link in mine),
+        scene_share=share,
         weakest=estimate.weakest,
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,

@@ -1,43 +1,38 @@
 """Check deployed extrinsics on recordings without a board: the edges of the scene decide."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
-from lce_rig.core.data import Events, Image, Sample, Scan
-from lce_rig.core.errors import SessionError, SourceError
-from lce_rig.core.findings import Finding
-from lce_rig.core.losses import Losses
-from lce_rig.core.results import Calibration
+from lce_rig.core.data import Events, Image
+from lce_rig.core.errors import SessionError
+from lce_rig.core.findings import Figure, Finding, Severity
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Calibration, ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.devices.opening import edge_cameras
-from lce_rig.devices.reading import AttachedSensors, LiveSource
+from lce_rig.devices.reading import LiveSource
 from lce_rig.export.result import SavedResult, read_result
+from lce_rig.pipeline.board_drift import BoardDrift, board_finding, watch_boards
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import RESULT, result_parts
-from lce_rig.recordings import open_recordings
-from lce_rig.recordings.joining import join_recordings, require_sensors
-from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording
+from lce_rig.pipeline.scene_captures import EVENTS_NS, SceneCaptures, Seen, evenly, own_offset_ns
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.drift import AxisDrift, Drift, watch
+from lce_rig.scene.drift import AxisDrift, Drift, State, watch
+from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
 from lce_rig.scene.views import build_view, without_board, without_movers
-from lce_rig.session import Capture, Session
-from lce_rig.timing.event_buffer import EventCut
-from lce_rig.timing.rig_clock import RigClock
-from lce_rig.timing.scan_pairing import Frame, pair_by_time
+from lce_rig.session import Session
+from lce_rig.timing.rig_time import event_channel, rig_time_ns
 from lce_rig.verify.drift_picture import draw_drift
 from lce_rig.verify.overlay_files import write_picture
-from lce_rig.words import as_json, describe
+from lce_rig.words import as_json
 
-MAX_CAPTURES = 60
-"""More captures add time and memory but, of one place, no information: they are thinned out evenly."""
-_LIVE_WAIT_S = 0.2
+_MIN_MOVING = 3
+_MAX_BOARDS = 20
+_SEVERITIES: dict[State, Severity] = {"changed": "error", "unknown": "warning", "unchanged": "note"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,28 +41,88 @@ class PairDrift:
 
     Attributes:
         calibration: the deployed extrinsics.
-        drift: the verdict.
+        drift: the scene's opinion; where images show the board, without its edges.
+        board: the board's own; None where both sensors see it in fewer than three placements.
         example: the capture drawn by `write`; None without any.
     """
 
     calibration: Calibration
     drift: Drift
+    board: BoardDrift | None
     example: tuple[str, Image, SceneView] | None
+
+    @property
+    def states(self) -> dict[str, State]:
+        """Both opinions on each axis: changed if either says so, unchanged if either covers it."""
+        scene = {axis.axis: axis.state for axis in self.drift.axes}
+        if self.board is None:
+            return scene
+        return {axis.axis: _either(scene[axis.axis], axis.state) for axis in self.board.axes}
+
+    @property
+    def state(self) -> State:
+        """The verdict: changed if any axis is; unchanged only if no axis is unknown."""
+        states = set(self.states.values())
+        return "changed" if "changed" in states else "unknown" if "unknown" in states else "unchanged"
+
+    @property
+    def summary(self) -> Finding:
+        """The verdict as a finding."""
+        if self.board is None:
+            return self.drift.findings[0]
+        axes = {each: tuple(a for a, state in self.states.items() if state == each) for each in _SEVERITIES}
+        figures: dict[str, Figure] = {
+            "n_captures": self.drift.n_captures,
+            "n_boards": self.board.n_boards,
+            "changed": axes["changed"],
+            "unknown": axes["unknown"],
+        }
+        code = {
+            "changed": "scene.changed_with_board",
+            "unknown": "scene.unknown_with_board",
+            "unchanged": "scene.unchanged_with_board",
+        }
+        return Finding(code[self.state], _SEVERITIES[self.state], figures=figures)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """The verdict first, then the scene's opinion on each axis and what is missing, then the board's."""
+        if self.board is None:
+            return self.drift.findings
+        told = tuple(board_finding(axis) for axis in self.board.axes if axis.state != "unchanged")
+        return (self.summary, *self.drift.findings, *told)
 
     def document(self) -> dict[str, Any]:
         """List everything as plain types for JSON."""
         return {
             "camera": self.calibration.camera,
             "lidar": self.calibration.lidar,
-            "state": self.drift.state,
+            "state": self.state,
+            "states": self.states,
+            "scene_state": self.drift.state,
             "n_captures": self.drift.n_captures,
             "n_edges": self.drift.n_edges,
             "axes": [_axis(axis) for axis in self.drift.axes],
             "T_cam_lidar": self.drift.T_cam_lidar.tolist(),
             "T_cam_lidar_best": self.drift.T_best.tolist(),
             "covariance_best": None if self.drift.cov_best is None else self.drift.cov_best.tolist(),
-            "findings": [as_json(finding) for finding in self.drift.findings],
+            "board": None if self.board is None else _board(self.board),
+            "findings": [as_json(finding) for finding in self.findings],
         }
+
+
+def _either(first: State, second: State) -> State:
+    return next(state for state in ("changed", "unchanged", "unknown") if state in (first, second))
+
+
+def _board(board: BoardDrift) -> dict[str, Any]:
+    return {
+        "n_boards": board.n_boards,
+        "n_placements": board.n_placements,
+        "mpe_m": board.metrics.mpe_m,
+        "mee_m": board.metrics.mee_m,
+        "axes": [_axis(axis) for axis in board.axes],
+    }
 
 
 def _axis(axis: AxisDrift) -> dict[str, Any]:
@@ -114,7 +169,6 @@ def drift(
     result: SavedResult | None = None,
     *,
     rig: Rig | None = None,
-    ignore_board: bool = False,
     progress: Progress = silent,
 ) -> DriftReport:
     """Compare the extrinsics of a result with the scene of a session or of recordings.
@@ -126,7 +180,6 @@ def drift(
             the same time, such as a pcap and the images' folder.
         result: the deployed extrinsics; None for the session's own result.
         rig: the profile of a recording; a session has its own.
-        ignore_board: leave out the edges at the board, where an image shows one, and what moves before a
             standing rig.
         progress: called with (done, total) captures, or images and scans.
 
@@ -139,16 +192,17 @@ def drift(
         place = " and ".join(map(str, paths))
         if result is None:
             raise SessionError(f"{place}: a recording has no result", "Name one with --result FILE.")
-        watcher = _Watcher(rig, result, place, ignore_board)
-        watcher.take_recordings(paths, progress)
+        captures = SceneCaptures(rig, result, place)
+        captures.take_recordings(paths, progress)
     elif len(paths) != 1:
         raise SessionError("several recordings need the profile of their rig", "Name one with --rig.")
     else:
         session = Session.open(paths[0])
         result = result or read_result(session.path.joinpath(*result_parts(None), RESULT))
-        watcher = _Watcher(session.rig, result, str(session.path), ignore_board)
-        watcher.take_session(session, progress)
-    return watcher.finish()
+        rig = session.rig
+        captures = SceneCaptures(rig, result, str(session.path))
+        captures.take_session(session, progress)
+    return judge(rig, result, captures)
 
 
 def drift_live(
@@ -156,7 +210,6 @@ def drift_live(
     result: SavedResult,
     sources: Sequence[LiveSource],
     *,
-    ignore_board: bool = False,
     is_over: Callable[[int], bool],
 ) -> DriftReport:
     """Compare the extrinsics of a result with what attached sensors see.
@@ -165,229 +218,137 @@ def drift_live(
         rig: the profile.
         result: the deployed extrinsics.
         sources: of every sensor and of the sync board; not open yet.
-        ignore_board: as for `drift`.
         is_over: asked several times a second with the number of scans so far; True ends it.
 
     Raises:
         SessionError: the result belongs to another rig.
         SourceError: a sensor cannot be opened, or nothing came of any camera and LiDAR of the result.
     """
-    watcher = _Watcher(rig, result, f"the sensors of rig {rig.name}", ignore_board)
-    watcher.take_live(sources, is_over)
-    return watcher.finish()
+    captures = SceneCaptures(rig, result, f"the sensors of rig {rig.name}")
+    captures.take_live(sources, is_over)
+    return judge(rig, result, captures)
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """One capture of one camera and LiDAR: an image, or else events about the scan."""
-
-    name: str
-    image: Image | None
-    events: EventCut | None
-    scan: Scan
-
-
-_Item = TypeVar("_Item")
-
-
-class _Thinned(list[_Item]):
-    """The items of a stream, every one at first, every second once there are too many, and so on."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._n_taken, self._stride = 0, 1
-
-    def take(self, item: _Item) -> None:
-        """Keep an item if it is its turn."""
-        if self._n_taken % self._stride == 0:
-            self.append(item)
-        self._n_taken += 1
-        if len(self) > MAX_CAPTURES:
-            self[:] = self[::2]
-            self._stride *= 2
-
-
-class _Watcher:
-    """Takes captures of all kinds of sources for every camera and LiDAR of a result.
+def judge(rig: Rig, result: SavedResult, captures: SceneCaptures) -> DriftReport:
+    """Judge a result by captures of a scene.
 
     Raises:
-        SessionError: the result belongs to another rig.
+        SourceError: there are none of any camera and LiDAR of the result.
     """
+    captures.require_any()
+    judging = _Judge(rig)
+    pairs = tuple(map(judging.pair, result.pairs, captures.kept))
+    return DriftReport(rig, pairs, tuple(dict.fromkeys(captures.notes)))
 
-    def __init__(self, rig: Rig, result: SavedResult, source: str, ignore_board: bool) -> None:
-        if result.rig != rig.name or not result.pairs:
-            what = f"the result belongs to rig {result.rig!r}" if result.pairs else "the result holds no pair"
-            raise SessionError(f"{what}; {source} belongs to rig {rig.name!r}")
-        for c in result.pairs:
-            if c.camera not in rig.cameras or c.lidar not in rig.lidars:
-                raise SessionError(f"the result names {c.camera} and {c.lidar}, which rig {rig.name!r} lacks")
-        self._rig, self._source, self._ignore_board = rig, source, ignore_board
-        self._pairs = result.pairs
-        self._kept: list[_Thinned[_Seen]] = [_Thinned() for _ in result.pairs]
-        self._notes: list[str] = []
 
-    def take_session(self, session: Session, progress: Progress) -> None:
-        """Read the captures of a session; what is damaged is skipped."""
-        captures = _evenly(session.captures, MAX_CAPTURES * len(self._pairs))
-        for done, capture in enumerate(captures, start=1):
-            with suppress(SessionError):
-                self._take_capture(capture)
-            progress(done, len(captures))
+class _Judge:
+    """Judges cameras and LiDARs in turn; the motion of a LiDAR is estimated once for all cameras."""
 
-    def _take_capture(self, capture: Capture) -> None:
-        cameras, lidars = {c.camera for c in self._pairs}, {c.lidar for c in self._pairs}
-        images: list[Image] = []
-        scans: list[Scan] = []
-        events: list[Events] = []
-        # A damaged file costs its own sensor only.
-        for key in capture.image_keys:
-            if key[0] in cameras:
-                with suppress(SessionError):
-                    images.append(capture.image(*key))
-        for lidar in capture.lidars:
-            if lidar in lidars:
-                with suppress(SessionError):
-                    scans.append(capture.scan(lidar))
-        for camera in capture.event_cameras:
-            if camera in cameras:
-                with suppress(SessionError):
-                    events.append(capture.events(camera))
-        self._take(capture.name, images, scans, [_whole(each) for each in events if len(each)])
+    def __init__(self, rig: Rig) -> None:
+        self._rig, self._finder = rig, BoardFinder(rig)
+        self._motions: dict[int, RigMotion | None] = {}
 
-    def take_recordings(self, paths: Sequence[Path], progress: Progress) -> None:
-        """Read recordings: pairs of images and point clouds, or streams, whose scans are paired by time.
-
-        Raises:
-            SourceError: one cannot be read at all.
-        """
-        for recording in join_recordings(open_recordings(paths, self._rig), self._rig):
-            try:
-                if isinstance(recording, PairedRecording):
-                    self._take_pairs(recording, progress)
-                elif isinstance(recording, ContinuousRecording):
-                    self._take_stream(recording, progress)
-            except SourceError as error:
-                if not any(self._kept):
-                    raise
-                # What came before the damage is judged.
-                self._notes.append(f"not read to its end: {error.what}")
-            self._notes += recording.notes
-
-    def _take_pairs(self, recording: PairedRecording, progress: Progress) -> None:
-        pairs = _evenly(recording.pairs, MAX_CAPTURES * len(self._pairs))
-        failures: list[SourceError] = []
-        for done, files in enumerate(pairs, start=1):
-            try:
-                pair = files.read()
-                self._take(pair.label, pair.images, pair.scans)
-            except SourceError as error:
-                failures.append(error)
-            progress(done, len(pairs))
-        if failures and len(failures) == len(pairs):
-            raise failures[0]
-        self._notes += [f"skipped: {error.what}" for error in failures]
-
-    def _take_stream(self, recording: ContinuousRecording, progress: Progress) -> None:
-        require_sensors(recording)
-        losses = Losses()
-        samples = _counted(recording.samples(), recording.n_samples, progress)
-        for frame in pair_by_time(samples, self._rig, losses, are_events_enough=True):
-            self._take_frame(frame)
-        if not any(self._kept) and losses.counts():
-            (why, n), *_ = losses.counts()
-            raise SourceError(f"{recording.path}: {n} scans cannot be used: {describe(why)}")
-
-    def take_live(self, sources: Sequence[LiveSource], is_over: Callable[[int], bool]) -> None:
-        """Read attached sensors until it is over.
-
-        Raises:
-            SourceError: a sensor cannot be opened.
-        """
-        board = next((source for source in sources if isinstance(source, SyncTimes)), None)
-        clock = RigClock(self._rig, has_board=board is not None, edge_cameras=edge_cameras(self._rig))
-        n_frames = 0
-        with (
-            AttachedSensors(sources) as sensors,
-            FrameFeed(self._rig, sensors, clock, board, are_events_enough=True) as feed,
-        ):
-            while not is_over(n_frames):
-                frame = feed.take(_LIVE_WAIT_S)
-                if frame is not None:
-                    n_frames += 1
-                    self._take_frame(frame)
-            self._notes += [error.what for error, _ in sensors.lost().values()]
-
-    def _take_frame(self, frame: Frame) -> None:
-        self._take(f"{1e-9 * frame.time_ns:.2f} s", frame.images, frame.scans, frame.events)
-
-    def _take(
-        self, name: str, images: Sequence[Image], scans: Sequence[Scan], events: Sequence[EventCut] = ()
-    ) -> None:
-        for c, kept in zip(self._pairs, self._kept, strict=True):
-            scan = next((each for each in scans if each.sensor == c.lidar), None)
-            own = [image for image in images if image.sensor == c.camera]
-            # Frames before images that were made of events.
-            frames = self._rig.cameras[c.camera].first_channel("frames")
-            own = [image for image in own if image.channel == frames] or own
-            cut = next((each for each in events if each.sensor == c.camera), None)
-            if scan is not None and (own or cut):
-                # Grey: colour is not used, and would hold three times the memory.
-                image = replace(own[0], pixels=own[0].grey) if own else None
-                kept.take(_Seen(name, image, None if own else cut, scan))
-
-    def finish(self) -> DriftReport:
-        """Judge what was taken.
-
-        Raises:
-            SourceError: nothing of any camera and LiDAR of the result was taken.
-        """
-        if not any(self._kept):
-            wanted = " or ".join(f"{c.camera} and {c.lidar}" for c in self._pairs)
-            raise SourceError(
-                f"{self._source} holds no images and scans of {wanted} at the same time",
-                "Check the profile's topics and timestamps; `lce-rig doctor` looks at attached sensors.",
-            )
-        pairs = tuple(map(self._judge, self._pairs, self._kept))
-        return DriftReport(self._rig, pairs, tuple(dict.fromkeys(self._notes)))
-
-    def _judge(self, c: Calibration, kept: Sequence[_Seen]) -> PairDrift:
+    def pair(self, c: Calibration, kept: Sequence[Seen]) -> PairDrift:
         lens = self._rig.cameras[c.camera].to_intrinsics()
         views: list[SceneView] = []
-        example: tuple[str, Image, SceneView] | None = None
+        whole: list[SceneView] = []
+        boards: list[tuple[Seen, ImageBoard]] = []
+        moving: list[MovingView] = []
+        n_untimed = 0
         for seen in kept:
-            if seen.image is None:
-                continue
             view = build_view(self._rig, c, seen.name, seen.image, seen.scan)
-            if self._ignore_board:
-                view = without_board(view, BoardFinder(self._rig).image(seen.image), self._rig, c)
+            motion = self._motion(seen)
+            if motion is not None:
+                after_s = _after_s(view.edges.points, seen, self._rig, c)
+                if after_s is None:
+                    n_untimed += 1
+                    continue
+                points = motion.moved(view.edges.points, after_s)
+                view = replace(view, edges=replace(view.edges, points=points))
+                moving.append(MovingView(view, motion))
+            whole.append(view)
+            if isinstance(seen.image, Image):
+                board = self._finder.image(seen.image)
+                view = without_board(view, board, self._rig, c)
+                if motion is None and isinstance(board, ImageBoard):
+                    boards.append((seen, board))
             views.append(view)
-            if example is None or len(view.edges) > len(example[2].edges):
-                example = seen.name, seen.image, view
-        if self._ignore_board:
+        if boards:
+            # Who holds the board moves with it.
             views = without_movers(views)
         judged = watch(views, lens, c.T_cam_lidar, c.cov)
         if not kept:
             lacking = Finding("scene.no_samples", "error", c.camera, {"lidar": c.lidar})
             judged = replace(judged, findings=(lacking,))
-        return PairDrift(c, judged, example)
+        elif n_untimed:
+            untimed = Finding("scene.no_firing_times", "warning", c.lidar, {"n_captures": n_untimed})
+            judged = replace(judged, findings=(*judged.findings, untimed))
+        if len(moving) >= _MIN_MOVING and judged.curves and judged.state != "changed":
+            judged = _with_clocks(judged, clocks_apart_s(moving, lens, c.T_cam_lidar), c.camera)
+        return PairDrift(c, judged, self._boards(c, boards), _example(kept, whole))
+
+    def _boards(self, c: Calibration, boards: Sequence[tuple[Seen, ImageBoard]]) -> BoardDrift | None:
+        """Ask the boards, of at most 20 captures."""
+        images: dict[str, ImageBoard] = {}
+        scans: dict[str, list[LidarBoard]] = {}
+        for seen, board in evenly(boards, _MAX_BOARDS):
+            found = self._finder.scan(seen.scan)
+            if isinstance(found, list):
+                images[seen.name], scans[seen.name] = board, found
+        if not images:
+            return None
+        channel = boards[0][0].image.channel if isinstance(boards[0][0].image, Image) else ""
+        return watch_boards(self._rig, c, channel, images, scans)
+
+    def _motion(self, seen: Seen) -> RigMotion | None:
+        """Estimate the rig's motion at a capture; None where it stands, or nothing tells."""
+        if seen.previous is None:
+            return None
+        key = id(seen.scan)
+        if key not in self._motions:
+            motion = estimate_motion(seen.previous, seen.scan)
+            self._motions[key] = None if motion is None or motion.is_still else motion
+        return self._motions[key]
 
 
-def _whole(events: Events) -> EventCut:
-    """Give all events of a capture as a cut."""
-    return EventCut(events, int(events.t_ns[0]), int(events.t_ns[-1]) + 1, 0, 0)
+def _example(kept: Sequence[Seen], views: Sequence[SceneView]) -> tuple[str, Image, SceneView] | None:
+    """Choose the capture with most edges for the picture."""
+    if not views:
+        return None
+    view = max(views, key=lambda each: len(each.edges))
+    image = next(seen.image for seen in kept if seen.name == view.capture)
+    return view.capture, _picture_of(image) if isinstance(image, Events) else image, view
 
 
-def _counted(samples: Iterable[Sample], n_samples: int, progress: Progress) -> Iterator[Sample]:
-    done = 0
-    for sample in samples:
-        yield sample
-        if not isinstance(sample, Events):
-            done += 1
-            progress(done, n_samples)
+def _picture_of(events: Events) -> Image:
+    """Draw the number of events of each pixel, dark on white."""
+    counts = np.zeros((events.height_px, events.width_px))
+    np.add.at(counts, (events.y, events.x), 1.0)
+    grey = np.asarray(np.clip(255 - 60 * counts, 0, 255), dtype=np.uint8)
+    return Image(events.sensor, "events", None, grey)
 
 
-def _evenly(items: Sequence[_Item], n: int) -> list[_Item]:
-    """Choose n of the items or fewer."""
-    if len(items) <= n:
-        return list(items)
-    return [items[k] for k in np.linspace(0, len(items) - 1, n).round().astype(int)]
+def _after_s(points: Array, seen: Seen, rig: Rig, c: Calibration) -> Array | None:
+    """Tell how long after each edge (N, 3) the image was taken; None where times are unknown."""
+    image, scan_ns = seen.image, rig_time_ns(seen.scan, rig)
+    image_ns = rig_time_ns(image, rig)
+    fired_s = firing_times_s(seen.scan, points)
+    if scan_ns is None or image_ns is None or fired_s is None:
+        return None
+    channel = image.channel if isinstance(image, Image) else event_channel(rig, c.camera) or ""
+    # Events are cut about their middle.
+    middle_ns = EVENTS_NS // 2 if isinstance(image, Events) else 0
+    return np.asarray(1e-9 * (image_ns + middle_ns + own_offset_ns(c, channel) - scan_ns) - fired_s)
+
+
+def _with_clocks(judged: Drift, apart_s: float | None, camera: str) -> Drift:
+    """Give no all-clear where the images of a moving rig fit the scans of another time."""
+    if apart_s is None:
+        return judged
+    found = Finding("scene.clocks_apart", "warning", camera, {"apart_s": apart_s})
+    axes = tuple(
+        replace(axis, state="unknown", reason=found.code) if axis.state == "unchanged" else axis
+        for axis in judged.axes
+    )
+    others = [each for each in judged.findings[1:] if each.code != "scene.axis_unchanged"]
+    return replace(judged, axes=axes, findings=(found, *others))

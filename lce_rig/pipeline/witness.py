@@ -1,6 +1,6 @@
 """Ask the scene for its opinion on extrinsics that a board gave: its edges are no part of the evidence."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -34,20 +34,31 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
         detections: of this session: its captures, and where the board is.
         calibration: the extrinsics and their covariance.
     """
-    views = list(_views(session, detections, calibration))
+    views = scene_views(session, detections, calibration, MAX_CAPTURES)
     return opinion_of(views, session.rig.cameras[calibration.camera].to_intrinsics(), calibration)
 
 
-def _views(session: Session, detections: Detections, c: Calibration) -> Iterator[SceneView]:
+def scene_views(
+    session: Session, detections: Detections, calibration: Calibration, n_most: int
+) -> list[SceneView]:
+    """Find the edges of the scene in captures of a session, spread over it, without those at the board.
+
+    Args:
+        session, detections, calibration: as of `hear_scene`.
+        n_most: captures.
+    """
+    c = calibration
     channel = session.rig.cameras[c.camera].first_channel("frames") or ""
     boards = detections.images.get((c.camera, channel), {})
     names = sorted(boards.keys() & detections.lidars[c.lidar].keys())
-    for k in np.linspace(0, len(names) - 1, min(len(names), MAX_CAPTURES)).round().astype(int):
+    views = []
+    for k in np.linspace(0, len(names) - 1, min(len(names), n_most)).round().astype(int):
         with suppress(SessionError):
             capture = session.capture(names[k])
             image, scan = capture.image(c.camera, channel), capture.scan(c.lidar)
             view = build_view(session.rig, c, capture.name, image, scan)
-            yield without_board(view, boards[capture.name], session.rig, c)
+            views.append(without_board(view, boards[capture.name], session.rig, c))
+    return views
 
 
 def opinion_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibration) -> SceneOpinion:

@@ -135,9 +135,13 @@ class Alignment:
         """Score extrinsics along one axis of the tangent, the others as in `start` (6,)."""
         offsets = _STEPS * _REACH[axis]
         shares = self.shares(perturb(self.T_cam_lidar, start + offsets[:, None] * np.eye(6)[axis]))
-        by_part = np.array([self._by_part(each) for each in shares])
-        by_capture = np.array([np.bincount(self._of_view, each, self.n_captures) for each in shares])
-        return Curve(offsets, by_part, by_capture)
+        by_part, by_capture = zip(*map(self.split, shares), strict=True)
+        return Curve(offsets, np.array(by_part), np.array(by_capture))
+
+    def split(self, shares: Array) -> tuple[Array, Array]:
+        """Sum shares (N,) over each channel's parts of the image, (P,), and over the captures, (C,)."""
+        by_capture = np.bincount(self._of_view, shares, self.n_captures)
+        return self._by_part(shares), np.asarray(by_capture, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)

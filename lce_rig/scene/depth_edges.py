@@ -58,7 +58,7 @@ def leave_standing(captures: Sequence[DepthEdges]) -> list[DepthEdges]:
     few edges stay, the rig itself moves, and all are kept.
     """
     keep = [_recurs(edges, [each for each in _evenly(captures) if each is not edges]) for edges in captures]
-    if not keep or np.mean(np.concatenate(keep)) < _STANDING_SHARE:
+    if not any(map(len, captures)) or np.mean(np.concatenate(keep)) < _STANDING_SHARE:
         return list(captures)
     return [edges.select(each) for edges, each in zip(captures, keep, strict=True)]
 

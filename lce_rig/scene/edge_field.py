@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.data import Events
 from lce_rig.core.geometry import Array
 
 # At a focal length of 1000 px; other lenses and resolutions scale them, so that angles stay the same.
@@ -16,6 +17,7 @@ _WINDOW_PX = (121.0, 31.0)  # along and across the direction searched
 _WEAKEST_GREY = 2.0  # An image whose strongest edges are weaker shows noise.
 _CLIP_PERCENTILE = 99
 _FLOOR = 0.005
+_CLEAR = 0.5  # log-likelihood ratio of an edge that stands out
 _OUTLIERS = 0.5  # share of depth edges that no image edge accompanies
 
 
@@ -39,6 +41,13 @@ class EdgeField:
         rows = at.reshape(-1, pixels.shape[-2], 2)
         sampled = cv2.remap(self.values, rows[..., 0], rows[..., 1], cv2.INTER_LINEAR, borderValue=0.0)
         return np.asarray(sampled.reshape(pixels.shape[:-1]), dtype=np.float64)
+
+    def has_edges_near(self, pixels: Array, reach_px: float) -> NDArray[np.bool_]:
+        """Find which pixels (N, 2) of the image have an edge within a distance."""
+        side = 2 * round(reach_px / self.reduction) + 1
+        near = cv2.dilate((self.values > _CLEAR).astype(np.float32), np.ones((side, side)))
+        is_near = EdgeField(np.asarray(near, dtype=np.float32), self.reduction).sample(pixels) > 0
+        return np.asarray(is_near, dtype=np.bool_)
 
     def coarser(self) -> "EdgeField":
         """Blur and halve the field."""
@@ -66,9 +75,31 @@ def build_edge_field(grey: NDArray[np.uint8], focal_px: float) -> EdgeField:
     gradient = np.abs(cv2.Scharr(smooth, cv2.CV_32F, 1, 0)) / 16
     strongest = max(float(np.percentile(gradient, _CLIP_PERCENTILE)), _WEAKEST_GREY)
     clipped = np.minimum(gradient / strongest, 1.0)
+    return EdgeField(_likelihood_ratio(clipped, scale), reduction)
+
+
+def build_event_field(events: Events, focal_px: float) -> EdgeField:
+    """Turn the events of a short time into a field: where brightness changed, an edge passed.
+
+    Their count per pixel takes the place of the gradient: only edges that move, or that a moving rig passes,
+    are in it.
+
+    Args:
+        events: of a few hundredths of a second.
+        focal_px: of the lens.
+    """
+    pixels = events.y.astype(np.intp) * events.width_px + events.x
+    counts = np.bincount(pixels, minlength=events.width_px * events.height_px).astype(np.float32)
+    # A flickering pixel counts no more than an edge's.
+    strongest = max(float(np.percentile(counts[counts > 0], _CLIP_PERCENTILE)), 1.0) if len(events) else 1.0
+    clipped = np.minimum(counts.reshape(events.height_px, events.width_px) / strongest, 1.0)
+    return EdgeField(_likelihood_ratio(clipped, focal_px / _REFERENCE_PX), 1)
+
+
+def _likelihood_ratio(strength: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
+    """Blur edges to the uncertainty of an outline and compare them with their mean over a window."""
     sigma_px = scale * _SIGMA_PX
-    blurred = cv2.GaussianBlur(clipped, (0, 0), sigmaX=sigma_px, sigmaY=max(0.5, sigma_px / 2))
+    blurred = cv2.GaussianBlur(strength, (0, 0), sigmaX=sigma_px, sigmaY=max(0.5, sigma_px / 2))
     window = (int(_WINDOW_PX[0] * scale) | 1, int(_WINDOW_PX[1] * scale) | 1)
     ratio = (blurred + _FLOOR) / (cv2.blur(blurred, window) + _FLOOR)
-    values = np.log(_OUTLIERS + (1 - _OUTLIERS) * ratio)
-    return EdgeField(np.asarray(values, dtype=np.float32), reduction)
+    return np.asarray(np.log(_OUTLIERS + (1 - _OUTLIERS) * ratio), dtype=np.float32)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import Calibration, ImageBoard, Refusal
 from lce_rig.detect.events.figures import outline_px
@@ -15,16 +15,22 @@ from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.depth_edges import find_depth_edges, leave_standing
-from lce_rig.scene.edge_field import build_edge_field
+from lce_rig.scene.edge_field import build_edge_field, build_event_field
 
 _BOARD_MARGIN_RAD = 0.04  # Extrinsics may be off by as much.
+_EVENTS_NEAR_RAD = 0.06  # as far as the score is searched
 
 
-def build_view(rig: Rig, calibration: Calibration, name: str, image: Image, scan: Scan) -> SceneView:
-    """Find the edges of one capture's scan and image."""
+def build_view(rig: Rig, calibration: Calibration, name: str, image: Image | Events, scan: Scan) -> SceneView:
+    """Find the edges of one capture's scan, and of its image or of events about the scan."""
     lidar, lens = rig.lidars[calibration.lidar], rig.cameras[calibration.camera].to_intrinsics()
     edges = find_depth_edges(scan, Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad))
-    return SceneView(name, edges, build_edge_field(image.grey, lens.fx_px))
+    if isinstance(image, Image):
+        return SceneView(name, edges, build_edge_field(image.grey, lens.fx_px))
+    field = build_event_field(image, lens.fx_px)
+    # Edges without events about them stand still before a standing rig: they say nothing.
+    pixels, _ = lens.project(transform(calibration.T_cam_lidar, edges.points))
+    return SceneView(name, edges.select(field.has_edges_near(pixels, _EVENTS_NEAR_RAD * lens.fx_px)), field)
 
 
 def without_board(

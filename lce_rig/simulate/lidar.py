@@ -232,6 +232,7 @@ def sweep_scene(
     rng: np.random.Generator,
     stamp_ns: int = 0,
     board_at: Callable[[NDArray[np.int64]], Array] | None = None,
+    lidar_at: Callable[[NDArray[np.int64]], Array] | None = None,
 ) -> Sweep:
     """Send the beams of one revolution.
 
@@ -243,8 +244,11 @@ def sweep_scene(
         rng: source of the azimuth phase.
         stamp_ns: device time of the first firing.
         board_at: T_world_board (N, 4, 4) at times (N,) ns of the timestamp's clock; None for the scene's.
+        lidar_at: T_world_lidar (N, 4, 4) at such times, of a moving rig; None for `T_world_lidar`.
     """
     laser, offset_ns, azimuth_rad = _firings(model, rng)
+    if lidar_at is not None:
+        T_world_lidar = lidar_at(stamp_ns + offset_ns)
     origins_world, directions_world = _beams(model, T_world_lidar, laser, azimuth_rad)
     if board_at is None:
         returns = receive(scene, origins_world, directions_world, noise)
@@ -373,7 +377,7 @@ def _measure(
 def _beams(
     model: LidarModel, T_world_lidar: Array, laser: NDArray[np.intp], azimuth_rad: Array
 ) -> tuple[Array, Array]:
-    """Find where beams (N,) begin and where they go, (N, 3) each, world."""
+    """Find where beams (N,) begin and where they go, (N, 3) each, world; of one pose, or one each."""
     origins = np.zeros((len(laser), 3))
     origins[:, 2] = model.vertical_offsets_m[laser]
     elevation_rad = model.elevations_rad[laser]
@@ -381,7 +385,8 @@ def _beams(
     directions = np.stack(
         [level * np.cos(azimuth_rad), level * np.sin(azimuth_rad), np.sin(elevation_rad)], axis=-1
     )
-    return transform(T_world_lidar, origins), directions @ T_world_lidar[:3, :3].T
+    R = T_world_lidar[..., :3, :3]
+    return (R @ origins[..., None])[..., 0] + T_world_lidar[..., :3, 3], (R @ directions[..., None])[..., 0]
 
 
 def _firings(

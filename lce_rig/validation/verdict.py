@@ -32,7 +32,7 @@ def judge(
     camera: str,
     lidar: str,
     n_captures: int,
-    between_cameras: Sequence[Finding] = (),
+    others: Sequence[Finding] = (),
 ) -> tuple[Verdict, tuple[Finding, ...]]:
     """Judge extrinsics by all checks.
 
@@ -43,7 +43,7 @@ def judge(
         camera: name of the camera.
         lidar: name of the LiDAR.
         n_captures: number of captures, including those without a board.
-        between_cameras: contradictions between this camera and others.
+        others: of other evidence: contradictions between cameras, what the scene did to the result.
 
     Returns:
         The verdict, and the reasons for anything but a pass: worst first, causes before symptoms. A note on
@@ -55,7 +55,7 @@ def judge(
         *_plate(estimate, rig.board.to_board()),
         *_shared(examination, rig, lidar),
         *split_findings(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
-        *between_cameras,
+        *others,
         *_motion(estimate, rig.verdict.max_plane_misfit_m),
         *_channels(estimate, rig),
         *_residuals(estimate, rig),

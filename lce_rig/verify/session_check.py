@@ -236,7 +236,7 @@ def check_session(
     """
     pair = Pair(calibration.camera, channel, calibration.lidar)
     board = rig.board.to_board()
-    meetings = _meetings(rig, detections, channel, calibration, clocks)
+    meetings = find_meetings(rig, detections, channel, calibration, clocks)
     residuals = [
         capture_residual(calibration.T_cam_lidar, meeting.at_scan_time, board)
         for meeting in meetings.values()
@@ -348,10 +348,21 @@ def _sees_board(detections: Detections, pair: Pair, name: str) -> bool:
     return isinstance(image, ImageBoard) and isinstance(lidar, list)
 
 
-def _meetings(
+def find_meetings(
     rig: Rig, detections: Detections, channel: str, calibration: Calibration, clocks: Clocks
 ) -> dict[str, Meeting]:
-    """Match both sensors' boards in each capture of a channel in which they agree."""
+    """Match both sensors' boards in each capture of a channel in which they agree.
+
+    Args:
+        rig: the profile.
+        detections: of the captures.
+        channel: of the camera.
+        calibration: the extrinsics.
+        clocks: the profile's settings of the two sensors' times.
+
+    Returns:
+        By name of the capture.
+    """
     observations = {}
     for name in calibration.channels:
         pair = Pair(calibration.camera, name, calibration.lidar)

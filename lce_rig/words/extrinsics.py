@@ -197,6 +197,28 @@ def _agree(finding: Finding) -> str:
     )
 
 
+def _scene_change(finding: Finding) -> str:
+    sizes = [finding.figure(name) for name in ("rotation_deg", "rotation_sigma_deg")]
+    sizes += [1000 * finding.figure(name) for name in ("translation_m", "translation_sigma_m")]
+    return f"{sizes[0]:.2f} deg, {sizes[2]:.0f} mm (expected {sizes[1]:.2f} deg, {sizes[3]:.0f} mm)"
+
+
+def _scene_used(finding: Finding) -> str:
+    """The scene moved the boards' extrinsics by {rotation_deg}, {translation_m}; {n_captures}, {n_edges}.
+
+    Expected: {rotation_sigma_deg}, {translation_sigma_m}.
+    """
+    return f"the scene moved the boards' extrinsics by {_scene_change(finding)}"
+
+
+def _scene_not_used(finding: Finding) -> str:
+    """The scene would move the extrinsics by {rotation_deg}, {translation_m}; {n_captures}, {n_edges}.
+
+    Expected: {rotation_sigma_deg}, {translation_sigma_m}.
+    """
+    return f"the scene contradicts the boards and is not used: it would move them by {_scene_change(finding)}"
+
+
 def _scene(finding: Finding) -> str:
     """The scene contradicts {axis} by {change_deg} or {change_m}; {sigma_deg}, {sigma_m}, {sigmas}.
 
@@ -322,6 +344,14 @@ PHRASES: dict[str, Phrase] = {
         "{subject}: board positions differ by {rms_m:mm} rms ({images_rms_m:mm} from the images alone), "
         "relative poses from extrinsics and images by " + _APART,
         "check whether a camera has moved, and the intrinsics",
+    ),
+    "verdict.scene_used": Phrase(_scene_used),
+    "verdict.scene_unknown": Phrase(
+        "the scene shows nothing that the boards do not show better; {n_edges} edges, {n_captures} captures",
+    ),
+    "verdict.scene_not_used": Phrase(
+        _scene_not_used,
+        "check the intrinsics and the board's size. `lce-rig drift SESSION -o FOLDER` draws the edges",
     ),
     "verdict.widened": Phrase(_widened),
     "verdict.scene": Phrase(

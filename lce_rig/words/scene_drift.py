@@ -41,6 +41,36 @@ def _best_uncertain(finding: Finding) -> str:
     return f"the best extrinsics in all axes together are uncertain: {_motions(finding, 'axes')}"
 
 
+def _unchanged_with_board(finding: Finding) -> str:
+    """No change seen in {n_captures} captures, {n_boards} of which show the board."""
+    n = finding.figures
+    return f"the extrinsics fit the scene in {n['n_captures']} captures, and the board in {n['n_boards']}"
+
+
+def _changed_with_board(finding: Finding) -> str:
+    """The scene or the board says that {changed} changed; {n_captures}, {n_boards}, {unknown}."""
+    return f"the extrinsics do not fit the scene or the board: {_motions(finding, 'changed')}"
+
+
+def _unknown_with_board(finding: Finding) -> str:
+    """Neither the scene nor the board can tell {unknown}; {n_captures}, {n_boards}, {changed}."""
+    return f"neither the scene nor the board can tell: {_motions(finding, 'unknown')}"
+
+
+def _board_changed(finding: Finding) -> str:
+    """Changed by {change_m} or {change_deg} +- {sigma_m} or {sigma_deg}; {smallest_m}."""
+    change = f"{_figure(finding, 'change', signed=True)} +- {_figure(finding, 'sigma')}"
+    return f"board, {motion_words(finding.subject)}: changed by {change}"
+
+
+def _board_unsure(finding: Finding) -> str:
+    """Changes below {smallest_m} or {smallest_deg} would not be seen; {change_m}, {sigma_m}."""
+    return (
+        f"board, {motion_words(finding.subject)}: changes below {_figure(finding, 'smallest')} "
+        "would not be seen"
+    )
+
+
 def _axis_unchanged(finding: Finding) -> str:
     """No change of {smallest_m} or {smallest_deg}; {change_m}, {change_deg}, {sigma_m}, {sigma_deg}."""
     return f"{motion_words(finding.subject)}: no change of {_figure(finding, 'smallest')} or more"
@@ -75,9 +105,22 @@ PHRASES = {
     "scene.few_edges": Phrase(
         "{n_edges} edges of the scene in {n_captures} captures are too few or too close together", _RECORD
     ),
+    "scene.unchanged_with_board": Phrase(_unchanged_with_board),
+    "scene.changed_with_board": Phrase(_changed_with_board, f"fasten the sensors, {_BOARD}"),
+    "scene.unknown_with_board": Phrase(_unknown_with_board, f"{_RECORD}, or {_BOARD}"),
+    "scene.board_changed": Phrase(_board_changed),
+    "scene.board_unsure": Phrase(_board_unsure, "hold the board at more places"),
     "scene.no_samples": Phrase(
         "no image or events of {subject} within the tolerance of a scan of {lidar}",
         "check the topics and timestamps of the recording, or record this camera",
+    ),
+    "scene.no_firing_times": Phrase(
+        "{n_captures} captures of a moving rig are not used: scans of {subject} or images have no times",
+        "record points with their firing times, or let the rig stand",
+    ),
+    "scene.clocks_apart": Phrase(
+        "while the rig moves, images of {subject} fit best {apart_s:+.2f} s from their timestamps",
+        "let the rig stand, or correct the clocks: `lce-rig doctor` measures them",
     ),
     "scene.best_uncertain": Phrase(_best_uncertain, _BOARD),
     "scene.axis_unchanged": Phrase(_axis_unchanged),

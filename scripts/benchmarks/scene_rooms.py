@@ -70,19 +70,8 @@ class FurnishedRoom:
         Raises:
             NotEnoughDataError: they are too few.
         """
-        quality = self.rig.quality.model_copy(update={"min_captures": 3})
-        rig = self.rig.model_copy(update={"quality": quality})
-        (calibration,), _ = pipeline.calibrate_detections(rig, self.only(names))
+        (calibration,), _ = pipeline.calibrate_detections(with_few(self.rig), only(self.detections, names))
         return calibration
-
-    def only(self, names: Sequence[str]) -> Detections:
-        """Keep the detections of some captures."""
-        every = self.detections
-        return replace(
-            every,
-            images={key: {k: v for k, v in of.items() if k in names} for key, of in every.images.items()},
-            lidars={key: {k: v for k, v in of.items() if k in names} for key, of in every.lidars.items()},
-        )
 
     def views(
         self, names: Sequence[str], calibration: Calibration, *, ignore_board: bool = False
@@ -98,6 +87,20 @@ class FurnishedRoom:
                     view = without_board(view, found, self.rig, calibration)
                 views.append(view)
         return views
+
+
+def with_few(rig: Rig) -> Rig:
+    """Accept three captures."""
+    return rig.model_copy(update={"quality": rig.quality.model_copy(update={"min_captures": 3})})
+
+
+def only(every: Detections, names: Sequence[str]) -> Detections:
+    """Keep the detections of some captures."""
+    return replace(
+        every,
+        images={key: {k: v for k, v in of.items() if k in names} for key, of in every.images.items()},
+        lidars={key: {k: v for k, v in of.items() if k in names} for key, of in every.lidars.items()},
+    )
 
 
 def furnished_room(

@@ -38,6 +38,20 @@ def test_calibrate_finds_the_simulated_truth_within_four_sigma(lce_rig, session)
     assert np.abs(T - truth).max() < 0.02
 
 
+def test_calibrate_uses_the_scene_if_asked_and_keeps_the_result_of_the_boards_beside_it(lce_rig, calibrated):
+    alone = read(calibrated / "calibration" / "result.json")["pairs"][0]
+    assert alone["scene_share"] is None
+    outcome = lce_rig("calibrate", calibrated, "--use-scene", "--name", "scene", "--json")
+    pair = json.loads(outcome.out)["pairs"][0]
+    share = pair["scene_share"]
+    assert share["T_cam_lidar_boards"] == alone["T_cam_lidar"] and share["cov_boards"] == alone["cov"]
+    told = {"used": "scene_used", "unknown": "scene_unknown", "contradicts": "scene_not_used"}[share["state"]]
+    assert f"verdict.{told}" in {finding["code"] for finding in pair["findings"]}
+    final = share if share["state"] == "used" else alone
+    assert pair["T_cam_lidar"] == final["T_cam_lidar"] and pair["cov"] == final["cov"]
+    assert share["n_captures"] == 16 and share["n_edges"] > 0
+
+
 def test_the_same_session_gives_the_same_bytes(lce_rig, calibrated):
     first = (calibrated / "calibration" / "result.json").read_bytes()
     lce_rig("calibrate", calibrated)

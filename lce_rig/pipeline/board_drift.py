@@ -1,0 +1,131 @@
+"""What boards in view say about deployed extrinsics: `verify`'s residuals, axis by axis."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, Metrics, Observation
+from lce_rig.detect.detection import Detections
+from lce_rig.extrinsics.local_quadratic import SCALE, expand
+from lce_rig.extrinsics.metrics import capture_residual, summarise
+from lce_rig.pipeline.calibration import clocks_of
+from lce_rig.residuals.quadratics import Quadratics
+from lce_rig.rig import LidarSettings, Rig
+from lce_rig.scene.alignment import AXES, IS_ROTATION
+from lce_rig.scene.drift import AxisDrift, State
+from lce_rig.verify.session_check import find_meetings
+
+_THRESHOLD_SIGMAS, _POWER_SIGMAS = 3.0, 1.645  # as for the scene
+# What results of one rig differ by from session to session, m and rad, order of AXES.
+_BIAS = np.array([0.005, 0.005, 0.010, *np.radians([0.12, 0.10, 0.12])])
+_LARGEST = np.where(IS_ROTATION, np.radians(1.5), 0.10)
+_OUTLIER = 3.0  # times the median residual
+_MIN_PLACEMENTS = 3  # The scatter of fewer says little.
+
+
+@dataclass(frozen=True, eq=False)
+class BoardDrift:
+    """Deployed extrinsics compared with the boards of some captures.
+
+    Attributes:
+        axes: one verdict each, order of AXES, were this axis the only one that changed.
+        metrics: residuals of the deployed extrinsics, as `verify` has them.
+        n_boards: captures in which both sensors see the board.
+        n_placements: places at which it was held.
+    """
+
+    axes: tuple[AxisDrift, ...]
+    metrics: Metrics
+    n_boards: int
+    n_placements: int
+
+
+def watch_boards(
+    rig: Rig,
+    calibration: Calibration,
+    channel: str,
+    images: Mapping[str, ImageBoard],
+    scans: Mapping[str, list[LidarBoard]],
+) -> BoardDrift | None:
+    """Compare deployed extrinsics with boards.
+
+    Args:
+        rig: the profile.
+        calibration: the deployed extrinsics.
+        channel: of the images.
+        images, scans: the board in them, by capture.
+
+    Returns:
+        None where both sensors see the board at about the same place in fewer than three placements.
+    """
+    deployed = calibration
+    if channel not in calibration.channels:
+        deployed = replace(calibration, channels=(*calibration.channels, channel))
+    detections = Detections({(calibration.camera, channel): dict(images)}, {calibration.lidar: dict(scans)})
+    clocks = clocks_of(rig, calibration.camera, calibration.lidar)
+    board = rig.board.to_board()
+    meetings = find_meetings(rig, detections, channel, deployed, clocks)
+    met = [meeting.at_scan_time for meeting in meetings.values()]
+    if not met:
+        return None
+    residuals = [capture_residual(calibration.T_cam_lidar, each, board) for each in met]
+    rms_m = np.array([np.hypot(each.plane_rms_m, each.edge_rms_m) for each in residuals])
+    # Another plate, or a board that moved between image and scan.
+    is_inlier = rms_m <= _OUTLIER * np.median(rms_m)
+    seen = [each for each, keep in zip(met, is_inlier, strict=True) if keep]
+    cost = _expand(seen, board, calibration.T_cam_lidar, rig.lidars[calibration.lidar])
+    if len(cost.groups) < _MIN_PLACEMENTS:
+        return None
+    sigma_deployed = np.sqrt(np.diag(calibration.cov))
+    axes = tuple(_judge(axis, cost, float(sigma_deployed[axis])) for axis in range(6))
+    return BoardDrift(axes, summarise(residuals), len(seen), len(cost.groups))
+
+
+def _expand(seen: list[Observation], board: Board, T_cam_lidar: Array, lidar: LidarSettings) -> Quadratics:
+    cost = expand(
+        seen,
+        board,
+        T_cam_lidar,
+        laser_bias_sigma_m=lidar.laser_bias_sigma_m,
+        range_offset_sigma_m=lidar.range_offset_sigma_m,
+    )
+    return cost.hold(SCALE)
+
+
+def _judge(axis: int, cost: Quadratics, sigma_deployed: float) -> AxisDrift:
+    """Estimate the change of one axis alone; the larger variance of residuals and jackknife counts."""
+    unit = float(np.degrees(1.0)) if IS_ROTATION[axis] else 1.0
+    p = len(cost.prior)
+    alone = cost.of(np.array([axis, *range(6, p)]))
+    change = float(alone.optimum()[0])
+    variance = float(alone.covariance()[0, 0])
+    without_each = alone.without_each()[:, 0]
+    n = len(without_each)
+    scatter = (n - 1) / n * float(np.sum((without_each - without_each.mean()) ** 2))
+    variance = max(variance, scatter)
+    sigma = float(np.sqrt(variance + sigma_deployed**2 + _BIAS[axis] ** 2))
+    smallest = (_THRESHOLD_SIGMAS + _POWER_SIGMAS) * sigma
+    state: State = "unchanged"
+    if abs(change) > _THRESHOLD_SIGMAS * sigma:
+        state = "changed"
+    elif smallest > _LARGEST[axis]:
+        state = "unknown"
+    reason = "" if state != "unknown" else "scene.board_unsure"
+    return AxisDrift(AXES[axis], state, unit * change, unit * sigma, unit * smallest, reason)
+
+
+def board_finding(axis: AxisDrift) -> Finding:
+    """Tell an axis that the boards find changed, or cannot tell."""
+    unit = "deg" if axis.is_rotation else "m"
+    figures: dict[str, Figure] = {
+        f"change_{unit}": axis.change,
+        f"sigma_{unit}": axis.sigma,
+        f"smallest_{unit}": axis.smallest,
+    }
+    if axis.state == "changed":
+        return Finding("scene.board_changed", "error", axis.axis, figures)
+    return Finding("scene.board_unsure", "note", axis.axis, figures)

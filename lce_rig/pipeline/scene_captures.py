@@ -1,0 +1,279 @@
+"""Captures of a scene: from sessions, recordings of all kinds and attached sensors, in bounded memory."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
+from lce_rig.core.data import Events, Image, Sample, Scan
+from lce_rig.core.errors import SessionError, SourceError
+from lce_rig.core.geometry import transform
+from lce_rig.core.losses import Losses
+from lce_rig.core.results import Calibration
+from lce_rig.devices.opening import edge_cameras
+from lce_rig.devices.reading import AttachedSensors, LiveSource
+from lce_rig.export.result import SavedResult
+from lce_rig.pipeline.detect_session import Progress
+from lce_rig.recordings import open_recordings
+from lce_rig.recordings.joining import join_recordings, require_sensors
+from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording
+from lce_rig.rig import Rig
+from lce_rig.session import Capture, Session
+from lce_rig.timing.event_buffer import EventCut
+from lce_rig.timing.rig_clock import RigClock
+from lce_rig.timing.rig_time import event_channel, rig_offset_ns, rig_time_ns, stream_of
+from lce_rig.timing.scan_pairing import Frame, pair_by_time
+from lce_rig.words import describe
+
+MAX_CAPTURES = 60
+"""More captures add time and memory but, of one place, no information: they are thinned out evenly."""
+_LIVE_WAIT_S = 0.2
+#: Of events this long about the time at which the LiDAR looks where the camera does.
+EVENTS_NS = 20_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One capture of one camera and LiDAR.
+
+    Attributes:
+        name: of the capture, or its time.
+        image: what the camera saw, or else events of 20 ms.
+        scan: of the LiDAR.
+        previous: the scan before, where the recording is continuous.
+    """
+
+    name: str
+    image: Image | Events
+    scan: Scan
+    previous: Scan | None
+
+
+_Item = TypeVar("_Item")
+
+
+class _Thinned(list[_Item]):
+    """The items of a stream, every one at first, every second once there are too many, and so on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._n_taken, self._stride = 0, 1
+
+    def take(self, item: _Item) -> None:
+        """Keep an item if it is its turn."""
+        if self._n_taken % self._stride == 0:
+            self.append(item)
+        self._n_taken += 1
+        if len(self) > MAX_CAPTURES:
+            self[:] = self[::2]
+            self._stride *= 2
+
+
+class SceneCaptures:
+    """Captures from all kinds of sources, for every camera and LiDAR of a result.
+
+    Memory does not grow with a recording's length: of each camera and LiDAR, 60 captures are kept.
+
+    Args:
+        rig: the profile.
+        result: the deployed extrinsics.
+        source: what is read, for messages.
+
+    Attributes:
+        kept: by index of the result's pairs.
+        notes: what was chosen, assumed or could not be read, in words.
+
+    Raises:
+        SessionError: the result belongs to another rig.
+    """
+
+    def __init__(self, rig: Rig, result: SavedResult, source: str) -> None:
+        if result.rig != rig.name or not result.pairs:
+            what = f"the result belongs to rig {result.rig!r}" if result.pairs else "the result holds no pair"
+            raise SessionError(f"{what}; {source} belongs to rig {rig.name!r}")
+        for c in result.pairs:
+            if c.camera not in rig.cameras or c.lidar not in rig.lidars:
+                raise SessionError(f"the result names {c.camera} and {c.lidar}, which rig {rig.name!r} lacks")
+        self._rig, self._source = rig, source
+        self._pairs = result.pairs
+        self.kept: list[_Thinned[Seen]] = [_Thinned() for _ in result.pairs]
+        self.notes: list[str] = []
+        self._last: dict[str, Scan] = {}
+
+    def take_session(self, session: Session, progress: Progress) -> None:
+        """Read the captures of a session; what is damaged is skipped."""
+        captures = evenly(session.captures, MAX_CAPTURES * len(self._pairs))
+        for done, capture in enumerate(captures, start=1):
+            with suppress(SessionError):
+                self._take_capture(capture)
+            progress(done, len(captures))
+
+    def _take_capture(self, capture: Capture) -> None:
+        cameras, lidars = {c.camera for c in self._pairs}, {c.lidar for c in self._pairs}
+        images: list[Image] = []
+        scans: list[Scan] = []
+        events: list[Events] = []
+        # A damaged file costs its own sensor only.
+        for key in capture.image_keys:
+            if key[0] in cameras:
+                with suppress(SessionError):
+                    images.append(capture.image(*key))
+        for lidar in capture.lidars:
+            if lidar in lidars:
+                with suppress(SessionError):
+                    scans.append(capture.scan(lidar))
+        for camera in capture.event_cameras:
+            if camera in cameras:
+                with suppress(SessionError):
+                    events.append(capture.events(camera))
+        self._take(capture.name, images, scans, [_whole(each, self._rig) for each in events if len(each)])
+
+    def take_recordings(self, paths: Sequence[Path], progress: Progress) -> None:
+        """Read recordings: pairs of images and point clouds, or streams, whose scans are paired by time.
+
+        Raises:
+            SourceError: one cannot be read at all.
+        """
+        for recording in join_recordings(open_recordings(paths, self._rig), self._rig):
+            try:
+                if isinstance(recording, PairedRecording):
+                    self._take_pairs(recording, progress)
+                elif isinstance(recording, ContinuousRecording):
+                    self._take_stream(recording, progress)
+            except SourceError as error:
+                if not any(self.kept):
+                    raise
+                # What came before the damage is judged.
+                self.notes.append(f"not read to its end: {error.what}")
+            self.notes += recording.notes
+
+    def _take_pairs(self, recording: PairedRecording, progress: Progress) -> None:
+        pairs = evenly(recording.pairs, MAX_CAPTURES * len(self._pairs))
+        failures: list[SourceError] = []
+        for done, files in enumerate(pairs, start=1):
+            try:
+                pair = files.read()
+                self._take(pair.label, pair.images, pair.scans)
+            except SourceError as error:
+                failures.append(error)
+            progress(done, len(pairs))
+        if failures and len(failures) == len(pairs):
+            raise failures[0]
+        self.notes += [f"skipped: {error.what}" for error in failures]
+
+    def _take_stream(self, recording: ContinuousRecording, progress: Progress) -> None:
+        require_sensors(recording)
+        losses = Losses()
+        samples = _counted(recording.samples(), recording.n_samples, progress)
+        for frame in pair_by_time(samples, self._rig, losses, are_events_enough=True):
+            self.take_frame(frame)
+        if not any(self.kept) and losses.counts():
+            (why, n), *_ = losses.counts()
+            raise SourceError(f"{recording.path}: {n} scans cannot be used: {describe(why)}")
+
+    def take_live(self, sources: Sequence[LiveSource], is_over: Callable[[int], bool]) -> None:
+        """Read attached sensors until it is over.
+
+        Raises:
+            SourceError: a sensor cannot be opened.
+        """
+        board = next((source for source in sources if isinstance(source, SyncTimes)), None)
+        clock = RigClock(self._rig, has_board=board is not None, edge_cameras=edge_cameras(self._rig))
+        n_frames = 0
+        with (
+            AttachedSensors(sources) as sensors,
+            FrameFeed(self._rig, sensors, clock, board, are_events_enough=True) as feed,
+        ):
+            while not is_over(n_frames):
+                frame = feed.take(_LIVE_WAIT_S)
+                if frame is not None:
+                    n_frames += 1
+                    self.take_frame(frame)
+            self.notes += [error.what for error, _ in sensors.lost().values()]
+
+    def take_frame(self, frame: Frame) -> None:
+        """Take what the rig saw at one time of a continuous recording."""
+        self._take(f"{1e-9 * frame.time_ns:.2f} s", frame.images, frame.scans, frame.events)
+        self._last = {scan.sensor: scan for scan in frame.scans}
+
+    def _take(
+        self, name: str, images: Sequence[Image], scans: Sequence[Scan], events: Sequence[EventCut] = ()
+    ) -> None:
+        for c, kept in zip(self._pairs, self.kept, strict=True):
+            scan = next((each for each in scans if each.sensor == c.lidar), None)
+            own = [image for image in images if image.sensor == c.camera]
+            # Frames before images that were made of events.
+            frames = self._rig.cameras[c.camera].first_channel("frames")
+            own = [image for image in own if image.channel == frames] or own
+            if scan is None:
+                continue
+            # Grey: colour is not used, and would hold three times the memory.
+            image: Image | Events | None = replace(own[0], pixels=own[0].grey) if own else None
+            if image is None:
+                cut = next((each for each in events if each.sensor == c.camera), None)
+                image = None if cut is None else _about_scan(cut, scan, self._rig, c)
+            if image is not None:
+                kept.take(Seen(name, image, scan, self._last.get(c.lidar)))
+
+    def require_any(self) -> None:
+        """Make sure that something was taken.
+
+        Raises:
+            SourceError: nothing of any camera and LiDAR of the result.
+        """
+        if not any(self.kept):
+            wanted = " or ".join(f"{c.camera} and {c.lidar}" for c in self._pairs)
+            raise SourceError(
+                f"{self._source} holds no images and scans of {wanted} at the same time",
+                "Check the profile's topics and timestamps; `lce-rig doctor` looks at attached sensors.",
+            )
+
+
+def _about_scan(cut: EventCut, scan: Scan, rig: Rig, c: Calibration) -> Events | None:
+    """Copy the events of the time at which the LiDAR looks where the camera does; None if there are none."""
+    scan_ns = rig_time_ns(scan, rig)
+    if scan_ns is None or scan.offset_ns is None or not len(scan.points):
+        return None
+    pixels, is_valid = rig.cameras[c.camera].to_intrinsics().project(transform(c.T_cam_lidar, scan.points))
+    is_seen = is_valid & rig.cameras[c.camera].to_intrinsics().is_inside(pixels)
+    if not is_seen.any():
+        return None
+    offset_ns = cut.offset_ns + own_offset_ns(c, event_channel(rig, c.camera) or "")
+    middle_ns = scan_ns + int(np.median(scan.offset_ns[is_seen])) - offset_ns
+    events = cut.events.between(middle_ns - EVENTS_NS // 2, middle_ns + EVENTS_NS // 2)
+    if not len(events):
+        return None
+    columns = {name: getattr(events, name).copy() for name in ("t_ns", "x", "y", "polarity")}
+    return replace(events, **columns)
+
+
+def own_offset_ns(c: Calibration, channel: str) -> int:
+    """Return what the calibration adds to a channel's timestamps beyond the profile's expected offset."""
+    found = [each.time_offset_s for each in c.channel_results if each.channel == channel]
+    return round(1e9 * found[0]) if found and found[0] is not None else 0
+
+
+def _whole(events: Events, rig: Rig) -> EventCut:
+    """Give all events of a capture as a cut."""
+    offset_ns = rig_offset_ns(stream_of(events, rig), rig)
+    return EventCut(events, int(events.t_ns[0]), int(events.t_ns[-1]) + 1, offset_ns, 0)
+
+
+def _counted(samples: Iterable[Sample], n_samples: int, progress: Progress) -> Iterator[Sample]:
+    done = 0
+    for sample in samples:
+        yield sample
+        if not isinstance(sample, Events):
+            done += 1
+            progress(done, n_samples)
+
+
+def evenly(items: Sequence[_Item], n: int) -> list[_Item]:
+    """Choose n of the items or fewer."""
+    if len(items) <= n:
+        return list(items)
+    return [items[k] for k in np.linspace(0, len(items) - 1, n).round().astype(int)]

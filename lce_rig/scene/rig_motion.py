@@ -1,0 +1,146 @@
+"""How a rig moves while it records: edges at the time of an image, and whether the clocks agree."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Scan
+from lce_rig.core.geometry import Array, exp_so3, log_so3
+from lce_rig.core.interrupts import without_interrupt
+from lce_rig.scene.alignment import Alignment, Curve, SceneView
+
+# Scans of a standing rig differ by less in a tenth of a second: noise, and people who pass by.
+_STILL_MPS, _STILL_RAD_S = 0.2, np.radians(1.5)
+_LONGEST_GAP_S = 0.5
+_VOXEL_M = 0.15
+_REACH_M = 0.6  # of the first round of matching
+_ROBUST_M = 0.1  # Residuals beyond this hardly count: people and cars move otherwise.
+_MIN_FITNESS = 0.5
+_NORMALS_M = 0.8
+_CLOCKS_S = np.linspace(-0.15, 0.15, 31)
+# Clocks nearer to each other than this are not told from motion that is not quite constant.
+_APART_S = 0.02
+_APART_SIGMAS, _APART_SIGNIFICANCE = 3.0, 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class RigMotion:
+    """Constant velocity of a LiDAR, in its own frame.
+
+    Attributes:
+        velocity_mps: (3,).
+        rate_rad_s: (3,) rotation.
+    """
+
+    velocity_mps: Array
+    rate_rad_s: Array
+
+    @property
+    def is_still(self) -> bool:
+        """Whether it is too slow to be told from none."""
+        return bool(
+            np.linalg.norm(self.velocity_mps) < _STILL_MPS and np.linalg.norm(self.rate_rad_s) < _STILL_RAD_S
+        )
+
+    def moved(self, points: Array, after_s: Array) -> Array:
+        """Give standing points as the LiDAR has them some time later.
+
+            p' = exp(w dt)^T (p - v dt)
+
+        Args:
+            points: (N, 3) m, frame lidar at the time that each was seen.
+            after_s: (N,) from then to the time wanted.
+        """
+        shifted = points - after_s[:, None] * self.velocity_mps
+        turns = exp_so3(-after_s[:, None] * self.rate_rad_s)
+        return np.asarray(np.einsum("nij,nj->ni", turns, shifted))
+
+
+def estimate_motion(previous: Scan, scan: Scan) -> RigMotion | None:
+    """Estimate a rig's motion from two consecutive scans: point-to-plane ICP with a robust loss.
+
+    A corridor does not tell how fast a rig moves along it.
+
+    Returns:
+        None where the scans have no timestamps, are not consecutive, or do not match.
+
+    References:
+        S. Rusinkiewicz and M. Levoy, Efficient variants of the ICP algorithm, 3DIM 2001.
+    """
+    if previous.stamp_ns is None or scan.stamp_ns is None:
+        return None
+    gap_s = 1e-9 * (scan.stamp_ns - previous.stamp_ns)
+    if not 0 < gap_s < _LONGEST_GAP_S:
+        return None
+    with without_interrupt():
+        import open3d as o3d
+    register = o3d.pipelines.registration
+    target, source = (_cloud(each) for each in (previous, scan))
+    if min(len(target.points), len(source.points)) < 100:
+        return None
+    target.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(_NORMALS_M, 20))
+    loss = register.TransformationEstimationPointToPlane(register.TukeyLoss(_ROBUST_M))
+    T_previous_scan = np.eye(4)
+    for reach_m in (_REACH_M, 2 * _ROBUST_M):
+        found = register.registration_icp(
+            source, target, reach_m, T_previous_scan, loss, register.ICPConvergenceCriteria(1e-5, 1e-5, 20)
+        )
+        T_previous_scan = np.asarray(found.transformation)
+    if found.fitness < _MIN_FITNESS:
+        return None
+    return RigMotion(T_previous_scan[:3, 3] / gap_s, log_so3(T_previous_scan[:3, :3]) / gap_s)
+
+
+def _cloud(scan: Scan) -> Any:
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(scan.points, dtype=np.float64)))
+    return cloud.voxel_down_sample(_VOXEL_M)
+
+
+def firing_times_s(scan: Scan, points: Array) -> Array | None:
+    """Tell when points (N, 3) of a scan, or beside its returns, were seen: s after its first firing."""
+    from scipy.spatial import cKDTree
+
+    if scan.offset_ns is None or not len(scan.points):
+        return None
+    _, nearest = cKDTree(scan.points).query(points)
+    chosen: NDArray[np.intp] = np.asarray(nearest, dtype=np.intp)
+    return np.asarray(1e-9 * scan.offset_ns[chosen], dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class MovingView:
+    """A capture of a moving rig, its edges as they were at the image's time, and the motion."""
+
+    view: SceneView
+    motion: RigMotion
+
+
+def clocks_apart_s(views: Sequence[MovingView], intrinsics: Intrinsics, T_cam_lidar: Array) -> float | None:
+    """Find by how much images come later than their timestamps say, from captures of a moving rig.
+
+    The score is searched along the time of the images as along an axis of the extrinsics.
+
+    Returns:
+        None where the edges fit at the time that the timestamps say, or the motion is too slow to tell.
+    """
+    rows = []
+    for after_s in _CLOCKS_S:
+        later = [_later(each, float(after_s)) for each in views]
+        alignment = Alignment(later, intrinsics, T_cam_lidar)
+        rows.append(alignment.split(alignment.shares(T_cam_lidar)))
+    curve = Curve(_CLOCKS_S, np.array([parts for parts, _ in rows]), np.array([each for _, each in rows]))
+    peak_s = curve.peak
+    is_apart = abs(peak_s) > max(_APART_S, _APART_SIGMAS * curve.sigma())
+    return peak_s if is_apart and curve.significance(peak_s, 0.0) > _APART_SIGNIFICANCE else None
+
+
+def _later(each: MovingView, after_s: float) -> SceneView:
+    edges = each.view.edges
+    points = each.motion.moved(edges.points, np.full(len(edges), after_s))
+    return replace(each.view, edges=replace(edges, points=points))

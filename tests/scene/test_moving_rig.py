@@ -1,0 +1,86 @@
+"""A rig that drives: its motion from two scans, its edges at the images' time, its clocks compared."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.export.result import SavedResult
+from lce_rig.pipeline.drift import judge
+from lce_rig.pipeline.scene_captures import SceneCaptures
+from lce_rig.scene.alignment import AXES
+from lce_rig.scene.rig_motion import estimate_motion
+from lce_rig.timing.scan_pairing import Frame
+from tests.scene.conftest import deployed, small_rig
+from tests.scene.moving_rig import START_NS, MovingRig
+
+pytestmark = pytest.mark.long
+PERIOD_NS = 100_000_000
+DRIVES = [((0.8, 0.2), 0.35, (0, 0)), ((0.5, -0.3), -0.4, (0.8, 0.5)), ((0.3, -0.5), 0.45, (1.0, -0.5))]
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """Captures of three drives: the rig's motion, the scan before, the scan, an image 30 ms or more later."""
+    captures = []
+    for k, (velocity, turn, at) in enumerate(DRIVES):
+        rig = MovingRig.build(small_rig(), 2, (*velocity, 0.0), turn, at)
+        for step in (0, 5):
+            start_ns = START_NS + step * PERIOD_NS
+            before = rig.scan("lidar", start_ns - PERIOD_NS, 10 * k + step)
+            scan = rig.scan("lidar", start_ns, 100 + 10 * k + step)
+            image = rig.image("cam", start_ns + 30_000_000 + 15_000_000 * k, k)
+            captures.append((rig, before, scan, image))
+    return captures
+
+
+def watch_captures(driven, late_ns=0, change=lambda scan: scan):
+    rig = driven[0][0]
+    result = SavedResult(rig.stage.rig.name, "a test", (deployed(rig.truth("cam", "lidar")),), {})
+    captures = SceneCaptures(rig.stage.rig, result, "the drive")
+    for _, before, scan, image in driven:
+        stamped = replace(image, stamp_ns=image.stamp_ns - late_ns)
+        for each, images in ((before, ()), (scan, (stamped,))):
+            captures.take_frame(Frame(each.stamp_ns, images, (change(each),)))
+    (pair,) = judge(rig.stage.rig, result, captures).pairs
+    return pair.drift
+
+
+def test_two_scans_tell_the_motion(driven) -> None:
+    for rig, before, scan, _ in driven:
+        motion = estimate_motion(before, scan)
+        T_world_lidar = rig.sensor_at("lidar", before.stamp_ns)
+        velocity = T_world_lidar[:3, :3].T @ rig.velocity_mps
+        assert np.linalg.norm(motion.velocity_mps - velocity) < 0.08
+        assert motion.rate_rad_s == pytest.approx([0, 0, rig.turn_rad_s], abs=0.012)
+
+
+def test_scans_of_a_standing_rig_tell_no_motion(seen) -> None:
+    standing = MovingRig.build(small_rig(), 2, (0, 0, 0), 0.0)
+    before, scan = (standing.scan("lidar", START_NS + k * PERIOD_NS, k) for k in range(2))
+    assert estimate_motion(before, scan).is_still
+    assert estimate_motion(before, replace(scan, stamp_ns=None)) is None
+    assert estimate_motion(before, replace(scan, stamp_ns=before.stamp_ns + 4 * 10**9)) is None
+
+
+def test_a_drive_with_true_extrinsics_shows_no_change(driven) -> None:
+    drift = watch_captures(driven)
+    assert drift.n_captures == len(driven)
+    assert not [f.code for f in drift.findings if f.code in ("scene.clocks_apart", "scene.axis_changed")]
+    yaw, aside = drift.axes[AXES.index("rotation_y")], drift.axes[AXES.index("translation_x")]
+    assert yaw.state == aside.state == "unchanged"
+    assert abs(yaw.change) < 0.12 and abs(aside.change) < 0.012
+
+
+@pytest.mark.parametrize("late_ns", [-100_000_000, 100_000_000])
+def test_clocks_apart_while_moving_are_never_an_all_clear(driven, late_ns) -> None:
+    drift = watch_captures(driven, late_ns)
+    assert not [axis for axis in drift.axes if axis.state == "unchanged"]
+    apart = [f.figures["apart_s"] for f in drift.findings if f.code == "scene.clocks_apart"]
+    assert apart == [pytest.approx(1e-9 * late_ns, abs=0.03)]
+
+
+def test_scans_without_firing_times_are_not_used_while_moving(driven) -> None:
+    drift = watch_captures(driven, change=lambda scan: replace(scan, offset_ns=None))
+    assert drift.n_captures == 0 and drift.state == "unknown"
+    assert [f.figures["n_captures"] for f in drift.findings if f.code == "scene.no_firing_times"] == [6]

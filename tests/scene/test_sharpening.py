@@ -1,0 +1,85 @@
+"""Boards and scene in one estimate: what the scene adds, and when it may not."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lce_rig import pipeline
+from lce_rig.core.geometry import Array, difference, invert, perturb, transform
+from lce_rig.core.results import Calibration, SceneShare
+from lce_rig.export.result import read_result, write_result
+from lce_rig.pipeline.sharpening import share_of
+from lce_rig.pipeline.witness import scene_views
+from lce_rig.scene.alignment import SceneView
+from lce_rig.session import Session
+
+from .conftest import Seen, deployed
+
+WEAK = np.diag([0.01, 0.03, 0.02, *np.radians([0.3, 0.5, 0.3])]) ** 2
+
+
+def boards_alone(seen: Seen, tangent: Array, cov: Array) -> Calibration:
+    """A board result that is off by a tangent and claims a covariance."""
+    return replace(deployed(perturb(seen.truth.T_cam_lidar, tangent)), cov=cov)
+
+
+def share(seen: Seen, calibration: Calibration, views: list[SceneView] | None = None) -> SceneShare:
+    lens = seen.rig.cameras["cam"].to_intrinsics()
+    return share_of(seen.views if views is None else views, lens, calibration)
+
+
+def yaw_error_deg(seen: Seen, T: Array) -> float:
+    return float(abs(np.degrees(difference(T, seen.truth.T_cam_lidar)[4])))
+
+
+def test_a_weak_board_result_is_moved_towards_the_truth_and_claims_less(seen: Seen) -> None:
+    off = np.array([0.0, 0.0, 0.0, 0.0, np.radians(0.7), 0.0])
+    calibration = boards_alone(seen, off, WEAK)
+    found = share(seen, calibration)
+    assert found.state == "used" and found.n_directions >= 1
+    assert yaw_error_deg(seen, found.T_cam_lidar) < 0.3 < yaw_error_deg(seen, calibration.T_cam_lidar)
+    assert found.cov[4, 4] < 0.5 * WEAK[4, 4]
+    assert np.allclose(perturb(found.T_cam_lidar_boards, found.change), found.T_cam_lidar, atol=1e-9)
+
+
+def test_a_strong_board_result_stays(seen: Seen) -> None:
+    strong = boards_alone(seen, np.zeros(6), WEAK * 1e-6)
+    found = share(seen, strong)
+    assert found.state == "unknown" and found.n_directions == 0
+    assert np.abs(found.change).max() < 1e-4
+
+
+def test_a_scene_that_contradicts_the_boards_is_not_used(seen: Seen) -> None:
+    off = np.array([0.0, 0.0, 0.0, 0.0, np.radians(1.5), 0.0])
+    found = share(seen, boards_alone(seen, off, np.diag([0.005] * 3 + [np.radians(0.15)] * 3) ** 2))
+    assert found.state == "contradicts" and found.surprise > 10
+
+
+def test_without_edges_the_boards_decide(seen: Seen) -> None:
+    empty = [replace(view, edges=view.edges.select(np.zeros(len(view.edges), bool))) for view in seen.views]
+    calibration = boards_alone(seen, np.zeros(6), WEAK)
+    found = share(seen, calibration, empty)
+    assert (found.state, found.n_edges) == ("unknown", 0)
+    assert np.allclose(found.T_cam_lidar, calibration.T_cam_lidar) and np.allclose(found.cov, WEAK)
+
+
+def test_the_board_is_left_out(seen: Seen, room: Path) -> None:
+    session = Session.open(room)
+    views = scene_views(session, pipeline.detect(session), seen.truth, 60)
+    assert [view.capture for view in views] == [capture.name for capture in session.captures]
+    size_m = np.array([seen.rig.board.width_m, seen.rig.board.height_m])
+    for view, capture in zip(views, seen.captures, strict=True):
+        on_board = transform(invert(capture.T_lidar_board["lidar"]), view.edges.points)
+        is_near = np.all(np.abs(on_board) < [*(0.5 * size_m + 0.03), 0.1], axis=1)
+        assert len(view.edges) > 20 and not is_near.any()
+
+
+def test_the_share_is_written_and_read_back(seen: Seen, tmp_path: Path) -> None:
+    calibration = boards_alone(seen, np.zeros(6), WEAK)
+    found = share(seen, calibration)
+    fused = replace(calibration, T_cam_lidar=found.T_cam_lidar, cov=found.cov, scene_share=found)
+    write_result(tmp_path / "result.json", seen.rig.name, [fused])
+    saved = read_result(tmp_path / "result.json").pairs[0].scene_share
+    assert saved is not None and saved.state == found.state
+    assert np.array_equal(saved.cov_boards, WEAK) and np.allclose(saved.change, found.change)
