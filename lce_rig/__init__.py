@@ -36,11 +36,12 @@ if TYPE_CHECKING:
     from lce_rig.export.reference import Reference, read_reference
     from lce_rig.export.result import SavedResult, read_result
     from lce_rig.extrinsics import CalibrateOptions
-    from lce_rig.pipeline.calibration import calibrate
     from lce_rig.pipeline.collect_recordings import collect_from
     from lce_rig.pipeline.comparison import Repeat, repeat
     from lce_rig.pipeline.detect_session import detect
+    from lce_rig.pipeline.drift import DriftReport, drift
     from lce_rig.pipeline.result_files import Result
+    from lce_rig.pipeline.union import calibrate
     from lce_rig.pipeline.verification import Verification, verify
     from lce_rig.recordings.protocol import SourceOptions
     from lce_rig.rig import Rig, load_rig
@@ -52,6 +53,7 @@ __all__ = [
     "Calibration",
     "CollectOptions",
     "Detections",
+    "DriftReport",
     "Events",
     "Finding",
     "Image",
@@ -76,6 +78,7 @@ __all__ = [
     "collect_from",
     "describe",
     "detect",
+    "drift",
     "export",
     "load_rig",
     "read_reference",
@@ -104,11 +107,12 @@ _HOMES = {
     "lce_rig.export": ("export",),
     "lce_rig.export.reference": ("Reference", "read_reference"),
     "lce_rig.export.result": ("SavedResult", "read_result"),
-    "lce_rig.pipeline.calibration": ("calibrate",),
     "lce_rig.pipeline.collect_recordings": ("collect_from",),
     "lce_rig.pipeline.detect_session": ("detect",),
+    "lce_rig.pipeline.drift": ("DriftReport", "drift"),
     "lce_rig.pipeline.comparison": ("Repeat", "repeat"),
     "lce_rig.pipeline.result_files": ("Result",),
+    "lce_rig.pipeline.union": ("calibrate",),
     "lce_rig.pipeline.verification": ("Verification", "verify"),
     "lce_rig.rig": ("Rig", "load_rig"),
     "lce_rig.session": ("Session",),

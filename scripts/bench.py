@@ -15,6 +15,8 @@
     scripts/bench.py usable      are captures that are taken usable? live sessions, --record, recordings
     scripts/bench.py uncertainty  the joint estimate: errors against their bound, truth of its claim
     scripts/bench.py scene       extrinsics checked without a board, on recordings by others
+    scripts/bench.py drift_inputs  bad input to drift: is any an all-clear? a bag of a minute: time, memory
+    scripts/bench.py scene_methods  the scene's score compared with published ones, on the same recordings
     scripts/bench.py scene_sharpen  boards and scene in one estimate: simulated rooms, recordings
     scripts/bench.py witness     the scene beside the boards: good results refused, wrong ones found
     scripts/bench.py growth      calibrate after detection as sessions grow: time and memory
@@ -44,6 +46,8 @@ PARTS = {
     "offline": 0,
     "usable": 20,
     "scene": 0,
+    "drift_inputs": 0,
+    "scene_methods": 0,
     "scene_sharpen": 100,
     "witness": 20,
     "growth": 0,
@@ -104,7 +108,7 @@ def main() -> None:
         bench(seeds, arguments.captures or 5, arguments.only, arguments.first_seed)
     elif arguments.part == "faults":
         bench(arguments.seeds or PARTS["faults"], n_sessions=arguments.scans)
-    elif arguments.part == "scene":
+    elif arguments.part in ("scene", "scene_methods"):
         bench(min(arguments.splits, 2), arguments.only)
     elif arguments.part == "scene_sharpen":
         seeds = arguments.seeds or PARTS["scene_sharpen"]
@@ -119,7 +123,7 @@ def main() -> None:
         bench(arguments.seconds or 60.0)
     elif arguments.part == "offline":
         bench(arguments.seconds or 15.0)
-    elif arguments.part == "speed":
+    elif arguments.part in ("speed", "drift_inputs"):
         bench()
     else:
         bench(arguments.seeds or PARTS[arguments.part])

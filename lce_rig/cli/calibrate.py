@@ -14,7 +14,6 @@ from lce_rig.cli.options import (
     cameras_option,
     event_image_option,
     require_sensors,
-    session_argument,
     split_names,
 )
 from lce_rig.core.errors import NotEnoughDataError
@@ -67,7 +66,7 @@ def _at_distances(c: Calibration) -> list[str]:
     ]
 
 
-SCENE_STATES = {"agrees": "agrees", "contradicts": "[red]contradicts[/]", "unknown": "cannot tell"}
+_OPINIONS = {"agrees": "agrees", "contradicts": "[red]contradicts[/]", "unknown": "cannot tell"}
 
 
 def scene_texts(opinion: SceneOpinion) -> list[str]:
@@ -77,7 +76,7 @@ def scene_texts(opinion: SceneOpinion) -> list[str]:
     seen = f"{show.counted(opinion.n_captures, 'capture')}, {opinion.n_edges} edges"
     if not opinion.axes:
         return [f"cannot tell: too few edges ({seen})"]
-    texts = [f"{SCENE_STATES[opinion.state]} ({seen})"]
+    texts = [f"{_OPINIONS[opinion.state]} ({seen})"]
     texts += [
         f"{motion_words(axis.axis)}: {_value(axis, axis.change, '+')} +- {_value(axis, axis.sigma)} "
         f"{_UNITS[axis.unit]}"
@@ -105,7 +104,9 @@ def _by_kind(axes: Sequence[AxisOpinion], *, with_size: bool = False) -> list[st
 _UNITS = {"deg": "deg", "m": "mm"}
 
 
-def _value(axis: AxisOpinion, value: float, sign: str = "") -> str:
+def _value(axis: AxisOpinion, value: float | None, sign: str = "") -> str:
+    if value is None:
+        return "?"
     return f"{value:{sign}.2f}" if axis.unit == "deg" else f"{1000 * value:{sign}.0f}"
 
 
@@ -186,7 +187,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@session_argument
+@click.argument("sessions", nargs=-1, type=click.Path(path_type=Path), metavar="[SESSION]...")
 @click.option(
     "--reference",
     type=click.Path(path_type=Path),
@@ -214,7 +215,8 @@ if TYPE_CHECKING:
 @click.option(
     "--name",
     metavar="NAME",
-    help="Write the result to SESSION/results/NAME/ and leave SESSION/calibration/ unchanged.",
+    help="Write the result to SESSION/results/NAME/ and leave SESSION/calibration/ unchanged "
+    "[default of several sessions: union].",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export failed results too, marked NOT FOR USE.")
@@ -230,7 +232,7 @@ if TYPE_CHECKING:
     help="Set the number of random subsets per size (I in the paper).",
 )
 def calibrate(
-    session: Path,
+    sessions: tuple[Path, ...],
     reference: Path | None,
     cameras: tuple[str, ...],
     channels: list[str] | None,
@@ -249,17 +251,25 @@ def calibrate(
     transforms. The earlier result moves to SESSION/calibration/previous/. A run without a result leaves it
     unchanged.
 
+    Several SESSIONs of one rig whose sensors were not moved in between give one result from all captures. It
+    goes into results/union/ of the first; nothing else changes. Each session is calibrated alone before, and
+    sessions that disagree are refused.
+
     Exits with 7 if a result has failed; the exports then skip that camera, unless --force is given. Exits
-    with 6 if a camera has no result.
+    with 7 if sessions disagree, and with 6 if a camera has no result.
     """
     import lce_rig as lce
     from lce_rig.core.errors import UsageError
     from lce_rig.export.reference import read_reference
-    from lce_rig.pipeline.result_files import OVERLAYS, new_result_parts
+    from lce_rig.pipeline.result_files import OVERLAYS, UNION, new_result_parts
+    from lce_rig.pipeline.union import require_unit
 
+    paths = sessions or (Path("session"),)
+    name = UNION if name is None and len(paths) > 1 else name
     new_result_parts(name)
-    opened = lce.Session.open(session)
-    rig = opened.rig
+    opened = [lce.Session.open(path) for path in paths]
+    require_unit(opened)
+    first, rig = opened[0], opened[0].rig
     require_sensors("camera", cameras, rig.cameras)
     options = lce.CalibrateOptions(method, n_draws, seed)
     wanted = [
@@ -273,9 +283,11 @@ def calibrate(
             f"{reference}: T_cam_lidar names no sensors, but the rig has several: {', '.join(wanted)}",
             'Write {"pairs": [{"camera": ..., "lidar": ..., "T_cam_lidar": ...}, ...]}, or add --camera.',
         )
-    with _earlier_result_named(opened.path.joinpath(*new_result_parts(name))):
-        with show.progress_bar("detecting") as progress:
-            detections = lce.detect(opened, event_image=event_image, progress=progress)
+    with _earlier_result_named(first.path.joinpath(*new_result_parts(name))):
+        detections = []
+        for each in opened:
+            with show.progress_bar("detecting") as progress:
+                detections.append(lce.detect(each, event_image=event_image, progress=progress))
         with show.progress_bar("calibrating") as progress:
             result = lce.calibrate(
                 opened,
@@ -294,7 +306,7 @@ def calibrate(
         written = result.write(name=name, force=force)
     if written.had_overlays:
         with show.progress_bar("drawing") as progress:
-            lce.verify(opened, result, detections, name=name, event_image=event_image).write(
+            lce.verify(first, result, detections[0], name=name, event_image=event_image).write(
                 progress=progress
             )
         show.note(f"overlays drawn again in {written.files[0].parent / OVERLAYS}")
@@ -307,7 +319,8 @@ def calibrate(
             show.print_lines(camera_lines(calibration, result.pairs))
         show.note("written: " + ", ".join(f.name for f in written.files) + f" in {written.files[0].parent}")
     _tell_earlier(written)
-    _exit(result.pairs, wanted, {pair.camera for pair in detections.pairs}, are_printed=not as_json)
+    seen = {pair.camera for own in detections for pair in own.pairs}
+    _exit(result.pairs, wanted, seen, are_printed=not as_json)
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """`lce-rig drift`: compare deployed extrinsics with the edges of a scene, exit by what they say."""
 
+import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -144,7 +145,7 @@ def _table(pair: "PairDrift") -> Any:
 def _figures(axis: "AxisDrift") -> tuple[str, ...]:
     scale, unit, digits = (1.0, "deg", 2) if axis.is_rotation else (1000.0, "mm", 0)
     return tuple(
-        f"{scale * value:{sign}.{digits}f} {unit}"
+        f"{scale * value:{sign}.{digits}f} {unit}" if math.isfinite(value) else "-"
         for value, sign in ((axis.change, "+"), (axis.sigma, ""), (axis.smallest, ""))
     )
 

@@ -229,11 +229,12 @@ class LidarBoard:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One board placement seen by one camera channel and one LiDAR."""
+    """One board placement seen by one camera channel and one LiDAR; of several sessions, also its session."""
 
     capture: str
     image: ImageBoard
     lidar: LidarBoard
+    session: str = ""
 
 
 @dataclass(frozen=True)
@@ -313,6 +314,21 @@ class PointUncertainty:
     centre_m: float
     corner_px: float
     corner_m: float
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """One cause of the standard deviations of extrinsics; the squares of all causes add up.
+
+    Attributes:
+        source: "captures" (their scatter), "lidar_ranges", an error of the profile's lens or board such as
+            "focal_length" or "square_size", or "contradiction_" with the check that contradicts.
+        sigma_rotation_deg, sigma_translation_m: what it contributes.
+    """
+
+    source: str
+    sigma_rotation_deg: float
+    sigma_translation_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -438,6 +454,9 @@ class Calibration:
         channel_results: what each of these says alone.
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
+        cov_shared: (6, 6) the part of it that all sessions of one lens and board have in common, as the
+            profile states these; zero if unknown.
+        contributions: the causes of `cov`, the largest first.
         egt_rotation_deg, egt_translation_m: error against a reference given by the user; None without.
         verdict: "pass", "marginal" or "fail".
         findings: the reasons for it, worst first, and notes.
@@ -477,6 +496,8 @@ class Calibration:
     uncertainty: tuple[PointUncertainty, ...] = ()
     estimated_with: tuple[str, ...] = ()
     other_cameras: tuple[OtherCamera, ...] = ()
+    cov_shared: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    contributions: tuple[Contribution, ...] = ()
     scene_share: SceneShare | None = None
     scene: SceneOpinion | None = None
     weakest: WeakestMotion | None = None

@@ -16,7 +16,7 @@ class AxisOpinion:
         unit: of the figures.
         change: from the extrinsics to where the scene's edges fit best.
         sigma: standard deviation of `change`, that of the extrinsics included.
-        smallest: the smallest change that would contradict in 95 % of trials.
+        smallest: the smallest change that would contradict in 95 % of trials; None if none within reach.
     """
 
     axis: str
@@ -24,7 +24,7 @@ class AxisOpinion:
     unit: Literal["deg", "m"]
     change: float
     sigma: float
-    smallest: float
+    smallest: float | None
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,6 +18,7 @@ from lce_rig.core.limits import describe
 from lce_rig.core.results import (
     Calibration,
     ChannelResult,
+    Contribution,
     OtherCamera,
     PointUncertainty,
     Refusal,
@@ -163,6 +164,14 @@ class OtherCameraRecord(_SavedRecord):
     board_rms_m: _NotNegative
 
 
+class ContributionRecord(_SavedRecord):
+    """One cause of the standard deviations; the squares of all add up."""
+
+    source: str
+    sigma_rotation_deg: _NotNegative | None
+    sigma_translation_m: _NotNegative | None
+
+
 class SceneShareRecord(_SavedRecord):
     """The boards' own extrinsics, and what the scene did to them."""
 
@@ -187,7 +196,7 @@ class AxisRecord(_SavedRecord):
     unit: Literal["deg", "m"]
     change: _Figure
     sigma: _NotNegative
-    smallest: _NotNegative
+    smallest: _NotNegative | None
 
 
 class SceneRecord(_SavedRecord):
@@ -235,6 +244,8 @@ class PairRecord(_SavedRecord):
     uncertainty: list[UncertaintyRecord] = Field(default_factory=list)
     estimated_with: list[str] = Field(default_factory=list)
     other_cameras: list[OtherCameraRecord] = Field(default_factory=list)
+    cov_shared: _Cov = Field(default_factory=lambda: np.zeros((6, 6)).tolist())
+    contributions: list[ContributionRecord] = Field(default_factory=list)
     scene_share: SceneShareRecord | None = None
     scene: SceneRecord | None = None
 
@@ -260,6 +271,7 @@ class ResultRecord(_SavedRecord):
     rig: str
     made_by: str
     inputs_sha256: dict[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = Field(default_factory=dict)
+    sessions: dict[str, str] = Field(default_factory=dict)
     pairs: list[PairRecord]
 
     @model_validator(mode="after")
@@ -283,16 +295,21 @@ class SavedResult:
         made_by: the program and its version.
         pairs: one for each camera and LiDAR.
         inputs_sha256: SHA-256 of the result's input files, by their path in the session.
+        sessions: of an estimate from several, by name: their paths from the one that holds the result.
     """
 
     rig: str
     made_by: str
     pairs: tuple[Calibration, ...]
     inputs_sha256: Mapping[str, str]
+    sessions: Mapping[str, str] = field(default_factory=dict)
 
 
 def to_json_dict(
-    rig_name: str, calibrations: Sequence[Calibration], inputs_sha256: Mapping[str, str] | None = None
+    rig_name: str,
+    calibrations: Sequence[Calibration],
+    inputs_sha256: Mapping[str, str] | None = None,
+    sessions: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Build the content of result.json from plain types, keys in a fixed order.
 
@@ -302,6 +319,7 @@ def to_json_dict(
         rig_name: of the profile.
         calibrations: one for each camera and LiDAR.
         inputs_sha256: SHA-256 of the result's input files, by their path in the session.
+        sessions: of an estimate from several, as in `SavedResult`; one session is not named.
 
     Raises:
         ResultRefusedError: a pose or covariance is not finite.
@@ -312,6 +330,7 @@ def to_json_dict(
         "rig": rig_name,
         "made_by": MADE_BY,
         "inputs_sha256": dict(sorted((inputs_sha256 or {}).items())),
+        **({"sessions": dict(sessions)} if sessions else {}),
         "pairs": pairs,
     }
 
@@ -426,7 +445,7 @@ def read_result(path: Path | str) -> SavedResult:
         )
         raise SessionError(what, "Run `lce-rig calibrate SESSION` again.") from error
     calibrations = tuple(_calibration(pair) for pair in record.pairs)
-    return SavedResult(record.rig, record.made_by, calibrations, record.inputs_sha256)
+    return SavedResult(record.rig, record.made_by, calibrations, record.inputs_sha256, record.sessions)
 
 
 def _calibration(pair: PairRecord) -> Calibration:
@@ -459,6 +478,11 @@ def _calibration(pair: PairRecord) -> Calibration:
         uncertainty=tuple(PointUncertainty(**each.model_dump()) for each in pair.uncertainty),
         estimated_with=tuple(pair.estimated_with),
         other_cameras=tuple(_other(record) for record in pair.other_cameras),
+        cov_shared=np.array(pair.cov_shared, dtype=np.float64),
+        contributions=tuple(
+            Contribution(each.source, figure(each.sigma_rotation_deg), figure(each.sigma_translation_m))
+            for each in pair.contributions
+        ),
         scene_share=None if pair.scene_share is None else _share(pair.scene_share),
         scene=None if pair.scene is None else pair.scene.opinion,
     )

@@ -22,11 +22,12 @@ from lce_rig.extrinsics.metrics import error_to_reference
 from lce_rig.extrinsics.observability import require_observable
 from lce_rig.extrinsics.options import Algorithm1Parts, EstimateSettings
 from lce_rig.extrinsics.report import report_estimate, with_parts
-from lce_rig.extrinsics.systematic import ring_sensitivities
+from lce_rig.extrinsics.systematic import profile_sensitivities, ring_sensitivities
 from lce_rig.residuals.features import CaptureFeatures, extract_features
 from lce_rig.residuals.moments import Problem, Solutions, Weights
 from lce_rig.residuals.placements import group_placements
 from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS
+from lce_rig.residuals.quadratics import Quadratics
 from lce_rig.solvers.certificate import solve_globally
 from lce_rig.solvers.covariance import systematic_covariances
 from lce_rig.solvers.registration import eliminate_linear, linear_unknowns, rotation_from_directions
@@ -313,10 +314,11 @@ def calibrate_by_algorithm_1(
     draws = draw_subsets(problem, T_planes, options.n_draws, parts.n_rounds, options.seed, progress)
     # Draws judge the solution and do not choose it, so all begin at the same place.
     solution = problem.solve(np.ones((1, problem.n_captures)), T_planes, parts.n_rounds)
-    covariances = _covariances(fitted, board, options, problem, solution)
+    cost = problem.quadratics(solution.x[0], solution.edge_ids[0], group_placements(fitted))
+    covariances = _covariances(fitted, board, options, problem, solution, cost)
     held_out = np.full(len(features), np.nan) if draws is None else draws.capture_held_out_m
     certificates, cov = solution.certificates, covariances[0] + covariances[1]
-    return report_estimate(
+    estimate = report_estimate(
         solution.T[0],
         cov[:6, :6],
         observations,
@@ -328,6 +330,19 @@ def calibrate_by_algorithm_1(
         refused=outliers,
         diagnostics=_diagnostics(problem, solution, covariances, shifts_m, draws),
     )
+    if options.tolerances is None:
+        return estimate
+    of_profile = profile_sensitivities(
+        fitted,
+        board,
+        parts.features,
+        problem,
+        solution.x[0],
+        solution.edge_ids[0],
+        cost.information,
+        options.tolerances,
+    )
+    return replace(estimate, sensitivities=of_profile)
 
 
 def _start(
@@ -370,20 +385,25 @@ def _covariances(
     options: EstimateSettings,
     problem: Problem,
     solution: Solutions,
+    cost: Quadratics,
 ) -> tuple[Array, Array]:
     """Estimate the covariances (6 + k, 6 + k) of the solution, edge shift last.
 
     Returns:
         The part from the scatter between captures, and the part from the LiDAR's errors common to them.
     """
-    x, edge_ids = solution.x[0], solution.edge_ids[0]
-    cost = problem.quadratics(x, edge_ids, group_placements(observations))
     scatter = cost.jackknife_covariance()
     laser_m, offset_m = options.laser_bias_sigma_m, options.range_offset_sigma_m
     if laser_m == 0 and offset_m == 0:
         return scatter, np.zeros_like(scatter)
     sensitivities = ring_sensitivities(
-        observations, board, options.parts.features, problem, x, edge_ids, cost.information
+        observations,
+        board,
+        options.parts.features,
+        problem,
+        solution.x[0],
+        solution.edge_ids[0],
+        cost.information,
     )
     lasers, offset = systematic_covariances(sensitivities, laser_m, offset_m)
     return scatter, lasers + offset

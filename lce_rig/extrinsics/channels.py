@@ -106,19 +106,15 @@ class _Mover:
         kept = [k for k, scan in enumerate(self.scans) if only is None or only in scan.images]
         scans = [self.scans[k] for k in kept]
         if self.offsets is None:
-            return [_still_observation(scan, only) for scan in scans]
+            return [scan.observation(only) for scan in scans]
         motions = fit_motions(self.samples.select(kept), self.offsets.offset_s, only)
-        still = [_still_observation(scan, only) for scan in scans]
+        still = [scan.observation(only) for scan in scans]
         return deskew_points(at_scan_time(still, motions, self.sweep_s), motions, self.T_cam_lidar)
 
     @property
     def is_motion_own(self) -> bool:
         """Whether a channel alone shows motion, so that channels can be compared."""
         return bool(np.mean(self.samples.is_followed.any(axis=1)) > 0.5)
-
-
-def _still_observation(scan: SharedScan, only: str | None) -> Observation:
-    return scan.observation() if only is None else Observation(scan.capture, scan.images[only], scan.lidar)
 
 
 def _agree(candidates: Mapping[str, Sequence[CaptureCandidates]], board: Board) -> dict[str, Consensus]:
@@ -139,7 +135,9 @@ def _agree(candidates: Mapping[str, Sequence[CaptureCandidates]], board: Board) 
 def _alone(consensus: Consensus, board: Board, options: EstimateSettings) -> CalibrationEstimate:
     """Calibrate one channel by Algorithm 1 as if boards stood still, without draws."""
     return calibrate_observations(
-        consensus.observations, board, replace(options, method="paper", estimator=None, n_draws=0)
+        consensus.observations,
+        board,
+        replace(options, method="paper", estimator=None, n_draws=0, tolerances=None),
     )
 
 
@@ -148,7 +146,8 @@ def _alone_moved(
 ) -> CalibrationEstimate:
     only = channel if len(mover.samples.channels) > 1 else None
     return _widened(
-        calibrate_observations(mover.observations(only), board, replace(options, n_draws=0)), offsets
+        calibrate_observations(mover.observations(only), board, replace(options, n_draws=0, tolerances=None)),
+        offsets,
     )
 
 
@@ -240,7 +239,7 @@ def _difference(
     first, second = results
     if mover.offsets is None or mover.is_motion_own:
         return difference(first.T_cam_lidar, second.T_cam_lidar), first.cov + second.cov
-    fast = replace(options, n_draws=0)
+    fast = replace(options, n_draws=0, tolerances=None)
     seen = [mover.observations(result.channel) for result in results]
     rng = np.random.default_rng(options.seed)
     ways: list[tuple[float, Array, Array]] = []

@@ -216,7 +216,7 @@ def _refine(pairs: _Pairs, R: Array, t: Array, n_captures: int) -> tuple[Array, 
 def _observation(item: CaptureCandidates, pairs: _Pairs, index: int) -> Observation:
     T_cam_board = _camera_poses(item)[pairs.pose[index]]
     image = item.image if pairs.pose[index] == 0 else replace(item.image, T_cam_board=T_cam_board)
-    return Observation(item.capture, image, item.lidar[pairs.candidate[index]])
+    return Observation(item.capture, image, item.lidar[pairs.candidate[index]], item.session)
 
 
 def _explain(item: CaptureCandidates, pairs: _Pairs, rows: NDArray[np.intp], R: Array, t: Array) -> Refusal:

@@ -14,6 +14,7 @@ from lce_rig.core.results import (
     Refusal,
     WeakestMotion,
 )
+from lce_rig.extrinsics.tolerances import Sensitivity
 from lce_rig.residuals.quadratics import Quadratics
 
 
@@ -24,8 +25,8 @@ class CalibrationEstimate:
     Attributes:
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera: from the scatter between
-            captures, and from range errors of the LiDAR that are common to all captures. It excludes errors
-            of the intrinsics and of the board's size.
+            captures, and from range errors of the LiDAR that are common to all captures. Errors of the
+            profile's lens and board are not in it, but in `sensitivities`.
         certificate: of the final cost over all captures used; its gap is infinite if there is none.
         metrics: errors over all captures used, of the boards as measured.
         used: names of the captures used, sorted; one stands for all that hold the same scan.
@@ -37,6 +38,8 @@ class CalibrationEstimate:
         weakest: the least determined motion.
         diagnostics: further figures.
         method: that found it, as `CalibrateOptions.method`.
+        sensitivities: how far errors of the profile's lens and board move the result; empty without
+            `EstimateSettings.tolerances`.
         expansion: the method's own cost about its result, capture by capture, in the extrinsic (and those of
             cameras estimated with it) alone; None if the method has none.
         estimated_with: cameras whose extrinsics were estimated together with this one.
@@ -59,6 +62,7 @@ class CalibrationEstimate:
     weakest: WeakestMotion
     diagnostics: Diagnostics
     method: str = "paper"
+    sensitivities: tuple[Sensitivity, ...] = ()
     expansion: Quadratics | None = None
     estimated_with: tuple[str, ...] = ()
     same_scan: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

@@ -46,20 +46,23 @@ class SharedScan:
         captures: names of those that hold it, sorted; its images may lie in several, with copies of it.
         images: the board by channel, at least one.
         lidar: the board in the scan.
+        session: where captures are of several.
     """
 
     captures: tuple[str, ...]
     images: Mapping[str, ImageBoard]
     lidar: LidarBoard
+    session: str = ""
 
     @property
     def capture(self) -> str:
         """The capture that stands for all of them."""
         return self.captures[0]
 
-    def observation(self) -> Observation:
-        """Pair the scan with its first channel's image."""
-        return Observation(self.capture, next(iter(self.images.values())), self.lidar)
+    def observation(self, channel: str | None = None) -> Observation:
+        """Pair the scan with a channel's image, by default the first's."""
+        image = self.images[channel or next(iter(self.images))]
+        return Observation(self.capture, image, self.lidar, self.session)
 
 
 def join_scans(
@@ -99,6 +102,7 @@ def join_scans(
             tuple(sorted({o.capture for o in group.values()})),
             {channel: o.image for channel, o in group.items()},
             next(iter(group.values())).lidar,
+            next(iter(group.values())).session,
         )
         for group in groups.values()
     ]

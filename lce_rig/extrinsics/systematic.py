@@ -1,12 +1,13 @@
-"""The effect of the LiDAR's constant errors on the solution.
+"""The effect of constant errors on the solution: of the LiDAR's ranges, of the profile's lens and board.
 
 The scatter between captures shows their noise. A laser whose ranges are all 8 mm too long has the same error
 in each capture: it causes no scatter, but moves the extrinsics.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from functools import partial
+from itertools import groupby, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Observation
+from lce_rig.extrinsics.tolerances import Sensitivity, Tolerances, Variant, sensitivities_of, vary
 from lce_rig.residuals.features import CaptureFeatures, FeatureSettings, extract_features
 from lce_rig.residuals.moments import Problem
 from lce_rig.solvers.covariance import symmetric_inverse
@@ -59,25 +61,78 @@ def ring_sensitivities(
     """
     boards = [observation.lidar for observation in observations]
     seen = [np.union1d(lidar.ring, lidar.edge_ring) for lidar in boards]
-    capture = np.repeat(np.arange(len(boards)), [len(rings) for rings in seen])
     ring, column = np.unique(np.concatenate(seen), return_inverse=True)
+
+    def features_of(k: int) -> list[CaptureFeatures]:
+        shifted = shift_rings(boards[k], seen[k], STEP_M)
+        return [extract_features(replace(observations[k], lidar=lidar), board, settings) for lidar in shifted]
+
+    change = np.zeros((len(ring), len(information)))
+    np.add.at(change, column, _changes(features_of, board, problem, x, edge_ids) / STEP_M)
+    return np.asarray(-symmetric_inverse(information) @ change.T)
+
+
+def profile_sensitivities(
+    observations: Sequence[Observation],
+    board: Board,
+    settings: FeatureSettings,
+    problem: Problem,
+    x: Array,
+    edge_ids: NDArray[np.int8],
+    information: Array,
+    known: Tolerances,
+) -> tuple[Sensitivity, ...]:
+    """Differentiate the solution by errors of the profile's lens and board, as (1) does by range offsets.
+
+    Args:
+        observations, board, settings, problem, x, edge_ids, information: as of `ring_sensitivities`.
+        known: the profile's lens and its standard deviations.
+    """
+    variants = vary(observations, board, known)
+    n_captures, changes = len(observations), []
+    for assumed, group in groupby(variants, key=lambda variant: variant.board):
+        features_of = partial(_features_under, tuple(group), settings)
+        by_capture = _changes(features_of, assumed, problem, x, edge_ids)
+        changes.append(by_capture.reshape(n_captures, -1, by_capture.shape[1]).sum(axis=0))
+    moves = -np.concatenate(changes) @ symmetric_inverse(information)[:, :6]
+    return sensitivities_of(variants, moves, known)
+
+
+def _features_under(variants: Sequence[Variant], settings: FeatureSettings, k: int) -> list[CaptureFeatures]:
+    """Extract the features of capture k under each error."""
+    return [extract_features(variant.observations[k], variant.board, settings) for variant in variants]
+
+
+def _changes(
+    features_of: Callable[[int], list[CaptureFeatures]],
+    board: Board,
+    problem: Problem,
+    x: Array,
+    edge_ids: NDArray[np.int8],
+) -> Array:
+    """Compute by how much half gradients (n, 6 + k) differ from those of the captures as observed.
+
+    Args:
+        features_of: a capture's features, as they would be with each of some errors.
+        board: that is assumed.
+        problem, x, edge_ids: as of `ring_sensitivities`.
+
+    Returns:
+        Of the n features, capture by capture.
+    """
     gradients = problem.quadratics(x, edge_ids).gradients
-    starts = np.searchsorted(problem.edge_capture, np.arange(len(boards) + 1))
+    starts = np.searchsorted(problem.edge_capture, np.arange(problem.n_captures + 1))
     own_ids = [edge_ids[first:last] for first, last in pairwise(starts)]
-    moved = []
-    for start in range(0, len(boards), _CHUNK):
-        shifted: list[CaptureFeatures] = []
-        part = range(start, min(start + _CHUNK, len(boards)))
-        for k in part:
-            for lidar in shift_rings(boards[k], seen[k], STEP_M):
-                shifted.append(extract_features(replace(observations[k], lidar=lidar), board, settings))
-        repeated = [k for k in part for _ in seen[k]]
+    found = []
+    for start in range(0, problem.n_captures, _CHUNK):
+        by_capture = {k: features_of(k) for k in range(start, min(start + _CHUNK, problem.n_captures))}
+        features = [each for own in by_capture.values() for each in own]
+        repeated = [k for k, own in by_capture.items() for _ in own]
         keep = None if problem.keep is None else [problem.keep[k] for k in repeated]
         ids = np.concatenate([own_ids[k] for k in repeated])
-        moved.append(Problem(shifted, board, problem.weights, keep).quadratics(x, ids).gradients)
-    change = np.zeros((len(ring), len(information)))
-    np.add.at(change, column, (np.concatenate(moved) - gradients[capture]) / STEP_M)
-    return np.asarray(-symmetric_inverse(information) @ change.T)
+        moved = Problem(features, board, problem.weights, keep).quadratics(x, ids).gradients
+        found.append(moved - gradients[repeated])
+    return np.concatenate(found)
 
 
 def shift_rings(lidar: LidarBoard, rings: NDArray[np.int16], offset_m: float) -> list[LidarBoard]:

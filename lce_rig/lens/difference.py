@@ -120,6 +120,35 @@ def compare_lenses(
     return LensDifference(pixels, moved - pixels, is_covered, log_so3(R), sigma_px, turn @ cov @ turn.T)
 
 
+def lens_errors(
+    given: Intrinsics, fitted: Intrinsics, corners_px: Array, cov: Array, model: LensModel
+) -> tuple[Array, Array]:
+    """Fit errors of given intrinsics, as `Intrinsics.differentiate_by_errors`, to fitted ones.
+
+    Args:
+        given, fitted: for images of the same size.
+        corners_px: (n, 2) where boards were seen; the pixels' distances are least there.
+        cov: (P, P) of the fitted parameters.
+        model: of the fitted.
+
+    Returns:
+        The errors (4,), fitted less given, and their covariance (4, 4).
+
+    Raises:
+        ValueError: the given intrinsics project too few of the pixels.
+    """
+    rays = given.unproject(corners_px)
+    is_drawn = np.isfinite(rays).all(axis=1)
+    rays = rays[is_drawn & fitted.project(np.nan_to_num(rays))[1]]
+    if len(rays) < _LEAST_ALIGNED:
+        raise ValueError("the intrinsics project too few pixels")
+    pixels, _, by_lens = model.project(model.vector(fitted), rays)
+    by_errors = given.differentiate_by_errors(rays).reshape(-1, 4)
+    solve = np.linalg.pinv(by_errors)
+    by_lens = solve @ by_lens.reshape(-1, model.size)
+    return solve @ (pixels - given.project(rays)[0]).ravel(), by_lens @ cov @ by_lens.T
+
+
 def certainty_of(intrinsics: Intrinsics, corners_px: Array, cov: Array, model: LensModel) -> LensCertainty:
     """Propagate the covariance of intrinsics to the image's pixels.
 

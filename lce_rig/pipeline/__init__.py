@@ -10,10 +10,11 @@ session and the export layer touch files.
 """
 
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
-from lce_rig.pipeline.calibration import calibrate, calibrate_detections
+from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.pipeline.detect_session import detect, detection_digest, event_picture
 from lce_rig.pipeline.matching import refusals_of
 from lce_rig.pipeline.result_files import Result, inputs_sha256, write_results
+from lce_rig.pipeline.union import calibrate
 from lce_rig.pipeline.verification import verify, write_debug_images
 
 __all__ = [

@@ -30,6 +30,7 @@ from lce_rig.extrinsics import (
 from lce_rig.extrinsics.likelihood.calibrate_together import TogetherEstimate, calibrate_together
 from lce_rig.extrinsics.metrics import error_to_reference
 from lce_rig.extrinsics.relative_pose import relative_pose
+from lce_rig.extrinsics.tolerances import Tolerances
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.matching import candidates_of
@@ -269,7 +270,8 @@ def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: C
         raise not_enough(shortages[0])
     found = {item.capture for items in candidates.values() for item in items}
     refused = {name: why for name, why in refused.items() if name not in found}
-    settings = EstimateSettings.of(options, rig.lidars[pairs[0].lidar])
+    tolerances = Tolerances.of(rig.cameras[pairs[0].camera], rig.board)
+    settings = EstimateSettings.of(options, rig.lidars[pairs[0].lidar], tolerances)
     return _Sensors(tuple(pairs), settings, candidates, refused)
 
 
@@ -349,7 +351,10 @@ def _with_scene(rig: Rig, solved: _Solved, share: SceneShare) -> _Solved:
     if share.state != "used":
         return replace(solved, share=share)
     estimate = fuse(solved.estimate, share, rig.board.to_board())
-    validation = replace(solved.validation, cov=share.cov)
+    # Of an error of the boards' extrinsics, P' P^-1 is left.
+    left = np.linalg.solve(share.cov_boards, share.cov).T
+    cov_shared = left @ solved.validation.cov_shared @ left.T
+    validation = replace(solved.validation, cov=share.cov, cov_shared=cov_shared)
     return _Solved(solved.sensors, estimate, validation, share=share)
 
 
@@ -414,6 +419,8 @@ def _judged(
         lidar=lidar,
         T_cam_lidar=estimate.T_cam_lidar,
         cov=validation.cov,
+        cov_shared=validation.cov_shared,
+        contributions=validation.contributions,
         certificate=estimate.certificate,
         metrics=estimate.metrics,
         n_captures=n_captures,

@@ -1,6 +1,6 @@
 """Compare the calibrations of one rig in several sessions."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
@@ -73,7 +73,7 @@ def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
             f"{listed} Add one: lce-rig calibrate {session.path} --name NAME, or name a second session.",
         )
     results = {name: _read_calibrations(session, stored[name].folder) for name in chosen}
-    comparisons, lonely = _comparisons(results, are_independent=False)
+    comparisons, lonely = compare_sensors(results, are_independent=False)
     _require_some(comparisons, results, "results")
     outdated = [Finding("results.outdated", "warning", name) for name in chosen if stored[name].is_outdated]
     return Repeat(session.rig.name, comparisons, (), (*outdated, *lonely, *_failures(results)))
@@ -98,10 +98,9 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
     paths = [Path(folder) for folder in folders]
     if len(paths) < 2:
         raise UsageError("a comparison requires two sessions or more, 1 given", "Give two sessions or more.")
-    _require_different(paths)
-    sessions = dict(zip(_names(paths), (Session.open(path) for path in paths), strict=True))
-    _require_one_rig(sessions)
-    _require_independent(sessions)
+    sessions = dict(zip(session_names(paths), (Session.open(path) for path in paths), strict=True))
+    require_one_rig(sessions)
+    require_independent(sessions)
     results: dict[str, list[Calibration]] = {}
     calibrated: list[str] = []
     troubles: list[Finding] = []
@@ -115,7 +114,7 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
             troubles += own_troubles
         progress(done, len(sessions))
     rig = next(iter(sessions.values())).rig.name
-    comparisons, lonely = _comparisons(results)
+    comparisons, lonely = compare_sensors(results)
     _require_some(comparisons, results, "sessions")
     findings = (*_other_boards(sessions), *troubles, *lonely, *_failures(results))
     return Repeat(rig, comparisons, tuple(calibrated), findings)
@@ -140,26 +139,28 @@ def _failures(results: dict[str, list[Calibration]]) -> list[Finding]:
     ]
 
 
-def _require_different(paths: Sequence[Path]) -> None:
+def session_names(paths: Sequence[Path]) -> list[str]:
+    """Name sessions by their folder, or by their path if two folders have the same name.
+
+    Raises:
+        UsageError: one is given twice.
+    """
     resolved = [path.resolve() for path in paths]
     for path, where in zip(paths, resolved, strict=True):
         if resolved.count(where) > 1:
             raise UsageError(f"{path} is given twice", "Give independent sessions.")
-
-
-def _names(paths: Sequence[Path]) -> list[str]:
-    """Name sessions by their folder, or by their path if two folders have the same name."""
-    short = [path.resolve().name for path in paths]
+    short = [path.name for path in resolved]
     return short if len(set(short)) == len(short) else [str(path) for path in paths]
 
 
-def _require_one_rig(sessions: dict[str, Session]) -> None:
+def require_one_rig(sessions: Mapping[str, Session]) -> None:
+    """Refuse sessions of different rigs, or with different lenses; raises SessionError."""
     (first_name, first), *others = sessions.items()
     for name, session in others:
         if session.rig.name != first.rig.name:
             raise SessionError(
                 f"{first_name} belongs to rig {first.rig.name!r}, {name} to rig {session.rig.name!r}",
-                "Compare sessions of one rig.",
+                "Give sessions of one rig.",
             )
         keys = [key for key in differing_keys(first.rig, session.rig) if _is_of_sensors(key)]
         if keys:
@@ -175,7 +176,7 @@ def _is_of_sensors(difference: DifferingKey) -> bool:
     return block in ("cameras", "lidars") and not _SAME_SENSORS.isdisjoint(keys)
 
 
-def _require_independent(sessions: dict[str, Session]) -> None:
+def require_independent(sessions: Mapping[str, Session]) -> None:
     """Refuse sessions that share images or scans: a copy agrees with its original despite any error."""
     hashes: dict[str, list[frozenset[str]]] = {}
     for name, session in sessions.items():
@@ -251,7 +252,7 @@ def _read_calibrations(session: Session, folder: Path) -> list[Calibration]:
     return list(saved.pairs)
 
 
-def _comparisons(
+def compare_sensors(
     results: dict[str, list[Calibration]], *, are_independent: bool = True
 ) -> tuple[tuple[Repeatability, ...], list[Finding]]:
     """Compare each camera and LiDAR, and report those that only one session calibrates."""

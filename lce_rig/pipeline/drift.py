@@ -159,7 +159,9 @@ class DriftReport:
             name, image, view = pair.example
             c = pair.calibration
             lens = self.rig.cameras[c.camera].to_intrinsics()
-            picture = draw_drift(pair.drift, image, view.edges, lens, f"{c.camera}, {c.lidar}  {name}")
+            board = () if pair.board is None else pair.board.axes
+            title = f"{c.camera}, {c.lidar}  {name}"
+            picture = draw_drift(pair.drift, image, view.edges, lens, title, board)
             files.append(write_picture(Path(folder) / f"drift_{c.camera}_{c.lidar}.png", picture))
         return files
 

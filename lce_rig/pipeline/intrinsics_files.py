@@ -14,6 +14,7 @@ from lce_rig.core.errors import LceRigError, ResultRefusedError, UsageError
 from lce_rig.core.results import Refusal
 from lce_rig.export.camera_info import camera_info_text, read_camera_info, ros_distortion
 from lce_rig.export.files import MADE_BY, number, numbers
+from lce_rig.lens.difference import lens_errors
 from lce_rig.pipeline.lens import MeasuredIntrinsics
 from lce_rig.pipeline.result_files import keep_earlier
 from lce_rig.rig import (
@@ -113,6 +114,23 @@ def final(measured: MeasuredIntrinsics) -> Intrinsics:
     return replace(lens, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, distortion=distortion)
 
 
+def deviations(measured: MeasuredIntrinsics) -> dict[str, float]:
+    """Compute the standard deviations of the profile's block `intrinsics`, px, by key.
+
+    Its parameters are correlated: focal length, principal point and distortion share what their covariance
+    lets pixels move where boards were seen.
+    """
+    estimate, lens = measured.estimate, measured.estimate.intrinsics
+    corners_px = estimate.corners_px.reshape(-1, 2)
+    _, cov = lens_errors(lens, lens, corners_px, estimate.cov, estimate.model)
+    focal, x, y, corner_px = np.sqrt(np.diag(cov)).tolist()
+    return {
+        "focal_sigma_px": float(f"{focal * lens.fx_px:.2g}"),
+        "principal_point_sigma_px": float(f"{np.sqrt((x**2 + y**2) / 2):.2g}"),
+        "distortion_sigma_px": float(f"{corner_px:.2g}"),
+    }
+
+
 def profile_block(rig: Rig, measured: MeasuredIntrinsics) -> str:
     """Write the camera's block `intrinsics:`, indented for pasting into a profile."""
     lens, sigma = final(measured), measured.estimate.sigma
@@ -126,8 +144,9 @@ def profile_block(rig: Rig, measured: MeasuredIntrinsics) -> str:
     for index, key in enumerate(("fx_px", "fy_px", "cx_px", "cy_px")):
         lines.append(f"      {key}: {number(getattr(lens, key))}   # +- {sigma[index]:.2g}")
     names = " ".join(measured.estimate.model.coefficients)
-    deviations = " ".join(f"{value:.1g}" for value in sigma[4:])
-    lines.append(f"      distortion: {numbers(lens.distortion)}   # {names}, +- {deviations}")
+    spread = " ".join(f"{value:.1g}" for value in sigma[4:])
+    lines.append(f"      distortion: {numbers(lens.distortion)}   # {names}, +- {spread}")
+    lines += [f"      {key}: {value:g}" for key, value in deviations(measured).items()]
     return "\n".join(lines) + "\n"
 
 
@@ -160,13 +179,15 @@ def save_profile(
         why = "; ".join(f"{one.camera}: {describe(one.judgement)}" for one in refused)
         actions = dict.fromkeys(as_line(recommend(one.judgement)) for one in refused)
         raise ResultRefusedError(f"{path} not written. {why}", " ".join([*actions, _FORCE]))
-    text = _profile_text(session.rig)
+    text = profile_text(session.rig)
     for one in measured:
         lens, block = final(one), f"cameras.{one.camera}"
         if (lens.width_px, lens.height_px) != session.rig.cameras[one.camera].resolution_px:
             text = set_value(text, f"{block}.resolution_px", f"[{lens.width_px}, {lens.height_px}]")
         for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
             text = set_value(text, f"{block}.intrinsics.{key}", number(getattr(lens, key)))
+        for key, value in deviations(one).items():
+            text = set_value(text, f"{block}.intrinsics.{key}", f"{value:g}")
         text = set_value(text, f"{block}.intrinsics.model", lens.model)
         text = set_value(text, f"{block}.intrinsics.distortion", numbers(lens.distortion))
     head = "".join(f"# {line}\n" for one in measured for line in _head(session.rig, one))
@@ -175,7 +196,7 @@ def save_profile(
     return tuple(one.camera for one in measured)
 
 
-def _profile_text(rig: Rig) -> str:
+def profile_text(rig: Rig) -> str:
     """Find the text of a profile with comments: a shipped profile has them, a session's does not."""
     if rig.name in shipped_profiles() and load_rig(rig.name) == rig:
         return read_profile(find_profile(rig.name))
@@ -271,7 +292,10 @@ def _comparison(measured: MeasuredIntrinsics) -> dict[str, Any] | None:
         return None
     return {
         "intrinsics": _settings(measured.given),
-        **{name: _figure(value) for name, value in asdict(check).items()},
+        **{
+            name: value if isinstance(value, tuple) else _figure(value)
+            for name, value in asdict(check).items()
+        },
         "displacement_max_px": _figure(difference.max_px),
         "turn_rad": np.asarray(difference.turn_rad).tolist(),
         "verdict": verdict_of([] if measured.misfit is None else [measured.misfit]),

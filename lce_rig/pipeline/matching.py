@@ -17,7 +17,7 @@ def candidates_of(detections: Detections, pair: Pair) -> tuple[list[CaptureCandi
         elif isinstance(lidar, Refusal):
             refused[name] = lidar
         else:
-            candidates.append(CaptureCandidates(name, image, lidar))
+            candidates.append(CaptureCandidates(name, image, lidar, detections.session_of.get(name, "")))
     return candidates, refused
 
 

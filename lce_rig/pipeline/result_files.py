@@ -1,9 +1,10 @@
 """Write the files of a result into its session in one step; keep the last usable earlier ones."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from lce_rig.export.result import SavedResult
 
 RESULT, OVERLAYS, PREVIOUS = "result.json", "overlays", "previous"
+UNION = "union"
+"""How the result of several sessions is called in the first of them, unless it is named."""
 CURRENT = "current"
 """How the result in calibration/ is called beside those with names."""
 _LONGEST_NAME = 64
@@ -34,11 +37,14 @@ class Result:
         session: the source of the captures.
         pairs: one for each calibrated camera and LiDAR.
         shortages: for each other camera and LiDAR with captures, why it has no result.
+        sessions: by name, those of an estimate from several, `session` first; names of captures begin with
+            that of their session and a slash. Empty for one session.
     """
 
     session: Session
     pairs: tuple[Calibration, ...]
     shortages: tuple[Finding, ...] = ()
+    sessions: Mapping[str, Session] = field(default_factory=dict)
 
     def of(self, camera: str, lidar: str | None = None) -> Calibration:
         """Return the extrinsics of a camera with a LiDAR, by default the first with a result.
@@ -58,9 +64,7 @@ class Result:
             SessionError: a capture that was used is missing.
             ResultRefusedError: a pose or covariance is not finite.
         """
-        from lce_rig.export.result import to_json_dict
-
-        return to_json_dict(self.session.rig.name, self.pairs, inputs_sha256(self.session, self.pairs))
+        return _document(self.session, self.pairs, self.sessions)
 
     def text(self) -> str:
         """Write the content of result.json; raises like `document`."""
@@ -76,6 +80,7 @@ class Result:
         Args:
             folder: None, or the session's calibration/: the files there are replaced in one step, and the
                 earlier ones kept in calibration/previous/. In any other folder files are replaced one by one.
+                Several sessions' result goes into results/union/ of the first instead.
             name: writes the session's results/NAME/ instead, in the same way; calibration/ is untouched.
             force: export failed results too; each file then says so.
 
@@ -85,8 +90,9 @@ class Result:
         """
         own = self.session.path / CALIBRATION
         if folder is None or Path(folder).resolve() == own.resolve():
-            return write_results(self.session, self.pairs, force=force, name=name)
-        names = _write_files(Path(folder), self.session, self.pairs, force=force)
+            name = UNION if self.sessions and name is None else name
+            return write_results(self.session, self.pairs, force=force, name=name, sessions=self.sessions)
+        names = _write_files(Path(folder), self.session, self.pairs, self.sessions, force=force)
         return WrittenResults(tuple(Path(folder) / name for name in names), None, False, (), False)
 
 
@@ -141,7 +147,12 @@ def new_result_parts(name: str | None) -> tuple[str, ...]:
 
 
 def write_results(
-    session: Session, calibrations: Sequence[Calibration], *, force: bool, name: str | None = None
+    session: Session,
+    calibrations: Sequence[Calibration],
+    *,
+    force: bool,
+    name: str | None = None,
+    sessions: Mapping[str, Session] | None = None,
 ) -> WrittenResults:
     """Write result.json and, unless a verdict is fail, all exports, replacing an earlier run's.
 
@@ -155,6 +166,7 @@ def write_results(
         calibrations: the result.
         force: export failed results too.
         name: writes results/NAME/ instead of calibration/.
+        sessions: of an estimate from several, as in `Result`.
 
     Raises:
         UsageError: the name is not valid.
@@ -174,7 +186,7 @@ def write_results(
         had_overlays = has_drawn and not (draft / OVERLAYS).is_dir()
 
     with session.replacing(*parts, finish=finish) as draft:
-        names = _write_files(draft, session, calibrations, force=force)
+        names = _write_files(draft, session, calibrations, sessions or {}, force=force)
     previous = folder / PREVIOUS
     return WrittenResults(
         tuple(folder / name for name in names),
@@ -187,32 +199,108 @@ def write_results(
 
 
 def _write_files(
-    folder: Path, session: Session, calibrations: Sequence[Calibration], *, force: bool
+    folder: Path,
+    session: Session,
+    calibrations: Sequence[Calibration],
+    sessions: Mapping[str, Session],
+    *,
+    force: bool,
 ) -> list[str]:
     """Write result.json and the exports of usable results; return the files' names."""
     from lce_rig.export import export, remove_exports
-    from lce_rig.export.result import write_result
+    from lce_rig.export.result import layout
+    from lce_rig.session.durable import write_atomically
 
     usable = [c for c in calibrations if force or c.verdict != "fail"]
-    write_result(folder / RESULT, session.rig.name, calibrations, inputs_sha256(session, calibrations))
+    write_atomically(folder / RESULT, layout(_document(session, calibrations, sessions)))
     if not usable:
         remove_exports(folder)
         return [RESULT]
     return [RESULT, *(path.name for path in export(usable, session.rig, folder, is_forced=force))]
 
 
-def inputs_sha256(session: Session, calibrations: Sequence[Calibration]) -> dict[str, str]:
+def _document(
+    session: Session, calibrations: Sequence[Calibration], sessions: Mapping[str, Session]
+) -> dict[str, Any]:
+    """Build the content of result.json; other sessions are named by their path from the first."""
+    from lce_rig.export.result import to_json_dict
+
+    own = session.path.resolve()
+    paths = {name: os.path.relpath(each.path.resolve(), own) for name, each in sessions.items()}
+    return to_json_dict(session.rig.name, calibrations, inputs_sha256(session, calibrations, sessions), paths)
+
+
+def inputs_sha256(
+    session: Session, calibrations: Sequence[Calibration], sessions: Mapping[str, Session] | None = None
+) -> dict[str, str]:
     """Fingerprint the inputs of results: the profile, and the manifest of every capture used.
 
     A manifest holds the SHA-256 of the capture's files.
 
+    Args:
+        session: the source of the captures.
+        calibrations: the results.
+        sessions: of an estimate from several, as in `Result`.
+
     Returns:
-        SHA-256 by path in the session.
+        SHA-256 by path in the session; of several sessions, by name of the session and path in it.
 
     Raises:
         SessionError: a capture that was used is missing.
     """
     used = sorted({name for calibration in calibrations for name in calibration.captures_used})
+    if not sessions:
+        return _inputs(session, used)
+    return {
+        f"{name}/{path}": digest
+        for name, each in sessions.items()
+        for path, digest in _inputs(each, _of_session(name, used)).items()
+    }
+
+
+def _of_session(name: str, captures: Iterable[str]) -> list[str]:
+    """Give a session's own names of its captures among those of several sessions."""
+    split = (capture.rpartition("/") for capture in captures)
+    return [own for session, _, own in split if session == name]
+
+
+def as_named_in(
+    session: Session,
+    calibrations: Sequence[Calibration],
+    sessions: Iterable[str],
+    inputs: Mapping[str, str],
+) -> tuple[Calibration, ...]:
+    """Give the calibrations of several sessions with the captures of one of them, named as in it.
+
+    A session is recognised by its captures' manifests, wherever it lies. Of a session that was no part of the
+    estimate, no capture was used.
+
+    Args:
+        session: any session of the rig.
+        calibrations: of several sessions.
+        sessions: their names.
+        inputs: as `inputs_sha256` gives them.
+    """
+    held: set[str] = set()
+    for capture in session.captures:
+        with suppress(SessionError):  # a damaged capture is reported when it is read
+            held.add(capture.manifest_sha256)
+    shared = [path for path, digest in inputs.items() if digest in held]
+    is_part = [name for name in sessions if any(p.startswith(f"{name}/{CAPTURES}/") for p in shared)]
+    name = is_part[0] if is_part else ""
+    return tuple(
+        replace(
+            c,
+            captures_used=tuple(_of_session(name, c.captures_used)),
+            captures_refused={
+                own: why for each, why in c.captures_refused.items() for own in _of_session(name, [each])
+            },
+        )
+        for c in calibrations
+    )
+
+
+def _inputs(session: Session, used: Sequence[str]) -> dict[str, str]:
     profile = hashlib.sha256(read_file(session.path / PROFILE)).hexdigest()
     held = {capture.name: capture for capture in session.captures}
     # `Session.capture` raises where one is missing; it lists the folder each time.
@@ -346,7 +434,8 @@ def _stored(session: Session, name: str) -> StoredResult | None:
 def _is_outdated(session: Session, saved: "SavedResult") -> bool:
     """Return whether a result's inputs in its session have changed."""
     try:
-        return dict(saved.inputs_sha256) != inputs_sha256(session, saved.pairs)
+        sessions = {name: Session.open(session.path / path) for name, path in saved.sessions.items()}
+        return dict(saved.inputs_sha256) != inputs_sha256(session, saved.pairs, sessions)
     except LceRigError:
         return True
 

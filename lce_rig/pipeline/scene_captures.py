@@ -22,6 +22,7 @@ from lce_rig.recordings import open_recordings
 from lce_rig.recordings.joining import join_recordings, require_sensors
 from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording
 from lce_rig.rig import Rig
+from lce_rig.scene.views import MAX_CAPTURES
 from lce_rig.session import Capture, Session
 from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.rig_clock import RigClock
@@ -29,8 +30,6 @@ from lce_rig.timing.rig_time import event_channel, rig_offset_ns, rig_time_ns, s
 from lce_rig.timing.scan_pairing import Frame, pair_by_time
 from lce_rig.words import describe
 
-MAX_CAPTURES = 60
-"""More captures add time and memory but, of one place, no information: they are thinned out evenly."""
 _LIVE_WAIT_S = 0.2
 #: Of events this long about the time at which the LiDAR looks where the camera does.
 EVENTS_NS = 20_000_000
@@ -56,7 +55,7 @@ class Seen:
 _Item = TypeVar("_Item")
 
 
-class _Thinned(list[_Item]):
+class Thinned(list[_Item]):
     """The items of a stream, every one at first, every second once there are too many, and so on."""
 
     def __init__(self) -> None:
@@ -100,7 +99,7 @@ class SceneCaptures:
                 raise SessionError(f"the result names {c.camera} and {c.lidar}, which rig {rig.name!r} lacks")
         self._rig, self._source = rig, source
         self._pairs = result.pairs
-        self.kept: list[_Thinned[Seen]] = [_Thinned() for _ in result.pairs]
+        self.kept: list[Thinned[Seen]] = [Thinned() for _ in result.pairs]
         self.notes: list[str] = []
         self._last: dict[str, Scan] = {}
 

@@ -14,12 +14,11 @@ from lce_rig.detect.detection import Detections
 from lce_rig.extrinsics import CalibrationEstimate
 from lce_rig.extrinsics.metrics import capture_residual, summarise
 from lce_rig.extrinsics.observability import find_weakest
-from lce_rig.pipeline.scene_captures import MAX_CAPTURES
 from lce_rig.pipeline.witness import scene_views
 from lce_rig.residuals.features import AS_MEASURED, extract_features
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.estimate import estimate
-from lce_rig.scene.views import without_movers
+from lce_rig.scene.views import MAX_CAPTURES, without_movers
 from lce_rig.session import Session
 from lce_rig.validation.weighing import reason
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
+from typing import Literal
 
 import numpy as np
 
@@ -71,5 +72,7 @@ def opinion_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibr
 
 
 def _of_axis(drift: AxisDrift) -> AxisOpinion:
-    figures = float(drift.change), float(drift.sigma), float(drift.smallest)
-    return AxisOpinion(drift.axis, _STATES[drift.state], "deg" if drift.is_rotation else "m", *figures)
+    unit: Literal["deg", "m"] = "deg" if drift.is_rotation else "m"
+    smallest = float(drift.smallest) if np.isfinite(drift.smallest) else None
+    change, sigma = float(drift.change), float(drift.sigma)
+    return AxisOpinion(drift.axis, _STATES[drift.state], unit, change, sigma, smallest)

@@ -1,16 +1,17 @@
 """Residuals of planes and ring ends along the LiDAR's rays for boards at given poses, for the likelihood.
 
-Ranges. A ray u meets a board's plane n . p = h at r = h / (n . u) and reads, off by the offset o of its laser
-and displaced by f theta (the lens, below),
+Ranges. A ray u meets a board's plane n . p = h at r = h / (n . u) and reads, off by the range offset o of its
+laser and displaced by f theta (the lens, below) and by the laser's errors a of azimuth and elevation,
 
-    rho = r - n . f theta / (n . u) + o + noise                                                          (1)
+    rho = r - n . (f theta + r u' a) / (n . u) + o + noise                                               (1)
 
-The points determine three parameters of a plane's motion (`freedoms_of_plane`), so that all that an estimate
-needs of the returns of a ring in a capture are the sums of products of
+with u' the derivative of the ray by the two. The points determine three parameters of a plane's motion
+(`freedoms_of_plane`), so that all that an estimate needs of the returns of a ring in a capture are the sums
+of products of
 
-    v = [(1, x, y) / (n . u); 1; -n . f / (n . u); residual of (1)]
+    v = [(1, x, y) / (n . u); 1; -r n . u' / (n . u); -n . f / (n . u); residual of (1)]
 
-(7 x 7) with x and y on the board, however many there are.
+(9 x 9) with x and y on the board, however many there are.
 
 Ring ends. A ring's last ray on the board meets its plane s inside an edge, the next ray a step D
 farther out along the edge's normal. The beam has a width, so that the board is lost where the ray passes d
@@ -26,9 +27,10 @@ and r the range,
     d = d_0 + c r + d_1 q    where the background is far behind
     d = d_0 + c r + d_2 + d_3 q    where it is so near that both echoes blend into one                   (3)
 
-Recordings show d_1 near -17 mm, simulation -15 mm. What is left, the same for all ring ends (a beam that is
-not symmetric, a clock of the rotor), is a small displacement of ring ends against the returns between them,
-along azimuth and upwards.
+Recordings show d_1 near -17 mm, simulation -15 mm. A plate that is larger than its drawing shifts all edges
+alike and is part of d_0; by the shape p its upright edges lie farther out, the others as much farther in.
+What is left, the same for all ring ends (a beam that is not symmetric, a clock of the rotor), is a small
+displacement of ring ends against the returns between them, along azimuth and upwards.
 
 Lens. A spinning LiDAR sends its beams from a lens beside its axis, and drivers that do not know where place
 points as if they came from the axis. With e_a the direction of growing azimuth and alpha the elevation, a
@@ -55,13 +57,18 @@ Indices = NDArray[np.intp]
 N_FIELDS = 2
 # Half a beam's width, and what the outline found in the scan may be off by.
 _BORDER_M = 0.02
-# Columns of a return: three freedoms of its plane, its ring's offset, the lens, the residual.
-_ONE, _OF_RETURN = 3, 5 + N_FIELDS
-SHIFTS = ("d_0", "c", "d_1", "d_2", "d_3", "along azimuth", "upwards")
-"""Unknowns of (3), and the displacement of ring ends."""
+ERRORS_OF_LASER = ("range", "azimuth", "elevation")
+"""Constant errors of each laser, in m and rad."""
+N_OF_LASER = len(ERRORS_OF_LASER)
+# Columns of a return: three freedoms of its plane, its laser's errors, the lens, the residual.
+_OWN = 3
+_LENS = _OWN + N_OF_LASER
+_OF_RETURN = _LENS + N_FIELDS + 1
+SHIFTS = ("d_0", "c", "d_1", "d_2", "d_3", "p", "along azimuth", "upwards")
+"""Unknowns of (3), the plate's shape, and the displacement of ring ends."""
 N_SHIFTS = len(SHIFTS)
-# Columns of a ring end: by board pose, by lens, by shifts, residual.
-_OF_END = 6 + N_FIELDS + N_SHIFTS + 1
+# Columns of a ring end: by board pose, by its laser's errors, by lens, by shifts, residual.
+_OF_END = 6 + N_OF_LASER + N_FIELDS + N_SHIFTS + 1
 # A ring end on an edge parallel to its ring has hardly a step, and determines the edge less accurately.
 _SHORTEST_STEP_M = 2e-4
 BLENDS_M = 0.35
@@ -81,7 +88,7 @@ class StackedScans:
         rays: (N, 3) unit vectors, frame lidar.
         range_m: (N,).
         fields: (N, 3, 2) displacement by (4) for a lateral offset of 1 m, a vertical one of 1 m per rad.
-        end_capture: (M,) of each ring end.
+        end_capture, end_ring: (M,) of each ring end, ordered by capture.
         end_rays: (M, 3) unit vectors towards it.
         next_rays: (M, 3) unit vectors of the firing after it, which missed the board.
         end_fields: (M, 3, 2) as `fields`.
@@ -96,6 +103,7 @@ class StackedScans:
     range_m: Array
     fields: Array
     end_capture: Indices
+    end_ring: Indices
     end_rays: Array
     next_rays: Array
     end_fields: Array
@@ -120,15 +128,19 @@ def interior(lidar: LidarBoard, board: Board) -> LidarBoard:
 
 def stack_scans(boards: Sequence[LidarBoard]) -> StackedScans:
     """Stack the boards of F captures."""
-    rings = np.unique(np.concatenate([board.ring for board in boards]))
+    rings = np.unique(np.concatenate([numbers for b in boards for numbers in (b.ring, b.edge_ring)]))
     capture = np.repeat(np.arange(len(boards)), [len(board.points) for board in boards])
     ring = np.searchsorted(rings, np.concatenate([board.ring for board in boards]))
     points = np.concatenate([np.asarray(board.points, dtype=np.float64) for board in boards])
     order = np.lexsort((ring, capture))
     points, capture, ring = points[order], capture[order], ring[order]
     range_m = np.linalg.norm(points, axis=1)
+    end_capture = np.repeat(np.arange(len(boards)), [len(board.edge_points) for board in boards])
+    end_ring = np.searchsorted(rings, np.concatenate([board.edge_ring for board in boards]))
+    sorted_ends = np.lexsort((end_ring, end_capture))
     ends = np.concatenate([np.asarray(b.edge_points, dtype=np.float64).reshape(-1, 3) for b in boards])
-    angle = np.concatenate([board.edge_side * board.azimuth_step_rad for board in boards])
+    ends = ends[sorted_ends]
+    angle = np.concatenate([board.edge_side * board.azimuth_step_rad for board in boards])[sorted_ends]
     end_rays = ends / np.linalg.norm(ends, axis=1, keepdims=True)
     return StackedScans(
         n_captures=len(boards),
@@ -138,11 +150,12 @@ def stack_scans(boards: Sequence[LidarBoard]) -> StackedScans:
         rays=points / range_m[:, None],
         range_m=range_m,
         fields=lens_fields(points),
-        end_capture=np.repeat(np.arange(len(boards)), [len(board.edge_points) for board in boards]),
+        end_capture=end_capture[sorted_ends],
+        end_ring=end_ring[sorted_ends],
         end_rays=end_rays,
         next_rays=turn_about_z(end_rays, angle),
         end_fields=lens_fields(ends),
-        end_background=np.concatenate([describe_background(board) for board in boards]),
+        end_background=np.concatenate([describe_background(board) for board in boards])[sorted_ends],
     )
 
 
@@ -161,6 +174,16 @@ def lens_fields(points: Array) -> Array:
     fields[:, 0, 0], fields[:, 1, 0] = -points[:, 1] / across, points[:, 0] / across
     fields[:, 2, 1] = np.arctan2(points[:, 2], across)
     return fields
+
+
+def turn_rays(rays: Array) -> Array:
+    """Differentiate unit rays (N, 3) by azimuth and elevation: (N, 3, 2)."""
+    across = np.hypot(rays[:, 0], rays[:, 1])
+    turned = np.zeros((len(rays), 3, 2))
+    turned[:, 0, 0], turned[:, 1, 0] = -rays[:, 1], rays[:, 0]
+    turned[:, :2, 1] = -rays[:, :2] * (rays[:, 2] / across)[:, None]
+    turned[:, 2, 1] = across
+    return turned
 
 
 def is_blended(lidar: LidarBoard) -> NDArray[np.bool_]:
@@ -184,7 +207,7 @@ class RangeSums:
     """Sums of v v^T by capture and ring, at given board poses.
 
     Attributes:
-        sums: (F, L, 7, 7).
+        sums: (F, L, 9, 9).
         by_pose: (F, 3, 6) derivative of the plane's three freedoms by the tangent of T_lidar_board.
     """
 
@@ -192,13 +215,13 @@ class RangeSums:
     by_pose: Array
 
 
-def sum_ranges(scans: StackedScans, T_lidar_board: Array, offset_m: Array, lens: Array) -> RangeSums:
+def sum_ranges(scans: StackedScans, T_lidar_board: Array, lasers: Array, lens: Array) -> RangeSums:
     """Sum the returns' terms.
 
     Args:
         scans: rays.
         T_lidar_board: (F, 4, 4) board poses.
-        offset_m: (L,) of each ring.
+        lasers: (3, L) `ERRORS_OF_LASER` of each ring.
         lens: (2,) theta.
     """
     R, n = T_lidar_board[:, :3, :3], T_lidar_board[:, :3, 2]
@@ -210,9 +233,12 @@ def sum_ranges(scans: StackedScans, T_lidar_board: Array, offset_m: Array, lens:
     r = middle[k, 2] / cosine
     v = np.ones((len(r), _OF_RETURN))
     v[:, 0], v[:, 1], v[:, 2] = 1 / cosine, r * x - middle[k, 0], r * y - middle[k, 1]
-    v[:, 1:_ONE] /= cosine[:, None]
-    v[:, _ONE + 1 : -1] = -np.einsum("ni,nij->nj", n[k], scans.fields) / cosine[:, None]
-    v[:, -1] = r + v[:, _ONE + 1 : -1] @ lens + offset_m[scans.ring] - scans.range_m
+    v[:, 1:_OWN] /= cosine[:, None]
+    across = -n[k] / cosine[:, None]
+    v[:, _OWN + 1 : _LENS] = r[:, None] * np.einsum("ni,nij->nj", across, turn_rays(scans.rays))
+    v[:, _LENS:-1] = np.einsum("ni,nij->nj", across, scans.fields)
+    own = np.sum(v[:, _OWN:_LENS] * lasers[:, scans.ring].T, axis=1)
+    v[:, -1] = r + own + v[:, _LENS:-1] @ lens - scans.range_m
     sums = np.zeros((scans.n_captures * len(scans.rings), _OF_RETURN, _OF_RETURN))
     first = np.flatnonzero(np.diff(scans.group, prepend=-1))
     # Products of columns, each one contiguous: several times faster than outer products of rows.
@@ -233,11 +259,11 @@ def weigh_ranges(ranges: RangeSums, sigma_m: float, sigma_ring_m: float) -> tupl
         (I - k 1 1^T) / sigma^2,    k = sigma_ring^2 / (sigma^2 + n sigma_ring^2)
 
     Returns:
-        The weighted sums (F, L, 7, 7) and the log (F,) of the covariance's determinant.
+        The weighted sums (F, L, 9, 9) and the log (F,) of the covariance's determinant.
     """
-    n = ranges.sums[..., _ONE, _ONE]
+    n = ranges.sums[..., _OWN, _OWN]
     total = sigma_m**2 + n * sigma_ring_m**2
-    shared = ranges.sums[..., _ONE, :]
+    shared = ranges.sums[..., _OWN, :]
     k = (sigma_ring_m**2 / total)[..., None, None]
     weighted = (ranges.sums - k * shared[..., :, None] * shared[..., None, :]) / sigma_m**2
     log_volume = np.where(n > 0, (n - 1) * np.log(sigma_m**2) + np.log(total), 0.0)
@@ -249,57 +275,83 @@ def range_system(ranges: RangeSums, weighted: Array) -> Array:
 
     Args:
         ranges: the sums at the poses where the system is wanted.
-        weighted: (F, L, 7, 7) from `weigh_ranges`.
+        weighted: (F, L, 9, 9) from `weigh_ranges`.
 
     Returns:
-        (F, 6 + L + 3, 6 + L + 3): sums of products of [by board pose, by ring offset, by lens, residual].
+        (F, n, n), n = 6 + 3 L + 3: sums of products of [by board pose, by the lasers' errors, by lens,
+        residual], in the order of `spread_rings`.
     """
-    F, L = weighted.shape[:2]
-    # [by pose; by one ring's offset, by lens, residual] = v^T B, ring by ring.
-    B = np.zeros((F, _OF_RETURN, 6 + _OF_RETURN - _ONE))
-    B[:, :_ONE, :6] = ranges.by_pose
-    B[:, np.arange(_ONE, _OF_RETURN), np.arange(6, 6 + _OF_RETURN - _ONE)] = 1
-    total = np.swapaxes(B, 1, 2) @ weighted.sum(axis=1) @ B
-    own = np.swapaxes(B, 1, 2) @ np.swapaxes(weighted[:, :, _ONE], 1, 2)
-    system = np.zeros((F, 6 + L + N_FIELDS + 1, 6 + L + N_FIELDS + 1))
-    common = np.r_[0:6, 6 + L : 6 + L + N_FIELDS + 1]
-    pick = np.r_[0:6, 7 : 7 + N_FIELDS + 1]
-    system[:, common[:, None], common] = total[:, pick[:, None], pick]
+    F = len(weighted)
+    # [by pose; by one laser's errors, by lens, residual] = v^T B, ring by ring.
+    B = np.zeros((F, 1, _OF_RETURN, 6 + _OF_RETURN - _OWN))
+    B[:, 0, :_OWN, :6] = ranges.by_pose
+    B[:, :, np.arange(_OWN, _OF_RETURN), np.arange(6, 6 + _OF_RETURN - _OWN)] = 1
+    return spread_rings(np.swapaxes(B, 2, 3) @ weighted @ B)
+
+
+def spread_rings(by_ring: Array) -> Array:
+    """Sum normal equations over the rings of each capture, with unknowns of its own for each.
+
+    Args:
+        by_ring: (F, L, c, c) with columns by board pose (6), by the ring's laser (3), and others, which all
+            rings share.
+
+    Returns:
+        (F, n, n), n = c + 3 (L - 1): by board pose, the first error of all lasers, the second, the third, the
+        others.
+    """
+    F, L, c = by_ring.shape[:3]
+    shared = np.r_[0:6, 6 + N_OF_LASER : c]
+    n_own = N_OF_LASER * L
+    at = np.r_[0:6, 6 + n_own : c - N_OF_LASER + n_own]
+    system = np.zeros((F, c - N_OF_LASER + n_own, c - N_OF_LASER + n_own))
+    system[:, at[:, None], at] = by_ring.sum(axis=1)[:, shared[:, None], shared]
     ring = np.arange(6, 6 + L)
-    system[:, common[:, None], ring] = own[:, pick]
-    system[:, ring[:, None], common] = np.swapaxes(own[:, pick], 1, 2)
-    system[:, ring, ring] = weighted[:, :, _ONE, _ONE]
+    for i in range(N_OF_LASER):
+        cross = by_ring[:, :, 6 + i][:, :, shared]
+        system[:, (ring + i * L)[:, None], at] = cross
+        system[:, at[:, None], ring + i * L] = np.swapaxes(cross, 1, 2)
+        for j in range(N_OF_LASER):
+            system[:, ring + i * L, ring + j * L] = by_ring[:, :, 6 + i, 6 + j]
     return system
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeRows:
-    """Equation (2) for M ring ends, linear in the tangent of T_lidar_board, the lens and the shifts.
+    """Equation (2) for M ring ends, linear in the unknowns; ordered by capture and ring.
 
     Attributes:
-        capture: (M,).
-        rows: (M, 16) by board pose (6), by lens (2), by `SHIFTS`, e in m.
+        capture, ring: (M,).
+        rows: (M, 20) by board pose (6), by its laser's errors (3), by lens (2), by `SHIFTS`, e in m.
         step_m: (M,) D.
         range_m: (M,) to the board.
         is_backed: (M,) whether the background's echo blends into the board's.
+        n_rings: L.
     """
 
     capture: Indices
+    ring: Indices
     rows: Array
     step_m: Array
     range_m: Array
     is_backed: NDArray[np.bool_]
+    n_rings: int
 
     @cached_property
     def columns(self) -> Array:
-        """Derivatives (15, M), each column of `rows` contiguous."""
+        """Derivatives (19, M), each column of `rows` contiguous."""
         return np.ascontiguousarray(self.rows[:, :-1].T)
 
     @cached_property
     def products(self) -> Array:
-        """Products of each row's derivatives with each other (120, M), in the order of `np.triu_indices`."""
+        """Products of each row's derivatives with each other (190, M), in the order of `np.triu_indices`."""
         i, j = np.triu_indices(_OF_END - 1)
         return np.asarray(self.columns[i] * self.columns[j])
+
+    @property
+    def group(self) -> Indices:
+        """Index (M,) of each end's pair of capture and ring, ascending."""
+        return self.capture * self.n_rings + self.ring
 
     def blur_m(self, edge_rad: float, backed_rad: float) -> Array:
         """Blur (M,) of each interval's ends, by `Levels`."""
@@ -307,7 +359,7 @@ class EdgeRows:
 
 
 def edge_rows(
-    scans: StackedScans, T_lidar_board: Array, board: Board, lens: Array, shifts: Array
+    scans: StackedScans, T_lidar_board: Array, board: Board, lasers: Array, lens: Array, shifts: Array
 ) -> EdgeRows:
     """Linearise (2).
 
@@ -315,17 +367,24 @@ def edge_rows(
         scans: ring ends.
         T_lidar_board: (F, 4, 4) board poses.
         board: its size.
+        lasers: (3, L) `ERRORS_OF_LASER` of each ring.
         lens: (2,) theta.
-        shifts: (7,) `SHIFTS`.
+        shifts: (8,) `SHIFTS`.
     """
     T = T_lidar_board[scans.end_capture]
     R, t, n = T[:, :3, :3], T[:, :3, 3], T[:, :3, 2]
     h = np.sum(n * t, axis=1)
     cosine = np.sum(n * scans.end_rays, axis=1)
-    here = (h / cosine)[:, None] * scans.end_rays - t
-    beyond = (h / np.sum(n * scans.next_rays, axis=1))[:, None] * scans.next_rays - t
+    range_m = h / cosine
+    turned = turn_rays(scans.end_rays)
+    off = scans.end_fields @ lens
+    off += range_m[:, None] * np.einsum("mij,jm->mi", turned, lasers[1:, scans.end_ring])
+    # A displaced point is where its displaced ray meets the plane.
+    off -= (np.sum(n * off, axis=1) / cosine)[:, None] * scans.end_rays
+    here = range_m[:, None] * scans.end_rays - t + off
+    beyond = (h / np.sum(n * scans.next_rays, axis=1))[:, None] * scans.next_rays - t + off
     xy, xy_next = (np.einsum("mji,mj->mi", R[:, :, :2], p) for p in (here, beyond))
-    edge = board.nearest_edge((xy + xy_next) / 2)
+    edge = _edges_crossed(board, xy, xy_next, shifts[0])
     outwards = board.edges()[1][edge, :2]
     inside_m = distance_inside(board, xy, edge)
     step_m = np.maximum(np.abs(np.sum((xy_next - xy) * outwards, axis=1)), _SHORTEST_STEP_M)
@@ -335,15 +394,36 @@ def edge_rows(
     sideways = M - (np.sum(M * scans.end_rays, axis=1) / cosine)[:, None] * n
     rows = np.empty((len(M), _OF_END))
     rows[:, :6] = -differentiate(sideways, here)
-    rows[:, 6 : 6 + N_FIELDS] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
-    range_m = h / cosine
-    rows[:, 6 + N_FIELDS : -1] = _by_shifts(scans, sideways, range_m)
-    rows[:, -1] = inside_m + rows[:, 6:-1] @ np.concatenate([lens, shifts]) - step_m / 2
-    return EdgeRows(scans.end_capture, rows, step_m, range_m, scans.end_background[:, BLENDS] > 0)
+    rows[:, 6] = 0
+    rows[:, 7 : 6 + N_OF_LASER] = -range_m[:, None] * np.einsum("mi,mij->mj", sideways, turned)
+    of_lens, of_shifts = np.split(np.arange(6 + N_OF_LASER, _OF_END - 1), [N_FIELDS])
+    rows[:, of_lens] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
+    rows[:, of_shifts] = _by_shifts(scans, sideways, range_m, outwards)
+    rows[:, -1] = inside_m + rows[:, of_shifts] @ shifts - step_m / 2
+    is_backed = scans.end_background[:, BLENDS] > 0
+    return EdgeRows(scans.end_capture, scans.end_ring, rows, step_m, range_m, is_backed, len(scans.rings))
 
 
-def _by_shifts(scans: StackedScans, sideways: Array, range_m: Array) -> Array:
-    """Differentiate e by `SHIFTS`: (M, 7)."""
+def _edges_crossed(board: Board, xy_m: Array, xy_next_m: Array, shift_m: float) -> Indices:
+    """Number the edge (M,) that each ring leaves the board by: of those it crosses outwards, the nearest.
+
+    Args:
+        board: its size.
+        xy_m: (M, 2) last ray on the board.
+        xy_next_m: (M, 2) the next ray.
+        shift_m: by which ring ends lie beyond an edge.
+    """
+    anchors, outwards = (of_edges[:, :2] for of_edges in board.edges())
+    step_m = (xy_next_m - xy_m) @ outwards.T
+    inside_m = np.sum(anchors * outwards, axis=1) - xy_m @ outwards.T
+    distance_m = np.where(step_m > 0, np.abs(inside_m + shift_m - step_m / 2), np.inf)
+    return np.asarray(np.argmin(distance_m, axis=1))
+
+
+def _by_shifts(scans: StackedScans, sideways: Array, range_m: Array, outwards: Array) -> Array:
+    """Differentiate e by `SHIFTS`: (M, 8)."""
     of_width = np.column_stack([np.ones(len(range_m)), range_m, scans.end_background])
+    of_plate = outwards[:, 0] ** 2 - outwards[:, 1] ** 2
     displacement = np.stack([np.sum(sideways * scans.end_fields[:, :, 0], axis=1), sideways[:, 2]], axis=1)
-    return np.hstack([np.linalg.norm(sideways, axis=1, keepdims=True) * of_width, -displacement])
+    across = np.linalg.norm(sideways, axis=1, keepdims=True)
+    return np.hstack([across * of_width, of_plate[:, None], -displacement])

@@ -14,7 +14,7 @@ SAME_TURN_RAD = np.radians(3.0)
 def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
     """Number the board placements of captures; captures that stood in the same place share a number.
 
-    A capture joins the first placement whose first capture has its centre and its normal nearby.
+    A capture joins the first placement of its session whose first capture has its centre and normal nearby.
 
     Args:
         observations: with the camera's pose of the board.
@@ -23,11 +23,13 @@ def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
         (F,) numbers from 0.
     """
     T = np.array([observation.image.T_cam_board for observation in observations]).reshape(-1, 4, 4)
+    session = np.array([observation.session for observation in observations])
     numbers = np.zeros(len(observations), dtype=np.intp)
     firsts: list[int] = []
     for k, own in enumerate(T):
         apart = np.linalg.norm(T[firsts] - own, axis=1)
         is_same = (apart[:, 3] < SAME_PLACE_M) & (apart[:, 2] < SAME_TURN_RAD)
+        is_same &= session[firsts] == session[k]
         if is_same.any():
             numbers[k] = np.argmax(is_same)
         else:

@@ -9,6 +9,8 @@ from lce_rig.rig.settings import Figure, Positive, Settings, problem
 
 _MAX_SQUARE_M = 1.0
 _MAX_PLATE_M = 5.0
+# Beyond this the figure is in millimetres.
+_Deviation = Annotated[float, Field(ge=0, le=0.2)]
 
 
 class BoardSettings(Settings):
@@ -20,6 +22,10 @@ class BoardSettings(Settings):
         width_m: outer width of the plate, along the columns.
         height_m: outer height of the plate, along the rows.
         pattern_offset_m: (x right, y up) of the pattern's centre from the plate's centre.
+        square_sigma_m: standard deviation of `square_m`; by default a thousandth of it.
+        pattern_offset_sigma_m: standard deviation of each coordinate of `pattern_offset_m`.
+        plate_sigma_m: standard deviation of `width_m` and of `height_m`.
+        bow_sigma_m: standard deviation of the height of the plate's middle over its ends.
     """
 
     inner_corners: tuple[Annotated[int, Field(ge=2, le=100)], Annotated[int, Field(ge=2, le=100)]]
@@ -27,6 +33,10 @@ class BoardSettings(Settings):
     width_m: Positive
     height_m: Positive
     pattern_offset_m: tuple[Figure, Figure] = (0.0, 0.0)
+    square_sigma_m: _Deviation | None = None
+    pattern_offset_sigma_m: _Deviation = 0.003
+    plate_sigma_m: _Deviation = 0.002
+    bow_sigma_m: _Deviation = 0.001
 
     @field_validator("square_m")
     @classmethod

@@ -92,6 +92,10 @@ def draft_profile(
         f"  height_m: {board.height_m}",
         f"  pattern_offset_m: [{board.pattern_offset_m[0]}, {board.pattern_offset_m[1]}]"
         "    # pattern's centre from the plate's centre: [right, up]",
+        f"  square_sigma_m: {board.square_m / 1000:.2g}      # standard deviation of square_m",
+        "  pattern_offset_sigma_m: 0.003  # of each coordinate of pattern_offset_m",
+        "  plate_sigma_m: 0.002           # of width_m and height_m",
+        "  bow_sigma_m: 0.001             # of the height of the plate's middle over its ends",
         "",
         "lidars:",
     ]

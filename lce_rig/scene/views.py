@@ -17,6 +17,8 @@ from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.depth_edges import find_depth_edges, leave_standing
 from lce_rig.scene.edge_field import build_edge_field, build_event_field
 
+MAX_CAPTURES = 60
+"""More captures add time and memory but, of one place, no information: they are thinned out evenly."""
 _BOARD_MARGIN_RAD = 0.04  # Extrinsics may be off by as much.
 _EVENTS_NEAR_RAD = 0.06  # as far as the score is searched
 

@@ -16,7 +16,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
-from lce_rig.lens.difference import LensDifference, certainty_of, compare_lenses
+from lce_rig.lens.difference import LensDifference, certainty_of, compare_lenses, lens_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import model_of
 from lce_rig.validation.weighing import Verdict, reason
@@ -55,6 +55,9 @@ class IntrinsicsCheck:
             are of different families.
         covered: share of the image in which boards were seen.
         image_sigma_px: standard deviation of the fitted intrinsics, as `LensCertainty.image_sigma_px`.
+        errors: (4,) of the given intrinsics, as `Intrinsics.differentiate_by_errors`; None if they project
+            too little.
+        errors_cov: (4, 4) of these.
     """
 
     n_captures: int
@@ -70,6 +73,8 @@ class IntrinsicsCheck:
     chance: float | None
     covered: float
     image_sigma_px: float
+    errors: tuple[float, ...] | None = None
+    errors_cov: tuple[tuple[float, ...], ...] | None = None
 
     def verdict(self, target_deg: float = 0.2) -> Verdict:
         """Judge the given intrinsics; they pass unless significantly different from the fitted ones.
@@ -152,6 +157,10 @@ def compare_with_given(
     by_focal = np.zeros(fitted.model.size)
     by_focal[:2] = 0.5 / given_focal
     certainty = certainty_of(fitted.intrinsics, corners_px, fitted.cov, fitted.model)
+    errors, errors_cov = None, None
+    with suppress(ValueError):
+        found, cov = lens_errors(intrinsics, fitted.intrinsics, corners_px, fitted.cov, fitted.model)
+        errors, errors_cov = tuple(found.tolist()), tuple(map(tuple, cov.tolist()))
     check = IntrinsicsCheck(
         n_captures=len({view.capture for view in fitted.views}),
         rms_px=float(np.sqrt(np.mean(given_px**2))),
@@ -166,6 +175,8 @@ def compare_with_given(
         chance=_chance(fitted, intrinsics),
         covered=certainty.covered,
         image_sigma_px=certainty.image_sigma_px,
+        errors=errors,
+        errors_cov=errors_cov,
     )
     return check, difference
 
@@ -231,7 +242,7 @@ def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
     """
     judgement = judge_lens(check.covered, check.image_sigma_px, check, target_deg)
     figures: dict[str, Figure] = {
-        **asdict(check),
+        **{name: value for name, value in asdict(check).items() if not name.startswith("errors")},
         **judgement.figures,
         "is_visible": check.rms_px >= _VISIBLE * check.possible_px,
         "is_bent": check.is_bent,

@@ -143,6 +143,9 @@ def compare_calibrations(
     names = tuple(calibrations)
     T = np.array([calibrations[name].T_cam_lidar for name in names])
     cov = np.array([calibrations[name].cov for name in names])
+    if are_independent:
+        # Errors of a lens and board that all sessions share do not make their results differ.
+        cov = cov - np.array([calibrations[name].cov_shared for name in names])
     # A mean weighted by full covariances may lie outside all values, which is right for chi2 but confusing in
     # a table.
     mean, _ = mean_pose(T, np.broadcast_to(np.eye(6), cov.shape))

@@ -34,6 +34,7 @@ class Contrast:
         rotation_deg, translation_m: angle and distance between their extrinsics.
         chance: probability that random subsets differ as much, in units of their noise.
         n_first: number of captures in the first subset.
+        apart: (6,) tangent (translation m, rotation rad) from the second's extrinsics to the first's.
     """
 
     first: str
@@ -42,6 +43,19 @@ class Contrast:
     translation_m: float
     chance: float
     n_first: int
+    apart: tuple[float, ...] = ()
+
+    @property
+    def is_change(self) -> bool:
+        """Whether the subsets are the captures before and after one of them."""
+        return self.first == "before"
+
+    def excess(self, target: CalibrationSettings, limits: VerdictSettings) -> float:
+        """Measure the difference in units of its limit; 0 if random subsets may differ as much."""
+        if self.chance > limits.least_chance:
+            return 0.0
+        limit = limits.max_change if self.is_change else limits.max_contrast
+        return target.in_targets(self.rotation_deg, self.translation_m) / limit
 
 
 def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tuple[Contrast, ...]:
@@ -107,7 +121,7 @@ def _chi2(expansion: Quadratics, shares: Array) -> tuple[Array, Array]:
 
 def _contrast(first: str, second: str, apart: Array, chance: float, n_first: int) -> Contrast:
     rotation_deg, translation_m = tangent_sizes(apart)
-    return Contrast(first, second, rotation_deg, translation_m, chance, n_first)
+    return Contrast(first, second, rotation_deg, translation_m, chance, n_first, tuple(apart.tolist()))
 
 
 def split_findings(
@@ -126,13 +140,11 @@ def split_findings(
     """
     findings = []
     for c in contrasts:
-        is_change = c.first == "before"
-        excess = target.in_targets(c.rotation_deg, c.translation_m)
-        excess /= limits.max_change if is_change else limits.max_contrast
-        if c.chance > limits.least_chance or excess <= 1:
+        excess = c.excess(target, limits)
+        if excess <= 1:
             continue
         apart = {"rotation_deg": c.rotation_deg, "translation_m": c.translation_m, "chance": c.chance}
-        if is_change:
+        if c.is_change:
             figures: dict[str, Figure] = {"capture": captures[c.n_first], **apart}
             findings.append(reason("verdict.changed", figures, is_fail=excess > _FAIL))
         else:

@@ -8,11 +8,22 @@ import numpy as np
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
+from lce_rig.core.results import Contribution
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.local_quadratic import SCALE, expand
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.rig import LidarSettings, Rig, VerdictSettings
+from lce_rig.validation.contributions import (
+    KnownBetter,
+    channels_contradiction,
+    known_better,
+    lens_contradiction,
+    list_contributions,
+    profile_covariance,
+    scale_contradiction,
+    split_contradictions,
+)
 from lce_rig.validation.intrinsics_check import IntrinsicsCheck, check_intrinsics
 from lce_rig.validation.negative_control import NegativeControl, run_control
 from lce_rig.validation.nuisances import Nuisances, estimate_nuisances
@@ -128,7 +139,11 @@ class Validation:
     """Results of checks of an estimate on its own captures.
 
     Attributes:
-        cov: (6, 6) to report: the estimate's, widened if resampling spreads it farther.
+        cov: (6, 6) to report: the estimate's, widened if resampling spreads it farther, with errors of the
+            profile and what checks contradict.
+        cov_shared: (6, 6) the part of it from errors of the profile's lens and board.
+        contributions: its causes, the largest first.
+        known_better: what the session's boards determine better than the profile.
         widened_by: factor by which the standard deviations were widened; 1 if they were not.
         remark: why; None if they were not.
         contrasts: subsets of the captures that should agree.
@@ -138,6 +153,9 @@ class Validation:
     """
 
     cov: Array
+    cov_shared: Array
+    contributions: tuple[Contribution, ...]
+    known_better: tuple[KnownBetter, ...]
     widened_by: float
     remark: Finding | None
     contrasts: tuple[Contrast, ...]
@@ -173,25 +191,58 @@ def validate(
         range_offset_sigma_m=lidar.range_offset_sigma_m,
     )
     if len(expansion.groups) < _MIN_PLACEMENTS:
-        return Validation(estimate.cov, 1.0, None, (), None, None, intrinsics)
+        return _reported(estimate, rig, intrinsics=intrinsics)
     settled = expansion.hold(SCALE).settled()
     # Compare a covariance with the scatter of its own method, as another cost scatters differently.
     widened_by, remark = widening(estimate.cov, resample(estimate.expansion or settled), rig.verdict)
-    cov = widened_by**2 * estimate.cov
     control = run_control(
         observations,
         board,
         estimate.T_cam_lidar,
-        cov,
+        widened_by**2 * estimate.cov,
         settled,
         rig.calibration,
         rig.verdict.control_sigmas,
     )
     rings = np.unique(np.concatenate([observation.lidar.ring for observation in observations]))
     centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
-    nuisances = estimate_nuisances(expansion, rings)
-    contrasts = contrast_halves(settled, centres)
-    return Validation(cov, widened_by, remark, contrasts, control, nuisances, intrinsics)
+    return _reported(
+        estimate,
+        rig,
+        widened_by,
+        remark,
+        contrast_halves(settled, centres),
+        control,
+        estimate_nuisances(expansion, rings),
+        intrinsics,
+    )
+
+
+def _reported(
+    estimate: CalibrationEstimate,
+    rig: Rig,
+    widened_by: float = 1.0,
+    remark: Finding | None = None,
+    contrasts: tuple[Contrast, ...] = (),
+    control: NegativeControl | None = None,
+    nuisances: Nuisances | None = None,
+    intrinsics: IntrinsicsCheck | None = None,
+) -> Validation:
+    """Sum up the covariance to report."""
+    known = estimate.sensitivities
+    contradictions = [
+        *lens_contradiction(intrinsics, known, rig.calibration.target_sigma_deg),
+        *scale_contradiction(nuisances, known),
+        *split_contradictions(contrasts, rig.calibration, rig.verdict),
+        *channels_contradiction(estimate, rig.calibration),
+    ]
+    cov_shared = profile_covariance(known)
+    cov = widened_by**2 * estimate.cov + cov_shared + sum(each.cov for each in contradictions)
+    causes = list_contributions(estimate.diagnostics, widened_by, known, contradictions)
+    better = known_better(intrinsics, nuisances, known)
+    return Validation(
+        cov, cov_shared, causes, better, widened_by, remark, contrasts, control, nuisances, intrinsics
+    )
 
 
 def _thinned(views: Sequence[BoardView]) -> list[BoardView]:

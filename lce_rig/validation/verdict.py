@@ -7,11 +7,12 @@ import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Figure, Finding, ranked
-from lce_rig.core.geometry import Array, rotation_angle, tangent_sizes
+from lce_rig.core.geometry import rotation_angle, tangent_sizes
 from lce_rig.core.results import Calibration, Metrics
 from lce_rig.core.scene_opinion import SceneOpinion
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
+from lce_rig.validation.contributions import largest, measure_action, uncertainty_notes
 from lce_rig.validation.intrinsics_check import explain
 from lce_rig.validation.negative_control import control_findings
 from lce_rig.validation.nuisances import nuisance_findings
@@ -64,10 +65,11 @@ def judge(
         *_detected(estimate, n_captures, rig.quality.min_detected_fraction),
         *_placements(estimate, rig.quality.min_captures),
         *_nominal(estimate, rig.nominal(camera, lidar)),
-        *_precision(estimate, examination.cov, rig),
+        *_precision(estimate, examination, rig),
     ]
     if examination.remark is not None:
         findings.append(examination.remark)
+    findings += uncertainty_notes(examination.contributions, examination.known_better, rig.calibration)
     return verdict_of(findings), ranked(findings)
 
 
@@ -135,15 +137,16 @@ def _certificate(estimate: CalibrationEstimate) -> list[Finding]:
     return [reason("verdict.not_certified", {"gap": estimate.certificate.gap}, is_fail=True)]
 
 
-def _precision(estimate: CalibrationEstimate, cov: Array, rig: Rig) -> list[Finding]:
-    sigmas, target, of_lidar = np.sqrt(np.diag(cov)), rig.calibration, estimate.diagnostics
+def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig) -> list[Finding]:
+    sigmas, target, of_lidar = np.sqrt(np.diag(examination.cov)), rig.calibration, estimate.diagnostics
     turns_deg, shifts_m = np.degrees(sigmas[3:]), sigmas[:3]
     rotation = ("verdict.rotation_uncertain", "deg", turns_deg, target.target_sigma_deg)
     translation = ("verdict.translation_uncertain", "m", shifts_m, target.target_sigma_m)
     found = []
-    for (code, unit, axes, goal), of_lidar_alone in (
-        (rotation, of_lidar.sigma_systematic_rotation_deg),
-        (translation, of_lidar.sigma_systematic_translation_m),
+    causes = examination.contributions
+    for (code, unit, axes, goal), of_lidar_alone, main in (
+        (rotation, of_lidar.sigma_systematic_rotation_deg, largest(causes, "sigma_rotation_deg")),
+        (translation, of_lidar.sigma_systematic_translation_m, largest(causes, "sigma_translation_m")),
     ):
         sigma = float(np.linalg.norm(axes))
         if sigma > goal:
@@ -157,7 +160,7 @@ def _precision(estimate: CalibrationEstimate, cov: Array, rig: Rig) -> list[Find
             # No number of captures helps against the LiDAR's own errors; before that, more captures help
             # most as long as their scatter is the larger part.
             is_of_lidar = of_lidar_alone > goal and 2 * of_lidar_alone**2 > sigma**2
-            action = "measure_ranges" if is_of_lidar else ""
+            action = "measure_ranges" if is_of_lidar else measure_action(main)
             found.append(reason(code, figures, is_fail=is_fail, action=action))
     return found
 

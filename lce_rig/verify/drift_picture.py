@@ -1,5 +1,6 @@
 """One page on drift: a scene's edges under two extrinsics, and the score along each axis."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,17 +10,25 @@ from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array, transform
 from lce_rig.scene.alignment import AXES
 from lce_rig.scene.depth_edges import DepthEdges
-from lce_rig.scene.drift import Drift
+from lce_rig.scene.drift import AxisDrift, Drift
 from lce_rig.verify import canvas
 from lce_rig.verify.canvas import BLACK, INK, MAGENTA, Picture
 from lce_rig.words.extrinsics import motion_words
 
 _PAGE_PX = 1600
 _COLOURS = {"unchanged": "#2a7d3f", "changed": "#c0392b", "unknown": "#7a7f85"}
+_BOARD = "#b8860b"
 _CHART_DPI = 100
 
 
-def draw_drift(drift: Drift, image: Image, edges: DepthEdges, intrinsics: Intrinsics, title: str) -> Picture:
+def draw_drift(
+    drift: Drift,
+    image: Image,
+    edges: DepthEdges,
+    intrinsics: Intrinsics,
+    title: str,
+    board: Sequence[AxisDrift] = (),
+) -> Picture:
     """Draw one capture's depth edges under both extrinsics side by side, above the score along each axis.
 
     Args:
@@ -28,6 +37,7 @@ def draw_drift(drift: Drift, image: Image, edges: DepthEdges, intrinsics: Intrin
         edges: of its scan.
         intrinsics: of the camera.
         title: one line.
+        board: the board's opinion on each axis, if there is one.
 
     Returns:
         BGR (H, W, 3).
@@ -41,7 +51,7 @@ def draw_drift(drift: Drift, image: Image, edges: DepthEdges, intrinsics: Intrin
         canvas.draw_text(strip, f"{title}  {name}", 12, 27, 13, INK)
         panels.append(np.vstack([strip, picture]))
     page = np.hstack(panels)
-    return np.vstack([page, _draw_curves(drift)]) if drift.curves else page
+    return np.vstack([page, _draw_curves(drift, board)]) if drift.curves else page
 
 
 def _draw_edges(image: Image, edges: DepthEdges, intrinsics: Intrinsics, T_cam_lidar: Array) -> Picture:
@@ -53,7 +63,7 @@ def _draw_edges(image: Image, edges: DepthEdges, intrinsics: Intrinsics, T_cam_l
     return picture
 
 
-def _draw_curves(drift: Drift) -> Picture:
+def _draw_curves(drift: Drift, board: Sequence[AxisDrift]) -> Picture:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -72,11 +82,25 @@ def _draw_curves(drift: Drift) -> Picture:
             axes.axvspan(
                 -shown * verdict.smallest, shown * verdict.smallest, color=_COLOURS[verdict.state], alpha=0.12
             )
+        if board:
+            low, high = axes.get_ylim()
+            axes.errorbar(
+                shown * board[index].change,
+                low + 0.1 * (high - low),
+                xerr=shown * board[index].sigma,
+                fmt="D",
+                color=_BOARD,
+                markersize=4,
+                capsize=3,
+            )
         axes.set_xlim(scale * curve.offsets[0], scale * curve.offsets[-1])
         axes.set_title(f"{motion_words(AXES[index])}: {verdict.state}", fontsize=9)
         axes.set_xlabel(unit, fontsize=8)
         axes.tick_params(labelsize=8)
-    figure.suptitle("score along each axis; shaded: changes too small to be seen surely", fontsize=10)
+    said = "; diamond: what the board says, 1 standard deviation" if board else ""
+    figure.suptitle(
+        f"score of the scene along each axis; shaded: changes too small to be seen{said}", fontsize=10
+    )
     figure.tight_layout()
     chart.draw()
     return np.ascontiguousarray(np.asarray(chart.buffer_rgba())[..., 2::-1])

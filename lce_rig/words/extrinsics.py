@@ -154,6 +154,80 @@ def _widened(finding: Finding) -> str:
     return f"standard deviations widened {finding.figure('ratio'):.1f} times: {way} vary that much"
 
 
+_CAUSES = {
+    "captures": "the scatter of the captures",
+    "lidar_ranges": "the LiDAR's constant range errors",
+    "focal_length": "the focal length",
+    "principal_point": "the principal point",
+    "distortion": "the lens distortion",
+    "square_size": "the size of the squares",
+    "pattern_offset": "the pattern's place on the plate",
+    "plate_size": "the plate's size",
+    "board_bow": "the board's bow",
+}
+_CONTRADICTIONS = {
+    "intrinsics": "the profile's intrinsics and those of the session's boards",
+    "scale": "the camera's distances and the LiDAR's",
+    "channels": "the camera's channels",
+    "cameras": "the cameras",
+}
+_MEASURE_LENS = (
+    "measure the intrinsics (`lce-rig intrinsics --save-profile FILE`), or enter their standard deviations "
+    "in the profile"
+)
+_MEASURE = {
+    "measure_focal_length": _MEASURE_LENS,
+    "measure_principal_point": _MEASURE_LENS,
+    "measure_distortion": _MEASURE_LENS,
+    "measure_square_size": "measure across all squares, divide, and enter square_m and square_sigma_m",
+    "measure_pattern_offset": (
+        "measure the pattern's margins on all four sides of the plate, and enter pattern_offset_m and "
+        "pattern_offset_sigma_m"
+    ),
+    "measure_plate_size": "measure the plate, and enter width_m, height_m and plate_sigma_m",
+    "measure_board_bow": "lay a straight edge across the board, and enter bow_sigma_m",
+}
+
+
+def cause_words(source: str) -> str:
+    """Name a cause of standard deviations, as `Contribution.source`."""
+    if source in _CAUSES:
+        return _CAUSES[source]
+    check = source.removeprefix("contradiction_")
+    subsets = check.replace("_", " and ")
+    return f"the contradiction of {_CONTRADICTIONS.get(check, f'{subsets} captures')}"
+
+
+def _largest_cause(finding: Finding) -> str:
+    """Of the standard deviation {total_m} or {total_deg}, {share} is {source}: {sigma_m} or {sigma_deg}."""
+    q = finding.figures
+    if "sigma_m" in q:
+        what = "translation"
+        sizes = f"{1000 * finding.figure('sigma_m'):.1f} of {1000 * finding.figure('total_m'):.1f} mm"
+    else:
+        what, sizes = (
+            "rotation",
+            f"{finding.figure('sigma_deg'):.2f} of {finding.figure('total_deg'):.2f} deg",
+        )
+    return (
+        f"largest cause of the {what}'s uncertainty: {cause_words(str(q['source']))}, {sizes} "
+        f"({100 * finding.figure('share'):.0f} % of the variance)"
+    )
+
+
+def _known_better(finding: Finding) -> str:
+    """The session's boards determine {source} to {error_sigma}, the profile to {profile_sigma}: {error}."""
+    source = str(finding.figures["source"])
+    scale, unit = (1.0, "px") if source == "principal_point" else (100.0, "%")
+    error, sigma, of_profile = (
+        scale * finding.figure(name) for name in ("error", "error_sigma", "profile_sigma")
+    )
+    return (
+        f"the session's boards determine {cause_words(source)} better than the profile: {error:+.2f} +- "
+        f"{sigma:.2f} {unit} from it, which has +- {of_profile:.2f} {unit}"
+    )
+
+
 def _plate(finding: Finding) -> str:
     """The plate's {side} is {measured_m} in the scans, {profile_m} in the profile."""
     measured_m, profile_m = finding.figure("measured_m"), finding.figure("profile_m")
@@ -243,12 +317,12 @@ PHRASES: dict[str, Phrase] = {
     "verdict.rotation_uncertain": Phrase(
         _sigma("deg", 1.0),
         _least_determined("collect more captures"),
-        {"measure_ranges": _least_determined(_RANGES)},
+        {"measure_ranges": _least_determined(_RANGES), **_MEASURE},
     ),
     "verdict.translation_uncertain": Phrase(
         _sigma("mm", 1000.0),
         _least_determined("collect more captures"),
-        {"measure_ranges": _least_determined(_RANGES)},
+        {"measure_ranges": _least_determined(_RANGES), **_MEASURE},
     ),
     "verdict.plane_residual": Phrase(
         "LiDAR points {mean_m:mm} on average from the camera's board planes (limit {limit_m:mm})",
@@ -354,6 +428,8 @@ PHRASES: dict[str, Phrase] = {
         "check the intrinsics and the board's size. `lce-rig drift SESSION -o FOLDER` draws the edges",
     ),
     "verdict.widened": Phrase(_widened),
+    "verdict.largest_cause": Phrase(_largest_cause, "", _MEASURE),
+    "verdict.known_better": Phrase(_known_better),
     "verdict.scene": Phrase(
         _scene,
         f"check the intrinsics, squares and plate. {_LOOK}",
@@ -387,6 +463,12 @@ PHRASES: dict[str, Phrase] = {
         "{rotation_deg:3deg} and {translation_m:1mm}, {ratio:.1f} times as much as predicted",
         "do not use any of them until the cause is known",
         {"odd_one": "find the fault in {odd_one}, without it the others agree"},
+    ),
+    "union.moved": Phrase(
+        "the extrinsics of {camera} and {lidar} from {first} and {second} differ by {rotation_deg:3deg} and "
+        "{translation_m:1mm}, more than their uncertainties allow (chance {p:.2g})",
+        "the sensors were moved in between, or one of the sessions is wrong: calibrate them separately",
+        {"odd_one": "leave out {odd_one}: the sensors were moved, or the session is wrong; the others agree"},
     ),
     "repeat.failed": Phrase(
         "the calibration of {subject} ({camera} and {lidar}) failed",

@@ -44,7 +44,10 @@ def _best_uncertain(finding: Finding) -> str:
 def _unchanged_with_board(finding: Finding) -> str:
     """No change seen in {n_captures} captures, {n_boards} of which show the board."""
     n = finding.figures
-    return f"the extrinsics fit the scene in {n['n_captures']} captures, and the board in {n['n_boards']}"
+    return (
+        f"the extrinsics fit: the scene of {n['n_captures']} captures, "
+        f"or the board in {n['n_boards']}, covers each axis"
+    )
 
 
 def _changed_with_board(finding: Finding) -> str:
@@ -85,6 +88,8 @@ def _axis_changed(finding: Finding) -> str:
 
 def _large_scatter(finding: Finding) -> str:
     """Parts of the scene disagree; {smallest_m} or {smallest_deg} would be seen."""
+    if "inf" in _figure(finding, "smallest"):
+        return f"{motion_words(finding.subject)}: parts of the scene do not agree on any change"
     return f"{motion_words(finding.subject)}: changes below {_figure(finding, 'smallest')} would not be seen"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from benchmarks.recordings import RIGS, SETS, RecordedSet
-from benchmarks.scene_rooms import N_CAPTURES, ROOMS, FurnishedRoom, furnished_room, only, with_few
+from benchmarks.scene_rooms import ROOMS, FurnishedRoom, furnished_room, only, with_few
 from benchmarks.tables import print_head, print_row
 from lce_rig import pipeline
 from lce_rig.core.errors import NotEnoughDataError
@@ -21,7 +21,7 @@ from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.session import Session
 
-_SIZES = (3, 5, 10)
+_SIZES = {"rlfs": (3, 5, 10), "rles": (3, 5, 10), "os1_64": (11,)}
 _RECORDED = (*SETS, RecordedSet("os1_64", str(RIGS / "os1_64.yaml"), (("os1_64", "frames"),)))
 # Claims of drawn board results: weak as os1_64's, and usual.
 _DRAWN = {"0.5 deg, 30 mm an axis": (0.5, 0.030), "0.15 deg, 10 mm": (0.15, 0.010)}
@@ -65,35 +65,38 @@ def bench_scene_sharpen(n_rooms: int, n_splits: int, only_sets: str = "", folder
         if (
             recorded.name in ("rlfs01", "rlfs02", "os1_64")
             and recorded.is_there
-            and only_sets in recorded.name
+            and only_sets in f"recorded_{recorded.name}"
         ):
             _bench_recording(recorded, n_splits)
 
 
 def _bench_rooms(name: str, n_rooms: int, folder: Path) -> None:
-    sizes = (11,) if name == "os1_64" else _SIZES
-    n_captures = 11 if name == "os1_64" else N_CAPTURES
-    by_size: dict[int, list[_Trial]] = {size: [] for size in sizes}
-    drawn: dict[str, list[_Trial]] = {kind: [] for kind in _DRAWN}
-    for seed in range(n_rooms):
-        room = furnished_room(name, seed, n_captures, folder)
-        views = scene_views(room.session, room.detections, room.calibrate(room.names), 60)
-        for size, calibration in _calibrated(room, sizes):
-            share = share_of(views[:size], room.lens, calibration)
-            by_size[size].append(_Trial.of(share, room.T_cam_lidar))
-        for kind, (sigma_deg, sigma_m) in _DRAWN.items():
-            cov = np.diag([sigma_m] * 3 + [np.radians(sigma_deg)] * 3) ** 2
-            off = np.random.default_rng([seed, 5]).multivariate_normal(np.zeros(6), cov)
-            boards = replace(room.calibrate(room.names), T_cam_lidar=perturb(room.T_cam_lidar, off), cov=cov)
-            drawn[kind].append(_Trial.of(share_of(views[:5], room.lens, boards), room.T_cam_lidar))
+    rooms = [_trials(name, seed, folder) for seed in range(n_rooms)]
     print(f"\nSimulated rooms, {name}: boards detected and calibrated\n")
     print_head("captures", *_COLUMNS)
-    for size, trials in by_size.items():
-        _print_trials(str(size), trials)
+    for size in _SIZES[name]:
+        _print_trials(str(size), [room[str(size)] for room in rooms if str(size) in room])
     print("\nThe same rooms, 5 captures, board results drawn from a known covariance\n")
     print_head("drawn from", *_COLUMNS)
-    for kind, trials in drawn.items():
-        _print_trials(kind, trials)
+    for kind in _DRAWN:
+        _print_trials(kind, [room[kind] for room in rooms])
+
+
+def _trials(name: str, seed: int, folder: Path) -> dict[str, _Trial]:
+    """Sharpen the boards' results of one room, and drawn ones, by number of captures and by what is drawn."""
+    room = furnished_room(name, seed, max(_SIZES[name]), folder)
+    every = room.calibrate(room.names)
+    views = scene_views(room.session, room.detections, every, len(room.names))
+    trials = {
+        str(size): _Trial.of(share_of(views[:size], room.lens, calibration), room.T_cam_lidar)
+        for size, calibration in _calibrated(room, _SIZES[name])
+    }
+    for kind, (sigma_deg, sigma_m) in _DRAWN.items():
+        cov = np.diag([sigma_m] * 3 + [np.radians(sigma_deg)] * 3) ** 2
+        off = np.random.default_rng([seed, 5]).multivariate_normal(np.zeros(6), cov)
+        boards = replace(every, T_cam_lidar=perturb(room.T_cam_lidar, off), cov=cov)
+        trials[kind] = _Trial.of(share_of(views[:5], room.lens, boards), room.T_cam_lidar)
+    return trials
 
 
 def _calibrated(room: FurnishedRoom, sizes: Sequence[int]) -> Iterator[tuple[int, Calibration]]:

@@ -17,7 +17,15 @@ from lce_rig.extrinsics.likelihood.levels import MOST_LOST, Levels, Priors
 from lce_rig.extrinsics.likelihood.refine import to_extrinsic
 from lce_rig.extrinsics.likelihood.system import PER_CAMERA, State, Terms, assemble, density, linearise
 from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M
-from lce_rig.residuals.along_rays import N_FIELDS, N_SHIFTS, SHIFTS, EdgeRows, interior, stack_scans
+from lce_rig.residuals.along_rays import (
+    N_FIELDS,
+    N_OF_LASER,
+    N_SHIFTS,
+    SHIFTS,
+    EdgeRows,
+    interior,
+    stack_scans,
+)
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import LidarNoise, SimulationOptions
 
@@ -155,7 +163,7 @@ def _at_truth(rig: Rig, session: StillSession) -> Terms:
     pictures = stack_images(np.arange(len(found)), [item.image for item in found], np.ones(len(found)))
     T = session.T_cam_lidar
     T_lidar_board = invert(T) @ np.array([session.T_cam_board[item.capture] for item in found])
-    constants = np.zeros(PER_CAMERA + len(scans.rings) + N_FIELDS + N_SHIFTS)
+    constants = np.zeros(PER_CAMERA + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS)
     return linearise(scans, (pictures,), board, State(T[None], T_lidar_board, constants))
 
 

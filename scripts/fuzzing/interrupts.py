@@ -104,6 +104,7 @@ _VERBS: dict[str, Callable[[_Bench], list[object]]] = {
     "calibrate paper": lambda bench: ["calibrate", bench.fresh(), "--method", "paper"],
     "intrinsics": lambda bench: ["intrinsics", bench.fresh()],
     "verify": lambda bench: ["verify", bench.fresh(), "--result", bench.result],
+    "drift": lambda bench: ["drift", bench.fresh(), "--result", bench.result],
     "repeat": lambda bench: ["repeat", bench.fresh(), bench.second],
     "simulate": lambda bench: ["simulate", "--rig", "rlfs", bench.new(), "--captures", "3"],
     "collect --from": lambda bench: [

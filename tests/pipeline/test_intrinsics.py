@@ -10,6 +10,7 @@ import yaml
 from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.export.camera_info import read_camera_info
+from lce_rig.lens.models import MODELS
 from lce_rig.pipeline.intrinsics_files import final, profile_block, save_profile, write_intrinsics
 from lce_rig.pipeline.lens import measure_intrinsics
 from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
@@ -190,6 +191,16 @@ def test_the_block_can_be_pasted_into_the_profile(measured):
 
 def test_a_lens_of_another_family_goes_into_the_profile_too(session, measured, tmp_path):
     fisheye = replace(LENS, model="equidistant", distortion=(-0.05, 0.01, -0.002, 1e-5))
-    other = replace(measured, estimate=replace(measured.estimate, intrinsics=fisheye))
+    fitted = replace(
+        measured.estimate,
+        intrinsics=fisheye,
+        model=MODELS["equidistant"],
+        cov=np.diag([1.0, 1.0, 0.25, 0.25, *4 * [1e-8]]),
+    )
+    other = replace(measured, estimate=fitted)
     save_profile(session, [other], tmp_path / "new.yaml", is_forced=True)
-    assert load_rig(tmp_path / "new.yaml").cameras["davis"].to_intrinsics() == fisheye
+    davis = load_rig(tmp_path / "new.yaml").cameras["davis"]
+    assert davis.to_intrinsics() == fisheye
+    # Without correlations, and with certain distortion, they are those of the fit.
+    assert davis.intrinsics.focal_sigma_px == pytest.approx(np.sqrt(0.5), rel=0.2)
+    assert davis.intrinsics.principal_point_sigma_px == pytest.approx(0.5, rel=0.2)

@@ -9,11 +9,16 @@ import numpy as np
 import pytest
 
 from lce_rig.cli.main import run
+from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import perturb
-from lce_rig.export.result import write_result
+from lce_rig.export.result import SavedResult, read_result, write_result
 from lce_rig.pipeline.drift import drift
-from lce_rig.rig import dump_rig
+from lce_rig.pipeline.scene_captures import Thinned
+from lce_rig.recordings.ros.bag_recorder import BagRecorder
+from lce_rig.rig import Rig, dump_rig
+from lce_rig.scene.alignment import AXES
 from lce_rig.session import Session
+from tests.doctor.attached import Attached, attach
 
 
 @pytest.fixture
@@ -73,3 +78,114 @@ def test_a_damaged_capture_is_skipped(room, tmp_path) -> None:
     (tmp_path / "room" / "captures" / "000001" / "lidar.pcd").write_bytes(b"")
     (pair,) = drift(tmp_path / "room").pairs
     assert pair.drift.n_captures == 3
+
+
+def result_file(path, seen, *pairs):
+    write_result(path, seen.rig.name, list(pairs))
+    return path
+
+
+def record(path, rig, captures, cameras=("cam",)):
+    """Record captures as a bag, as drivers would."""
+    with BagRecorder(path, rig) as bag:
+        for capture in captures:
+            (image,) = capture.images
+            samples = [*capture.scans, *(replace(image, sensor=camera) for camera in cameras)]
+            for sample in sorted(samples, key=lambda each: each.stamp_ns):
+                bag.write(sample)
+    return path
+
+
+@pytest.fixture
+def two_cameras(seen):
+    """The rig with a second camera, a twin of the first."""
+    document = seen.rig.model_dump()
+    channels = {"frames": {"kind": "frames", "topic": "/cam2/image"}}
+    own = {"frame": "cam2_link", "optical_frame": "cam2_optical", "channels": channels}
+    document["cameras"]["cam2"] = {**document["cameras"]["cam"], **own}
+    return Rig.model_validate(document)
+
+
+@pytest.mark.parametrize("name", ["room.bag", "room_mcap"])
+def test_a_bag_is_compared_as_a_session_is(room, seen, turned, tmp_path, name, capsys) -> None:
+    bag = record(tmp_path / name, seen.rig, seen.captures)
+    (tmp_path / "rig.yaml").write_text(dump_rig(seen.rig))
+    words = ["drift", str(bag), "--rig", str(tmp_path / "rig.yaml"), "--json", "--result"]
+    assert run([*words, str(turned)]) == 7
+    capsys.readouterr()
+    assert run([*words, str(room / "calibration" / "result.json")]) == 0
+    (pair,) = json.loads(capsys.readouterr().out)["pairs"]
+    assert pair["n_captures"] == len(seen.captures)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([name, "result.json", "rig.yaml"])
+
+
+def test_of_several_cameras_the_worst_counts(seen, two_cameras, tmp_path, capsys) -> None:
+    bag = record(tmp_path / "two.bag", two_cameras, seen.captures, ("cam", "cam2"))
+    (tmp_path / "rig.yaml").write_text(dump_rig(two_cameras))
+    turned = perturb(seen.truth.T_cam_lidar, np.array([0, 0, 0, 0, np.radians(2.0), 0]))
+    second = replace(seen.truth, camera="cam2", T_cam_lidar=turned)
+    result = result_file(tmp_path / "result.json", seen, seen.truth, second)
+    words = ["drift", str(bag), "--rig", str(tmp_path / "rig.yaml"), "--result", str(result), "--json"]
+    assert run(words) == 7
+    states = {pair["camera"]: pair["state"] for pair in json.loads(capsys.readouterr().out)["pairs"]}
+    assert states == {"cam": "unchanged", "cam2": "changed"}
+
+
+def test_a_camera_that_was_not_recorded_costs_only_itself(seen, two_cameras, tmp_path) -> None:
+    bag = record(tmp_path / "one.bag", seen.rig, seen.captures)
+    result = SavedResult(seen.rig.name, "a test", (seen.truth, replace(seen.truth, camera="cam2")), {})
+    first, second = drift(bag, result, rig=two_cameras).pairs
+    assert (first.state, second.state) == ("unchanged", "unknown")
+    assert second.summary.code == "scene.no_samples" and second.summary.subject == "cam2"
+
+
+def test_a_recording_without_the_result_s_camera_is_an_error(seen, two_cameras, tmp_path) -> None:
+    bag = record(tmp_path / "one.bag", seen.rig, seen.captures[:1])
+    result = SavedResult(seen.rig.name, "a test", (replace(seen.truth, camera="cam2"),), {})
+    with pytest.raises(SourceError, match="cam2"):
+        drift(bag, result, rig=two_cameras)
+    with pytest.raises(SessionError, match="cam3"):
+        drift(bag, replace(result, pairs=(replace(seen.truth, camera="cam3"),)), rig=two_cameras)
+
+
+def test_long_recordings_are_thinned_evenly_while_they_are_read() -> None:
+    for n in (59, 60, 61, 1000):
+        kept = Thinned()
+        for number in range(n):
+            kept.take(number)
+        assert 30 <= len(kept) <= 60
+        assert set(np.diff(kept)) == {kept[1]} and n - kept[-1] <= kept[1]
+
+
+@pytest.mark.long
+def test_attached_sensors_are_watched(seen, tmp_path, capsys) -> None:
+    capture = seen.captures[0]
+    here = Attached(seen.rig, pixels=capture.images[0].grey, scan=capture.scans[0], has_board=False)
+    with attach(here, tmp_path) as (rig, _):
+        (tmp_path / "rig.yaml").write_text(dump_rig(rig.model_copy(update={"sync": None})))
+        result = result_file(tmp_path / "deployed.json", seen, seen.truth)
+        words = ["drift", "--rig", str(tmp_path / "rig.yaml"), "--result", str(result), "--json"]
+        code = run([*words, "--seconds", "4"])
+    (pair,) = json.loads(capsys.readouterr().out)["pairs"]
+    # One view of the room again and again says no more than once.
+    assert code in (0, 6) and pair["state"] != "changed"
+    assert pair["n_captures"] > 5
+
+
+def test_arguments_that_contradict_each_other_are_refused(room, seen, tmp_path) -> None:
+    (tmp_path / "rig.yaml").write_text(dump_rig(seen.rig))
+    assert run(["drift", str(room), "--seconds", "3"]) == 2
+    assert run(["drift", "--rig", str(tmp_path / "rig.yaml")]) == 2
+    assert run(["drift", str(tmp_path / "nothing"), "--rig", "rlfs"]) == 4
+
+
+def test_a_board_in_view_has_an_opinion_of_its_own(room, turned) -> None:
+    for result, state in ((None, "unchanged"), (read_result(turned), "changed")):
+        (pair,) = drift(room, result).pairs
+        assert pair.state == state
+        if pair.board is not None:
+            yaw = pair.board.axes[AXES.index("rotation_y")]
+            assert yaw.state == state and yaw.change == pytest.approx(
+                {"unchanged": 0.0, "changed": -2.0}[state], abs=3 * yaw.sigma
+            )
+    assert pair.board is not None and pair.board.n_boards == 4

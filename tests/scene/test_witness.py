@@ -1,13 +1,17 @@
 """The scene's opinion on results of a simulated room, without the board's edges."""
 
+import json
 import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from lce_rig.cli.calibrate import scene_texts
+from lce_rig.cli.main import run
 from lce_rig.core.geometry import perturb
-from lce_rig.core.scene_opinion import SceneOpinion
+from lce_rig.core.results import ChannelResult
+from lce_rig.core.scene_opinion import AxisOpinion, SceneOpinion
 from lce_rig.export.result import read_result, write_result
 from lce_rig.pipeline.detect_session import detect
 from lce_rig.pipeline.verification import verify
@@ -47,6 +51,29 @@ def test_a_result_turned_by_1_deg_is_contradicted_by_that(heard, seen, degrees) 
     (finding,) = judged.findings
     assert finding.code == "verdict.scene" and finding.figures["axis"] == "rotation_y"
     assert judged.verdict == {"warning": "marginal", "error": "fail"}[finding.severity]
+
+
+@pytest.mark.parametrize(("sigmas", "verdict"), [(-4.0, "marginal"), (6.0, "fail")])
+@pytest.mark.parametrize(("axis", "action"), [("rotation_x", ""), ("translation_z", "distances")])
+def test_the_size_of_a_contradiction_decides_and_its_axis_names_the_cause(
+    seen, sigmas, verdict, axis, action
+) -> None:
+    slight = AxisOpinion("rotation_y", "contradicts", "deg", 0.31, 0.1, 0.5)
+    strong = AxisOpinion(axis, "contradicts", "m", 0.02 * sigmas, 0.02, 0.1)
+    judged = with_opinion(seen.truth, SceneOpinion(6, 500, (strong, slight)))
+    (finding,) = judged.findings
+    assert judged.verdict == verdict and finding.action == action
+    assert finding.figures["axis"] == axis
+    assert finding.figure("sigmas") == pytest.approx(abs(sigmas))
+    assert finding.figures["n_axes"] == 2
+
+
+def test_of_moving_boards_the_times_may_be_wrong(seen) -> None:
+    channel = ChannelResult("frames", 9, 0.1, seen.truth.T_cam_lidar, seen.truth.cov, 0.01, 0.02, 0.03, 0.004)
+    moving = replace(seen.truth, channel_results=(channel,))
+    slight = AxisOpinion("rotation_y", "contradicts", "deg", 0.31, 0.1, 0.5)
+    judged = with_opinion(moving, SceneOpinion(6, 500, (slight,)))
+    assert [finding.action for finding in judged.findings] == ["times"]
 
 
 def session_of(seen, path, images_of):
@@ -104,3 +131,41 @@ def test_verify_hears_the_session_s_own_scene(heard, seen, tmp_path) -> None:
     (found,) = [finding for finding in check.findings if finding.code == "verdict.scene"]
     assert found.action == "deployed"
     assert check.document()["scene"]["state"] == "contradicts"
+
+
+def test_the_verbs_tell_the_opinion(heard, room, seen, tmp_path, capsys) -> None:
+    copy = tmp_path / "session"
+    shutil.copytree(room, copy)
+    result = turned(seen.truth, 1.0)
+    write_result(tmp_path / "result.json", seen.rig.name, [result])
+    assert run(["verify", str(copy), "--result", str(tmp_path / "result.json")]) == 7
+    captured = capsys.readouterr()
+    assert "scene: contradicts" in captured.out
+    assert "rotation about the camera's y axis" in captured.err
+    write_result(
+        copy / "calibration" / "result.json",
+        seen.rig.name,
+        [with_opinion(result, hear_scene(*heard, result))],
+    )
+    assert run(["results", str(copy), "--json"]) == 0
+    (stored,) = json.loads(capsys.readouterr().out)["results"]
+    assert stored["pairs"][0]["scene"] == "contradicts"
+    assert run(["results", str(copy)]) == 0
+    assert "differs" in capsys.readouterr().out
+
+
+def test_the_report_names_axes_and_sizes() -> None:
+    axes = (
+        AxisOpinion("rotation_y", "contradicts", "deg", -1.004, 0.09, 0.43),
+        AxisOpinion("translation_x", "agrees", "m", 0.004, 0.007, 0.033),
+        AxisOpinion("translation_z", "agrees", "m", 0.004, 0.017, 0.076),
+        AxisOpinion("rotation_x", "unknown", "deg", 0.1, 0.4, 2.0),
+    )
+    assert scene_texts(SceneOpinion(6, 544, axes)) == [
+        "[red]contradicts[/] (6 captures, 544 edges)",
+        "rotation about the camera's y axis (down): -1.00 +- 0.09 deg",
+        "would see changes along x 33, z 76 mm",
+        "cannot tell changes about x",
+    ]
+    assert scene_texts(SceneOpinion(2, 7)) == ["cannot tell: too few edges (2 captures, 7 edges)"]
+    assert scene_texts(SceneOpinion(0, 0)) == ["cannot tell: no capture has a frame and a scan"]

@@ -196,7 +196,7 @@ def test_few_placements_leave_nothing_to_be_left_out():
     examination = validate(estimate, RIG, RIG.lidars["lidar"], CAMERA, [])
     assert examination.control is None
     assert examination.contrasts == ()
-    assert examination.cov is estimate.cov
+    assert np.array_equal(examination.cov, estimate.cov)
 
 
 def test_settled_expansions_are_at_their_optimum():

@@ -13,11 +13,12 @@ from lce_rig.core.results import Observation
 from lce_rig.extrinsics.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.likelihood.levels import Levels, Priors
-from lce_rig.extrinsics.likelihood.refine import JointEstimate, inflate, refine
+from lce_rig.extrinsics.likelihood.refine import JointEstimate, inflate, move_under, refine
 from lce_rig.extrinsics.likelihood.system import PER_CAMERA
 from lce_rig.extrinsics.metrics import error_to_reference
 from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M, EstimateSettings
 from lce_rig.extrinsics.report import report_estimate, with_parts
+from lce_rig.extrinsics.tolerances import Sensitivity, sensitivities_of, vary
 from lce_rig.residuals.along_rays import N_SHIFTS, SHIFTS
 from lce_rig.residuals.features import extract_features
 from lce_rig.residuals.placements import group_placements
@@ -47,7 +48,7 @@ def calibrate_by_likelihood(
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
-    start = calibrate_by_algorithm_1(observations, board, options, progress)
+    start = calibrate_by_algorithm_1(observations, board, replace(options, tolerances=None), progress)
     used = [observation for observation in observations if observation.capture in start.used]
     priors, usual = what_is_known(options)
     joint = refine([used], board, [start.T_cam_lidar], priors, usual)
@@ -60,12 +61,18 @@ def calibrate_by_likelihood(
         algorithm_1_offset_m=offset_m,
     )
     estimate = describe(joint, 0, cov, start, used, board, options, figures)
-    return replace(estimate, expansion=expand_joint(joint, 0, placement))
+    found: tuple[Sensitivity, ...] = ()
+    if options.tolerances is not None:
+        variants = vary(used, board, options.tolerances)
+        moves = np.array([move_under(joint, each.observations, each.board) for each in variants])
+        found = sensitivities_of(variants, moves, options.tolerances)
+    return replace(estimate, expansion=expand_joint(joint, 0, placement), sensitivities=found)
 
 
 def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
     """Read the priors of constant errors and noise from the options."""
-    priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=EDGE_SHIFT_SIGMA_M)
+    offset_m = max(options.range_offset_sigma_m, _EXACT_M)
+    priors = Priors(offset_m=offset_m, shift_m=EDGE_SHIFT_SIGMA_M, known=options.known)
     return priors, Levels(laser_m=options.laser_bias_sigma_m)
 
 
@@ -139,8 +146,8 @@ def add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation
         edge_shift_echo_m=shifts["d_1"],
         edge_shift_blended_m=shifts["d_2"],
         edge_shift_blended_echo_m=shifts["d_3"],
-        range_offset_m=float(np.mean(joint.offset_m)),
-        laser_spread_m=float(np.std(joint.offset_m)),
+        range_offset_m=float(np.mean(joint.lasers[0])),
+        laser_spread_m=float(np.std(joint.lasers[0])),
         lens_lateral_m=float(joint.lens_m[0]),
         lens_vertical_m_per_rad=float(joint.lens_m[1]),
         camera_scale=1.0 - float(joint.scale[camera]),

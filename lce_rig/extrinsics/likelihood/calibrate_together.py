@@ -74,6 +74,7 @@ def calibrate_together(
         estimates[name] = replace(
             estimate,
             method=start.method,
+            sensitivities=start.sensitivities,
             expansion=expand_joint(joint, k, placement),
             estimated_with=tuple(other for other in names if other != name),
             same_scan=start.same_scan,

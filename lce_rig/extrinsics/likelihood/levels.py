@@ -8,7 +8,7 @@ import numpy as np
 
 from lce_rig.core.geometry import Array
 from lce_rig.extrinsics.background import BACKGROUND_SIGMAS_M
-from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M
+from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M, KnownLidar
 
 
 class PoseLevels(NamedTuple):
@@ -85,9 +85,12 @@ class Priors:
         shift_m: edge shift d_0, `along_rays`.
         growth: c, its change with range; recordings show none.
         background_m: d_1, d_2 and d_3, by the background of the edge.
+        plate_m: p, half the difference of what its width and height are off by.
         displacement_m: displacement of all ring ends against the returns between them.
         lateral_m: lens beside the LiDAR's axis, `along_rays`.
         vertical_m: its height, per rad of elevation.
+        azimuth_rad, elevation_rad: of each laser, about their means, which are part of the extrinsics.
+        known: the LiDAR's errors as measured before: lasers and lens have this mean and these deviations.
         scale: relative error of the camera's distances, from squares or focal length.
     """
 
@@ -95,15 +98,20 @@ class Priors:
     shift_m: float = EDGE_SHIFT_SIGMA_M
     growth: float = 0.0001
     background_m: tuple[float, float, float] = BACKGROUND_SIGMAS_M
+    plate_m: float = 0.001
     displacement_m: float = 0.00025
     lateral_m: float = 0.02
     vertical_m: float = 0.04
-    scale: float = 0.0005
+    azimuth_rad: float = 4e-4
+    elevation_rad: float = 2e-4
+    known: KnownLidar | None = None
+    scale: float = 0.001
 
     @property
     def shifts(self) -> Array:
-        """Deviations (7,) in the order of `along_rays.SHIFTS`."""
-        return np.array([self.shift_m, self.growth, *self.background_m, *2 * [self.displacement_m]])
+        """Deviations (8,) in the order of `along_rays.SHIFTS`."""
+        of_width = [self.shift_m, self.growth, *self.background_m, self.plate_m]
+        return np.array([*of_width, self.displacement_m, self.displacement_m])
 
 
 # Offsets of lasers without any in the profile.

@@ -2,8 +2,8 @@
 
 Unknowns are the tangent y_k (6) of each board's T_lidar_board, and z, which all captures share:
 
-    z = [tangent of T_cam_lidar (6) and scale of each camera, range offset of each ring (L), lens (2),
-         shifts of ring ends (7)]
+    z = [tangent of T_cam_lidar (6) and scale of each camera, errors of each laser's range (L), azimuth (L)
+         and elevation (L), lens (2), shifts of ring ends (8)]
 
 A board pose enters only the terms of its own capture: the matrix is an arrow head, and y_k is eliminated
 capture by capture (Schur complement).
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, perturb
@@ -21,12 +22,14 @@ from lce_rig.extrinsics.likelihood.image_terms import StackedImages, image_rows
 from lce_rig.extrinsics.likelihood.levels import Levels, PoseLevels, Priors
 from lce_rig.residuals.along_rays import (
     N_FIELDS,
+    N_OF_LASER,
     N_SHIFTS,
     EdgeRows,
     RangeSums,
     StackedScans,
     edge_rows,
     range_system,
+    spread_rings,
     sum_ranges,
     weigh_ranges,
 )
@@ -110,14 +113,14 @@ def information(blur: Array, lost_share: float) -> Array:
 def edge_system(
     edges: EdgeRows, edge_rad: float, backed_rad: float, lost_share: float, n_captures: int
 ) -> Array:
-    """Expand -2 ln p of the ring ends to second order, by capture: (F, 16, 16).
+    """Expand -2 ln p of the ring ends to second order, by capture and ring: (F, L, 20, 20).
 
     With J a row without its residual: J J^T times the information, J times the score in the last column, and
     -2 ln p itself in the corner. The information is the mean over all ring ends of such a blur, as that of a
     single one is zero in the middle of its interval and unusable as a Hessian.
     """
     size = edges.rows.shape[1]
-    system = np.zeros((n_captures, size, size))
+    system = np.zeros((n_captures * edges.n_rings, size, size))
     if len(edges.rows):
         D, blur = edges.step_m, edges.blur_m(edge_rad, backed_rad) / edges.step_m
         p, slope = density(edges.rows[:, -1] / D, blur, lost_share)
@@ -126,13 +129,13 @@ def edge_system(
             edges.columns * (-slope / p / D),
             -2 * np.log(p / D)[None],
         ]
-        first = np.flatnonzero(np.diff(edges.capture, prepend=-1))
+        first = np.flatnonzero(np.diff(edges.group, prepend=-1))
         sums = np.add.reduceat(np.concatenate(weighted), first, axis=1).T
-        seen, (i, j) = edges.capture[first], np.triu_indices(size - 1)
+        seen, (i, j) = edges.group[first], np.triu_indices(size - 1)
         system[seen[:, None], i, j] = system[seen[:, None], j, i] = sums[:, : len(i)]
         system[seen, :-1, -1] = system[seen, -1, :-1] = sums[:, len(i) : -1]
         system[seen, -1, -1] = sums[:, -1]
-    return system
+    return system.reshape(n_captures, edges.n_rings, size, size)
 
 
 @lru_cache(maxsize=1)
@@ -151,8 +154,9 @@ def _normal(z: Array) -> Array:
 
 
 PER_CAMERA = 7
-# The lasers' own offsets have zero mean, as the mean is the common offset; this much of it is left.
-_MEAN_FLOOR_M = 1e-6
+# The lasers' own errors have zero mean: that of ranges is the common offset, those of angles are part of the
+# extrinsics. This much of it is left.
+_MEAN_FLOOR = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +166,7 @@ class State:
     Attributes:
         T_cam_lidar: (C, 4, 4).
         T_lidar_board: (F, 4, 4).
-        constants: (7 C + L + 9,) z, zero in the places of the tangents.
+        constants: (7 C + 3 L + 10,) z, zero in the places of the tangents.
     """
 
     T_cam_lidar: Array
@@ -177,6 +181,12 @@ class State:
         return State(perturb(self.T_cam_lidar, z[tangents]), perturb(self.T_lidar_board, y), constants)
 
 
+def of_the_lidar(constants: Array) -> tuple[Array, Array, Array]:
+    """Split the constants that follow the cameras': errors of the lasers (3, L), lens (2,), shifts (8,)."""
+    lasers, lens, shifts = np.split(constants, [-N_FIELDS - N_SHIFTS, -N_SHIFTS])
+    return lasers.reshape(N_OF_LASER, -1), lens, shifts
+
+
 @dataclass(frozen=True, eq=False)
 class Terms:
     """All residuals at one state, before they are weighted.
@@ -187,6 +197,8 @@ class Terms:
         images: of each camera.
         image_rows: linearised, of each camera.
         constants: z of the state.
+        trust: (F,) weight of each capture.
+        rings: (L,) ring numbers.
     """
 
     ranges: RangeSums
@@ -194,6 +206,8 @@ class Terms:
     images: tuple[StackedImages, ...]
     image_rows: tuple[Array, ...]
     constants: Array
+    trust: Array
+    rings: NDArray[np.int16]
 
     @property
     def n_rings(self) -> int:
@@ -201,21 +215,29 @@ class Terms:
         return int(self.ranges.sums.shape[1])
 
 
-def linearise(scans: StackedScans, images: Sequence[StackedImages], board: Board, state: State) -> Terms:
-    """Linearise all terms."""
+def linearise(
+    scans: StackedScans,
+    images: Sequence[StackedImages],
+    board: Board,
+    state: State,
+    trust: Array | None = None,
+) -> Terms:
+    """Linearise all terms; `trust` (F,) is 1 for each capture by default."""
     per_camera = state.constants[: PER_CAMERA * len(images)].reshape(-1, PER_CAMERA)
     of_lidar = state.constants[PER_CAMERA * len(images) :]
-    offsets, lens, shifts = np.split(of_lidar, [len(scans.rings), len(scans.rings) + N_FIELDS])
+    lasers, lens, shifts = of_the_lidar(of_lidar)
     T_lidar_board = state.T_lidar_board
     return Terms(
-        sum_ranges(scans, T_lidar_board, offsets, lens),
-        edge_rows(scans, T_lidar_board, board, lens, shifts),
+        sum_ranges(scans, T_lidar_board, lasers, lens),
+        edge_rows(scans, T_lidar_board, board, lasers, lens, shifts),
         tuple(images),
         tuple(
             image_rows(own, T, T_lidar_board, float(constants[-1]))
             for own, T, constants in zip(images, state.T_cam_lidar, per_camera, strict=True)
         ),
         state.constants,
+        np.ones(scans.n_captures) if trust is None else trust,
+        scans.rings,
     )
 
 
@@ -274,7 +296,7 @@ class Assembly:
         of_edges = self._edge_block(levels.edge_rad, levels.backed_rad, levels.lost_share)
         of_pictures, picture_volume = self._image_block(levels.pose)
         return _eliminate(
-            of_ranges + of_edges + of_pictures,
+            (of_ranges + of_edges + of_pictures) * self._terms.trust[:, None, None],
             self._terms,
             levels,
             self._priors,
@@ -294,8 +316,9 @@ def _range_block(terms: Terms, range_m: float, ring_m: float) -> tuple[Array, fl
 def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: float) -> Array:
     """Weight the ring ends' terms."""
     block = _no_block(terms)
-    place = np.r_[0:6, block.shape[1] - 1 - N_FIELDS - N_SHIFTS : block.shape[1]]
-    block[:, place[:, None], place] = edge_system(terms.edges, edge_rad, backed_rad, lost_share, len(block))
+    place = np.r_[0:6, 6 + PER_CAMERA * len(terms.images) : block.shape[1]]
+    by_ring = edge_system(terms.edges, edge_rad, backed_rad, lost_share, len(block))
+    block[:, place[:, None], place] = spread_rings(by_ring)
     return block
 
 
@@ -324,28 +347,53 @@ def _eliminate(M: Array, terms: Terms, levels: Levels, priors: Priors, log_volum
     steps = np.linalg.solve(of_boards, rest)
     reduced = M[:, 6:, 6:] - np.swapaxes(rest, 1, 2) @ steps
     hessians, gradients, costs = reduced[:, :-1, :-1], reduced[:, :-1, -1], reduced[:, -1, -1]
-    prior, log_prior_volume = _prior(terms, levels, priors)
-    summed = Quadratics(gradients, hessians, prior, prior @ terms.constants, np.arange(len(M)))
+    prior, mean, log_prior_volume = _prior(terms, levels, priors)
+    off = terms.constants - mean
+    summed = Quadratics(gradients, hessians, prior, prior @ off, np.arange(len(M)))
     information, gradient = summed.information, gradients.sum(axis=0) + summed.prior_gradient
-    least = costs.sum() + terms.constants @ summed.prior_gradient
+    least = costs.sum() + off @ summed.prior_gradient
     least -= gradient @ np.linalg.solve(information, gradient)
     log_volume += np.linalg.slogdet(of_boards)[1].sum() + np.linalg.slogdet(information)[1]
     evidence = float(least + log_volume + log_prior_volume)
     return Reduced(summed, np.asarray(steps), evidence)
 
 
-def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, float]:
-    """Build the information (G, G) of the priors and the log of their covariance's determinant.
+def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, float]:
+    """Build the priors' information (G, G), their mean (G,) and the log of their covariance's determinant.
 
-    Offsets of L rings have the covariance sigma_laser^2 (I - 1 1^T / L) + sigma_offset^2 1 1^T.
+    Range offsets of L rings have the covariance sigma_laser^2 (I - 1 1^T / L) + sigma_offset^2 1 1^T.
     """
     L, C = terms.n_rings, len(terms.images)
-    prior = np.zeros((len(terms.constants), len(terms.constants)))
+    prior, mean = np.zeros((len(terms.constants), len(terms.constants))), np.zeros(len(terms.constants))
     scale = PER_CAMERA * np.arange(C) + 6
     prior[scale, scale] = 1 / priors.scale**2
-    cov = levels.laser_m**2 * (np.eye(L) - 1 / L) + priors.offset_m**2 + _MEAN_FLOOR_M**2 * np.eye(L)
-    ring = np.arange(PER_CAMERA * C, PER_CAMERA * C + L)
-    prior[ring[:, None], ring] = np.linalg.inv(cov)
-    last = np.arange(PER_CAMERA * C + L, len(prior))
-    prior[last, last] = np.concatenate([[priors.lateral_m, priors.vertical_m], priors.shifts]) ** -2.0
-    return prior, float(np.linalg.slogdet(cov)[1])
+    ring = PER_CAMERA * C + np.arange(L)
+    log_volume = 0.0
+    of_lasers = (
+        (levels.laser_m, priors.offset_m),
+        (priors.azimuth_rad, 0.0),
+        (priors.elevation_rad, 0.0),
+    )
+    lens_sigma = np.array([priors.lateral_m, priors.vertical_m])
+    known = priors.known
+    for k, (own, common) in enumerate(of_lasers):
+        cov = own**2 * (np.eye(L) - 1 / L)
+        if known is not None:
+            at, which = _places(terms.rings, known.rings)
+            cov = own**2 * np.eye(L)
+            cov[at, at] = known.lasers_sigma[k, which] ** 2
+            mean[ring[at] + k * L] = known.lasers[k, which]
+        cov = cov + common**2 + _MEAN_FLOOR**2 * np.eye(L)
+        prior[(ring + k * L)[:, None], ring + k * L] = np.linalg.inv(cov)
+        log_volume += float(np.linalg.slogdet(cov)[1])
+    last = np.arange(PER_CAMERA * C + N_OF_LASER * L, len(prior))
+    if known is not None:
+        mean[last[:N_FIELDS]], lens_sigma = known.lens, known.lens_sigma
+    prior[last, last] = np.concatenate([lens_sigma, priors.shifts]) ** -2.0
+    return prior, mean, log_volume
+
+
+def _places(rings: NDArray[np.int16], known: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Find the rings that are known: their indices among those seen, and among those known."""
+    _, seen, which = np.intersect1d(rings, known, return_indices=True)
+    return seen, which

@@ -14,17 +14,31 @@ from lce_rig.extrinsics.likelihood.levels import Levels, Priors
 from lce_rig.extrinsics.likelihood.system import Assembly, State, assemble, linearise
 from lce_rig.residuals.along_rays import (
     N_FIELDS,
+    N_OF_LASER,
     N_SHIFTS,
     SHIFTS,
     edge_rows,
+    lens_fields,
     stack_scans,
     sum_ranges,
+    turn_rays,
     weigh_ranges,
 )
 from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, simulate
 
 STEP = 1e-6
 NO_LENS, NO_SHIFTS = np.zeros(N_FIELDS), np.zeros(N_SHIFTS)
+
+
+def no_errors(scans):
+    return np.zeros((N_OF_LASER, len(scans.rings)))
+
+
+def ends(scans, T_lidar_board, lasers=None, lens=NO_LENS, shifts=NO_SHIFTS):
+    """Ring ends at boards' poses, with no errors but those given."""
+    return edge_rows(
+        scans, T_lidar_board, BOARD, no_errors(scans) if lasers is None else lasers, lens, shifts
+    )
 
 
 @pytest.fixture(scope="module")
@@ -67,15 +81,12 @@ def freedoms(scans, T_lidar_board):
 def test_derivatives_by_a_boards_pose_are_those_of_differences(scans, T_lidar_board, axis):
     tangent = STEP * np.eye(6)[axis]
     ahead, behind = perturb(T_lidar_board, tangent), perturb(T_lidar_board, -tangent)
-    by_pose = sum_ranges(scans, T_lidar_board, np.zeros(len(scans.rings)), NO_LENS).by_pose[scans.capture]
+    by_pose = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_LENS).by_pose[scans.capture]
     expected = (ranges_to(scans, ahead) - ranges_to(scans, behind)) / (2 * STEP)
     slopes = np.sum(freedoms(scans, T_lidar_board) * by_pose[:, :, axis], axis=1)
     assert np.allclose(slopes, expected, atol=1e-6)
-    rows = edge_rows(scans, T_lidar_board, BOARD, NO_LENS, NO_SHIFTS)
-    inside = [
-        (e.rows[:, -1] + e.step_m / 2)
-        for e in (edge_rows(scans, T, BOARD, NO_LENS, NO_SHIFTS) for T in (ahead, behind))
-    ]
+    rows = ends(scans, T_lidar_board)
+    inside = [(e.rows[:, -1] + e.step_m / 2) for e in (ends(scans, T) for T in (ahead, behind))]
     assert np.allclose(rows.rows[:, axis], (inside[0] - inside[1]) / (2 * STEP), atol=1e-6)
 
 
@@ -89,23 +100,54 @@ def test_a_displaced_lens_moves_ranges_and_ends_as_its_derivatives_say(
     for observation in observations:
         own = stack_scans([observation.lidar])
         points = own.rays * own.range_m[:, None] + theta * own.fields[:, :, lens]
-        ends = observation.lidar.edge_points
-        ends = ends + theta * own.end_fields[:, :, lens]
-        moved.append(replace(observation.lidar, points=points, ring=own.rings[own.ring], edge_points=ends))
+        points_of_ends = observation.lidar.edge_points
+        points_of_ends = points_of_ends + theta * lens_fields(points_of_ends)[:, :, lens]
+        moved.append(
+            replace(observation.lidar, points=points, ring=own.rings[own.ring], edge_points=points_of_ends)
+        )
     there = stack_scans(moved)
     gap = there.range_m - ranges_to(there, T_lidar_board) - (scans.range_m - ranges_to(scans, T_lidar_board))
-    sums = sum_ranges(scans, T_lidar_board, np.zeros(len(scans.rings)), NO_LENS).sums
-    assert sums.shape[2] == 7
+    sums = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_LENS).sums
+    assert sums.shape[2] == 9
     # Displacement along the normal over the ray's slope: what a range along the old ray would have to read.
     n = T_lidar_board[scans.capture, :3, 2]
     by_lens = -np.einsum("ni,ni->n", n, scans.fields[:, :, lens]) / np.sum(n * scans.rays, axis=1)
     assert np.allclose(-gap, theta * by_lens, atol=2e-5)
-    before, after = (
-        edge_rows(s, T_lidar_board, BOARD, NO_LENS, NO_SHIFTS).rows[:, -1] for s in (scans, there)
-    )
-    expected = theta * edge_rows(scans, T_lidar_board, BOARD, NO_LENS, NO_SHIFTS).rows[:, 6 + lens]
+    before, after = (ends(s, T_lidar_board).rows[:, -1] for s in (scans, there))
+    expected = theta * ends(scans, T_lidar_board).rows[:, 9 + lens]
     # Points were moved, not rays: their rays meet the plane elsewhere, by less than a hundredth of the shift.
     assert np.allclose(after - before, expected, atol=4e-5)
+
+
+@pytest.mark.parametrize("error", [1, 2])
+def test_a_lasers_angles_move_its_ranges_and_ends_as_its_derivatives_say(scans, T_lidar_board, error):
+    """One laser points elsewhere by 0.05 mrad: as if its rays were turned."""
+    lasers, ring = no_errors(scans), 3
+    lasers[error, ring] = 5e-5
+    is_mine = scans.ring == ring
+    turned = scans.rays + np.where(is_mine, 5e-5, 0.0)[:, None] * turn_rays(scans.rays)[:, :, error - 1]
+    expected = ranges_to(replace(scans, rays=turned), T_lidar_board) - ranges_to(scans, T_lidar_board)
+    sums = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_LENS).sums
+    by_error = [np.sum(expected[is_mine & (scans.capture == k)]) / 5e-5 for k in range(scans.n_captures)]
+    assert np.allclose(sums[:, ring, 3, 3 + error], by_error, rtol=1e-3, atol=0.02)
+    plain, told = (ends(scans, T_lidar_board, each) for each in (None, lasers))
+    slopes = plain.rows[:, 6 + error] * np.where(plain.ring == ring, 5e-5, 0.0)
+    assert np.allclose(told.rows[:, -1] - plain.rows[:, -1], slopes, atol=1e-7)
+    assert np.abs(slopes).max() > 5e-5
+
+
+def test_a_displaced_lens_leaves_ring_ends_at_their_edges(scans, T_lidar_board):
+    """Points 25 mm beside their rays, and boards as far the other way: each end keeps its edge and step."""
+    lens = np.array([0.025, 0.0])
+    plain = ends(scans, T_lidar_board)
+    moved = T_lidar_board.copy()
+    centres = moved[:, :3, 3]
+    across = np.stack([-centres[:, 1], centres[:, 0], 0 * centres[:, 0]], axis=1)
+    moved[:, :3, 3] += lens[0] * across / np.linalg.norm(across, axis=1, keepdims=True)
+    there = ends(scans, moved, lens=lens)
+    # The board is small: the displacement turns with azimuth by a few millimetres over its width.
+    assert np.abs(there.rows[:, -1] - plain.rows[:, -1]).max() < 0.005
+    assert np.allclose(there.step_m, plain.step_m, rtol=0.1)
 
 
 @pytest.mark.parametrize(("shift", "axis"), [("along azimuth", 0), ("upwards", 2)])
@@ -114,11 +156,11 @@ def test_ring_ends_displaced_against_all_returns_are_what_the_shifts_say(scans, 
     by_shift = NO_SHIFTS.copy()
     by_shift[SHIFTS.index(shift)] = 5e-4
     direction = scans.end_fields[:, :, 0] if axis == 0 else np.tile([0.0, 0.0, 1.0], (len(scans.end_rays), 1))
-    plain, told = (edge_rows(scans, T_lidar_board, BOARD, NO_LENS, s) for s in (NO_SHIFTS, by_shift))
+    plain, told = (ends(scans, T_lidar_board, shifts=s) for s in (NO_SHIFTS, by_shift))
     moved = plain.range_m[:, None] * scans.end_rays + 5e-4 * direction
     there = replace(scans, end_rays=moved / np.linalg.norm(moved, axis=1, keepdims=True))
     there = replace(there, next_rays=there.end_rays + scans.next_rays - scans.end_rays)
-    expected = edge_rows(there, T_lidar_board, BOARD, NO_LENS, NO_SHIFTS).rows[:, -1]
+    expected = ends(there, T_lidar_board).rows[:, -1]
     assert np.allclose(told.rows[:, -1], expected, atol=2e-5)
     assert np.ptp(expected - plain.rows[:, -1]) > 5e-4
 
@@ -138,7 +180,7 @@ def test_derivatives_of_pictures_are_those_of_differences(images, T_lidar_board)
 
 
 def test_errors_shared_by_a_rings_returns_are_weighed_by_their_covariance(scans, T_lidar_board):
-    ranges = sum_ranges(scans, T_lidar_board, np.zeros(len(scans.rings)), NO_LENS)
+    ranges = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_LENS)
     weighted, log_volume = weigh_ranges(ranges, 0.01, 0.004)
     ring = scans.ring[np.searchsorted(scans.capture, 1)]
     mine = (scans.capture == 1) & (scans.ring == ring)
@@ -146,7 +188,7 @@ def test_errors_shared_by_a_rings_returns_are_weighed_by_their_covariance(scans,
     by_plane = freedoms(scans, T_lidar_board)[mine]
     v = np.column_stack([by_plane, np.ones(len(r)), r - scans.range_m[mine]])
     cov = 0.01**2 * np.eye(len(r)) + 0.004**2
-    plain = [0, 1, 2, 3, 6]
+    plain = [0, 1, 2, 3, 8]
     assert np.allclose(weighted[1, ring][np.ix_(plain, plain)], v.T @ np.linalg.solve(cov, v), rtol=1e-8)
     total = 0.0
     for ring in range(len(scans.rings)):
@@ -172,7 +214,9 @@ def plain_rows(terms, scans, T_lidar_board, levels, r):
         n = T_lidar_board[k, :3, 2]
         own[0, G + 6 * k : G + 6 * k + 6] = by_plane[i] @ terms.ranges.by_pose[k]
         own[0, 7 + scans.ring[i]] = 1
-        own[0, 7 + L : 7 + L + 2] = -n @ scans.fields[i] / (n @ scans.rays[i])
+        turned = r[i] * turn_rays(scans.rays[i : i + 1])[0]
+        own[0, [7 + L + scans.ring[i], 7 + 2 * L + scans.ring[i]]] = -n @ turned / (n @ scans.rays[i])
+        own[0, 7 + 3 * L : 7 + 3 * L + 2] = -n @ scans.fields[i] / (n @ scans.rays[i])
         own[0, -1] = r[i] - scans.range_m[i]
         rows.append(own)
     same = scans.group[:, None] == scans.group[None]
@@ -180,7 +224,7 @@ def plain_rows(terms, scans, T_lidar_board, levels, r):
     return np.concatenate(rows), block_diag(*noise)
 
 
-EDGE_FIELDS = ("rows", "step_m", "range_m", "is_backed")
+EDGE_FIELDS = ("ring", "rows", "step_m", "range_m", "is_backed")
 
 
 def without_ends(edges):
@@ -189,7 +233,8 @@ def without_ends(edges):
 
 
 def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, images, T_lidar_board):
-    L, G = len(scans.rings), 7 + len(scans.rings) + N_FIELDS + N_SHIFTS
+    L = len(scans.rings)
+    G = 7 + N_OF_LASER * L + N_FIELDS + N_SHIFTS
     terms = linearise(scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, np.zeros(G)))
     terms = replace(terms, edges=without_ends(terms.edges))
     priors = Priors()
@@ -197,7 +242,12 @@ def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, image
 
     def plainly(levels):
         rows, cov = plain_rows(terms, scans, T_lidar_board, levels, r)
-        lasers = levels.laser_m**2 * (np.eye(L) - 1 / L) + priors.offset_m**2 + 1e-12 * np.eye(L)
+        own = (levels.laser_m, priors.azimuth_rad, priors.elevation_rad)
+        common = (priors.offset_m, 0.0, 0.0)
+        about_mean = np.eye(L) - 1 / L
+        lasers = block_diag(
+            *(a**2 * about_mean + b**2 + 1e-12 * np.eye(L) for a, b in zip(own, common, strict=True))
+        )
         constants = np.square([priors.lateral_m, priors.vertical_m, *priors.shifts])
         known = block_diag(priors.scale**-2, np.linalg.inv(lasers), np.diag(1 / constants))
         A, e = rows[:, :-1], rows[:, -1]
@@ -218,7 +268,7 @@ def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, image
 
 
 def test_what_a_search_for_levels_keeps_is_right_at_each_step_and_gone_with_it(scans, images, T_lidar_board):
-    zeros = np.zeros(7 + len(scans.rings) + N_FIELDS + N_SHIFTS)
+    zeros = np.zeros(7 + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS)
     terms = linearise(scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, zeros))
     assembly, base = Assembly(terms, Priors()), Levels()
     for changed in (base, replace(base, range_m=0.02), replace(base, lost_share=0.3), base):
