@@ -436,7 +436,7 @@ def _judged(
         estimated_with=estimate.estimated_with,
         other_cameras=tuple(_other_camera(solved, link, k) for link in mine),
         scene_share=share,
-        weakest=estimate.weakest,
+        weakest=estimate.weakest.by(validation.cov),
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,
         observations=estimate.observations,

@@ -151,7 +151,9 @@ def largest(causes: Sequence[Contribution], size: str) -> str:
 
 
 def measure_action(source: str) -> str:
-    """Return the action of a finding that measures a cause; "" if more captures reduce it."""
+    """Return the action of a finding against a cause; "" if more captures reduce it."""
+    if source.startswith("contradiction_"):
+        return "settle_contradiction"
     return f"measure_{source}" if source in get_args(Source) else ""
 
 

@@ -154,7 +154,7 @@ def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig)
                 f"sigma_{unit}": sigma,
                 f"target_{unit}": goal,
                 f"by_axis_{unit}": tuple(float(axis) for axis in axes),
-                **estimate.weakest.figures(),
+                **estimate.weakest.by(examination.cov).figures(),
             }
             is_fail = sigma > rig.verdict.fail_factor * goal
             # No number of captures helps against the LiDAR's own errors; before that, more captures help

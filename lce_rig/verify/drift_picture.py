@@ -14,6 +14,7 @@ from lce_rig.scene.drift import AxisDrift, Drift
 from lce_rig.verify import canvas
 from lce_rig.verify.canvas import BLACK, INK, MAGENTA, Picture
 from lce_rig.words.extrinsics import motion_words
+from lce_rig.words.scene_drift import STATES
 
 _PAGE_PX = 1600
 _COLOURS = {"unchanged": "#2a7d3f", "changed": "#c0392b", "unknown": "#7a7f85"}
@@ -94,12 +95,13 @@ def _draw_curves(drift: Drift, board: Sequence[AxisDrift]) -> Picture:
                 capsize=3,
             )
         axes.set_xlim(scale * curve.offsets[0], scale * curve.offsets[-1])
-        axes.set_title(f"{motion_words(AXES[index])}: {verdict.state}", fontsize=9)
+        axes.set_title(f"{motion_words(AXES[index])}: {STATES[verdict.state]}", fontsize=9)
         axes.set_xlabel(unit, fontsize=8)
         axes.tick_params(labelsize=8)
     said = "; diamond: what the board says, 1 standard deviation" if board else ""
     figure.suptitle(
-        f"score of the scene along each axis; shaded: changes too small to be seen{said}", fontsize=10
+        f"score of the scene along each axis; shaded: changes too small to be seen{said}",
+        fontsize=10,
     )
     figure.tight_layout()
     chart.draw()

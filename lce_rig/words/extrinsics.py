@@ -185,6 +185,7 @@ _MEASURE = {
         "pattern_offset_sigma_m"
     ),
     "measure_plate_size": "measure the plate, and enter width_m, height_m and plate_sigma_m",
+    "settle_contradiction": "settle the contradicting check first, then collect more captures",
     "measure_board_bow": "lay a straight edge across the board, and enter bow_sigma_m",
 }
 
