@@ -88,7 +88,7 @@ def straight():
     captures = []
     for k in range(4):
         rig = MovingRig.build(small_rig(), 2, (1.2, 0.0, 0.0), 0.0, (0.3 * k, 0.0))
-        before, scan = (rig.scan("lidar", START_NS + step * PERIOD_NS, 10 * k + step) for step in (-1, 0))
+        before, scan = (rig.scan("lidar", START_NS + step * PERIOD_NS, 10 * k + step + 1) for step in (-1, 0))
         captures.append((rig, before, scan, rig.image("cam", START_NS + 50_000_000, k)))
     return captures
 
