@@ -176,6 +176,7 @@ _MEASURE_LENS = (
     "in the profile"
 )
 _MEASURE = {
+    "resolve": "resolve what contradicts first: more captures do not reduce this",
     "measure_focal_length": _MEASURE_LENS,
     "measure_principal_point": _MEASURE_LENS,
     "measure_distortion": _MEASURE_LENS,
