@@ -92,6 +92,8 @@ class Priors:
         azimuth_rad, elevation_rad: of each laser, about their means, which are part of the extrinsics.
         known: the LiDAR's errors as measured before: lasers and lens have this mean and these deviations.
         scale: relative error of the camera's distances, from squares or focal length.
+        scale_is_claimed: whether the covariance contains that error. It must not where the effects of focal
+            length and squares are added to it (`tolerances`).
     """
 
     offset_m: float = 0.005
@@ -106,6 +108,7 @@ class Priors:
     elevation_rad: float = 2e-4
     known: KnownLidar | None = None
     scale: float = 0.001
+    scale_is_claimed: bool = True
 
     @property
     def shifts(self) -> Array:

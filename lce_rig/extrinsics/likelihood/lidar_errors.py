@@ -13,6 +13,13 @@ from lce_rig.extrinsics.likelihood.refine import refine
 from lce_rig.extrinsics.options import EstimateSettings, KnownLidar
 from lce_rig.residuals.along_rays import ERRORS_OF_LASER, N_OF_LASER
 
+WIDENED = np.array([1.26, 1.39, 1.0])
+"""By what factor the deviations of ranges, azimuths and elevations exceed those of the joint estimate.
+
+Errors found on two recorded sessions of one LiDAR (rlfs01, rlfs02) apart differ by so many of its deviations
+(rms; elevations by 0.60). Over 20 simulated LiDARs, errors of ranges are 0.86 of them.
+"""
+
 
 @dataclass(frozen=True, eq=False)
 class LidarErrors:
@@ -67,6 +74,7 @@ def estimate_lidar(
             for k in range(N_OF_LASER)
         ]
     )
+    sigma *= WIDENED[:, None]
     lens = slice(N_OF_LASER * L, N_OF_LASER * L + len(joint.lens_m))
     rings = np.concatenate([o.lidar.ring for own in sessions for o in own])
     known = KnownLidar(
