@@ -27,6 +27,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "check": ("lce_rig.cli.check", "Report the detections in each capture, or the cause of refusal."),
     "calibrate": ("lce_rig.cli.calibrate", "Estimate the extrinsics of a session."),
     "intrinsics": ("lce_rig.cli.intrinsics", "Estimate the cameras' intrinsics from a session."),
+    "lidar-intrinsics": ("lce_rig.cli.lidar_intrinsics", "Estimate a LiDAR's constant errors from sessions."),
     "verify": ("lce_rig.cli.verify", "Project the point clouds into the images and print residuals."),
     "drift": ("lce_rig.cli.drift", "Check without a board whether extrinsics still hold."),
     "results": ("lce_rig.cli.results", "List the results of a session with figures and verdicts."),
@@ -53,7 +54,9 @@ class LateGroup(click.Group):
         """Import the verb's module."""
         if cmd_name not in COMMANDS:
             return None
-        command: click.Command = getattr(importlib.import_module(COMMANDS[cmd_name][0]), cmd_name)
+        command: click.Command = getattr(
+            importlib.import_module(COMMANDS[cmd_name][0]), cmd_name.replace("-", "_")
+        )
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -407,11 +407,6 @@ class WeakestMotion:
         """Whether the motion is a rotation."""
         return MOTIONS.index(self.motion) >= 3
 
-    def by(self, cov: Array) -> "WeakestMotion":
-        """Give the motion with its standard deviation by the reported covariance (6, 6)."""
-        index = MOTIONS.index(self.motion)
-        return WeakestMotion(self.motion, math.sqrt(cov[index, index]))
-
     def figures(self) -> dict[str, Figure]:
         """Give motion and standard deviation as figures of a finding."""
         if self.is_rotation:

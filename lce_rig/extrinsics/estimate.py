@@ -12,7 +12,6 @@ from lce_rig.core.results import (
     Metrics,
     Observation,
     Refusal,
-    WeakestMotion,
 )
 from lce_rig.extrinsics.tolerances import Sensitivity
 from lce_rig.residuals.quadratics import Quadratics
@@ -35,7 +34,7 @@ class CalibrationEstimate:
         fitted: the same as used in the method's cost: Algorithm 1 moves ring ends by the background's shift.
         residuals: one per capture used, in the order of `used`.
         held_out_m: mean over captures of `CaptureResidual.held_out_m`.
-        weakest: the least determined motion.
+        lever_m: rms distance of the boards from the camera.
         diagnostics: further figures.
         method: that found it, as `CalibrateOptions.method`.
         sensitivities: how far errors of the profile's lens and board move the result; empty without
@@ -59,7 +58,7 @@ class CalibrationEstimate:
     fitted: Mapping[str, Observation]
     residuals: tuple[CaptureResidual, ...]
     held_out_m: float
-    weakest: WeakestMotion
+    lever_m: float
     diagnostics: Diagnostics
     method: str = "paper"
     sensitivities: tuple[Sensitivity, ...] = ()

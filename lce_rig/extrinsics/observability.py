@@ -70,9 +70,13 @@ def main_motion(direction: Array) -> Motion:
     return MOTIONS[int(np.argmax(np.abs(direction)))]
 
 
-def find_weakest(cov: Array, features: Sequence[CaptureFeatures]) -> WeakestMotion:
-    """Find the least determined motion and its standard deviation, from a covariance (6, 6)."""
-    lever_m = lever_arm(features)
+def find_weakest(cov: Array, lever_m: float) -> WeakestMotion:
+    """Find the least determined motion and its standard deviation.
+
+    Args:
+        cov: (6, 6) of the tangent.
+        lever_m: the boards' `lever_arm`, by which rotations count as displacements.
+    """
     scale = np.r_[np.ones(3), np.full(3, lever_m)]
     _, vectors = np.linalg.eigh(cov * np.outer(scale, scale))
     motion = main_motion(vectors[:, -1])

@@ -4,12 +4,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.tolerances import Tolerances
 from lce_rig.residuals.features import AS_FITTED, FeatureSettings
-from lce_rig.rig import LidarSettings
+from lce_rig.rig import LidarIntrinsicsSettings, LidarSettings
 
 Method = Literal["ml", "paper"]
 
@@ -78,6 +82,44 @@ class Algorithm1Parts:
         return 1 / EDGE_SHIFT_SIGMA_M**2 if self.is_shift_free and self.use_ends else None
 
 
+@dataclass(frozen=True, eq=False)
+class KnownLidar:
+    """Constant errors of a LiDAR, measured before.
+
+    Attributes:
+        rings: (K,) ring numbers.
+        lasers: (3, K) errors of range m, azimuth rad and elevation rad, as `along_rays.ERRORS_OF_LASER`.
+        lasers_sigma: (3, K) their standard deviations about what is common to all lasers.
+        lens: (2,) lateral m and vertical m per rad displacement of the lens.
+        lens_sigma: (2,) of it.
+    """
+
+    rings: NDArray[np.intp]
+    lasers: Array
+    lasers_sigma: Array
+    lens: Array
+    lens_sigma: Array
+
+    @classmethod
+    def of(cls, settings: LidarIntrinsicsSettings | None) -> "KnownLidar | None":
+        """Read a profile's block; None if there is none."""
+        if settings is None:
+            return None
+        lasers = settings.lasers
+        values = [[e.range_m, np.radians(e.azimuth_deg), np.radians(e.elevation_deg)] for e in lasers]
+        sigmas = [
+            [e.range_sigma_m, np.radians(e.azimuth_sigma_deg), np.radians(e.elevation_sigma_deg)]
+            for e in lasers
+        ]
+        return cls(
+            np.array([e.ring for e in lasers], dtype=np.intp),
+            np.array(values).T,
+            np.array(sigmas).T,
+            np.array([settings.lens_lateral_m, settings.lens_vertical_m_per_rad]),
+            np.array([settings.lens_lateral_sigma_m, settings.lens_vertical_sigma_m_per_rad]),
+        )
+
+
 @dataclass(frozen=True)
 class EstimateSettings(CalibrateOptions):
     """The user's options, the profile's settings of the LiDAR, and parts that benchmarks replace.
@@ -85,6 +127,7 @@ class EstimateSettings(CalibrateOptions):
     Attributes:
         laser_bias_sigma_m: standard deviation a priori of the lasers' range offsets about their mean.
         range_offset_sigma_m: standard deviation a priori of that mean, the offset common to all ranges.
+        known: constant errors of the LiDAR that were measured before; None if there are none.
         tolerances: of the profile's lens and board; None does not compute their effect.
         parts: of Algorithm 1.
         estimator: replaces the method.
@@ -92,6 +135,7 @@ class EstimateSettings(CalibrateOptions):
 
     laser_bias_sigma_m: float = 0.0
     range_offset_sigma_m: float = 0.0
+    known: KnownLidar | None = None
     tolerances: Tolerances | None = None
     parts: Algorithm1Parts = Algorithm1Parts()
     estimator: "Estimator | None" = None
@@ -106,6 +150,7 @@ class EstimateSettings(CalibrateOptions):
             settings,
             laser_bias_sigma_m=lidar.laser_bias_sigma_m,
             range_offset_sigma_m=lidar.range_offset_sigma_m,
+            known=KnownLidar.of(lidar.intrinsics),
             tolerances=tolerances,
         )
 

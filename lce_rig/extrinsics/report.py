@@ -11,7 +11,7 @@ from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.results import Certificate, Observation, Refusal
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.metrics import capture_residual, summarise
-from lce_rig.extrinsics.observability import find_weakest
+from lce_rig.extrinsics.observability import lever_arm
 from lce_rig.residuals.features import CaptureFeatures
 from lce_rig.residuals.placements import group_placements
 
@@ -82,6 +82,6 @@ def report_estimate(
         fitted={observation.capture: observation for observation in fitted or observations},
         residuals=residuals,
         held_out_m=float(np.mean(held_out)),
-        weakest=find_weakest(cov, features),
+        lever_m=lever_arm(features),
         diagnostics=figures,
     )

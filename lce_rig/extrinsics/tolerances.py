@@ -78,6 +78,11 @@ class Tolerances:
             bow_m=board.bow_sigma_m,
         )
 
+    @property
+    def scale(self) -> float:
+        """Relative standard deviation of distances along the camera's line of sight."""
+        return float(np.hypot(self.focal_length, self.square_size))
+
     def sigma(self, source: Source) -> float:
         """Return the standard deviation of a source, in its own unit."""
         return {

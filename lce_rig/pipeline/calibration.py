@@ -29,6 +29,7 @@ from lce_rig.extrinsics import (
 )
 from lce_rig.extrinsics.likelihood.calibrate_together import TogetherEstimate, calibrate_together
 from lce_rig.extrinsics.metrics import error_to_reference
+from lce_rig.extrinsics.observability import find_weakest
 from lce_rig.extrinsics.relative_pose import relative_pose
 from lce_rig.extrinsics.tolerances import Tolerances
 from lce_rig.lens.lens_estimate import BoardView
@@ -436,7 +437,7 @@ def _judged(
         estimated_with=estimate.estimated_with,
         other_cameras=tuple(_other_camera(solved, link, k) for link in mine),
         scene_share=share,
-        weakest=estimate.weakest.by(validation.cov),
+        weakest=find_weakest(validation.cov, estimate.lever_m),
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,
         observations=estimate.observations,

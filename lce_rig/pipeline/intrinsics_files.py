@@ -179,7 +179,7 @@ def save_profile(
         why = "; ".join(f"{one.camera}: {describe(one.judgement)}" for one in refused)
         actions = dict.fromkeys(as_line(recommend(one.judgement)) for one in refused)
         raise ResultRefusedError(f"{path} not written. {why}", " ".join([*actions, _FORCE]))
-    text = _profile_text(session.rig)
+    text = profile_text(session.rig)
     for one in measured:
         lens, block = final(one), f"cameras.{one.camera}"
         if (lens.width_px, lens.height_px) != session.rig.cameras[one.camera].resolution_px:
@@ -196,7 +196,7 @@ def save_profile(
     return tuple(one.camera for one in measured)
 
 
-def _profile_text(rig: Rig) -> str:
+def profile_text(rig: Rig) -> str:
     """Find the text of a profile with comments: a shipped profile has them, a session's does not."""
     if rig.name in shipped_profiles() and load_rig(rig.name) == rig:
         return read_profile(find_profile(rig.name))

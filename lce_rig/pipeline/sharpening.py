@@ -13,9 +13,7 @@ from lce_rig.core.results import Calibration, SceneShare
 from lce_rig.detect.detection import Detections
 from lce_rig.extrinsics import CalibrationEstimate
 from lce_rig.extrinsics.metrics import capture_residual, summarise
-from lce_rig.extrinsics.observability import find_weakest
 from lce_rig.pipeline.witness import scene_views
-from lce_rig.residuals.features import AS_MEASURED, extract_features
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.estimate import estimate
 from lce_rig.scene.views import MAX_CAPTURES, without_movers
@@ -97,14 +95,12 @@ def fuse(by_boards: CalibrationEstimate, share: SceneShare, board: Board) -> Cal
         capture_residual(T, observations[each.capture], board, each.held_out_m)
         for each in by_boards.residuals
     )
-    features = [extract_features(observations[name], board, AS_MEASURED) for name in by_boards.used]
     return replace(
         by_boards,
         T_cam_lidar=T,
         cov=share.cov,
         residuals=residuals,
         metrics=summarise(residuals),
-        weakest=find_weakest(share.cov, features),
     )
 
 

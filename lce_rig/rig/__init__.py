@@ -12,6 +12,7 @@ from lce_rig.rig.sensors import (
     DriverSettings,
     FrameTimingSettings,
     IntrinsicsSettings,
+    LidarIntrinsicsSettings,
     LidarSettings,
     TimestampSettings,
 )
@@ -26,6 +27,7 @@ __all__ = [
     "DriverSettings",
     "FrameTimingSettings",
     "IntrinsicsSettings",
+    "LidarIntrinsicsSettings",
     "LidarSettings",
     "NominalExtrinsic",
     "QualitySettings",

@@ -93,6 +93,40 @@ class DriverSettings(Settings):
     controls: dict[Text, bool | int | float | Text] = Field(default_factory=dict)
 
 
+class LaserSettings(Settings):
+    """Constant errors of one laser, with their standard deviations about the errors common to all.
+
+    Attributes:
+        ring: its number.
+        range_m: positive for ranges too long.
+        azimuth_deg, elevation_deg: by which its true beam deviates from the reported one.
+    """
+
+    ring: Annotated[int, Field(ge=0, le=1000)]
+    range_m: Annotated[float, Field(ge=-1, le=1)]
+    range_sigma_m: Annotated[float, Field(gt=0, le=0.2)]
+    azimuth_deg: Annotated[float, Field(ge=-5, le=5)] = 0.0
+    azimuth_sigma_deg: Annotated[float, Field(gt=0, le=5)] = 0.023
+    elevation_deg: Annotated[float, Field(ge=-5, le=5)] = 0.0
+    elevation_sigma_deg: Annotated[float, Field(gt=0, le=5)] = 0.011
+
+
+class LidarIntrinsicsSettings(Settings):
+    """Constant errors of a LiDAR, as `lce-rig lidar-intrinsics` measures them, for `--method ml`.
+
+    Attributes:
+        lens_lateral_m: displacement of the beams' origin from the axis, towards growing azimuth.
+        lens_vertical_m_per_rad: its height, per rad of elevation.
+        lasers: errors of each.
+    """
+
+    lens_lateral_m: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+    lens_lateral_sigma_m: Annotated[float, Field(gt=0, le=0.5)] = 0.02
+    lens_vertical_m_per_rad: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+    lens_vertical_sigma_m_per_rad: Annotated[float, Field(gt=0, le=0.5)] = 0.04
+    lasers: Annotated[tuple[LaserSettings, ...], Field(min_length=1, max_length=256)]
+
+
 class LidarSettings(Settings):
     """One spinning LiDAR.
 
@@ -106,6 +140,7 @@ class LidarSettings(Settings):
         beam_divergence_rad: full angle by which the beam widens.
         laser_bias_sigma_m: standard deviation of the lasers' constant range errors about their mean.
         range_offset_sigma_m: standard deviation of that mean, the range error common to all lasers.
+        intrinsics: measured constant errors; None if there are none.
     """
 
     model: Text = "VLP-16"
@@ -118,6 +153,7 @@ class LidarSettings(Settings):
     beam_divergence_rad: NotNegative = 0.003
     laser_bias_sigma_m: RangeError = 0.008
     range_offset_sigma_m: RangeError = 0.005
+    intrinsics: LidarIntrinsicsSettings | None = None
     timestamps: TimestampSettings = TimestampSettings(reference="first_firing")
     driver: DriverSettings = DriverSettings()
 

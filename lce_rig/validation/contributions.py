@@ -32,6 +32,7 @@ _CHANCE, _SURE = 0.002, 3.0
 _CLEARLY = 0.5
 # Two subsets of the captures that contradict each other: the result is the mean of both.
 _HALF = 0.5
+_CONTRADICTION = "contradiction_"
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +140,7 @@ def list_contributions(
             widened_by * figures.sigma_systematic_translation_m,
         ),
         *(Contribution(each.source, *sigma_sizes(each.covariance())) for each in sensitivities),
-        *(Contribution(f"contradiction_{each.source}", *sigma_sizes(each.cov)) for each in contradictions),
+        *(Contribution(_CONTRADICTION + each.source, *sigma_sizes(each.cov)) for each in contradictions),
     ]
     return tuple(sorted(parts, key=lambda part: -part.sigma_translation_m))
 
@@ -152,8 +153,8 @@ def largest(causes: Sequence[Contribution], size: str) -> str:
 
 def measure_action(source: str) -> str:
     """Return the action of a finding against a cause; "" if more captures reduce it."""
-    if source.startswith("contradiction_"):
-        return "settle_contradiction"
+    if source.startswith(_CONTRADICTION):
+        return "resolve"
     return f"measure_{source}" if source in get_args(Source) else ""
 
 

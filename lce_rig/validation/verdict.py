@@ -11,6 +11,7 @@ from lce_rig.core.geometry import rotation_angle, tangent_sizes
 from lce_rig.core.results import Calibration, Metrics
 from lce_rig.core.scene_opinion import SceneOpinion
 from lce_rig.extrinsics.estimate import CalibrationEstimate
+from lce_rig.extrinsics.observability import find_weakest
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 from lce_rig.validation.contributions import largest, measure_action, uncertainty_notes
 from lce_rig.validation.intrinsics_check import explain
@@ -154,7 +155,7 @@ def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig)
                 f"sigma_{unit}": sigma,
                 f"target_{unit}": goal,
                 f"by_axis_{unit}": tuple(float(axis) for axis in axes),
-                **estimate.weakest.by(examination.cov).figures(),
+                **find_weakest(examination.cov, estimate.lever_m).figures(),
             }
             is_fail = sigma > rig.verdict.fail_factor * goal
             # No number of captures helps against the LiDAR's own errors; before that, more captures help

@@ -176,6 +176,7 @@ _MEASURE_LENS = (
     "in the profile"
 )
 _MEASURE = {
+    "resolve": "resolve what contradicts first: more captures do not reduce this",
     "measure_focal_length": _MEASURE_LENS,
     "measure_principal_point": _MEASURE_LENS,
     "measure_distortion": _MEASURE_LENS,
@@ -185,7 +186,6 @@ _MEASURE = {
         "pattern_offset_sigma_m"
     ),
     "measure_plate_size": "measure the plate, and enter width_m, height_m and plate_sigma_m",
-    "settle_contradiction": "settle the contradicting check first, then collect more captures",
     "measure_board_bow": "lay a straight edge across the board, and enter bow_sigma_m",
 }
 

@@ -130,6 +130,11 @@ PHRASES = {
         "while the rig moves, images of {subject} fit best {apart_s:+.2f} s from their timestamps",
         "let the rig stand, or correct the clocks: `lce-rig doctor` measures them",
     ),
+    "scene.clocks_instead": Phrase(
+        "or the clocks are apart: while the rig moves, images of {subject} {apart_s:+.2f} s from their "
+        "timestamps explain it nearly as well",
+        "let the rig stand, which tells one from the other",
+    ),
     "scene.best_uncertain": Phrase(_best_uncertain, _BOARD),
     "scene.axis_unchanged": Phrase(_axis_unchanged),
     "scene.axis_changed": Phrase(_axis_changed),

@@ -3,18 +3,24 @@
 import tempfile
 import time
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.recordings import RIGS, SETS, RecordedSet
+from benchmarks.scene_rooms import furnished_room
 from benchmarks.tables import print_head, print_row
 from lce_rig import pipeline
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array, difference, perturb
 from lce_rig.core.results import Calibration
 from lce_rig.detect.finder import BoardFinder
+from lce_rig.export.result import SavedResult
+from lce_rig.pipeline.drift import PairDrift, judge
+from lce_rig.pipeline.scene_captures import SceneCaptures, Seen
+from lce_rig.rig import Rig
 from lce_rig.scene.alignment import AXES, IS_ROTATION, SceneView
 from lce_rig.scene.depth_edges import leave_standing
 from lce_rig.scene.drift import Drift, watch
@@ -25,6 +31,8 @@ _NAMES = ("rlfs01", "rlfs02", "acfr_vlp16", "os1_64")
 _SETS = (*SETS, RecordedSet("os1_64", str(RIGS / "os1_64.yaml"), (("os1_64", "frames"),)))
 _OF_ONE_RIG = (("rlfs01", "rlfs02"), ("rlfs02", "rlfs01"))
 _PART = 5
+_N_ROOMS = 10
+_STATES = ("changed", "unchanged", "unknown")
 _CHI2_99 = 16.8  # of 6 axes
 _SIZES = (
     np.array([0.05, 0.05, 0.05, *np.radians([1.0, 0.5, 1.0])]),
@@ -33,44 +41,76 @@ _SIZES = (
 _UNIT = np.where(IS_ROTATION, np.degrees(1.0), 1000.0)
 
 
+@dataclass(frozen=True, eq=False)
 class _Watched:
-    """The views of one recorded set, and its board calibration."""
+    """The views of one recorded set or simulated room, and its board calibration."""
 
-    def __init__(self, recorded: RecordedSet, ignore_board: bool) -> None:
-        self._ignore_board = ignore_board
+    rig: Rig
+    calibration: Calibration
+    samples: list[Seen]
+    views: list[SceneView]
+    ignore_board: bool
+    edges_ms: float = 0.0
+
+    @classmethod
+    def recorded(cls, recorded: RecordedSet, *, ignore_board: bool) -> "_Watched":
+        """Calibrate a recorded set and find its edges."""
         with tempfile.TemporaryDirectory() as folder:
             recorded.collect(Path(folder) / "session")
             session = Session.open(Path(folder) / "session")
-            (self.calibration,) = pipeline.calibrate(session).pairs
-            c: Calibration = self.calibration
-            self.lens: Intrinsics = session.rig.cameras[c.camera].to_intrinsics()
-            samples = [(s.name, s.image(c.camera, "frames"), s.scan(c.lidar)) for s in session.captures]
+            (c,) = pipeline.calibrate(session).pairs
+            samples = _samples(session, c)
             start = time.perf_counter()
-            self.views = [build_view(session.rig, c, *sample) for sample in samples]
-            self.edges_ms = 1000 * (time.perf_counter() - start) / len(samples)
+            views = [build_view(session.rig, c, each.name, each.image, each.scan) for each in samples]
+            edges_ms = 1000 * (time.perf_counter() - start) / len(samples)
             if ignore_board:
                 finder = BoardFinder(session.rig)
-                self.views = [
-                    without_board(view, finder.image(image), session.rig, c)
-                    for view, (_, image, _) in zip(self.views, samples, strict=True)
+                views = [
+                    without_board(view, finder.image(each.image), session.rig, c)
+                    for view, each in zip(views, samples, strict=True)
+                    if isinstance(each.image, Image)
                 ]
+        return cls(session.rig, c, samples, views, ignore_board, edges_ms)
 
-    def parts(self, n_splits: int) -> list[list[SceneView]]:
+    @classmethod
+    def room(cls, seed: int, *, ignore_board: bool) -> "_Watched":
+        """Calibrate a simulated room and find its edges."""
+        room = furnished_room("rlfs", seed)
+        c = room.calibrate(room.names)
+        views = room.views(room.names, c, ignore_board=ignore_board)
+        return cls(room.rig, c, _samples(room.session, c), views, ignore_board)
+
+    @property
+    def lens(self) -> Intrinsics:
+        """The camera's intrinsics."""
+        return self.rig.cameras[self.calibration.camera].to_intrinsics()
+
+    def parts(self, n_splits: int) -> list["_Part"]:
         """Split the captures at random into parts of five, several times."""
         rng = np.random.default_rng(0)
         orders = [rng.permutation(len(self.views)) for _ in range(n_splits)]
         return [
-            self.seen([self.views[k] for k in order[first : first + _PART]])
+            (self, self.seen([self.views[k] for k in order[first : first + _PART]]))
             for order in orders
             for first in range(0, len(order) - _PART + 1, _PART)
         ]
 
     def seen(self, views: list[SceneView]) -> list[SceneView]:
         """Leave out what moves, where the board is left out, as `drift` does."""
-        if not self._ignore_board:
+        if not self.ignore_board:
             return views
         standing = leave_standing([view.edges for view in views])
         return [replace(view, edges=edges) for view, edges in zip(views, standing, strict=True)]
+
+    def drift(self, views: list[SceneView], deployed: Calibration) -> PairDrift:
+        """Judge a result by some captures as `lce-rig drift` does, by scene and boards."""
+        result = SavedResult(self.rig.name, "", (deployed,), {})
+        captures = SceneCaptures(self.rig, result, "a part")
+        names = {view.capture for view in views}
+        for each in self.samples:
+            if each.name in names:
+                captures.kept[0].take(each)
+        return judge(self.rig, result, captures).pairs[0]
 
     def judge(self, views: list[SceneView], tangent: Array, *, is_joint: bool = False) -> Drift:
         """Watch the board calibration, moved by a tangent."""
@@ -78,35 +118,49 @@ class _Watched:
         return watch(views, self.lens, perturb(c.T_cam_lidar, tangent), c.cov, is_joint=is_joint)
 
 
+def _samples(session: Session, c: Calibration) -> list[Seen]:
+    return [Seen(s.name, s.image(c.camera, "frames"), s.scan(c.lidar), None) for s in session.captures]
+
+
+# Five captures, and what they are judged against.
+_Part = tuple[_Watched, list[SceneView]]
+
+
 def bench_scene(n_splits: int, only: str = "") -> None:
-    """Print the tables of docs/drift.md."""
+    """Print the tables of docs/drift.md; simulated rooms are split once, as one set."""
     for ignore_board in (False, True):
         print(f"\n### {'Edges at the board left out' if ignore_board else 'All edges'}")
         sets = [each for each in _SETS if each.name in _NAMES and each.is_there and only in each.name]
-        watched = {each.name: _Watched(each, ignore_board) for each in sets}
-        _print_unchanged(watched, n_splits)
-        _print_changed(watched, n_splits)
+        watched = {each.name: _Watched.recorded(each, ignore_board=ignore_board) for each in sets}
+        seeds = range(_N_ROOMS if only in "rooms" else 0)
+        rooms = [_Watched.room(seed, ignore_board=ignore_board) for seed in seeds]
+        parts = {name: own.parts(n_splits) for name, own in watched.items()}
+        if rooms:
+            parts["rooms"] = [part for room in rooms for part in room.parts(1)]
+        _print_unchanged(watched, parts)
+        _print_changed(parts)
         _print_joint(watched, n_splits)
+        if ignore_board:
+            _print_beside(watched, parts)
 
 
-def _print_unchanged(watched: dict[str, _Watched], n_splits: int) -> None:
+def _print_unchanged(watched: dict[str, _Watched], parts: dict[str, list["_Part"]]) -> None:
     print("\nUnchanged rigs, and images mirrored (nothing fits)\n")
     print_head(
         "calibrated on", "watched", "parts", "no change seen", "cannot tell", "false alarms", "mirrored"
     )
-    for source, target in [*((name, name) for name in watched), *_OF_ONE_RIG]:
-        if source not in watched or target not in watched:
+    for source, target in [*((name, name) for name in parts), *_OF_ONE_RIG]:
+        if source not in parts or target not in parts:
             continue
-        own, deployed = watched[target], watched[source].calibration
         states: Counter[str] = Counter()
         mirrored: Counter[str] = Counter()
-        parts = own.parts(n_splits)
-        for views in parts:
+        for own, views in parts[target]:
+            deployed = own.calibration if source == target else watched[source].calibration
             arguments = (own.lens, deployed.T_cam_lidar, deployed.cov)
             states[watch(views, *arguments, is_joint=False).state] += 1
             mirrored[watch(list(map(_mirrored, views)), *arguments, is_joint=False).state] += 1
         shown = (states["unchanged"], states["unknown"], states["changed"])
-        print_row(source, target, len(parts), *shown, _counts(mirrored))
+        print_row(source, target, len(parts[target]), *shown, _counts(mirrored))
 
 
 def _counts(states: Counter[str]) -> str:
@@ -118,20 +172,19 @@ def _mirrored(view: SceneView) -> SceneView:
     return replace(view, field=replace(view.field, values=mirrored))
 
 
-def _print_changed(watched: dict[str, _Watched], n_splits: int) -> None:
+def _print_changed(every: dict[str, list["_Part"]]) -> None:
     print("\nOne axis changed, both signs; of the changes not seen, those for which the axis was unknown\n")
     print_head(
         "set", "axis", "seen", "cannot tell", "below the claim", "false all-clear", "right axis",
         "3 cm, .3 deg: seen",
         "smallest claimed (median)", "at the smallest: seen",
     )  # fmt: skip
-    for name, own in watched.items():
-        parts = own.parts(n_splits)
-        before = [own.judge(views, np.zeros(6)) for views in parts]
+    for name, parts in every.items():
+        before = [own.judge(views, np.zeros(6)) for own, views in parts]
         for axis, label in enumerate(AXES):
             tally: Counter[str] = Counter()
             smallest = [drift.axes[axis].smallest for drift in before]
-            for views, drift in zip(parts, before, strict=True):
+            for (own, views), drift in zip(parts, before, strict=True):
                 unit = float(_UNIT[axis]) if IS_ROTATION[axis] else 1.0
                 is_known = drift.axes[axis].state == "unchanged"
                 for sign in (-1.0, 1.0):
@@ -188,7 +241,7 @@ def _print_joint(watched: dict[str, _Watched], n_splits: int) -> None:
         T, cov = own.calibration.T_cam_lidar, own.calibration.cov
         moved = difference(drift.T_best, T) * _UNIT
         claimed = np.sqrt(np.diag(_cov_best(drift))) * _UNIT
-        parts = [own.judge(part, np.zeros(6), is_joint=True) for part in own.parts(n_splits)]
+        parts = [own.judge(part, np.zeros(6), is_joint=True) for _, part in own.parts(n_splits)]
         rms = np.sqrt(np.mean([(difference(part.T_best, T) * _UNIT) ** 2 for part in parts], axis=0))
         chi2 = [_chi2(part, T, cov) for part in parts]
         figures = [
@@ -247,3 +300,29 @@ def _print_basin(name: str, own: _Watched, T_best: Array, angle_deg: float, shif
 
 def _figures(values: Array, digits: int) -> str:
     return ", ".join(f"{value:.{digits}f}" for value in values)
+
+
+def _print_beside(watched: dict[str, _Watched], parts: dict[str, list[_Part]]) -> None:
+    print("\nBoard and scene beside each other, as `lce-rig drift` judges\n")
+    print_head("calibrated on", "watched", "changed by", "trials", "changed", "that axis", "no change seen",
+               "cannot tell", "board alone: no change seen", "board would see (median)")  # fmt: skip
+    for source, target in [*((name, name) for name in parts), *_OF_ONE_RIG]:
+        if source not in parts or target not in parts:
+            continue
+        for axis in (None, *range(6)) if source == target else (None,):
+            tally: Counter[str] = Counter()
+            smallest = []
+            for own, views in parts[target]:
+                c = own.calibration if source == target else watched[source].calibration
+                for sign in (1.0,) if axis is None else (-1.0, 1.0):
+                    step = np.zeros(6) if axis is None else sign * _SIZES[0] * np.eye(6)[axis]
+                    pair = own.drift(views, replace(c, T_cam_lidar=perturb(c.T_cam_lidar, step)))
+                    tally[pair.state] += 1
+                    board = () if pair.board is None else pair.board.axes
+                    tally["board"] += bool(board) and all(each.state == "unchanged" for each in board)
+                    smallest += [[each.smallest for each in board]] if board else []
+                    tally["axis"] += axis is not None and pair.states[AXES[axis]] == "changed"
+            size = "nothing" if axis is None else f"{AXES[axis]} {_SIZES[0][axis] * _UNIT[axis]:g}"
+            n, states = sum(tally[each] for each in _STATES), [tally[each] for each in _STATES[1:]]
+            told = _figures(np.median(smallest, axis=0), 3) if smallest else ""
+            print_row(source, target, size, n, tally["changed"], tally["axis"], *states, tally["board"], told)

@@ -88,3 +88,19 @@ def test_too_few_captures_exit_with_6(lce_rig, session):
     outcome = lce_rig("intrinsics", session)
     assert outcome.code == 6
     assert "3 of 3 captures" in outcome.err
+
+
+def test_a_lidars_errors_are_printed_and_written_to_a_profile_or_refused(lce_rig, simulated, few, tmp_path):
+    refused = lce_rig("lidar-intrinsics", few)
+    assert refused.code == 6
+    new = tmp_path / "new.yaml"
+    outcome = lce_rig("lidar-intrinsics", simulated, "--json", "--save-profile", new)
+    assert outcome.code == 0, outcome.err
+    document = json.loads(outcome.out)
+    lasers = load_rig(new).lidars["lidar"].intrinsics.lasers
+    assert [laser.ring for laser in lasers] == [row["ring"] for row in document["lasers"]]
+    for laser, row in zip(lasers, document["lasers"], strict=True):
+        assert laser.range_m == pytest.approx(row["range_m"], abs=1e-5)
+        assert laser.range_sigma_m == pytest.approx(row["range_sigma_m"], abs=1e-5)
+    again = lce_rig("lidar-intrinsics", simulated, "--save-profile", new)
+    assert again.code == 2

@@ -24,8 +24,8 @@ from lce_rig.residuals.features import extract_features
 from lce_rig.residuals.placements import group_placements
 from lce_rig.residuals.quadratics import Quadratics
 
-# A profile that states no range errors is used as it says.
-_EXACT_M = 1e-6
+# A profile that states no range errors, or none of its scale, is used as it says.
+_EXACT_M, _EXACT = 1e-6, 1e-6
 
 
 def calibrate_by_likelihood(
@@ -71,7 +71,12 @@ def calibrate_by_likelihood(
 
 def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
     """Read the priors of constant errors and noise from the options."""
-    priors = Priors(offset_m=max(options.range_offset_sigma_m, _EXACT_M), shift_m=EDGE_SHIFT_SIGMA_M)
+    offset_m = max(options.range_offset_sigma_m, _EXACT_M)
+    priors = Priors(offset_m=offset_m, shift_m=EDGE_SHIFT_SIGMA_M, known=options.known)
+    if options.tolerances is not None:
+        # The effects of focal length and squares on the result contain what the scale does not absorb.
+        scale = max(options.tolerances.scale, _EXACT)
+        priors = replace(priors, scale=scale, scale_is_claimed=False)
     return priors, Levels(laser_m=options.laser_bias_sigma_m)
 
 
@@ -130,12 +135,8 @@ def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp])
 
 
 def add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation: float) -> Diagnostics:
-    """Replace the start's constant errors, noise levels and covariance parts by those of a joint estimate.
-
-    With information H = sum_k H_k + P, the covariance H^-1 is H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1: the part
-    that differs between sessions, and that of constant errors.
-    """
-    levels, cost = joint.levels, joint.cost
+    """Replace the start's constant errors, noise levels and covariance parts by those of a joint estimate."""
+    levels, J = joint.levels, joint.to_extrinsics[camera]
     shifts = dict(zip(SHIFTS, joint.shifts.tolist(), strict=True))
     figures = replace(
         start,
@@ -159,5 +160,4 @@ def add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation
         noise_depth_m=levels.depth_m,
         noise_across_m=levels.across_m,
     )
-    J = joint.to_extrinsics[camera] @ cost.covariance()
-    return with_parts(figures, J @ cost.hessians.sum(axis=0) @ J.T, J @ cost.prior @ J.T)
+    return with_parts(figures, J @ joint.cov_scatter @ J.T, J @ joint.cov_constants @ J.T)

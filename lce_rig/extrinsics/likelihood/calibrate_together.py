@@ -80,7 +80,7 @@ def calibrate_together(
             same_scan=start.same_scan,
         )
     scale = np.concatenate(scales)
-    cov = scale[:, None] * (J @ joint.cost.covariance() @ J.T) * scale
+    cov = scale[:, None] * (J @ (joint.cov_scatter + joint.cov_constants) @ J.T) * scale
     return TogetherEstimate(names, estimates, cov)
 
 

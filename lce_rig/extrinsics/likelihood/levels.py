@@ -8,7 +8,7 @@ import numpy as np
 
 from lce_rig.core.geometry import Array
 from lce_rig.extrinsics.background import BACKGROUND_SIGMAS_M
-from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M
+from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M, KnownLidar
 
 
 class PoseLevels(NamedTuple):
@@ -90,7 +90,10 @@ class Priors:
         lateral_m: lens beside the LiDAR's axis, `along_rays`.
         vertical_m: its height, per rad of elevation.
         azimuth_rad, elevation_rad: of each laser, about their means, which are part of the extrinsics.
+        known: the LiDAR's errors as measured before: lasers and lens have this mean and these deviations.
         scale: relative error of the camera's distances, from squares or focal length.
+        scale_is_claimed: whether the covariance contains that error. It must not where the effects of focal
+            length and squares are added to it (`tolerances`).
     """
 
     offset_m: float = 0.005
@@ -103,7 +106,9 @@ class Priors:
     vertical_m: float = 0.04
     azimuth_rad: float = 4e-4
     elevation_rad: float = 2e-4
+    known: KnownLidar | None = None
     scale: float = 0.001
+    scale_is_claimed: bool = True
 
     @property
     def shifts(self) -> Array:

@@ -23,6 +23,7 @@ from lce_rig.extrinsics.likelihood.system import (
     assemble,
     linearise,
     of_the_lidar,
+    scale_places,
 )
 from lce_rig.residuals.along_rays import (
     N_FIELDS,
@@ -43,7 +44,6 @@ from lce_rig.solvers.covariance import symmetric_inverse
 # not mistaken for small noise. The terms stay linearised: an evaluation involves small matrices only, no
 # points.
 
-_STEP = 1e-3
 # Levels lie within these factors of the typical value, e^-4.6 and e^3.
 _BELOW, _ABOVE = -4.6, 3.0
 
@@ -68,14 +68,17 @@ def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, n_rou
     def levels_at(logs: Array) -> Levels:
         return replace(usual, **dict(zip(names, np.exp(logs).tolist(), strict=True)))
 
-    def cost(logs: Array) -> float:
-        unlikely = float(np.sum(((logs - middle) / sigma) ** 2))
-        return assembly.at(levels_at(logs)).minus_2_log_evidence + unlikely
+    def cost(logs: Array) -> tuple[float, Array]:
+        evidence, slopes = assembly.evidence(levels_at(logs), names)
+        off = (logs - middle) / sigma
+        return evidence + float(off @ off), slopes + 2 * off / sigma
 
     highest = np.where(np.array(names) == "lost_share", np.log(MOST_LOST), middle + _ABOVE)
     bounds = list(zip(middle + _BELOW, highest, strict=True))
-    options = {"maxiter": n_rounds, "eps": _STEP, "ftol": 1e-6}
-    return levels_at(minimize(cost, _logs(start, names), method="L-BFGS-B", bounds=bounds, options=options).x)
+    options = {"maxiter": n_rounds, "ftol": 1e-6}
+    first = _logs(start, names)
+    found = minimize(cost, first, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return levels_at(found.x)
 
 
 def _logs(levels: Levels, names: list[str]) -> Array:
@@ -100,6 +103,8 @@ class JointEstimate:
         T_cam_lidar: (C, 4, 4).
         T_lidar_board: (F, 4, 4).
         cov: (C, 6, 6) of each result, everything else marginalised, tangent (translation m, rotation rad).
+        cov_scatter, cov_constants: (G, G) of the unknowns z of `system`: the part that differs between
+            sessions, and that of constant errors.
         to_extrinsics: (C, 6, G) derivative of each result's tangent by the unknowns z of `system`.
         rings: (L,) ring numbers.
         lasers: (3, L) errors of each ring, `along_rays.ERRORS_OF_LASER`; positive for ranges too long.
@@ -117,6 +122,8 @@ class JointEstimate:
     T_cam_lidar: Array
     T_lidar_board: Array
     cov: Array
+    cov_scatter: Array
+    cov_constants: Array
     to_extrinsics: Array
     rings: NDArray[np.int16]
     lasers: Array
@@ -271,19 +278,22 @@ def _summarise(
 ) -> JointEstimate:
     cost = assemble(terms, levels, priors).cost
     C, constants = len(state.T_cam_lidar), state.constants
-    cov = cost.covariance()
+    scatter, of_constants = _covariance_parts(cost, priors, C)
+    cov = scatter + of_constants
     J = _to_extrinsics(state).reshape(C, 6, -1)
     lasers, lens, shifts = of_the_lidar(constants[PER_CAMERA * C :])
     return JointEstimate(
         T_cam_lidar=perturb(state.T_cam_lidar, J @ constants),
         T_lidar_board=state.T_lidar_board,
         cov=J @ cov @ np.swapaxes(J, 1, 2),
+        cov_scatter=scatter,
+        cov_constants=of_constants,
         to_extrinsics=J,
         rings=rings,
         lasers=lasers,
         lens_m=lens,
         shifts=shifts,
-        scale=constants[PER_CAMERA * np.arange(C) + 6],
+        scale=constants[scale_places(C)],
         constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
         trust=terms.trust,
         levels=levels,
@@ -291,6 +301,18 @@ def _summarise(
         state=state,
         priors=priors,
     )
+
+
+def _covariance_parts(cost: Quadratics, priors: Priors, n_cameras: int) -> tuple[Array, Array]:
+    """Split the covariance (G, G) by its causes: noise of the captures, and constant errors.
+
+    With information H = sum_k H_k + P, H^-1 = H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1.
+    """
+    inverse, claimed = cost.covariance(), cost.prior
+    if not priors.scale_is_claimed:
+        claimed, scale = claimed.copy(), scale_places(n_cameras)
+        claimed[scale, scale] = 0.0
+    return inverse @ cost.hessians.sum(axis=0) @ inverse, inverse @ claimed @ inverse
 
 
 def move_under(joint: JointEstimate, observations: Sequence[Observation], board: Board) -> Array:

@@ -9,11 +9,12 @@ A board pose enters only the terms of its own capture: the matrix is an arrow he
 capture by capture (Schur complement).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, perturb
@@ -121,13 +122,8 @@ def edge_system(
     size = edges.rows.shape[1]
     system = np.zeros((n_captures * edges.n_rings, size, size))
     if len(edges.rows):
-        D, blur = edges.step_m, edges.blur_m(edge_rad, backed_rad) / edges.step_m
-        p, slope = density(edges.rows[:, -1] / D, blur, lost_share)
-        weighted = [
-            edges.products * (information(blur, lost_share) / D**2),
-            edges.columns * (-slope / p / D),
-            -2 * np.log(p / D)[None],
-        ]
+        weight, score, value = _expand_ends(edges, edge_rad, backed_rad, lost_share)
+        weighted = [edges.products * weight, edges.columns * score, value[None]]
         first = np.flatnonzero(np.diff(edges.group, prepend=-1))
         sums = np.add.reduceat(np.concatenate(weighted), first, axis=1).T
         seen, (i, j) = edges.group[first], np.triu_indices(size - 1)
@@ -135,6 +131,15 @@ def edge_system(
         system[seen, :-1, -1] = system[seen, -1, :-1] = sums[:, len(i) : -1]
         system[seen, -1, -1] = sums[:, -1]
     return system.reshape(n_captures, edges.n_rings, size, size)
+
+
+def _expand_ends(
+    edges: EdgeRows, edge_rad: float, backed_rad: float, lost_share: float
+) -> tuple[Array, Array, Array]:
+    """Compute the factors (M,) of J J^T and of J in `edge_system`, and -2 ln p."""
+    D, blur = edges.step_m, edges.blur_m(edge_rad, backed_rad) / edges.step_m
+    p, slope = density(edges.rows[:, -1] / D, blur, lost_share)
+    return information(blur, lost_share) / D**2, -slope / p / D, -2 * np.log(p / D)
 
 
 @lru_cache(maxsize=1)
@@ -153,9 +158,16 @@ def _normal(z: Array) -> Array:
 
 
 PER_CAMERA = 7
+# Of the logarithm of a level, for differences.
+_LOG_STEP = 1e-4
 # The lasers' own errors have zero mean: that of ranges is the common offset, those of angles are part of the
 # extrinsics. This much of it is left.
 _MEAN_FLOOR = 1e-6
+
+
+def scale_places(n_cameras: int) -> NDArray[np.intp]:
+    """Return the place (C,) of each camera's scale in z."""
+    return PER_CAMERA * np.arange(n_cameras) + 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +209,7 @@ class Terms:
         image_rows: linearised, of each camera.
         constants: z of the state.
         trust: (F,) weight of each capture.
+        rings: (L,) ring numbers.
     """
 
     ranges: RangeSums
@@ -205,6 +218,7 @@ class Terms:
     image_rows: tuple[Array, ...]
     constants: Array
     trust: Array
+    rings: NDArray[np.int16]
 
     @property
     def n_rings(self) -> int:
@@ -234,6 +248,7 @@ def linearise(
         ),
         state.constants,
         np.ones(scans.n_captures) if trust is None else trust,
+        scans.rings,
     )
 
 
@@ -244,11 +259,13 @@ class Reduced:
     Attributes:
         cost: of F captures in z, at the constants' present values.
         board_steps: (F, 6, G + 1), y = -board_steps [z; 1].
+        of_boards: (F, 6, 6) information of the board poses alone.
         minus_2_log_evidence: -2 ln p(data | levels) up to a constant, all unknowns integrated out.
     """
 
     cost: Quadratics
     board_steps: Array
+    of_boards: Array
     minus_2_log_evidence: float
 
     def step(self) -> tuple[Array, Array]:
@@ -257,6 +274,17 @@ class Reduced:
         gradient = self.cost.gradients.sum(axis=0) + self.cost.prior_gradient
         z = -np.linalg.solve(self.cost.information, gradient)
         return z, -self.board_steps @ np.append(z, 1.0)
+
+    def second_moments(self) -> Array:
+        """Compute the mean (F, 6 + G + 1, 6 + G + 1) of v v^T, v = [y, z, 1], given the data."""
+        z, y = self.step()
+        F, G = len(y), len(z)
+        by_z = np.concatenate([-self.board_steps[:, :, :G], np.broadcast_to(np.eye(G), (F, G, G))], axis=1)
+        v = np.column_stack([y, np.broadcast_to(np.append(z, 1.0), (F, G + 1))])
+        found = v[:, :, None] * v[:, None, :]
+        found[:, :-1, :-1] += by_z @ np.linalg.inv(self.cost.information) @ np.swapaxes(by_z, 1, 2)
+        found[:, :6, :6] += np.linalg.inv(self.of_boards)
+        return np.asarray(found)
 
 
 def assemble(terms: Terms, levels: Levels, priors: Priors) -> Reduced:
@@ -298,6 +326,65 @@ class Assembly:
             self._priors,
             range_volume + picture_volume,
         )
+
+    def evidence(self, levels: Levels, names: Sequence[str]) -> tuple[float, Array]:
+        """Compute -2 ln p(data | levels) and its derivative by the logarithms of some levels.
+
+        By a level, it is the mean of v^T dM v over all unknowns given the data, with M the products of
+        [board pose, z, 1] and their priors, and the change of the covariances' log determinants. Only M is
+        differentiated by differences.
+        """
+        terms, reduced = self._terms, self.at(levels)
+        moments = reduced.second_moments()
+        own = moments * terms.trust[:, None, None]
+        block, range_volume = self._range_block(levels.range_m, levels.ring_m)
+        pictures, picture_volume = self._image_block(levels.pose)
+        of_ends = _end_costs(terms, own)
+        prior, mean, prior_volume = _prior(terms, levels, self._priors)
+        # All captures have the same z; the mean of the square of its distance from that of the prior.
+        z = terms.constants - mean
+        shift = moments[0, 6:-1, -1]
+        of_constants = moments[0, 6:-1, 6:-1] + np.outer(z, z) + np.outer(z, shift) + np.outer(shift, z)
+
+        def change(name: str) -> float:
+            there = replace(levels, **{name: getattr(levels, name) * np.exp(_LOG_STEP)})
+            if name in ("range_m", "ring_m"):
+                moved, volume = _range_block(terms, there.range_m, there.ring_m)
+                return float(np.vdot(own, moved - block)) + volume - range_volume
+            if name in PoseLevels._fields:
+                moved, volume = _image_block(terms, there.pose)
+                return float(np.vdot(own, moved - pictures)) + volume - picture_volume
+            if name == "laser_m":
+                moved, _, volume = _prior(terms, there, self._priors)
+                return float(np.vdot(of_constants, moved - prior)) + volume - prior_volume
+            return of_ends(there) - of_ends(levels)
+
+        slopes = np.array([change(name) for name in names]) / _LOG_STEP
+        return reduced.minus_2_log_evidence, slopes
+
+
+def _end_costs(terms: Terms, moments: Array) -> Callable[[Levels], float]:
+    """Return the ring ends' part of -2 ln p for moments (F, n, n) of all unknowns, by level."""
+    edges, n_cameras, n_rings = terms.edges, len(terms.images), terms.n_rings
+    lasers = 6 + PER_CAMERA * n_cameras + n_rings * np.arange(N_OF_LASER)
+    shared = np.arange(lasers[0] + N_OF_LASER * n_rings, moments.shape[1] - 1)
+    M = len(edges.rows)
+    place = np.column_stack(
+        [
+            np.broadcast_to(np.arange(6), (M, 6)),
+            edges.ring[:, None] + lasers,
+            np.broadcast_to(shared, (M, len(shared))),
+        ]
+    )
+    J, k = edges.rows[:, :-1], edges.capture
+    squares = np.einsum("mi,mij,mj->m", J, moments[k[:, None, None], place[:, :, None], place[:, None, :]], J)
+    firsts = np.sum(J * moments[k[:, None], place, -1], axis=1)
+
+    def cost(levels: Levels) -> float:
+        weight, score, value = _expand_ends(edges, levels.edge_rad, levels.backed_rad, levels.lost_share)
+        return float(weight @ squares + 2 * score @ firsts + value @ terms.trust[k])
+
+    return cost
 
 
 def _range_block(terms: Terms, range_m: float, ring_m: float) -> tuple[Array, float]:
@@ -343,36 +430,53 @@ def _eliminate(M: Array, terms: Terms, levels: Levels, priors: Priors, log_volum
     steps = np.linalg.solve(of_boards, rest)
     reduced = M[:, 6:, 6:] - np.swapaxes(rest, 1, 2) @ steps
     hessians, gradients, costs = reduced[:, :-1, :-1], reduced[:, :-1, -1], reduced[:, -1, -1]
-    prior, log_prior_volume = _prior(terms, levels, priors)
-    summed = Quadratics(gradients, hessians, prior, prior @ terms.constants, np.arange(len(M)))
+    prior, mean, log_prior_volume = _prior(terms, levels, priors)
+    off = terms.constants - mean
+    summed = Quadratics(gradients, hessians, prior, prior @ off, np.arange(len(M)))
     information, gradient = summed.information, gradients.sum(axis=0) + summed.prior_gradient
-    least = costs.sum() + terms.constants @ summed.prior_gradient
+    least = costs.sum() + off @ summed.prior_gradient
     least -= gradient @ np.linalg.solve(information, gradient)
     log_volume += np.linalg.slogdet(of_boards)[1].sum() + np.linalg.slogdet(information)[1]
     evidence = float(least + log_volume + log_prior_volume)
-    return Reduced(summed, np.asarray(steps), evidence)
+    return Reduced(summed, np.asarray(steps), of_boards, evidence)
 
 
-def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, float]:
-    """Build the information (G, G) of the priors and the log of their covariance's determinant.
+def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, float]:
+    """Build the priors' information (G, G), their mean (G,) and the log of their covariance's determinant.
 
     Range offsets of L rings have the covariance sigma_laser^2 (I - 1 1^T / L) + sigma_offset^2 1 1^T.
     """
     L, C = terms.n_rings, len(terms.images)
-    prior = np.zeros((len(terms.constants), len(terms.constants)))
-    scale = PER_CAMERA * np.arange(C) + 6
+    prior, mean = np.zeros((len(terms.constants), len(terms.constants))), np.zeros(len(terms.constants))
+    scale = scale_places(C)
     prior[scale, scale] = 1 / priors.scale**2
     ring = PER_CAMERA * C + np.arange(L)
-    about_mean, log_volume = np.eye(L) - 1 / L, 0.0
+    log_volume = 0.0
     of_lasers = (
         (levels.laser_m, priors.offset_m),
         (priors.azimuth_rad, 0.0),
         (priors.elevation_rad, 0.0),
     )
+    lens_sigma = np.array([priors.lateral_m, priors.vertical_m])
+    known = priors.known
     for k, (own, common) in enumerate(of_lasers):
-        cov = own**2 * about_mean + common**2 + _MEAN_FLOOR**2 * np.eye(L)
+        cov = own**2 * (np.eye(L) - 1 / L)
+        if known is not None:
+            at, which = _places(terms.rings, known.rings)
+            cov = own**2 * np.eye(L)
+            cov[at, at] = known.lasers_sigma[k, which] ** 2
+            mean[ring[at] + k * L] = known.lasers[k, which]
+        cov = cov + common**2 + _MEAN_FLOOR**2 * np.eye(L)
         prior[(ring + k * L)[:, None], ring + k * L] = np.linalg.inv(cov)
         log_volume += float(np.linalg.slogdet(cov)[1])
     last = np.arange(PER_CAMERA * C + N_OF_LASER * L, len(prior))
-    prior[last, last] = np.concatenate([[priors.lateral_m, priors.vertical_m], priors.shifts]) ** -2.0
-    return prior, log_volume
+    if known is not None:
+        mean[last[:N_FIELDS]], lens_sigma = known.lens, known.lens_sigma
+    prior[last, last] = np.concatenate([lens_sigma, priors.shifts]) ** -2.0
+    return prior, mean, log_volume
+
+
+def _places(rings: NDArray[np.int16], known: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Find the rings that are known: their indices among those seen, and among those known."""
+    _, seen, which = np.intersect1d(rings, known, return_indices=True)
+    return seen, which

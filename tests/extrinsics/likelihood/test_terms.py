@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 from lce_rig.core.geometry import difference, invert, perturb
 from lce_rig.extrinsics.consensus import find_consensus
 from lce_rig.extrinsics.likelihood.image_terms import image_rows, stack_images
-from lce_rig.extrinsics.likelihood.levels import Levels, Priors
+from lce_rig.extrinsics.likelihood.levels import LOG_SIGMA, Levels, Priors
 from lce_rig.extrinsics.likelihood.system import Assembly, State, assemble, linearise
 from lce_rig.residuals.along_rays import (
     N_FIELDS,
@@ -265,6 +265,21 @@ def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, image
     ):
         fast = [assemble(terms, levels, priors).minus_2_log_evidence for levels in (base, changed)]
         assert np.isclose(fast[1] - fast[0], plainly(changed) - plainly(base), rtol=1e-5)
+
+
+def test_the_evidence_changes_with_each_level_as_its_derivative_says(scans, images, T_lidar_board):
+    zeros = np.zeros(7 + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS)
+    trust = np.linspace(0.4, 1.0, scans.n_captures)
+    terms = linearise(scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, zeros), trust)
+    assembly, base, step = Assembly(terms, Priors()), Levels(), 1e-3
+    value, slopes = assembly.evidence(base, list(LOG_SIGMA))
+    assert value == assembly.at(base).minus_2_log_evidence
+    for name, slope in zip(LOG_SIGMA, slopes, strict=True):
+        below, above = (
+            assembly.at(replace(base, **{name: getattr(base, name) * np.exp(by)})).minus_2_log_evidence
+            for by in (-step, step)
+        )
+        assert slope == pytest.approx((above - below) / (2 * step), rel=2e-3, abs=0.05)
 
 
 def test_what_a_search_for_levels_keeps_is_right_at_each_step_and_gone_with_it(scans, images, T_lidar_board):

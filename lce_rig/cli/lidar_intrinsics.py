@@ -1,0 +1,95 @@
+"""`lce-rig lidar-intrinsics`: estimate a LiDAR's constant errors from the boards of sessions."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lce_rig.cli import show
+from lce_rig.cli.options import json_option
+
+if TYPE_CHECKING:
+    from lce_rig.extrinsics.likelihood.lidar_errors import LidarErrors
+
+
+@click.command(name="lidar-intrinsics")
+@click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="SESSION...")
+@click.option("--lidar", metavar="NAME", help="Choose the LiDAR [default: the profile's first].")
+@click.option(
+    "--save-profile",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write the first session's profile to a new file, with the estimated errors.",
+)
+@json_option
+def lidar_intrinsics(
+    sessions: tuple[Path, ...], lidar: str | None, save_profile: Path | None, as_json: bool
+) -> None:
+    """Estimate the constant errors of a LiDAR from the boards of one or several SESSIONs.
+
+    Prints the errors of range, azimuth and elevation of each laser and the displacement of the beams' origin,
+    with standard deviations. The sessions' extrinsics may differ; boards must have stood still. With the
+    profile written by --save-profile, `calibrate --method ml` of later sessions starts from these errors.
+    Exits with 6 for too few captures, with 7 if they do not determine the lasers' ranges.
+    """
+    from lce_rig.core.errors import UsageError
+    from lce_rig.pipeline.lidar_intrinsics import measure_lidar, save_lidar
+    from lce_rig.session import Session
+
+    if save_profile is not None and save_profile.exists():
+        raise UsageError(f"{save_profile} exists already", "Choose another file; existing files are kept.")
+    opened = [Session.open(path) for path in sessions]
+    with show.progress_bar("detecting") as progress:
+        errors = measure_lidar(opened, lidar, progress=progress)
+    if as_json:
+        show.print_json(_document(errors))
+    else:
+        known, mm = errors.found, 1e3
+        show.print_lines(
+            [
+                f"{sum(errors.n_captures)} captures of {len(errors.n_captures)} sessions",
+                f"  lens  {mm * known.lens[0]:+.1f} +- {mm * known.lens_sigma[0]:.1f} mm beside the axis, "
+                f"{mm * known.lens[1]:+.1f} +- {mm * known.lens_sigma[1]:.1f} mm per rad of elevation",
+            ]
+        )
+        show.print_table(_table(errors))
+    if save_profile is not None:
+        save_lidar(opened[0], lidar, errors, save_profile)
+        show.note(f"written: {save_profile}")
+
+
+def _table(errors: "LidarErrors") -> Any:
+    table = show.plain_table("")
+    for title in ("laser", "range mm", "sigma", "azimuth deg", "sigma", "elevation deg", "sigma", "returns"):
+        table.add_column(title, justify="right")
+    for row in _document(errors)["lasers"]:
+        cells = [f"{row['ring']}", f"{1e3 * row['range_m']:+.1f}", f"{1e3 * row['range_sigma_m']:.1f}"]
+        for angle in ("azimuth", "elevation"):
+            cells += [f"{row[f'{angle}_deg']:+.3f}", f"{row[f'{angle}_sigma_deg']:.3f}"]
+        table.add_row(*cells, f"{row['n_points']}")
+    return table
+
+
+def _document(errors: "LidarErrors") -> dict[str, Any]:
+    """Build what --json prints."""
+    import numpy as np
+
+    known = errors.found
+    values, sigmas = known.lasers.copy(), known.lasers_sigma.copy()
+    values[1:], sigmas[1:] = np.degrees(values[1:]), np.degrees(sigmas[1:])
+    names = ("range_m", "azimuth_deg", "elevation_deg")
+    deviations = ("range_sigma_m", "azimuth_sigma_deg", "elevation_sigma_deg")
+    lasers = []
+    for k, ring in enumerate(known.rings.tolist()):
+        row: dict[str, Any] = {"ring": ring, "n_points": int(errors.n_points[k])}
+        row |= {name: float(values[i, k]) for i, name in enumerate(names)}
+        row |= {name: float(sigmas[i, k]) for i, name in enumerate(deviations)}
+        lasers.append(row)
+    return {
+        "n_captures": list(errors.n_captures),
+        "lens_lateral_m": float(known.lens[0]),
+        "lens_lateral_sigma_m": float(known.lens_sigma[0]),
+        "lens_vertical_m_per_rad": float(known.lens[1]),
+        "lens_vertical_sigma_m_per_rad": float(known.lens_sigma[1]),
+        "lasers": lasers,
+    }

@@ -1,0 +1,120 @@
+"""A LiDAR's constant errors from the boards of one or several sessions, and a profile that states them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
+from lce_rig.detect.detection import Pair
+from lce_rig.export.files import MADE_BY
+from lce_rig.extrinsics import CalibrateOptions, EstimateSettings
+from lce_rig.extrinsics.algorithm_1 import calibrate_by_algorithm_1
+from lce_rig.extrinsics.likelihood.lidar_errors import LidarErrors, estimate_lidar
+from lce_rig.extrinsics.methods import agree
+from lce_rig.pipeline.detect_session import Progress, detect, silent
+from lce_rig.pipeline.intrinsics_files import profile_text
+from lce_rig.pipeline.matching import candidates_of
+from lce_rig.rig import parse_rig, set_value
+from lce_rig.session import Session
+from lce_rig.session.durable import write_atomically
+
+# A laser's range must be known so much better than before for a profile to state it.
+_LEAST_GAIN = 2.0
+_FEWEST_CAPTURES = 8
+
+
+def measure_lidar(
+    sessions: Sequence[Session], lidar: str | None = None, *, progress: Progress = silent
+) -> LidarErrors:
+    """Estimate the constant errors of a LiDAR from sessions of still boards seen by it and a frame camera.
+
+    Args:
+        sessions: at least one; the extrinsics may differ between them, the LiDAR and the board do not.
+        lidar: its name in the profiles; None for the only one.
+        progress: called with (done, total) while a session is read.
+
+    Raises:
+        UsageError: sessions of different boards or LiDARs.
+        NotEnoughDataError: too few captures that agree.
+        ResultRefusedError: the captures do not determine the lasers' ranges.
+    """
+    rig = sessions[0].rig
+    name = lidar or next(iter(rig.lidars))
+    for session in sessions:
+        if name not in session.rig.lidars:
+            raise UsageError(
+                f"{session.path}: no LiDAR {name}", f"Choose of: {', '.join(session.rig.lidars)}."
+            )
+        if session.rig.board != rig.board:
+            raise UsageError(
+                f"{session.path} has another board than {sessions[0].path}", "Give sessions of one board."
+            )
+    board, settings = rig.board.to_board(), rig.lidars[name]
+    options = EstimateSettings.of(CalibrateOptions(n_draws=0), settings)
+    used, starts = [], []
+    for session in sessions:
+        detections = detect(session, progress=progress)
+        for pair in detections.pairs:
+            if pair.lidar != name or not _is_still(session, pair):
+                continue
+            candidates, _ = candidates_of(detections, pair)
+            estimate = calibrate_by_algorithm_1(agree(candidates, board).observations, board, options)
+            used.append([estimate.observations[capture] for capture in estimate.used])
+            starts.append(estimate.T_cam_lidar)
+    n_captures = sum(map(len, used))
+    if n_captures < _FEWEST_CAPTURES:
+        raise NotEnoughDataError(
+            f"{n_captures} captures of {name} agree with a frame camera ({_FEWEST_CAPTURES} needed)",
+            "Collect more captures of a still board, or give more sessions of this LiDAR.",
+        )
+    errors = estimate_lidar(used, board, starts, options)
+    if errors.gain[0] < _LEAST_GAIN:
+        after_mm, before_mm = 1e3 * np.median(errors.found.lasers_sigma[0]), 1e3 * errors.prior_sigma[0]
+        raise ResultRefusedError(
+            f"{n_captures} captures do not determine the lasers' ranges: standard deviation {after_mm:.1f}, "
+            f"without them {before_mm:.1f} mm ({before_mm / _LEAST_GAIN:.1f} mm at most)",
+            "Collect more captures, with the board at several heights, so that each laser meets it in many.",
+        )
+    return errors
+
+
+def _is_still(session: Session, pair: Pair) -> bool:
+    return session.rig.cameras[pair.camera].channels[pair.channel].kind == "frames"
+
+
+def save_lidar(session: Session, lidar: str | None, errors: LidarErrors, path: Path) -> None:
+    """Write a session's profile with measured errors of a LiDAR to a new file.
+
+    Raises:
+        UsageError: the file exists already.
+    """
+    if path.exists():
+        raise UsageError(f"{path} exists already", "Choose another file; existing files are kept.")
+    name, known = lidar or next(iter(session.rig.lidars)), errors.found
+    lasers = ", ".join(
+        "{"
+        f"ring: {ring}, range_m: {r:.5f}, range_sigma_m: {rs:.5f}, azimuth_deg: {a:.4f}, "
+        f"azimuth_sigma_deg: {as_:.4f}, elevation_deg: {e:.4f}, elevation_sigma_deg: {es:.4f}"
+        "}"
+        for ring, (r, a, e), (rs, as_, es) in zip(
+            known.rings.tolist(), _in_degrees(known.lasers), _in_degrees(known.lasers_sigma), strict=True
+        )
+    )
+    block = f"lidars.{name}.intrinsics"
+    values = (
+        f"{{lens_lateral_m: {known.lens[0]:.5f}, lens_lateral_sigma_m: {known.lens_sigma[0]:.5f}, "
+        f"lens_vertical_m_per_rad: {known.lens[1]:.5f}, lens_vertical_sigma_m_per_rad: "
+        f"{known.lens_sigma[1]:.5f}, lasers: [{lasers}]}}"
+    )
+    text = set_value(profile_text(session.rig), block, values)
+    n = sum(errors.n_captures)
+    text = f"# intrinsics of LiDAR {name}, measured by {MADE_BY} from {n} captures\n" + text
+    parse_rig(text, str(path))
+    write_atomically(path, text)
+
+
+def _in_degrees(errors: np.ndarray) -> list[list[float]]:
+    """List range m, azimuth deg and elevation deg by laser from (3, K) in m and rad."""
+    scale = np.array([1.0, np.degrees(1.0), np.degrees(1.0)])
+    return [list(map(float, row)) for row in (errors.T * scale)]
