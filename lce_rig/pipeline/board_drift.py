@@ -16,13 +16,11 @@ from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.residuals.quadratics import Quadratics
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.scene.alignment import AXES, IS_ROTATION
-from lce_rig.scene.drift import AxisDrift, State
+from lce_rig.scene.drift import LARGEST, POWER_SIGMAS, THRESHOLD_SIGMAS, AxisDrift, State
 from lce_rig.verify.session_check import find_meetings
 
-_THRESHOLD_SIGMAS, _POWER_SIGMAS = 3.0, 1.645  # as for the scene
 # What results of one rig differ by from session to session, m and rad, order of AXES.
 _BIAS = np.array([0.005, 0.005, 0.010, *np.radians([0.12, 0.10, 0.12])])
-_LARGEST = np.where(IS_ROTATION, np.radians(1.5), 0.10)
 _OUTLIER = 3.0  # times the median residual
 _MIN_PLACEMENTS = 3  # The scatter of fewer says little.
 
@@ -108,11 +106,11 @@ def _judge(axis: int, cost: Quadratics, sigma_deployed: float) -> AxisDrift:
     scatter = (n - 1) / n * float(np.sum((without_each - without_each.mean()) ** 2))
     variance = max(variance, scatter)
     sigma = float(np.sqrt(variance + sigma_deployed**2 + _BIAS[axis] ** 2))
-    smallest = (_THRESHOLD_SIGMAS + _POWER_SIGMAS) * sigma
+    smallest = (THRESHOLD_SIGMAS + POWER_SIGMAS) * sigma
     state: State = "unchanged"
-    if abs(change) > _THRESHOLD_SIGMAS * sigma:
+    if abs(change) > THRESHOLD_SIGMAS * sigma:
         state = "changed"
-    elif smallest > _LARGEST[axis]:
+    elif smallest > LARGEST[axis]:
         state = "unknown"
     reason = "" if state != "unknown" else "scene.board_unsure"
     return AxisDrift(AXES[axis], state, unit * change, unit * sigma, unit * smallest, reason)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image
 from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Figure, Finding, Severity
@@ -161,7 +162,7 @@ class DriftReport:
             lens = self.rig.cameras[c.camera].to_intrinsics()
             board = () if pair.board is None else pair.board.axes
             title = f"{c.camera}, {c.lidar}  {name}"
-            picture = draw_drift(pair.drift, image, view.edges, lens, title, board)
+            picture = draw_drift(pair.drift, image, view.edges, lens, title, pair.states, board)
             files.append(write_picture(Path(folder) / f"drift_{c.camera}_{c.lidar}.png", picture))
         return files
 
@@ -182,7 +183,6 @@ def drift(
             the same time, such as a pcap and the images' folder.
         result: the deployed extrinsics; None for the session's own result.
         rig: the profile of a recording; a session has its own.
-            standing rig.
         progress: called with (done, total) captures, or images and scans.
 
     Raises:
@@ -285,8 +285,8 @@ class _Judge:
         elif n_untimed:
             untimed = Finding("scene.no_firing_times", "warning", c.lidar, {"n_captures": n_untimed})
             judged = replace(judged, findings=(*judged.findings, untimed))
-        if len(moving) >= _MIN_MOVING and judged.curves and judged.state != "changed":
-            judged = _with_clocks(judged, clocks_apart_s(moving, lens, c.T_cam_lidar), c.camera)
+        if len(moving) >= _MIN_MOVING and judged.curves:
+            judged = _with_clocks(judged, moving, lens, c.camera)
         return PairDrift(c, judged, self._boards(c, boards), _example(kept, whole))
 
     def _boards(self, c: Calibration, boards: Sequence[tuple[Seen, ImageBoard]]) -> BoardDrift | None:
@@ -343,14 +343,21 @@ def _after_s(points: Array, seen: Seen, rig: Rig, c: Calibration) -> Array | Non
     return np.asarray(1e-9 * (image_ns + middle_ns + own_offset_ns(c, channel) - scan_ns) - fired_s)
 
 
-def _with_clocks(judged: Drift, apart_s: float | None, camera: str) -> Drift:
-    """Give no all-clear where the images of a moving rig fit the scans of another time."""
+def _with_clocks(judged: Drift, moving: Sequence[MovingView], lens: Intrinsics, camera: str) -> Drift:
+    """Give no all-clear where the images of a moving rig fit the scans of another time.
+
+    Where the extrinsics seem changed, clocks that explain it nearly as well are named beside them.
+    """
+    is_changed = judged.state == "changed"
+    apart_s = clocks_apart_s(moving, lens, judged.T_cam_lidar, judged.T_changed if is_changed else None)
     if apart_s is None:
         return judged
-    found = Finding("scene.clocks_apart", "warning", camera, {"apart_s": apart_s})
+    code = "scene.clocks_instead" if is_changed else "scene.clocks_apart"
+    found = Finding(code, "warning", camera, {"apart_s": apart_s})
     axes = tuple(
-        replace(axis, state="unknown", reason=found.code) if axis.state == "unchanged" else axis
+        replace(axis, state="unknown", reason=code) if axis.state == "unchanged" else axis
         for axis in judged.axes
     )
-    others = [each for each in judged.findings[1:] if each.code != "scene.axis_unchanged"]
-    return replace(judged, axes=axes, findings=(found, *others))
+    first, *rest = judged.findings
+    others = [each for each in rest if each.code != "scene.axis_unchanged"]
+    return replace(judged, axes=axes, findings=(*([first] if is_changed else []), found, *others))

@@ -15,14 +15,16 @@ from lce_rig.scene.estimate import BIAS, estimate
 State = Literal["unchanged", "changed", "unknown"]
 
 # Tuned on rlfs01 (docs/drift.md); the other recordings were only measured.
-_THRESHOLD_SIGMAS = 3.0
-_POWER_SIGMAS = 1.645  # At the smallest change, 95 % of the trials exceed the threshold.
-# A witness that sees only larger changes cannot tell.
-_LARGEST = np.where(IS_ROTATION, np.radians(1.5), 0.10)
+THRESHOLD_SIGMAS = 3.0
+POWER_SIGMAS = 1.645
+"""At the smallest change, 95 % of the trials exceed the threshold."""
+LARGEST = np.where(IS_ROTATION, np.radians(1.5), 0.10)
+"""A witness that sees only larger changes cannot tell, rad and m, order of AXES."""
+NEARLY = 0.1
+"""What scores so much less alone, as a share, may be what changed."""
 _MIN_EDGES = 60
 _MIN_PARTS = 6  # of the image, that carry edges
 _MIN_SCORE = 0.10  # mean log-likelihood ratio of a depth edge; 0 where edges do not belong together
-_NEARLY = 0.1  # An axis that scores so much less alone may be the one that changed.
 # Upright outlines hardly show pitch: without a slanted one the curve is nearly flat, its peak meaningless.
 _MIN_CONTRAST = 0.3  # of a peak above its curve's median, as a share of the peak
 _MIN_GAIN = 2.0  # significance of the score at a change above that of the deployed extrinsics
@@ -87,6 +89,12 @@ class Drift:
         states = {axis.state for axis in self.axes}
         return "changed" if "changed" in states else "unknown" if "unknown" in states else "unchanged"
 
+    @property
+    def T_changed(self) -> Array:
+        """(4, 4) the deployed extrinsics, moved along the axes that changed and no other."""
+        moved = [axis.change if axis.state == "changed" else 0.0 for axis in self.axes]
+        return perturb(self.T_cam_lidar, np.where(IS_ROTATION, np.radians(moved), moved))
+
 
 def watch(
     views: Sequence[SceneView],
@@ -150,7 +158,7 @@ def _decide(
         if not moved:
             break
         axis = max(moved, key=lambda each: curves[each].total.max())
-        least = (1 - _NEARLY) * curves[axis].total.max()
+        least = (1 - NEARLY) * curves[axis].total.max()
         instead = tuple(AXES[each] for each in moved if each != axis and curves[each].total.max() > least)
         tangent[axis] += curves[axis].peak
         changed[axis] = replace(verdicts[axis], instead=instead)
@@ -164,7 +172,7 @@ def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment)
     peak, scatter = curve.peak, curve.sigma()
     sigma = float(np.sqrt(scatter**2 + sigma_deployed**2 + BIAS[axis] ** 2))
     smallest = max(
-        (_THRESHOLD_SIGMAS + _POWER_SIGMAS) * sigma, curve.smallest_significant(_MIN_GAIN + _GAIN_MARGIN)
+        (THRESHOLD_SIGMAS + POWER_SIGMAS) * sigma, curve.smallest_significant(_MIN_GAIN + _GAIN_MARGIN)
     )
     mean_score = float(curve.total.max() / alignment.weight_of_parts.sum() * alignment.n_captures)
     reason = ""
@@ -176,9 +184,9 @@ def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment)
         or np.median(curve.total) > (1 - _MIN_CONTRAST) * curve.total.max()
     ):
         reason = "scene.flat"
-    is_beyond = abs(peak) > _THRESHOLD_SIGMAS * sigma
+    is_beyond = abs(peak) > THRESHOLD_SIGMAS * sigma
     is_changed = is_beyond and not reason and curve.significance(peak, 0.0) > _MIN_GAIN
-    if not reason and (smallest > _LARGEST[axis] or is_beyond):
+    if not reason and (smallest > LARGEST[axis] or is_beyond):
         reason = "scene.large_scatter"
     state: State = "changed" if is_changed else "unknown" if reason else "unchanged"
     figures = (unit * peak, unit * sigma, unit * smallest)
@@ -214,7 +222,7 @@ def _open_axes(cov_best: Array | None) -> list[Finding]:
     """Name the axes in which the best extrinsics are uncertain."""
     if cov_best is None:
         return []
-    is_open = np.sqrt(np.diag(cov_best)) > _LARGEST
+    is_open = np.sqrt(np.diag(cov_best)) > LARGEST
     axes = tuple(axis for axis, each in zip(AXES, is_open, strict=True) if each)
     return [Finding("scene.best_uncertain", "warning", figures={"axes": axes})] if axes else []
 

@@ -12,6 +12,7 @@ from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, exp_so3, log_so3
 from lce_rig.core.interrupts import without_interrupt
 from lce_rig.scene.alignment import Alignment, Curve, SceneView
+from lce_rig.scene.drift import NEARLY
 
 # Scans of a standing rig differ by less in a tenth of a second: noise, and people who pass by.
 _STILL_MPS, _STILL_RAD_S = 0.2, np.radians(1.5)
@@ -121,13 +122,22 @@ class MovingView:
     motion: RigMotion
 
 
-def clocks_apart_s(views: Sequence[MovingView], intrinsics: Intrinsics, T_cam_lidar: Array) -> float | None:
+def clocks_apart_s(
+    views: Sequence[MovingView], intrinsics: Intrinsics, T_cam_lidar: Array, T_changed: Array | None = None
+) -> float | None:
     """Find by how much images come later than their timestamps say, from captures of a moving rig.
 
     The score is searched along the time of the images as along an axis of the extrinsics.
 
+    Args:
+        views: the captures.
+        intrinsics: of the camera.
+        T_cam_lidar: (4, 4) deployed.
+        T_changed: (4, 4) changed extrinsics that explain the images otherwise.
+
     Returns:
-        None where the edges fit at the time that the timestamps say, or the motion is too slow to tell.
+        None where the edges fit at the time that the timestamps say, the motion is too slow to tell, or
+        changed extrinsics explain the images better.
     """
     rows = []
     for after_s in _CLOCKS_S:
@@ -135,6 +145,10 @@ def clocks_apart_s(views: Sequence[MovingView], intrinsics: Intrinsics, T_cam_li
         alignment = Alignment(later, intrinsics, T_cam_lidar)
         rows.append(alignment.split(alignment.shares(T_cam_lidar)))
     curve = Curve(_CLOCKS_S, np.array([parts for parts, _ in rows]), np.array([each for _, each in rows]))
+    if T_changed is not None:
+        at_once = Alignment([each.view for each in views], intrinsics, T_cam_lidar)
+        if curve.total.max() < (1 - NEARLY) * at_once.shares(T_changed).sum():
+            return None
     peak_s = curve.peak
     is_apart = abs(peak_s) > max(_APART_S, _APART_SIGMAS * curve.sigma())
     return peak_s if is_apart and curve.significance(peak_s, 0.0) > _APART_SIGNIFICANCE else None

@@ -1,6 +1,6 @@
 """One page on drift: a scene's edges under two extrinsics, and the score along each axis."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,11 @@ from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array, transform
 from lce_rig.scene.alignment import AXES
 from lce_rig.scene.depth_edges import DepthEdges
-from lce_rig.scene.drift import AxisDrift, Drift
+from lce_rig.scene.drift import AxisDrift, Drift, State
 from lce_rig.verify import canvas
 from lce_rig.verify.canvas import BLACK, INK, MAGENTA, Picture
 from lce_rig.words.extrinsics import motion_words
+from lce_rig.words.scene_drift import STATES
 
 _PAGE_PX = 1600
 _COLOURS = {"unchanged": "#2a7d3f", "changed": "#c0392b", "unknown": "#7a7f85"}
@@ -27,16 +28,18 @@ def draw_drift(
     edges: DepthEdges,
     intrinsics: Intrinsics,
     title: str,
+    states: Mapping[str, State],
     board: Sequence[AxisDrift] = (),
 ) -> Picture:
     """Draw one capture's depth edges under both extrinsics side by side, above the score along each axis.
 
     Args:
-        drift: the verdict.
+        drift: the scene's opinion.
         image: of the capture.
         edges: of its scan.
         intrinsics: of the camera.
         title: one line.
+        states: the verdict on each axis, the board's opinion included.
         board: the board's opinion on each axis, if there is one.
 
     Returns:
@@ -51,7 +54,7 @@ def draw_drift(
         canvas.draw_text(strip, f"{title}  {name}", 12, 27, 13, INK)
         panels.append(np.vstack([strip, picture]))
     page = np.hstack(panels)
-    return np.vstack([page, _draw_curves(drift, board)]) if drift.curves else page
+    return np.vstack([page, _draw_curves(drift, states, board)]) if drift.curves else page
 
 
 def _draw_edges(image: Image, edges: DepthEdges, intrinsics: Intrinsics, T_cam_lidar: Array) -> Picture:
@@ -63,7 +66,7 @@ def _draw_edges(image: Image, edges: DepthEdges, intrinsics: Intrinsics, T_cam_l
     return picture
 
 
-def _draw_curves(drift: Drift, board: Sequence[AxisDrift]) -> Picture:
+def _draw_curves(drift: Drift, states: Mapping[str, State], board: Sequence[AxisDrift]) -> Picture:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -74,9 +77,10 @@ def _draw_curves(drift: Drift, board: Sequence[AxisDrift]) -> Picture:
     order = [*range(3, 6), *range(3)]
     for axes, index in zip(grid.ravel(), order, strict=True):
         verdict, curve = drift.axes[index], drift.curves[AXES[index]]
+        state = states[AXES[index]]
         unit, scale = ("deg", np.degrees(1.0)) if verdict.is_rotation else ("mm", 1000.0)
         shown = 1.0 if verdict.is_rotation else 1000.0
-        axes.plot(scale * curve.offsets, curve.total, color=_COLOURS[verdict.state])
+        axes.plot(scale * curve.offsets, curve.total, color=_COLOURS[state])
         axes.axvline(0.0, color="black", linewidth=0.8)
         if np.isfinite(verdict.smallest):
             axes.axvspan(
@@ -94,7 +98,8 @@ def _draw_curves(drift: Drift, board: Sequence[AxisDrift]) -> Picture:
                 capsize=3,
             )
         axes.set_xlim(scale * curve.offsets[0], scale * curve.offsets[-1])
-        axes.set_title(f"{motion_words(AXES[index])}: {verdict.state}", fontsize=9)
+        by_board = "" if state == verdict.state else ", by the board"
+        axes.set_title(f"{motion_words(AXES[index])}: {STATES[state]}{by_board}", fontsize=9)
         axes.set_xlabel(unit, fontsize=8)
         axes.tick_params(labelsize=8)
     said = "; diamond: what the board says, 1 standard deviation" if board else ""

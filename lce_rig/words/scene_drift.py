@@ -7,6 +7,9 @@ from lce_rig.words.rendering import Phrase
 _BOARD = "collect a session with the board and run `lce-rig calibrate`"
 _RECORD = "record where upright edges of furniture, doors or people stand before something farther away"
 
+STATES = {"unchanged": "no change seen", "changed": "changed", "unknown": "cannot tell"}
+"""What is said of an axis, by its state."""
+
 
 def _figure(finding: Finding, name: str, signed: bool = False) -> str:
     sign = "+" if signed else ""
@@ -126,6 +129,11 @@ PHRASES = {
     "scene.clocks_apart": Phrase(
         "while the rig moves, images of {subject} fit best {apart_s:+.2f} s from their timestamps",
         "let the rig stand, or correct the clocks: `lce-rig doctor` measures them",
+    ),
+    "scene.clocks_instead": Phrase(
+        "or the clocks are apart: while the rig moves, images of {subject} {apart_s:+.2f} s from their "
+        "timestamps explain it nearly as well",
+        "let the rig stand, which tells one from the other",
     ),
     "scene.best_uncertain": Phrase(_best_uncertain, _BOARD),
     "scene.axis_unchanged": Phrase(_axis_unchanged),

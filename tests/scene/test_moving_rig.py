@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lce_rig.core.geometry import perturb
 from lce_rig.export.result import SavedResult
 from lce_rig.pipeline.drift import judge
 from lce_rig.pipeline.scene_captures import SceneCaptures
@@ -34,9 +35,10 @@ def driven():
     return captures
 
 
-def watch_captures(driven, late_ns=0, change=lambda scan: scan):
+def watch_captures(driven, late_ns=0, change=lambda scan: scan, T_cam_lidar=None):
     rig = driven[0][0]
-    result = SavedResult(rig.stage.rig.name, "a test", (deployed(rig.truth("cam", "lidar")),), {})
+    T = rig.truth("cam", "lidar") if T_cam_lidar is None else T_cam_lidar
+    result = SavedResult(rig.stage.rig.name, "a test", (deployed(T),), {})
     captures = SceneCaptures(rig.stage.rig, result, "the drive")
     for _, before, scan, image in driven:
         stamped = replace(image, stamp_ns=image.stamp_ns - late_ns)
@@ -78,6 +80,32 @@ def test_clocks_apart_while_moving_are_never_an_all_clear(driven, late_ns) -> No
     assert not [axis for axis in drift.axes if axis.state == "unchanged"]
     apart = [f.figures["apart_s"] for f in drift.findings if f.code == "scene.clocks_apart"]
     assert apart == [pytest.approx(1e-9 * late_ns, abs=0.03)]
+
+
+@pytest.fixture(scope="module")
+def straight():
+    """Captures of a drive straight ahead, which the clocks and the line of sight explain alike."""
+    captures = []
+    for k in range(4):
+        rig = MovingRig.build(small_rig(), 2, (1.2, 0.0, 0.0), 0.0, (0.3 * k, 0.0))
+        before, scan = (rig.scan("lidar", START_NS + step * PERIOD_NS, 10 * k + step + 1) for step in (-1, 0))
+        captures.append((rig, before, scan, rig.image("cam", START_NS + 50_000_000, k)))
+    return captures
+
+
+def test_clocks_are_named_beside_a_change_that_they_explain(straight) -> None:
+    drift = watch_captures(straight, 100_000_000)
+    assert drift.state == "changed" and not [a for a in drift.axes if a.state == "unchanged"]
+    summary, clocks, *_ = drift.findings
+    assert (summary.code, clocks.code) == ("scene.changed", "scene.clocks_instead")
+    assert clocks.figures["apart_s"] == pytest.approx(0.1, abs=0.03)
+
+
+def test_clocks_are_not_named_where_only_the_extrinsics_explain(driven) -> None:
+    turned = perturb(driven[0][0].truth("cam", "lidar"), np.array([0, 0, 0, np.radians(2.0), 0, 0]))
+    drift = watch_captures(driven, T_cam_lidar=turned)
+    assert drift.axes[AXES.index("rotation_x")].state == "changed"
+    assert not [f for f in drift.findings if f.code.startswith("scene.clocks")]
 
 
 def test_scans_without_firing_times_are_not_used_while_moving(driven) -> None:
