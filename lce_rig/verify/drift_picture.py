@@ -53,6 +53,8 @@ def draw_drift(
         strip = canvas.panel(half, 40)
         canvas.draw_text(strip, f"{title}  {name}", 12, 27, 13, INK)
         panels.append(np.vstack([strip, picture]))
+    # Between images as white as the page, such as those of events.
+    panels[0][:, -2:] = BLACK
     page = np.hstack(panels)
     return np.vstack([page, _draw_curves(drift, states, board)]) if drift.curves else page
 
