@@ -189,7 +189,7 @@ def _tell(
 
     Raises:
         SourceError: a sensor was lost permanently; the captures are kept.
-        SessionError: the recording ended early, for example on a full disk; the captures are kept.
+        LceRigError: the recording ended early, for example on a full disk; the captures are kept.
         NotEnoughDataError: there is no capture, or too few when the new placements are exhausted.
     """
     from lce_rig.core.errors import NotEnoughDataError

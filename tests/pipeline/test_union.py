@@ -53,7 +53,8 @@ def test_one_estimate_of_two_sessions_is_nearer_to_the_truth_than_each_and_says_
         errors[1] += [difference(c.T_cam_lidar, T_FORWARD) for c in alone]
         errors[2].append(error := difference(both.T_cam_lidar, T_FORWARD))
         nees.append(error @ np.linalg.solve(both.cov, error))
-        ratios.append(both.sigma_translation_m / np.mean([c.sigma_translation_m for c in alone]))
+        scatter_m = [c.diagnostics.sigma_scatter_translation_m for c in (both, *alone)]
+        ratios.append(scatter_m[0] / np.mean(scatter_m[1:]))
         assert len(both.captures_used) == 24
     rms = {n: np.sqrt(np.mean(np.square(own), axis=0)) for n, own in errors.items()}
     assert np.linalg.norm(rms[2][:3]) < 0.9 * np.linalg.norm(rms[1][:3])

@@ -186,7 +186,7 @@ def test_a_recording_cut_by_a_full_disk_is_told_by_the_exit_code_and_spares_the_
         # Captures fit below this limit, the packets of the LiDAR soon do not.
         resource.prlimit(collecting.pid, resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
         collecting.wait_for_captures(3)
-        assert collecting.end() == 4
+        assert collecting.end() == 5
     assert len(errors(collecting.said)) == 1 and str(streams) in errors(collecting.said)[0]
     assert len(check_whole(session)) >= 3
 
