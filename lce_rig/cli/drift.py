@@ -98,13 +98,18 @@ def drift(
             raise error(f"{names}: {describe(first)}", as_line(recommend(first)))
 
 
+# What was seen is judged after Ctrl-C; a second one ends that too.
+_JUDGING_S = 120.0
+
+
 def _watch_live(rig: "Rig", saved: "SavedResult", seconds: float | None) -> "DriftReport":
     """Watch attached sensors until the time is over, or a signal or q asks to stop."""
+    from lce_rig.core.interrupts import patience
     from lce_rig.devices.opening import open_live
     from lce_rig.pipeline.drift import drift_live
     from lce_rig.screen.keys import controls
 
-    with show.progress_bar("watching, seconds") as progress, controls() as asked:
+    with show.progress_bar("watching, seconds") as progress, controls() as asked, patience(_JUDGING_S):
         began_s: list[float] = []
 
         def is_over(n_scans: int) -> bool:
@@ -119,35 +124,43 @@ def _watch_live(rig: "Rig", saved: "SavedResult", seconds: float | None) -> "Dri
         return drift_live(rig, saved, open_live(rig), is_over=is_over)
 
 
-_STATES = {"unchanged": "no change seen", "changed": "[red]changed[/]", "unknown": "[yellow]cannot tell[/]"}
+_COLOURS = {"unchanged": "none", "changed": "red", "unknown": "yellow"}
 
 
 def _table(pair: "PairDrift") -> Any:
-    from lce_rig.words.extrinsics import motion_words
+    from lce_rig.words.scene_drift import STATES
 
     opinions = [("scene", pair.drift.axes if pair.drift.curves else None)]
     if pair.board is not None:
         opinions.append(("board", pair.board.axes))
-    table = show.plain_table(f"{pair.calibration.camera}, {pair.calibration.lidar}", "axis of the camera", "")
+    title = f"{pair.calibration.camera}, {pair.calibration.lidar} (camera: x right, y down, z forward)"
+    table = show.plain_table(title, "axis of\nthe camera", "")
     for name, _ in opinions:
-        for title in (f"{name}: best fit at", "+-", "would have seen"):
+        # With two opinions, all fits into 80 columns.
+        for title in (f"{name}:\nbest fit at", "would\nhave seen"):
             table.add_column(title, justify="right")
     for index, axis in enumerate(pair.drift.axes):
         figures = [
             figure
             for _, axes in opinions
-            for figure in (("-", "-", "-") if axes is None else _figures(axes[index]))
+            for figure in (("-", "-") if axes is None else _figures(axes[index]))
         ]
-        table.add_row(motion_words(axis.axis), _STATES[pair.states[axis.axis]], *figures)
+        state = pair.states[axis.axis]
+        table.add_row(_axis(axis), f"[{_COLOURS[state]}]{STATES[state]}[/]", *figures)
     return table
 
 
-def _figures(axis: "AxisDrift") -> tuple[str, ...]:
-    scale, unit, digits = (1.0, "deg", 2) if axis.is_rotation else (1000.0, "mm", 0)
-    return tuple(
-        f"{scale * value:{sign}.{digits}f} {unit}" if math.isfinite(value) else "-"
-        for value, sign in ((axis.change, "+"), (axis.sigma, ""), (axis.smallest, ""))
-    )
+def _axis(axis: "AxisDrift") -> str:
+    name = axis.axis[-1]
+    return f"about {name}, deg" if axis.is_rotation else f"along {name}, mm"
+
+
+def _figures(axis: "AxisDrift") -> tuple[str, str]:
+    scale, digits = (1.0, 2) if axis.is_rotation else (1000.0, 0)
+    if not math.isfinite(axis.sigma):
+        return "-", "-"
+    best = f"{scale * axis.change:+.{digits}f} +- {scale * axis.sigma:.{digits}f}"
+    return best, f"{scale * axis.smallest:.{digits}f}" if math.isfinite(axis.smallest) else "-"
 
 
 def _summary(pair: "PairDrift") -> list[str]:

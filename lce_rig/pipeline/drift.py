@@ -183,7 +183,6 @@ def drift(
             the same time, such as a pcap and the images' folder.
         result: the deployed extrinsics; None for the session's own result.
         rig: the profile of a recording; a session has its own.
-            standing rig.
         progress: called with (done, total) captures, or images and scans.
 
     Raises:

@@ -14,10 +14,10 @@ from lce_rig.scene.drift import AxisDrift, Drift, State
 from lce_rig.verify import canvas
 from lce_rig.verify.canvas import BLACK, INK, MAGENTA, Picture
 from lce_rig.words.extrinsics import motion_words
+from lce_rig.words.scene_drift import STATES
 
 _PAGE_PX = 1600
 _COLOURS = {"unchanged": "#2a7d3f", "changed": "#c0392b", "unknown": "#7a7f85"}
-_WORDS = {"unchanged": "no change seen", "changed": "changed", "unknown": "cannot tell"}
 _BOARD = "#b8860b"
 _CHART_DPI = 100
 
@@ -53,6 +53,8 @@ def draw_drift(
         strip = canvas.panel(half, 40)
         canvas.draw_text(strip, f"{title}  {name}", 12, 27, 13, INK)
         panels.append(np.vstack([strip, picture]))
+    # Between images as white as the page, such as those of events.
+    panels[0][:, -2:] = BLACK
     page = np.hstack(panels)
     return np.vstack([page, _draw_curves(drift, states, board)]) if drift.curves else page
 
@@ -99,7 +101,7 @@ def _draw_curves(drift: Drift, states: Mapping[str, State], board: Sequence[Axis
             )
         axes.set_xlim(scale * curve.offsets[0], scale * curve.offsets[-1])
         by_board = "" if state == verdict.state else ", by the board"
-        axes.set_title(f"{motion_words(AXES[index])}: {_WORDS[state]}{by_board}", fontsize=9)
+        axes.set_title(f"{motion_words(AXES[index])}: {STATES[state]}{by_board}", fontsize=9)
         axes.set_xlabel(unit, fontsize=8)
         axes.tick_params(labelsize=8)
     said = "; diamond: what the board says, 1 standard deviation" if board else ""

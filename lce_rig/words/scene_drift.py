@@ -7,6 +7,9 @@ from lce_rig.words.rendering import Phrase
 _BOARD = "collect a session with the board and run `lce-rig calibrate`"
 _RECORD = "record where upright edges of furniture, doors or people stand before something farther away"
 
+STATES = {"unchanged": "no change seen", "changed": "changed", "unknown": "cannot tell"}
+"""What is said of an axis, by its state."""
+
 
 def _figure(finding: Finding, name: str, signed: bool = False) -> str:
     sign = "+" if signed else ""

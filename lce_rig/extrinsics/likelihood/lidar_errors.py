@@ -74,13 +74,14 @@ def estimate_lidar(
             for k in range(N_OF_LASER)
         ]
     )
-    sigma *= WIDENED[:, None]
+    prior = np.array([joint.levels.laser_m, priors.azimuth_rad, priors.elevation_rad])
+    # Lasers that met few boards are known as well as without these sessions.
+    sigma = np.minimum(sigma * WIDENED[:, None], np.maximum(sigma, prior[:, None]))
     lens = slice(N_OF_LASER * L, N_OF_LASER * L + len(joint.lens_m))
     rings = np.concatenate([o.lidar.ring for own in sessions for o in own])
     known = KnownLidar(
         joint.rings.astype(np.intp), joint.lasers, sigma, joint.lens_m, joint.constants_sigma[lens]
     )
-    prior = np.array([joint.levels.laser_m, priors.azimuth_rad, priors.elevation_rad])
     n_points = np.array([np.count_nonzero(rings == ring) for ring in joint.rings])
     assert len(prior) == len(ERRORS_OF_LASER)
     return LidarErrors(known, prior, tuple(len(own) for own in sessions), n_points)
