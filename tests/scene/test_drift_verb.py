@@ -13,16 +13,19 @@ import numpy as np
 import pytest
 
 from lce_rig.cli.main import run
+from lce_rig.core.data import Events
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import perturb
 from lce_rig.export.result import SavedResult, read_result, write_result
-from lce_rig.pipeline.drift import drift
-from lce_rig.pipeline.scene_captures import Thinned
+from lce_rig.pipeline.drift import drift, judge
+from lce_rig.pipeline.scene_captures import SceneCaptures, Thinned
 from lce_rig.recordings.ros.bag_recorder import BagRecorder
 from lce_rig.recordings.velodyne.datagrams import build_frame
 from lce_rig.rig import Rig, dump_rig
 from lce_rig.scene.alignment import AXES
 from lce_rig.session import Session
+from lce_rig.timing.event_buffer import EventCut
+from lce_rig.timing.scan_pairing import Frame
 from tests.doctor.attached import Attached, attach
 from tests.recordings.events.aedat4_files import RawFrame, write_davis
 from tests.recordings.test_pcap import to_datagram, write_pcap
@@ -222,6 +225,24 @@ def test_packets_of_a_lidar_and_a_file_of_a_davis_are_compared(seen, turned, tmp
     for result, state in ((deployed, "unchanged"), (read_result(turned), "changed")):
         (pair,) = drift([pcap, davis], result, rig=rig).pairs
         assert (pair.state, pair.drift.n_captures) == (state, len(scans))
+
+
+def test_events_of_a_standing_rig_cannot_tell_and_say_why(seen) -> None:
+    result = SavedResult(seen.rig.name, "a test", (seen.truth,), {})
+    captures = SceneCaptures(seen.rig, result, "a standing rig")
+    rng = np.random.default_rng(0)
+    for capture in seen.captures:
+        (scan,) = capture.scans
+        t_ns = scan.stamp_ns + np.arange(0, PERIOD_NS, 100_000)
+        n = len(t_ns)
+        x, y = rng.integers(0, 640, n).astype(np.uint16), rng.integers(0, 360, n).astype(np.uint16)
+        noise = Events("cam", t_ns, x, y, np.ones(n, dtype=np.bool_), 640, 360)
+        cut = EventCut(noise, int(t_ns[0]), int(t_ns[-1]) + 1, 0, 0)
+        captures.take_frame(Frame(scan.stamp_ns, (), (scan,), (cut,)))
+    (pair,) = judge(seen.rig, result, captures).pairs
+    assert pair.state == "unknown" and pair.drift.n_captures == len(seen.captures)
+    told = [each.subject for each in pair.findings if each.code == "scene.events_of_standing_rig"]
+    assert told == ["cam"]
 
 
 def test_arguments_that_contradict_each_other_are_refused(room, seen, tmp_path) -> None:
