@@ -98,13 +98,18 @@ def drift(
             raise error(f"{names}: {describe(first)}", as_line(recommend(first)))
 
 
+# What was seen is judged after Ctrl-C; a second one ends that too.
+_JUDGING_S = 120.0
+
+
 def _watch_live(rig: "Rig", saved: "SavedResult", seconds: float | None) -> "DriftReport":
     """Watch attached sensors until the time is over, or a signal or q asks to stop."""
+    from lce_rig.core.interrupts import patience
     from lce_rig.devices.opening import open_live
     from lce_rig.pipeline.drift import drift_live
     from lce_rig.screen.keys import controls
 
-    with show.progress_bar("watching, seconds") as progress, controls() as asked:
+    with show.progress_bar("watching, seconds") as progress, controls() as asked, patience(_JUDGING_S):
         began_s: list[float] = []
 
         def is_over(n_scans: int) -> bool:

@@ -285,6 +285,9 @@ class _Judge:
         elif n_untimed:
             untimed = Finding("scene.no_firing_times", "warning", c.lidar, {"n_captures": n_untimed})
             judged = replace(judged, findings=(*judged.findings, untimed))
+        if judged.state == "unknown" and not moving and any(isinstance(each.image, Events) for each in kept):
+            standing = Finding("scene.events_of_standing_rig", "warning", c.camera)
+            judged = replace(judged, findings=(*judged.findings, standing))
         if len(moving) >= _MIN_MOVING and judged.curves:
             judged = _with_clocks(judged, moving, lens, c.camera)
         return PairDrift(c, judged, self._boards(c, boards), _example(kept, whole))

@@ -53,6 +53,8 @@ def draw_drift(
         strip = canvas.panel(half, 40)
         canvas.draw_text(strip, f"{title}  {name}", 12, 27, 13, INK)
         panels.append(np.vstack([strip, picture]))
+    # Between images as white as the page, such as those of events.
+    panels[0][:, -2:] = BLACK
     page = np.hstack(panels)
     return np.vstack([page, _draw_curves(drift, states, board)]) if drift.curves else page
 
@@ -98,8 +100,8 @@ def _draw_curves(drift: Drift, states: Mapping[str, State], board: Sequence[Axis
                 capsize=3,
             )
         axes.set_xlim(scale * curve.offsets[0], scale * curve.offsets[-1])
-        by_board = "" if state == verdict.state else ", by the board"
-        axes.set_title(f"{motion_words(AXES[index])}: {STATES[state]}{by_board}", fontsize=9)
+        by_board = "" if state == verdict.state else " (board)"
+        axes.set_title(f"{motion_words(AXES[index])}: {STATES[state]}{by_board}", fontsize=8)
         axes.set_xlabel(unit, fontsize=8)
         axes.tick_params(labelsize=8)
     said = "; diamond: what the board says, 1 standard deviation" if board else ""

@@ -135,6 +135,10 @@ PHRASES = {
         "timestamps explain it nearly as well",
         "let the rig stand, which tells one from the other",
     ),
+    "scene.events_of_standing_rig": Phrase(
+        "{subject} is judged by events, which show only what moves, and the rig was not seen to move",
+        "move the rig slowly past upright edges, or record images as well",
+    ),
     "scene.best_uncertain": Phrase(_best_uncertain, _BOARD),
     "scene.axis_unchanged": Phrase(_axis_unchanged),
     "scene.axis_changed": Phrase(_axis_changed),

@@ -2,6 +2,10 @@
 
 import json
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
 import cv2
@@ -9,16 +13,23 @@ import numpy as np
 import pytest
 
 from lce_rig.cli.main import run
+from lce_rig.core.data import Events
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import perturb
 from lce_rig.export.result import SavedResult, read_result, write_result
-from lce_rig.pipeline.drift import drift
-from lce_rig.pipeline.scene_captures import Thinned
+from lce_rig.pipeline.drift import drift, judge
+from lce_rig.pipeline.scene_captures import SceneCaptures, Thinned
 from lce_rig.recordings.ros.bag_recorder import BagRecorder
+from lce_rig.recordings.velodyne.datagrams import build_frame
 from lce_rig.rig import Rig, dump_rig
 from lce_rig.scene.alignment import AXES
 from lce_rig.session import Session
+from lce_rig.timing.event_buffer import EventCut
+from lce_rig.timing.scan_pairing import Frame
 from tests.doctor.attached import Attached, attach
+from tests.recordings.events.aedat4_files import RawFrame, write_davis
+from tests.recordings.test_pcap import to_datagram, write_pcap
+from tests.recordings.vlp16_room import PERIOD_NS, T0_NS, packets_of
 
 
 @pytest.fixture
@@ -170,6 +181,68 @@ def test_attached_sensors_are_watched(seen, tmp_path, capsys) -> None:
     # One view of the room again and again says no more than once.
     assert code in (0, 6) and pair["state"] != "changed"
     assert pair["n_captures"] > 5
+
+
+@pytest.mark.long
+def test_ctrl_c_ends_the_watch_and_judges_what_was_seen(seen, tmp_path) -> None:
+    capture = seen.captures[0]
+    here = Attached(seen.rig, pixels=capture.images[0].grey, scan=capture.scans[0], has_board=False)
+    with attach(here, tmp_path) as (rig, _):
+        (tmp_path / "rig.yaml").write_text(dump_rig(rig.model_copy(update={"sync": None})))
+        result = result_file(tmp_path / "deployed.json", seen, seen.truth)
+        words = ["drift", "--rig", str(tmp_path / "rig.yaml"), "--result", str(result), "--json"]
+        command = [sys.executable, "-m", "lce_rig", *words]
+        pipe = subprocess.PIPE
+        with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
+            for line in process.stderr:
+                if "Ctrl-C" in line:
+                    break
+            time.sleep(4.0)
+            process.send_signal(signal.SIGINT)
+            said, why = process.communicate(timeout=120)
+    assert process.returncode in (0, 6), why
+    (pair,) = json.loads(said)["pairs"]
+    assert pair["state"] != "changed" and pair["n_captures"] > 0
+
+
+def test_packets_of_a_lidar_and_a_file_of_a_davis_are_compared(seen, turned, tmp_path) -> None:
+    """As two recorders leave them: a pcap of the VLP-16, and frames of the camera's own file."""
+    starts_ns = [T0_NS + k * PERIOD_NS for k in range(len(seen.captures))]
+    scans = [
+        replace(capture.scans[0], stamp_ns=t) for capture, t in zip(seen.captures, starts_ns, strict=True)
+    ]
+    frames = [
+        RawFrame((t + PERIOD_NS // 2) // 1000 - 2000, 4000, capture.images[0].grey)
+        for capture, t in zip(seen.captures, starts_ns, strict=True)
+    ]
+    datagrams = map(to_datagram, packets_of(scans))
+    pcap = write_pcap(tmp_path / "lidar.pcap", [(each.host_ns, build_frame(each)) for each in datagrams])
+    davis = write_davis(tmp_path / "cam.aedat4", [], frames, (640, 360))
+    document = seen.rig.model_dump()
+    document["cameras"]["cam"]["channels"]["events"] = {"kind": "events", "topic": "/cam/events"}
+    rig = Rig.model_validate(document)
+    deployed = SavedResult(seen.rig.name, "a test", (seen.truth,), {})
+    for result, state in ((deployed, "unchanged"), (read_result(turned), "changed")):
+        (pair,) = drift([pcap, davis], result, rig=rig).pairs
+        assert (pair.state, pair.drift.n_captures) == (state, len(scans))
+
+
+def test_events_of_a_standing_rig_cannot_tell_and_say_why(seen) -> None:
+    result = SavedResult(seen.rig.name, "a test", (seen.truth,), {})
+    captures = SceneCaptures(seen.rig, result, "a standing rig")
+    rng = np.random.default_rng(0)
+    for capture in seen.captures:
+        (scan,) = capture.scans
+        t_ns = scan.stamp_ns + np.arange(0, PERIOD_NS, 100_000)
+        n = len(t_ns)
+        x, y = rng.integers(0, 640, n).astype(np.uint16), rng.integers(0, 360, n).astype(np.uint16)
+        noise = Events("cam", t_ns, x, y, np.ones(n, dtype=np.bool_), 640, 360)
+        cut = EventCut(noise, int(t_ns[0]), int(t_ns[-1]) + 1, 0, 0)
+        captures.take_frame(Frame(scan.stamp_ns, (), (scan,), (cut,)))
+    (pair,) = judge(seen.rig, result, captures).pairs
+    assert pair.state == "unknown" and pair.drift.n_captures == len(seen.captures)
+    told = [each.subject for each in pair.findings if each.code == "scene.events_of_standing_rig"]
+    assert told == ["cam"]
 
 
 def test_arguments_that_contradict_each_other_are_refused(room, seen, tmp_path) -> None:
