@@ -141,6 +141,7 @@ class Validation:
     Attributes:
         cov: (6, 6) to report: the estimate's, widened if resampling spreads it farther, with errors of the
             profile and what checks contradict.
+        cov_agreed: (6, 6) the same without what checks contradict.
         cov_shared: (6, 6) the part of it from errors of the profile's lens and board.
         contributions: its causes, the largest first.
         known_better: what the session's boards determine better than the profile.
@@ -153,6 +154,7 @@ class Validation:
     """
 
     cov: Array
+    cov_agreed: Array
     cov_shared: Array
     contributions: tuple[Contribution, ...]
     known_better: tuple[KnownBetter, ...]
@@ -237,11 +239,22 @@ def _reported(
         *channels_contradiction(estimate, rig.calibration),
     ]
     cov_shared = profile_covariance(known)
-    cov = widened_by**2 * estimate.cov + cov_shared + sum(each.cov for each in contradictions)
+    cov_agreed = widened_by**2 * estimate.cov + cov_shared
+    cov = cov_agreed + sum(each.cov for each in contradictions)
     causes = list_contributions(estimate.diagnostics, widened_by, known, contradictions)
     better = known_better(intrinsics, nuisances, known)
     return Validation(
-        cov, cov_shared, causes, better, widened_by, remark, contrasts, control, nuisances, intrinsics
+        cov,
+        cov_agreed,
+        cov_shared,
+        causes,
+        better,
+        widened_by,
+        remark,
+        contrasts,
+        control,
+        nuisances,
+        intrinsics,
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Figure, Finding, ranked
-from lce_rig.core.geometry import rotation_angle, tangent_sizes
+from lce_rig.core.geometry import rotation_angle, sigma_sizes, tangent_sizes
 from lce_rig.core.results import Calibration, Metrics
 from lce_rig.core.scene_opinion import SceneOpinion
 from lce_rig.extrinsics.estimate import CalibrationEstimate
@@ -139,6 +139,7 @@ def _certificate(estimate: CalibrationEstimate) -> list[Finding]:
 
 
 def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig) -> list[Finding]:
+    agreed = dict(zip(("deg", "m"), sigma_sizes(examination.cov_agreed), strict=True))
     sigmas, target, of_lidar = np.sqrt(np.diag(examination.cov)), rig.calibration, estimate.diagnostics
     turns_deg, shifts_m = np.degrees(sigmas[3:]), sigmas[:3]
     rotation = ("verdict.rotation_uncertain", "deg", turns_deg, target.target_sigma_deg)
@@ -157,7 +158,8 @@ def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig)
                 f"by_axis_{unit}": tuple(float(axis) for axis in axes),
                 **find_weakest(examination.cov, estimate.lever_m).figures(),
             }
-            is_fail = sigma > rig.verdict.fail_factor * goal
+            # A contradiction is judged by the check that found it; here it says how wrong the result may be.
+            is_fail = agreed[unit] > rig.verdict.fail_factor * goal
             # No number of captures helps against the LiDAR's own errors; before that, more captures help
             # most as long as their scatter is the larger part.
             is_of_lidar = of_lidar_alone > goal and 2 * of_lidar_alone**2 > sigma**2
