@@ -7,7 +7,7 @@ import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, Metrics, Observation
 from lce_rig.detect.detection import Detections
 from lce_rig.extrinsics.local_quadratic import SCALE, expand
@@ -30,7 +30,8 @@ class BoardDrift:
     """Deployed extrinsics compared with the boards of some captures.
 
     Attributes:
-        axes: one verdict each, order of AXES, were this axis the only one that changed.
+        axes: one verdict each, order of AXES, were it the only one that changed besides the one that explains
+            most.
         metrics: residuals of the deployed extrinsics, as `verify` has them.
         n_boards: captures in which both sensors see the board.
         n_placements: places at which it was held.
@@ -75,12 +76,25 @@ def watch_boards(
     # Another plate, or a board that moved between image and scan.
     is_inlier = rms_m <= _OUTLIER * np.median(rms_m)
     seen = [each for each, keep in zip(met, is_inlier, strict=True) if keep]
-    cost = _expand(seen, board, calibration.T_cam_lidar, rig.lidars[calibration.lidar])
+    lidar = rig.lidars[calibration.lidar]
+    cost = _expand(seen, board, calibration.T_cam_lidar, lidar)
     if len(cost.groups) < _MIN_PLACEMENTS:
         return None
-    sigma_deployed = np.sqrt(np.diag(calibration.cov))
-    axes = tuple(_judge(axis, cost, float(sigma_deployed[axis])) for axis in range(6))
-    return BoardDrift(axes, summarise(residuals), len(seen), len(cost.groups))
+    sigmas = np.sqrt(np.diag(calibration.cov))
+    axes = [_judge(axis, cost, float(sigmas[axis])) for axis in range(6)]
+    if sum(axis.state == "changed" for axis in axes) > 1:
+        # One changed axis looks like several: that which explains most is changed, others are judged anew.
+        alone = [_alone(cost, axis) for axis in range(6)]
+        first = int(np.argmax([each.optimum()[0] ** 2 / each.covariance()[0, 0] for each in alone]))
+        moved = perturb(calibration.T_cam_lidar, alone[first].optimum()[0] * np.eye(6)[first])
+        rest = _expand(seen, board, moved, lidar)
+        axes = [axes[axis] if axis == first else _judge(axis, rest, float(sigmas[axis])) for axis in range(6)]
+    return BoardDrift(tuple(axes), summarise(residuals), len(seen), len(cost.groups))
+
+
+def _alone(cost: Quadratics, axis: int) -> Quadratics:
+    """Keep one axis of the extrinsics and what all captures share."""
+    return cost.of(np.array([axis, *range(6, len(cost.prior))]))
 
 
 def _expand(seen: list[Observation], board: Board, T_cam_lidar: Array, lidar: LidarSettings) -> Quadratics:
@@ -97,8 +111,7 @@ def _expand(seen: list[Observation], board: Board, T_cam_lidar: Array, lidar: Li
 def _judge(axis: int, cost: Quadratics, sigma_deployed: float) -> AxisDrift:
     """Estimate the change of one axis alone; the larger variance of residuals and jackknife counts."""
     unit = float(np.degrees(1.0)) if IS_ROTATION[axis] else 1.0
-    p = len(cost.prior)
-    alone = cost.of(np.array([axis, *range(6, p)]))
+    alone = _alone(cost, axis)
     change = float(alone.optimum()[0])
     variance = float(alone.covariance()[0, 0])
     without_each = alone.without_each()[:, 0]

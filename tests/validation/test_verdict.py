@@ -35,7 +35,8 @@ def verdict_of(estimate):
     """Judge a changed estimate by what the checks found on the sound one."""
 
     def judged(changed, n_captures=20, rig=RIG):
-        return judge(changed, replace(examined(estimate), cov=changed.cov), rig, "cam", "lidar", n_captures)
+        examination = replace(examined(estimate), cov=changed.cov, cov_agreed=changed.cov)
+        return judge(changed, examination, rig, "cam", "lidar", n_captures)
 
     return judged
 
@@ -67,6 +68,14 @@ def test_a_deviation_above_the_target_is_marginal_and_far_above_fails(estimate, 
     verdict, reasons = verdict_of(replace(estimate, cov=cov))
     assert verdict == expected
     assert all(reason.code == "verdict.rotation_uncertain" for reason in reasons)
+
+
+def test_a_contradiction_widens_the_claim_and_fails_nothing_by_its_width(estimate):
+    cov = np.diag([1e-8] * 3 + [np.radians(9.0 * RIG.calibration.target_sigma_deg) ** 2 / 3] * 3)
+    examination = replace(examined(estimate), cov=cov, cov_agreed=estimate.cov)
+    verdict, reasons = judge(estimate, examination, RIG, "cam", "lidar", 20)
+    assert verdict == "marginal"
+    assert [reason.code for reason in reasons] == ["verdict.rotation_uncertain"]
 
 
 def test_where_the_lidar_itself_misses_the_target_more_captures_are_not_advised(estimate, verdict_of):
