@@ -53,10 +53,10 @@ def drift(
 
     RECORDING is a session or, with --rig, a folder of images and point clouds, a ROS 1 or ROS 2 bag, an mcap,
     or several recordings of the same time, such as a pcap and a camera's file. With --rig and no RECORDING,
-    the attached sensors are watched; Ctrl-C ends this and judges what was seen. Depth edges of the scans are
-    compared with edges of the images; where the board is in view, it is asked as well, and both opinions are
-    shown. Exits with 0 if no axis has changed, with 7 if one has, and with 6 if
-    the scene cannot tell; of several cameras the worst counts.
+    the attached sensors are watched; Ctrl-C ends this and judges what was seen. Edges of the scans are
+    compared with edges of the images; where the board is in view, it is asked as well, and both are shown.
+    Exits with 0 if no axis has changed, with 7 if one has, and with 6 if neither the scene nor the board can
+    tell; of several cameras the worst counts.
     """
     from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
     from lce_rig.export.result import read_result

@@ -79,31 +79,32 @@ def _board_unsure(finding: Finding) -> str:
 
 def _axis_unchanged(finding: Finding) -> str:
     """No change of {smallest_m} or {smallest_deg}; {change_m}, {change_deg}, {sigma_m}, {sigma_deg}."""
-    return f"{motion_words(finding.subject)}: no change of {_figure(finding, 'smallest')} or more"
+    return f"scene, {motion_words(finding.subject)}: no change of {_figure(finding, 'smallest')} or more"
 
 
 def _axis_changed(finding: Finding) -> str:
     """Changed by {change_m} or {change_deg} +- {sigma_m} or {sigma_deg}; {smallest_m}, {instead}."""
     change = f"{_figure(finding, 'change', signed=True)} +- {_figure(finding, 'sigma')}"
     instead = f", or instead: {_motions(finding, 'instead')}" if finding.figures["instead"] else ""
-    return f"{motion_words(finding.subject)}: changed by {change}{instead}"
+    return f"scene, {motion_words(finding.subject)}: changed by {change}{instead}"
 
 
 def _large_scatter(finding: Finding) -> str:
     """Parts of the scene disagree; {smallest_m} or {smallest_deg} would be seen."""
     if "inf" in _figure(finding, "smallest"):
-        return f"{motion_words(finding.subject)}: parts of the scene do not agree on any change"
-    return f"{motion_words(finding.subject)}: changes below {_figure(finding, 'smallest')} would not be seen"
+        return f"scene, {motion_words(finding.subject)}: parts of the scene do not agree on any change"
+    smallest = _figure(finding, "smallest")
+    return f"scene, {motion_words(finding.subject)}: changes below {smallest} would not be seen"
 
 
 def _flat(finding: Finding) -> str:
     """The score along the axis has no clear peak."""
-    return f"{motion_words(finding.subject)}: no extrinsics along this axis fit the edges clearly"
+    return f"scene, {motion_words(finding.subject)}: no extrinsics along this axis fit the edges clearly"
 
 
 def _no_peak(finding: Finding) -> str:
     """The best fit is at the end of the range."""
-    return f"{motion_words(finding.subject)}: the best fit is at the end of the range searched"
+    return f"scene, {motion_words(finding.subject)}: the best fit is at the end of the range searched"
 
 
 PHRASES = {
