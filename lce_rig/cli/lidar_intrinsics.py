@@ -47,7 +47,8 @@ def lidar_intrinsics(
         known, mm = errors.found, 1e3
         show.print_lines(
             [
-                f"{sum(errors.n_captures)} captures of {len(errors.n_captures)} sessions",
+                f"{show.counted(sum(errors.n_captures), 'capture')} of "
+                f"{show.counted(len(errors.n_captures), 'session')}",
                 f"  lens  {mm * known.lens[0]:+.1f} +- {mm * known.lens_sigma[0]:.1f} mm beside the axis, "
                 f"{mm * known.lens[1]:+.1f} +- {mm * known.lens_sigma[1]:.1f} mm per rad of elevation",
             ]
