@@ -14,11 +14,11 @@ import numpy as np
 
 from lce_rig.core.errors import SessionError, SourceError, reading
 from lce_rig.core.results import Calibration
-from lce_rig.export.files import MADE_BY, number
-from lce_rig.export.frames import RPY_BODY_OPTICAL, Joint, choose_channels
+from lce_rig.export.files import MADE_BY
+from lce_rig.export.frames import Joint, choose_channels
 from lce_rig.export.probes import check_pose
 from lce_rig.export.robot_tree import JointChange, RobotJoint, RobotTree, fit_tree
-from lce_rig.export.rotations import rpy
+from lce_rig.export.urdf import joint_lines, origin
 from lce_rig.rig import Rig
 from lce_rig.session.durable import write_atomically
 
@@ -34,12 +34,15 @@ def read_robot_urdf(path: Path) -> RobotTree:
         SessionError: the file cannot be read or is no URDF; xacro has to be expanded first.
         SourceError: yourdfpy is not installed.
     """
+    return _parse(path, _text(path))
+
+
+def _parse(path: Path, text: bytes) -> RobotTree:
     try:
         from yourdfpy import URDF
     except ImportError as error:
         what = "reading a robot's URDF needs the package yourdfpy"
         raise SourceError(what, "pip install 'lce-rig[urdf]'") from error
-    text = _text(path)
     if b"xacro:" in text or b"${" in text:
         hint = f"Expand it first: `xacro {path.name} > robot.urdf`. Then copy the figures back by hand."
         raise SessionError(f"{path} is xacro, not URDF", hint)
@@ -95,11 +98,11 @@ def write_into_urdf(path: Path, calibrations: Sequence[Calibration], rig: Rig, n
         SessionError: it is not a URDF, does not fit (`fit_tree`), or cannot be written; it is unchanged.
         LceRigError: the new text reads back differently; the file is unchanged.
     """
-    tree = read_robot_urdf(path)
+    before = _text(path)
+    tree = _parse(path, before)
     changes = [change for change in fit_tree(tree, calibrations, rig)[1] if change.is_real]
     if not changes:
         return UrdfUpdate(path, None, ())
-    before = _text(path)
     after = _edited(before, changes, tree)
     draft = path.with_name(f".{path.name}.new.urdf")
     write_atomically(draft, after)
@@ -134,7 +137,7 @@ def _edited(text: bytes, changes: Sequence[JointChange], tree: RobotTree) -> byt
             start, end = places[tree.above[joint.child].name]
             edits.append(_origin_edit(text, start, end, joint))
         else:
-            added += _new_joint(joint)
+            added += [f"  <link name={quoteattr(joint.child)}/>", *joint_lines(joint)]
     if added:
         end = text.rindex(b"</robot")
         lines = [f"  <!-- added by {MADE_BY} -->", *added]
@@ -166,13 +169,6 @@ def _find_joints(text: bytes) -> dict[str, tuple[int, int]]:
     return places
 
 
-def _origin(joint: Joint) -> bytes:
-    angles = RPY_BODY_OPTICAL if joint.is_optical else rpy(joint.T_parent_child[:3, :3])
-    xyz = " ".join(number(value) for value in joint.T_parent_child[:3, 3])
-    turn = " ".join(number(value) for value in angles)
-    return f'<origin xyz="{xyz}" rpy="{turn}"/>'.encode()
-
-
 def _origin_edit(text: bytes, start: int, end: int, joint: Joint) -> tuple[int, int, bytes]:
     """Replace the origin of a joint, or put one behind its opening tag; comments are no origins."""
     blanked = re.sub(rb"<!--.*?-->", lambda found: b" " * len(found.group()), text[start:end], flags=re.S)
@@ -180,19 +176,8 @@ def _origin_edit(text: bytes, start: int, end: int, joint: Joint) -> tuple[int, 
     if found is None:
         tag = _TAG.match(blanked)
         assert tag is not None
-        return start + tag.end(), start + tag.end(), b"\n    " + _origin(joint)
-    new = _origin(joint)
+        return start + tag.end(), start + tag.end(), b"\n    " + origin(joint).encode()
+    new = origin(joint).encode()
     if not found.group().endswith(b"/>"):
         new = new.removesuffix(b"/>") + b">"
     return start + found.start(), start + found.end(), new
-
-
-def _new_joint(joint: Joint) -> list[str]:
-    return [
-        f"  <link name={quoteattr(joint.child)}/>",
-        f'  <joint name={quoteattr(f"{joint.parent}_to_{joint.child}")} type="fixed">',
-        f"    <parent link={quoteattr(joint.parent)}/>",
-        f"    <child link={quoteattr(joint.child)}/>",
-        f"    {_origin(joint).decode()}",
-        "  </joint>",
-    ]

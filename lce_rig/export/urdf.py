@@ -11,7 +11,7 @@ from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, pose
 from lce_rig.core.results import Calibration
 from lce_rig.export.files import header, number, reads_back
-from lce_rig.export.frames import RPY_BODY_OPTICAL, FrameTree, build_trees, check_tree, choose_channels
+from lce_rig.export.frames import RPY_BODY_OPTICAL, FrameTree, Joint, build_trees, check_tree, choose_channels
 from lce_rig.export.probes import check_pose
 from lce_rig.export.rotations import rotation_from_rpy, rpy
 from lce_rig.rig import Rig
@@ -42,18 +42,27 @@ def _text(tree: FrameTree, head: list[str], name: str) -> str:
     lines += [f"<!-- {line.replace('--', '- -').replace(': ', ' - ')} -->" for line in head]
     lines.append(f"<robot name={quoteattr(name)}>")
     lines += [f"  <link name={quoteattr(frame)}/>" for frame in tree.frames]
-    for joint in tree.joints:
-        angles = RPY_BODY_OPTICAL if joint.is_optical else rpy(joint.T_parent_child[:3, :3])
-        xyz = " ".join(number(value) for value in joint.T_parent_child[:3, 3])
-        turn = " ".join(number(value) for value in angles)
-        lines += [
-            f'  <joint name={quoteattr(f"{joint.parent}_to_{joint.child}")} type="fixed">',
-            f"    <parent link={quoteattr(joint.parent)}/>",
-            f"    <child link={quoteattr(joint.child)}/>",
-            f'    <origin xyz="{xyz}" rpy="{turn}"/>',
-            "  </joint>",
-        ]
+    lines += [line for joint in tree.joints for line in joint_lines(joint)]
     return "\n".join([*lines, "</robot>"]) + "\n"
+
+
+def joint_lines(joint: Joint) -> list[str]:
+    """Write a fixed joint."""
+    return [
+        f'  <joint name={quoteattr(f"{joint.parent}_to_{joint.child}")} type="fixed">',
+        f"    <parent link={quoteattr(joint.parent)}/>",
+        f"    <child link={quoteattr(joint.child)}/>",
+        f"    {origin(joint)}",
+        "  </joint>",
+    ]
+
+
+def origin(joint: Joint) -> str:
+    """Write the origin of a joint."""
+    angles = RPY_BODY_OPTICAL if joint.is_optical else rpy(joint.T_parent_child[:3, :3])
+    xyz = " ".join(number(value) for value in joint.T_parent_child[:3, 3])
+    turn = " ".join(number(value) for value in angles)
+    return f'<origin xyz="{xyz}" rpy="{turn}"/>'
 
 
 @reads_back

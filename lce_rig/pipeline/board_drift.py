@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lce_rig.core.board import Board
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, Metrics, Observation
 from lce_rig.detect.detection import Detections
 from lce_rig.extrinsics.local_quadratic import SCALE, expand
 from lce_rig.extrinsics.metrics import capture_residual, summarise
 from lce_rig.pipeline.calibration import clocks_of
-from lce_rig.residuals.quadratics import Quadratics
+from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.scene.alignment import AXES, IS_ROTATION
 from lce_rig.scene.drift import LARGEST, POWER_SIGMAS, THRESHOLD_SIGMAS, AxisDrift, State
@@ -114,10 +114,8 @@ def _judge(axis: int, cost: Quadratics, sigma_deployed: float) -> AxisDrift:
     alone = _alone(cost, axis)
     change = float(alone.optimum()[0])
     variance = float(alone.covariance()[0, 0])
-    without_each = alone.without_each()[:, 0]
-    n = len(without_each)
-    scatter = (n - 1) / n * float(np.sum((without_each - without_each.mean()) ** 2))
-    variance = max(variance, scatter)
+    without_each = alone.without_each()[:, :1]
+    variance = max(variance, float(jackknife_scatter(without_each - without_each.mean())[0, 0]))
     sigma = float(np.sqrt(variance + sigma_deployed**2 + _BIAS[axis] ** 2))
     smallest = (THRESHOLD_SIGMAS + POWER_SIGMAS) * sigma
     state: State = "unchanged"
@@ -131,12 +129,6 @@ def _judge(axis: int, cost: Quadratics, sigma_deployed: float) -> AxisDrift:
 
 def board_finding(axis: AxisDrift) -> Finding:
     """Tell an axis that the boards find changed, or cannot tell."""
-    unit = "deg" if axis.is_rotation else "m"
-    figures: dict[str, Figure] = {
-        f"change_{unit}": axis.change,
-        f"sigma_{unit}": axis.sigma,
-        f"smallest_{unit}": axis.smallest,
-    }
     if axis.state == "changed":
-        return Finding("scene.board_changed", "error", axis.axis, figures)
-    return Finding("scene.board_unsure", "note", axis.axis, figures)
+        return Finding("scene.board_changed", "error", axis.axis, axis.figures)
+    return Finding("scene.board_unsure", "note", axis.axis, axis.figures)

@@ -19,10 +19,11 @@ from lce_rig.export.result import SavedResult, read_result
 from lce_rig.pipeline.board_drift import BoardDrift, board_finding, watch_boards
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import RESULT, result_parts
-from lce_rig.pipeline.scene_captures import EVENTS_NS, SceneCaptures, Seen, evenly, own_offset_ns
+from lce_rig.pipeline.scene_captures import EVENTS_NS, SceneCaptures, Seen, own_offset_ns
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
-from lce_rig.scene.drift import AxisDrift, Drift, State, watch
+from lce_rig.scene.depth_edges import evenly
+from lce_rig.scene.drift import AxisDrift, Drift, State, overall, watch
 from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
 from lce_rig.scene.views import build_view, without_board, without_movers
 from lce_rig.session import Session
@@ -62,9 +63,8 @@ class PairDrift:
 
     @property
     def state(self) -> State:
-        """The verdict: changed if any axis is; unchanged only if no axis is unknown."""
-        states = set(self.states.values())
-        return "changed" if "changed" in states else "unknown" if "unknown" in states else "unchanged"
+        """The verdict on all axes."""
+        return overall(self.states.values())
 
     @property
     def summary(self) -> Finding:
@@ -127,9 +127,7 @@ def _board(board: BoardDrift) -> dict[str, Any]:
 
 
 def _axis(axis: AxisDrift) -> dict[str, Any]:
-    unit = "deg" if axis.is_rotation else "m"
-    figures = {"change": axis.change, "sigma": axis.sigma, "smallest": axis.smallest}
-    finite = {f"{name}_{unit}": value if np.isfinite(value) else None for name, value in figures.items()}
+    finite = {name: value if np.isfinite(value) else None for name, value in axis.figures.items()}
     return {"axis": axis.axis, "state": axis.state, **finite, "instead": list(axis.instead)}
 
 
@@ -180,7 +178,7 @@ def drift(
 
     Args:
         source: a session; or with `rig` a folder of images and point clouds, a bag, or several recordings of
-            the same time, such as a pcap and the images' folder.
+            the same time, such as a pcap and a camera's file.
         result: the deployed extrinsics; None for the session's own result.
         rig: the profile of a recording; a session has its own.
         progress: called with (done, total) captures, or images and scans.

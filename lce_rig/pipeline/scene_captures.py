@@ -22,6 +22,7 @@ from lce_rig.recordings import open_recordings
 from lce_rig.recordings.joining import join_recordings, require_sensors
 from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording
 from lce_rig.rig import Rig
+from lce_rig.scene.depth_edges import evenly
 from lce_rig.scene.views import MAX_CAPTURES
 from lce_rig.session import Capture, Session
 from lce_rig.timing.event_buffer import EventCut
@@ -237,8 +238,9 @@ def _about_scan(cut: EventCut, scan: Scan, rig: Rig, c: Calibration) -> Events |
     scan_ns = rig_time_ns(scan, rig)
     if scan_ns is None or scan.offset_ns is None or not len(scan.points):
         return None
-    pixels, is_valid = rig.cameras[c.camera].to_intrinsics().project(transform(c.T_cam_lidar, scan.points))
-    is_seen = is_valid & rig.cameras[c.camera].to_intrinsics().is_inside(pixels)
+    lens = rig.cameras[c.camera].to_intrinsics()
+    pixels, is_valid = lens.project(transform(c.T_cam_lidar, scan.points))
+    is_seen = is_valid & lens.is_inside(pixels)
     if not is_seen.any():
         return None
     offset_ns = cut.offset_ns + own_offset_ns(c, event_channel(rig, c.camera) or "")
@@ -269,10 +271,3 @@ def _counted(samples: Iterable[Sample], n_samples: int, progress: Progress) -> I
         if not isinstance(sample, Events):
             done += 1
             progress(done, n_samples)
-
-
-def evenly(items: Sequence[_Item], n: int) -> list[_Item]:
-    """Choose n of the items or fewer."""
-    if len(items) <= n:
-        return list(items)
-    return [items[k] for k in np.linspace(0, len(items) - 1, n).round().astype(int)]

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Literal
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from lce_rig.core.results import Calibration
 from lce_rig.core.scene_opinion import AxisOpinion, OpinionState, SceneOpinion
 from lce_rig.detect.detection import Detections
 from lce_rig.scene.alignment import SceneView
+from lce_rig.scene.depth_edges import evenly
 from lce_rig.scene.drift import AxisDrift, State, watch
 from lce_rig.scene.views import build_view, without_board, without_movers
 from lce_rig.session import Session
@@ -53,9 +53,9 @@ def scene_views(
     boards = detections.images.get((c.camera, channel), {})
     names = sorted(boards.keys() & detections.lidars[c.lidar].keys())
     views = []
-    for k in np.linspace(0, len(names) - 1, min(len(names), n_most)).round().astype(int):
+    for name in evenly(names, n_most):
         with suppress(SessionError):
-            capture = session.capture(names[k])
+            capture = session.capture(name)
             image, scan = capture.image(c.camera, channel), capture.scan(c.lidar)
             view = build_view(session.rig, c, capture.name, image, scan)
             views.append(without_board(view, boards[capture.name], session.rig, c))
@@ -72,7 +72,6 @@ def opinion_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibr
 
 
 def _of_axis(drift: AxisDrift) -> AxisOpinion:
-    unit: Literal["deg", "m"] = "deg" if drift.is_rotation else "m"
     smallest = float(drift.smallest) if np.isfinite(drift.smallest) else None
     change, sigma = float(drift.change), float(drift.sigma)
-    return AxisOpinion(drift.axis, _STATES[drift.state], unit, change, sigma, smallest)
+    return AxisOpinion(drift.axis, _STATES[drift.state], drift.unit, change, sigma, smallest)

@@ -3,9 +3,7 @@
 import numpy as np
 
 from lce_rig.core.geometry import Array, pose
-from lce_rig.rig.settings import Figure, FrameName, Settings
-
-Row = tuple[Figure, Figure, Figure]
+from lce_rig.rig.settings import FrameName, Row, Settings
 
 
 class Mount(Settings):

@@ -6,9 +6,8 @@ import numpy as np
 from pydantic import model_validator
 
 from lce_rig.core.geometry import Array, pose, project_to_so3
-from lce_rig.rig.settings import Figure, Name, Positive, Settings, problem
+from lce_rig.rig.settings import Figure, Name, Positive, Row, Settings, problem
 
-Row = tuple[Figure, Figure, Figure]
 # CAD models and papers round to three digits, which changes a unit quaternion's norm by up to about 1e-3.
 _ROUNDING = 5e-3
 

@@ -36,6 +36,7 @@ def _not_tiny(value: float) -> float:
 Positive = Annotated[float, Field(gt=0, le=_LARGEST), AfterValidator(_not_tiny)]
 NotNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
 Figure = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
+Row = tuple[Figure, Figure, Figure]
 Rate = Annotated[float, Field(ge=0.1, le=10_000)]
 
 

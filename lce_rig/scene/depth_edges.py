@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array
 from lce_rig.detect.lidar.measurement import Beam
 
+_Item = TypeVar("_Item")
 CHANNELS = ("depth", "reflectivity")
 """What an edge is one of: a jump in range, or in reflectivity along a continuous surface."""
 
@@ -57,15 +59,18 @@ def leave_standing(captures: Sequence[DepthEdges]) -> list[DepthEdges]:
     An edge stays if a third of the other captures have one in its place; it may be hidden in the rest. Where
     few edges stay, the rig itself moves, and all are kept.
     """
-    keep = [_recurs(edges, [each for each in _evenly(captures) if each is not edges]) for edges in captures]
+    compared = evenly(captures, _MAX_COMPARED)
+    keep = [_recurs(edges, [each for each in compared if each is not edges]) for edges in captures]
     if not any(map(len, captures)) or np.mean(np.concatenate(keep)) < _STANDING_SHARE:
         return list(captures)
     return [edges.select(each) for edges, each in zip(captures, keep, strict=True)]
 
 
-def _evenly(captures: Sequence[DepthEdges]) -> list[DepthEdges]:
-    n = min(len(captures), _MAX_COMPARED)
-    return [captures[k] for k in np.linspace(0, len(captures) - 1, n).round().astype(int)]
+def evenly(items: Sequence[_Item], n: int) -> list[_Item]:
+    """Choose n of the items or fewer, spread over all."""
+    if len(items) <= n:
+        return list(items)
+    return [items[k] for k in np.linspace(0, len(items) - 1, n).round().astype(int)]
 
 
 def _recurs(edges: DepthEdges, others: Sequence[DepthEdges]) -> NDArray[np.bool_]:

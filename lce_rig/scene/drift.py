@@ -1,6 +1,6 @@
 """Whether extrinsics still hold, axis by axis, from the scene's edges alone."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -59,6 +59,22 @@ class AxisDrift:
         """Whether the figures are in deg."""
         return self.axis.startswith("rotation")
 
+    @property
+    def unit(self) -> Literal["deg", "m"]:
+        """Of the figures."""
+        return "deg" if self.is_rotation else "m"
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """The figures by their names with the unit, as findings hold them."""
+        return {f"{name}_{self.unit}": getattr(self, name) for name in ("change", "sigma", "smallest")}
+
+
+def overall(states: Iterable[State]) -> State:
+    """Judge all axes: changed if any is; unchanged only if none is unknown."""
+    found = set(states)
+    return "changed" if "changed" in found else "unknown" if "unknown" in found else "unchanged"
+
 
 @dataclass(frozen=True, eq=False)
 class Drift:
@@ -85,9 +101,8 @@ class Drift:
 
     @property
     def state(self) -> State:
-        """The verdict: changed if any axis is; unchanged only if no axis is unknown."""
-        states = {axis.state for axis in self.axes}
-        return "changed" if "changed" in states else "unknown" if "unknown" in states else "unchanged"
+        """The verdict on all axes."""
+        return overall(axis.state for axis in self.axes)
 
     @property
     def T_changed(self) -> Array:
@@ -205,17 +220,11 @@ def _summary(axes: tuple[AxisDrift, ...], n_captures: int) -> Finding:
 
 
 def _of_axis(axis: AxisDrift) -> Finding:
-    unit = "deg" if axis.is_rotation else "m"
-    figures: dict[str, Figure] = {
-        f"change_{unit}": axis.change,
-        f"sigma_{unit}": axis.sigma,
-        f"smallest_{unit}": axis.smallest,
-    }
     if axis.state == "changed":
-        return Finding("scene.axis_changed", "error", axis.axis, {**figures, "instead": axis.instead})
+        return Finding("scene.axis_changed", "error", axis.axis, {**axis.figures, "instead": axis.instead})
     if axis.state == "unchanged":
-        return Finding("scene.axis_unchanged", "note", axis.axis, figures)
-    return Finding(axis.reason, "warning", axis.axis, figures)
+        return Finding("scene.axis_unchanged", "note", axis.axis, axis.figures)
+    return Finding(axis.reason, "warning", axis.axis, axis.figures)
 
 
 def _open_axes(cov_best: Array | None) -> list[Finding]:
