@@ -1,4 +1,4 @@
-"""A camera through the kernel's video interface, whose side a preloaded library takes by the kernel's header."""
+"""Cameras of the kernel's video interface; a preloaded library takes the kernel's side."""
 
 import json
 import os
@@ -20,7 +20,8 @@ from lce_rig.devices.v4l2.driver import V4l2Source
 from lce_rig.rig import load_rig
 
 settings = load_rig("rlfs").cameras["cam"]
-driver = settings.driver.model_copy(update={"device": "/dev/null", "controls": {}, "frame_rate_hz": None, "pixel_format": None})
+plain = {"device": "/dev/null", "controls": {}, "frame_rate_hz": None, "pixel_format": None}
+driver = settings.driver.model_copy(update=plain)
 settings = settings.model_copy(update={"driver": driver, "resolution_px": (64, 48)})
 for _ in range(2):  # opened a second time, the buffers are given back and asked for again
     with V4l2Source("cam", settings) as source:
