@@ -21,7 +21,7 @@ from lce_rig.rig.settings import (
     problem,
 )
 
-LIDAR_DRIVERS, CAMERA_DRIVERS = ("vlp16",), ("v4l2", "command", "davis")
+LIDAR_DRIVERS, CAMERA_DRIVERS = ("vlp16", "ros2"), ("v4l2", "command", "davis", "ros2")
 """Values of `driver.type`."""
 VLP16_MODELS = ("VLP-16", "VLP16", "PUCK")
 """How the names of the models begin whose beams and packets are known."""
