@@ -19,8 +19,9 @@ from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.core.results import Calibration
 from lce_rig.export import EXPORTS, export, load_exporter
 from lce_rig.export.camera_info import read_camera_info
-from lce_rig.export.frames import T_BODY_OPTICAL, build_trees, check_tree
+from lce_rig.export.frames import T_BODY_OPTICAL, check_tree
 from lce_rig.export.probes import check_pose, probe_points
+from lce_rig.export.robot_tree import build_trees
 from lce_rig.export.urdf import read_urdf
 from lce_rig.rig import Rig
 from tests.export.conftest import reason
@@ -159,12 +160,12 @@ def test_several_cameras_and_lidars_hang_in_one_tree_under_the_base(
     calibrations = [make(random_pose(i), camera=c, lidar=lidar) for i, (c, lidar) in enumerate(pairs)]
     paths = export(calibrations, rig, tmp_path)
     assert [path.name for path in paths if path.suffix == ".urdf"] == ["trio.urdf"]
-    poses = read_urdf(tmp_path / "trio.urdf")
-    assert next(iter(poses)) == (base or "velodyne")
-    assert len(poses) == 8
+    read = read_urdf(tmp_path / "trio.urdf")
+    assert read.chain("fish_optical")[-1] == (base or "velodyne")
+    assert len(read.frames) == 8
     for calibration in calibrations:
         camera, lidar = rig.cameras[calibration.camera], rig.lidars[calibration.lidar]
-        T_cam_lidar = invert(poses[camera.optical_frame]) @ poses[lidar.frame]
+        T_cam_lidar = read.find_pose(camera.optical_frame, lidar.frame)
         np.testing.assert_allclose(T_cam_lidar, calibration.T_cam_lidar, atol=1e-12)
 
 
