@@ -16,14 +16,8 @@ if TYPE_CHECKING:
     from lce_rig.core.results import Refusal
 
 FAMILIES = (
-    "detection",
-    "drivers",
-    "doctor",
-    "exports",
-    "extrinsics",
-    "guidance",
-    "recordings",
-    "scene_drift",
+    *("detection", "drivers", "doctor", "exports", "extrinsics", "guidance", "recordings", "scene_drift"),
+    "fleet",
 )
 """Modules of this package with a table PHRASES of their own."""
 
