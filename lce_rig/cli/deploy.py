@@ -81,11 +81,11 @@ def deploy(
     target = _target(target_name, targets, session, opened.rig)
     result = opened.path.joinpath(*result_parts(name))
     if dry_run:
-        _tell_plan(deployment.plan(result, opened.rig, target), target, as_json=as_json)
+        _tell_plan(deployment.plan(result, opened.rig, target, session=opened), target, as_json=as_json)
         return
     if target.run is not None:
         show.note(f"afterwards there: {target.run}")
-    done = deployment.deploy(result, opened.rig, target, reason=reason.strip())
+    done = deployment.deploy(result, opened.rig, target, session=opened, reason=reason.strip())
     _tell_done(done, target, as_json=as_json)
 
 

@@ -34,6 +34,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": ("lce_rig.cli.export", "Write a result for other programs, or into a robot's URDF."),
     "deploy": ("lce_rig.cli.deploy", "Put a result on a robot, ask what is there, or go back."),
     "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of sessions, or the results of one."),
+    "fleet": ("lce_rig.cli.fleet", "Calibrate the sessions of many robots; keep and query results."),
 }
 EXIT_BUG = 70
 

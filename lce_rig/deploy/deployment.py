@@ -32,11 +32,12 @@ from lce_rig.deploy.releases import (
     to_state,
 )
 from lce_rig.deploy.shell import CHANGED, COMMIT, PREPARE, RECORD, RUN, SAYS
-from lce_rig.export import export
+from lce_rig.export import export_formats
 from lce_rig.export.files import MADE_BY
 from lce_rig.export.result import SavedResult, read_result
 from lce_rig.rig import Rig
 from lce_rig.rig.target_settings import TargetSettings
+from lce_rig.session import Session
 from lce_rig.session.replacing import copy_over
 from lce_rig.words import describe, recommend
 
@@ -88,13 +89,14 @@ class Deployed:
     output: str | None = None
 
 
-def plan(result: Path, rig: Rig, target: TargetSettings) -> Plan:
+def plan(result: Path, rig: Rig, target: TargetSettings, *, session: Session | None = None) -> Plan:
     """Compare a result with what is at a target; nothing is changed there.
 
     Args:
         result: folder with its result.json.
         rig: the profile of the session.
         target: where to.
+        session: with images and scans, for formats that show them.
 
     Raises:
         SessionError: there is no result.
@@ -103,10 +105,12 @@ def plan(result: Path, rig: Rig, target: TargetSettings) -> Plan:
     place = open_place(target)
     state = read_state(place)
     with TemporaryDirectory(prefix="lce-rig-") as folder:
-        return _plan(result, rig, target, place, state, Path(folder))
+        return _plan(result, rig, target, session, place, state, Path(folder))
 
 
-def deploy(result: Path, rig: Rig, target: TargetSettings, *, reason: str = "") -> Deployed:
+def deploy(
+    result: Path, rig: Rig, target: TargetSettings, *, session: Session | None = None, reason: str = ""
+) -> Deployed:
     """Write the files of a result to a target, all at once, and run its command.
 
     If these very files are in place, only a command that has not succeeded yet runs. Whatever interrupts it,
@@ -116,6 +120,7 @@ def deploy(result: Path, rig: Rig, target: TargetSettings, *, reason: str = "") 
         result: folder with its result.json.
         rig: the profile of the session.
         target: where to.
+        session: with images and scans, for formats that show them.
         reason: why it is deployed against objections; it is written down there.
 
     Raises:
@@ -127,7 +132,7 @@ def deploy(result: Path, rig: Rig, target: TargetSettings, *, reason: str = "") 
     place = open_place(target)
     state = to_state(place, succeed(place, place.run(PREPARE)))
     with TemporaryDirectory(prefix="lce-rig-") as folder:
-        planned = _plan(result, rig, target, place, state, Path(folder))
+        planned = _plan(result, rig, target, session, place, state, Path(folder))
         if planned.objections and not reason:
             raise _refused(target, planned)
         record = planned.record
@@ -192,11 +197,17 @@ def rollback(target: TargetSettings, name: str | None = None, *, reason: str = "
 
 
 def _plan(
-    result: Path, rig: Rig, target: TargetSettings, place: Place, state: TargetState, folder: Path
+    result: Path,
+    rig: Rig,
+    target: TargetSettings,
+    session: Session | None,
+    place: Place,
+    state: TargetState,
+    folder: Path,
 ) -> Plan:
     """Write the new files to folder/new, fetch the current ones to folder/deployed, and compare."""
     new, deployed = folder / "new", folder / "deployed"
-    saved = _stage(result, rig, target, new)
+    saved = _stage(result, rig, target, session, new)
     changed_there = _changed_there(place, state, deployed)
     files = content_of(new)
     changed = differences(files, {} if state.current is None else state.current.files)
@@ -211,12 +222,14 @@ def _plan(
     )
 
 
-def _stage(result: Path, rig: Rig, target: TargetSettings, folder: Path) -> SavedResult:
+def _stage(
+    result: Path, rig: Rig, target: TargetSettings, session: Session | None, folder: Path
+) -> SavedResult:
     """Write the files of the set: result.json, the exports, and what else the target names."""
     saved = read_result(result / RESULT)
     folder.mkdir()
     # Whether a failed result may be deployed is decided on with everything else that speaks against it.
-    export(saved.pairs, rig, folder, formats=target.formats, is_forced=True)
+    export_formats(saved.pairs, rig, folder, formats=target.formats, is_forced=True, session=session)
     shutil.copyfile(result / RESULT, folder / RESULT)
     for pattern in target.files:
         found = sorted(path for path in _matching(result, pattern) if not (folder / path.name).exists())

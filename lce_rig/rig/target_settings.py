@@ -42,7 +42,7 @@ class TargetSettings(Settings):
     Attributes:
         to: a folder on this computer, or `user@host:path` by OpenSSH; robot software reads `to`/current/.
         robot: the robot there; results of another one are refused.
-        formats: export formats; None for those of the session.
+        formats: export formats; None for the profile's `exports`, else the usual ones.
         files: further files of the result's folder, as patterns such as `report.html`.
         run: a command to run there afterwards, by sh.
         run_timeout_s: time that it may take.

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from lce_rig.core.results import Refusal
 
 FAMILIES = (
-    *("deployment", "detection", "drivers", "doctor"),
-    *("extrinsics", "guidance", "recordings", "scene_drift"),
+    *("detection", "drivers", "doctor", "exports", "extrinsics", "guidance", "recordings", "scene_drift"),
+    *("fleet", "deployment"),
 )
 """Modules of this package with a table PHRASES of their own."""
 
