@@ -109,7 +109,13 @@ def plan(result: Path, rig: Rig, target: TargetSettings, *, session: Session | N
 
 
 def deploy(
-    result: Path, rig: Rig, target: TargetSettings, *, session: Session | None = None, reason: str = ""
+    result: Path,
+    rig: Rig,
+    target: TargetSettings,
+    *,
+    session: Session | None = None,
+    reason: str = "",
+    place: Place | None = None,
 ) -> Deployed:
     """Write the files of a result to a target, all at once, and run its command.
 
@@ -122,6 +128,7 @@ def deploy(
         target: where to.
         session: with images and scans, for formats that show them.
         reason: why it is deployed against objections; it is written down there.
+        place: another way to the target's folder than the target's own.
 
     Raises:
         SessionError: there is no result.
@@ -129,7 +136,7 @@ def deploy(
         TargetError: the target cannot be reached or written, or another deployment came first.
         CommandError: the command failed; the new files are in place.
     """
-    place = open_place(target)
+    place = place or open_place(target)
     state = to_state(place, succeed(place, place.run(PREPARE)))
     with TemporaryDirectory(prefix="lce-rig-") as folder:
         planned = _plan(result, rig, target, session, place, state, Path(folder))

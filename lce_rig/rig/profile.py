@@ -23,10 +23,7 @@ from lce_rig.rig.sync_settings import SyncSettings
 from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
-<<<<<<< HEAD
 _MOST_SENSORS, _MOST_TARGETS = 64, 256
-=======
-_MOST_SENSORS = 64
 OutputFormat = Literal[
     "extrinsics",
     "urdf",
@@ -44,7 +41,6 @@ OutputFormat = Literal[
     "ply",
     "ply_captures",
 ]
->>>>>>> main
 
 
 class Rig(Settings):

@@ -15,7 +15,7 @@ from lce_rig.rig import Rig, dump_rig
 
 FORMAT_VERSION = 1
 _MAY_DIFFER = re.compile(
-    r"description|nominal_extrinsics|targets\..*|(lidars|cameras)\.[^.]+\.driver(\..*)?|sync\.(device|baud)"
+    r"description|nominal_extrinsics|exports|targets\..*|(lidars|cameras)\.[^.]+\.driver(\..*)?|sync\.(device|baud)"
 ).fullmatch
 # Known later than the first capture, perhaps; another one is another rig.
 _IS_IDENTITY = re.compile(r"robot|(lidars|cameras)\.[^.]+\.serial").fullmatch

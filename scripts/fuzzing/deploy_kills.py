@@ -30,9 +30,11 @@ _ROOT = Path(__file__).parents[2]
 _MAIN = "from lce_rig.cli.main import main; main()"
 _N_CAPTURES = 8
 _PATIENCE_S = 300.0
-_EVERY = 20
+_EVERY = 10
 _VARIANTS = ((), ("--name", "other"))
 _KEEP = 4
+# Robots of each kind at a time.
+_N_LANES = 4
 
 Content = Mapping[str, str]
 
@@ -68,7 +70,7 @@ class _Robot:
     """A target, what is deployed there, and how its other end is killed.
 
     Attributes:
-        name: "folder" or "ssh".
+        name: of the target, such as "folder0" or "ssh1".
         folder: the target's.
         lose: kills what serves the connection.
         sets: the contents that may be found.
@@ -82,6 +84,11 @@ class _Robot:
     sets: list[Content] = field(default_factory=list)
     seconds: float = 0.0
     swap_s: float = 0.0
+
+    @property
+    def is_far(self) -> bool:
+        """Whether it is reached by ssh."""
+        return self.name.startswith("ssh")
 
 
 class _Reader:
@@ -126,18 +133,24 @@ def fuzz_deploy_kills(n: int, seed: int) -> DeployKillReport:
         )
         for variant in ((), ("--method", "ml", "--name", "other")):
             _must(_start(["calibrate", str(session), "--draws", "5", *variant]))
-        robots = [_Robot("folder", folder / "robot", lambda: None)]
-        targets: dict[str, object] = {"folder": {"to": str(folder / "robot"), "keep": _KEEP, "run": "true"}}
+        robots, targets = [], {}
+        for k in range(_N_LANES):
+            robots.append(_Robot(f"folder{k}", folder / f"robot{k}", lambda: None))
+            targets[f"folder{k}"] = {"to": str(robots[-1].folder), "keep": _KEEP, "run": "true"}
         try:
-            server = stack.enter_context(Sshd(folder / "ssh"))
-            robots.append(_Robot("ssh", folder / "far", server.lose_connections))
-            to = f"{server.to}:{folder / 'far'}"
-            targets["ssh"] = {"to": to, "keep": _KEEP, "run": "true", "ssh": server.options}
+            for k in range(_N_LANES):
+                server = stack.enter_context(Sshd(folder / f"ssh{k}"))
+                robots.append(_Robot(f"ssh{k}", folder / f"far{k}", server.lose_connections))
+                to = f"{server.to}:{robots[-1].folder}"
+                targets[f"ssh{k}"] = {"to": to, "keep": _KEEP, "run": "true", "ssh": server.options}
         except NoServerError as error:
             report.without_ssh = str(error)
         (folder / "deploy.yaml").write_text(yaml.safe_dump({"targets": targets}))
         threads = [
-            threading.Thread(target=_fuzz_robot, args=(session, robot, n, random.Random(seed), report))
+            threading.Thread(
+                target=_fuzz_robot,
+                args=(session, robot, -(-n // _N_LANES), random.Random(f"{seed} {robot.name}"), report),
+            )
             for robot in robots
         ]
         for thread in threads:
@@ -154,9 +167,7 @@ def _fuzz_robot(
     _learn(session, robot)
     with _Reader(robot) as reader:
         for k in range(n):
-            kind = (
-                ("program", "all", "other end")[k % 3] if robot.name == "ssh" else ("program", "all")[k % 2]
-            )
+            kind = ("program", "all", "other end")[k % 3] if robot.is_far else ("program", "all")[k % 2]
             _kill_once(session, robot, k, kind, chance, report)
             if k % _EVERY == _EVERY - 1:
                 report.wrong += [f"{robot.name} {k}: {what}" for what in _undisturbed(session, robot, report)]
@@ -187,11 +198,11 @@ def _kill_once(
     process = _deploy(session, robot, 1 - before)
     is_about_swap = chance.random() < 0.6
     if is_about_swap and _wait_for_draft(robot, process) is not None:
-        time.sleep(chance.uniform(0, 1.1 * robot.swap_s))
+        time.sleep(chance.uniform(0, 0.7 * robot.swap_s))
         report.n_about_swap += 1
     elif not is_about_swap:
         with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(chance.uniform(0, 1.1 * robot.seconds))
+            process.wait(chance.uniform(0, 0.9 * robot.seconds))
     report.n_too_late += process.poll() is not None
     if kind == "other end":
         robot.lose()
@@ -208,7 +219,7 @@ def _kill_once(
         process.wait(_PATIENCE_S)
     found = _current(robot.folder)
     report.n += 1
-    report.n_by_kind[f"{robot.name}, {kind}"] += 1
+    report.n_by_kind[f"{'ssh' if robot.is_far else 'folder'}, {kind}"] += 1
     report.n_left += bool(_left(robot.folder))
     if found not in robot.sets:
         report.wrong.append(f"{robot.name} {k} ({kind}): current is {_named(found)}")

@@ -48,6 +48,8 @@ class Sshd:
             *(f"Port {port}", "ListenAddress 127.0.0.1", f"HostKey {folder / 'host_key'}"),
             *(f"AuthorizedKeysFile {folder / 'authorized_keys'}", "PidFile none", "StrictModes no"),
             *("UsePAM no", "PasswordAuthentication no", "PermitRootLogin prohibit-password"),
+            # A login shell's own set-up is slow, and being killed in it could leave locks of its own behind.
+            f"SetEnv HOME={folder}",
             *("Subsystem sftp internal-sftp", "MaxStartups 100", "LogLevel ERROR"),
         ]
         (folder / "sshd_config").write_text("\n".join(lines) + "\n")
