@@ -112,10 +112,12 @@ class Result:
                 self.session, self.pairs, force=force, name=name, sessions=self.sessions, report=report
             )
         folder = Path(folder)
-        names = _write_files(folder, self.session, self.pairs, self.sessions, force=force, report=report)
-        return WrittenResults(
-            tuple(folder / name for name in names), None, False, (), False, report=_report_in(folder, report)
+        names, lacking = _write_files(
+            folder, self.session, self.pairs, self.sessions, force=force, report=report
         )
+        files = tuple(folder / name for name in names)
+        page = _report_in(folder, report)
+        return WrittenResults(files, None, False, (), False, findings=lacking, report=page)
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,7 @@ class WrittenResults:
         only_previous: cameras and LiDARs with a usable result there and no result in this run.
         is_same: whether this result is identical byte for byte to the earlier one.
         had_overlays: whether overlays of the earlier result moved to `previous`, and this one has none.
+        findings: what exports leave out or put differently, and why.
         report: the page; None if it was not asked for.
     """
 
@@ -138,6 +141,7 @@ class WrittenResults:
     only_previous: tuple[str, ...]
     is_same: bool
     had_overlays: bool = False
+    findings: tuple[Finding, ...] = ()
     report: Path | None = None
 
 
@@ -212,7 +216,9 @@ def write_results(
         had_overlays = has_drawn and not (draft / OVERLAYS).is_dir()
 
     with session.replacing(*parts, finish=finish) as draft:
-        names = _write_files(draft, session, calibrations, sessions or {}, force=force, report=report)
+        names, lacking = _write_files(
+            draft, session, calibrations, sessions or {}, force=force, report=report
+        )
     previous = folder / PREVIOUS
     return WrittenResults(
         tuple(folder / name for name in names),
@@ -221,6 +227,7 @@ def write_results(
         tuple(sorted(_usable(previous) - {f"{c.camera} and {c.lidar}" for c in calibrations})),
         is_same,
         had_overlays,
+        lacking,
         _report_in(folder, report),
     )
 
@@ -237,9 +244,13 @@ def _write_files(
     *,
     force: bool,
     report: bool,
-) -> list[str]:
-    """Write result.json, the report and the exports of usable results; name the files but the report."""
-    from lce_rig.export import export, remove_exports
+) -> tuple[list[str], tuple[Finding, ...]]:
+    """Write result.json, the report and the exports of usable results.
+
+    Returns:
+        The files' names without the report's, and what exports lack.
+    """
+    from lce_rig.export import export_formats, remove_exports
     from lce_rig.export.result import layout
     from lce_rig.session.durable import write_atomically
 
@@ -254,8 +265,9 @@ def _write_files(
         write_atomically(folder / REPORT, page)
     if not usable:
         remove_exports(folder)
-        return [RESULT]
-    return [RESULT, *(path.name for path in export(usable, session.rig, folder, is_forced=force))]
+        return [RESULT], ()
+    exported = export_formats(usable, session.rig, folder, is_forced=force, session=session)
+    return [RESULT, *(str(path.relative_to(folder)) for path in exported.files)], exported.findings
 
 
 def _document(
