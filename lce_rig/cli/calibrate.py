@@ -14,6 +14,7 @@ from lce_rig.cli.options import (
     cameras_option,
     event_image_option,
     require_sensors,
+    robot_option,
     split_names,
 )
 from lce_rig.core.errors import NotEnoughDataError
@@ -218,6 +219,7 @@ if TYPE_CHECKING:
     help="Write the result to SESSION/results/NAME/ and leave SESSION/calibration/ unchanged "
     "[default of several sessions: union].",
 )
+@robot_option
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export failed results too, marked NOT FOR USE.")
 @click.option(
@@ -239,6 +241,7 @@ def calibrate(
     event_image: Any,
     use_scene: bool,
     name: str | None,
+    robot: str | None,
     as_json: bool,
     force: bool,
     method: Any,
@@ -263,12 +266,16 @@ def calibrate(
     from lce_rig.export.reference import read_reference
     from lce_rig.pipeline.result_files import OVERLAYS, UNION, new_result_parts
     from lce_rig.pipeline.union import require_unit
+    from lce_rig.session.provenance import provenance_of
 
     paths = sessions or (Path("session"),)
     name = UNION if name is None and len(paths) > 1 else name
     new_result_parts(name)
     opened = [lce.Session.open(path) for path in paths]
     require_unit(opened)
+    for each in opened:
+        each.rig = each.rig.of_robot(robot)
+    provenance_of(opened)
     first, rig = opened[0], opened[0].rig
     require_sensors("camera", cameras, rig.cameras)
     options = lce.CalibrateOptions(method, n_draws, seed)

@@ -15,6 +15,7 @@ from lce_rig.core.results import Calibration
 from lce_rig.session import Session
 from lce_rig.session.capture import SAFE_NAME
 from lce_rig.session.capture_files import MANIFEST
+from lce_rig.session.provenance import Provenance, provenance_of
 from lce_rig.session.replacing import check_folder, copy_over
 from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE, RESULTS
 
@@ -57,11 +58,20 @@ class Result:
                 return pair
         raise NotEnoughDataError(f"no extrinsic of camera {camera}", "Collect more captures.")
 
+    @property
+    def provenance(self) -> Provenance:
+        """Where the result comes from: robot, sensors, date.
+
+        Raises:
+            SessionError: captures are of different robots, or of different units of a sensor.
+        """
+        return provenance_of([*self.sessions.values()] or [self.session])
+
     def document(self) -> dict[str, Any]:
         """Build the content of result.json from plain types.
 
         Raises:
-            SessionError: a capture that was used is missing.
+            SessionError: a capture that was used is missing, or `provenance` raises it.
             ResultRefusedError: a pose or covariance is not finite.
         """
         return _document(self.session, self.pairs, self.sessions)
@@ -227,7 +237,13 @@ def _document(
 
     own = session.path.resolve()
     paths = {name: os.path.relpath(each.path.resolve(), own) for name, each in sessions.items()}
-    return to_json_dict(session.rig.name, calibrations, inputs_sha256(session, calibrations, sessions), paths)
+    return to_json_dict(
+        session.rig.name,
+        calibrations,
+        inputs_sha256(session, calibrations, sessions),
+        paths,
+        provenance_of([*sessions.values()] or [session]),
+    )
 
 
 def inputs_sha256(

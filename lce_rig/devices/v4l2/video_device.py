@@ -4,6 +4,7 @@ import errno
 import os
 import select
 import stat
+from contextlib import suppress
 from ctypes import Structure, c_int32
 from dataclasses import dataclass
 from fcntl import ioctl
@@ -292,6 +293,25 @@ def video_devices() -> list[str]:
         name = Path("/sys/class/video4linux") / path.name / "name"
         found.append(f"{path} ({name.read_text().strip()})" if name.exists() else str(path))
     return found
+
+
+def serial_number(name: str, system: Path = Path("/sys/class/video4linux")) -> str:
+    """Give the serial number of the USB device behind a video device; "" where the kernel knows none.
+
+    Args:
+        name: of the video device: "video0".
+        system: where the kernel lists video devices.
+    """
+    try:
+        device = (system / name / "device").resolve(strict=True)
+    except (OSError, RuntimeError):
+        return ""
+    # The interface of a USB device lies in the device's folder, whose `serial` is its own.
+    for folder in (device, device.parent):
+        if (folder / "idVendor").exists() and (folder / "serial").exists():
+            with suppress(OSError, UnicodeDecodeError):
+                return (folder / "serial").read_text().strip()
+    return ""
 
 
 def _attached() -> str:
