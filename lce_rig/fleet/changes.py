@@ -18,7 +18,9 @@ the weighted mean of those before it, in units of its standard deviation:
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -42,7 +44,7 @@ _SENSOR_KNOWN = 9.0
 _FEWEST_FOR_SLOPE = 4
 _MOST_CHANGES = 50
 # 0.01 mm and 0.0006 deg: keep the weights of any table finite.
-_LEAST_VARIANCE = 1e-10
+_LEAST = 1e-10 * np.eye(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +67,11 @@ class Sessions:
     profile: NDArray[np.intp]
     days: Array
 
+    @cached_property
+    def weights(self) -> Array:
+        """(N, 6, 6) inverse covariances."""
+        return np.asarray(np.linalg.inv(self.cov + _LEAST))
+
     def part(self, first: int, last: int) -> "Sessions":
         """Take sessions of one series."""
         own = slice(first, last)
@@ -76,11 +83,6 @@ class Sessions:
             self.profile[own],
             self.days[own],
         )
-
-    @property
-    def group(self) -> NDArray[np.intp]:
-        """(N,) the series of each session."""
-        return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +105,11 @@ class References:
     """Each session against the weighted mean of those before it, and the mean of all.
 
     Attributes:
-        apart: (N, 6) difference, m and rad; NaN for the first session of a series.
+        apart: (N, 6) difference, m and rad; NaN for the first session of a part.
         sigma: (N, 6) standard deviation of it.
         chi2: (N,) of it.
         cusum: (N, 6) the larger of both cumulative sums, with its sign.
-        mean, cov: (G, 6), (G, 6, 6) of all, by series.
+        mean, cov: (G, 6), (G, 6, 6) of all, by part.
         smallest: (G, 6) change along each axis that one more session like the last would show.
     """
 
@@ -216,20 +218,22 @@ def _shrunk(factor: Array, n: int) -> Array:
 
 def rescaled(sessions: Sessions, scale: Array) -> Sessions:
     """Multiply the standard deviations of what scatters by factors (6,)."""
-    cov = sessions.cov * scale[:, None] * scale
-    return Sessions(
-        sessions.starts, sessions.tangents, cov, sessions.shared, sessions.profile, sessions.days
-    )
+    return replace(sessions, cov=sessions.cov * scale[:, None] * scale)
 
 
 class _Sums:
     """Weights and weighted tangents, summed over the sessions of each series."""
 
-    def __init__(self, sessions: Sessions, keep: NDArray[np.bool_] | None) -> None:
-        self.starts, self.group = sessions.starts[:-1], sessions.group
-        self.cov = sessions.cov + _LEAST_VARIANCE * np.eye(6)
-        self.weights = np.linalg.inv(self.cov)
-        if keep is not None:
+    def __init__(
+        self,
+        sessions: Sessions,
+        keep: NDArray[np.bool_] | None,
+        starts: NDArray[np.intp] | None = None,
+    ) -> None:
+        bounds = sessions.starts if starts is None else starts
+        self.starts, self.group = bounds[:-1], np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
+        self.weights = sessions.weights
+        if keep is not None and not keep.all():
             self.weights = self.weights * keep[:, None, None]
         self.weighted = _times(self.weights, sessions.tangents)
         self.total = np.add.reduceat(self.weights, self.starts)
@@ -239,9 +243,7 @@ class _Sums:
 
     def before(self) -> tuple[Array, Array]:
         """Sum weights (N, 6, 6) and weighted tangents (N, 6) of the sessions before each."""
-        return _before(self.weights, self.starts, self.group), _before(
-            self.weighted, self.starts, self.group
-        )
+        return _before(self.weights, self.starts, self.group), _before(self.weighted, self.starts, self.group)
 
 
 def _before(values: Array, starts: NDArray[np.intp], group: NDArray[np.intp]) -> Array:
@@ -255,6 +257,11 @@ def _times(matrices: Array, vectors: Array) -> Array:
 
 def _chi2(cov: Array, vectors: Array) -> Array:
     return np.asarray(np.einsum("...i,...i->...", vectors, np.linalg.solve(cov, vectors[..., None])[..., 0]))
+
+
+def _squares(weights: Array, weighted: Array) -> Array:
+    """Compute y^T W^-1 y, which summed weights W and tangents y explain by their mean."""
+    return np.asarray(np.einsum("ki,ki->k", weighted, np.linalg.solve(weights, weighted[..., None])[..., 0]))
 
 
 def _is_mixed(sessions: Sessions) -> NDArray[np.bool_]:
@@ -285,13 +292,19 @@ def statistics(sessions: Sessions, keep: NDArray[np.bool_] | None = None) -> Sta
     before, before_weighted = sums.before()
     k = np.flatnonzero(kept & ~is_first)
     if len(k):
+        total, total_weighted = sums.total[group[k]], sums.total_weighted[group[k]]
+        step[k] = (
+            _squares(before[k], before_weighted[k])
+            + _squares(total - before[k], total_weighted - before_weighted[k])
+            - np.einsum("gi,gi->g", sums.mean, sums.total_weighted)[group[k]]
+        )
+    k = np.flatnonzero(kept & ~is_first & mixed[group])
+    if len(k):
         cov_before = np.linalg.inv(before[k])
         cov_after = np.linalg.inv(sums.total[group[k]] - before[k])
         apart = _times(cov_after, sums.total_weighted[group[k]] - before_weighted[k])
         apart -= _times(cov_before, before_weighted[k])
-        cov = cov_before + cov_after
-        cov += mixed[group[k], None, None] * (sessions.shared[k] + sessions.shared[k - 1])
-        step[k] = _chi2(cov, apart)
+        step[k] = _chi2(cov_before + cov_after + sessions.shared[k] + sessions.shared[k - 1], apart)
 
     inside = kept & ~is_first
     # The last session that counts is at once a step and odd.
@@ -300,13 +313,13 @@ def statistics(sessions: Sessions, keep: NDArray[np.bool_] | None = None) -> Sta
     k = np.flatnonzero(inside)
     if len(k):
         g = group[k]
-        cov = sums.cov[k] - sums.mean_cov[g] + 2 * mixed[g, None, None] * sessions.shared[k]
+        cov = sessions.cov[k] + _LEAST - sums.mean_cov[g] + 2 * mixed[g, None, None] * sessions.shared[k]
         odd[k] = _chi2(cov, sessions.tangents[k] - sums.mean[g])
     return Statistics(step, odd, _slopes(sessions, sums, (lengths >= _FEWEST_FOR_SLOPE) & ~mixed)[0])
 
 
 def _slopes(sessions: Sessions, sums: _Sums, wanted: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
-    """Fit a slope to each series; (chi-squared, slope (G, 6) per day, its information (G, 6, 6))."""
+    """Fit a slope to each series: (chi-squared, slope (G, 6) per day, its information (G, 6, 6))."""
     starts, group = sums.starts, sums.group
     days = sessions.days - np.add.reduceat(sessions.days, starts)[group] / np.diff(sessions.starts)[group]
     first = np.add.reduceat(sums.weights * days[:, None, None], starts)
@@ -323,16 +336,19 @@ def _slopes(sessions: Sessions, sums: _Sums, wanted: NDArray[np.bool_]) -> tuple
     return chi2, slope, information
 
 
-def references(sessions: Sessions, keep: NDArray[np.bool_], limits: Limits) -> References:
-    """Compare each session with the weighted mean of those of its series before it.
+def references(
+    sessions: Sessions, starts_now: NDArray[np.intp], keep: NDArray[np.bool_], limits: Limits
+) -> References:
+    """Compare each session with the weighted mean of those of its part before it.
 
     Args:
-        sessions: series in which nothing changed.
-        keep: (N,) sessions that are part of the mean; the first one of each series is.
+        sessions: all.
+        starts_now: (G + 1,) as `Sessions.starts`, of parts in which nothing changed.
+        keep: (N,) sessions that belong to the mean; the first one of each part does.
         limits: of the fleet.
     """
-    sums = _Sums(sessions, keep)
-    starts, group, n = sums.starts, sums.group, len(sessions.tangents)
+    sums = _Sums(sessions, keep, starts_now)
+    starts, n = sums.starts, len(sessions.tangents)
     is_first = np.zeros(n, bool)
     is_first[starts] = True
     before, before_weighted = sums.before()
@@ -340,17 +356,16 @@ def references(sessions: Sessions, keep: NDArray[np.bool_], limits: Limits) -> R
     chi2, z = np.full(n, np.nan), np.zeros((n, 6))
     k = np.flatnonzero(~is_first)
     if len(k):
-        cov = np.linalg.inv(before[k])
+        cov: Array = np.linalg.inv(before[k])
         apart[k] = sessions.tangents[k] - _times(cov, before_weighted[k])
-        cov += sums.cov[k]
+        cov += sessions.cov[k]
         differs = sessions.profile[k] != sessions.profile[k - 1]
         cov += differs[:, None, None] * (sessions.shared[k] + sessions.shared[k - 1])
         sigma[k] = np.sqrt(np.einsum("kii->ki", cov))
         chi2[k] = _chi2(cov, apart[k])
         z[k] = np.where(keep[k, None], apart[k] / sigma[k], 0.0)
     above, below = _cusum(z, starts), _cusum(-z, starts)
-    last = sessions.starts[1:] - 1
-    information = np.linalg.inv(sums.mean_cov + sums.cov[last])
+    information = np.linalg.inv(sums.mean_cov + sessions.cov[starts_now[1:] - 1])
     smallest = np.sqrt(limits.smallest_chi2 / np.einsum("gii->gi", information))
     return References(
         apart, sigma, chi2, np.where(above >= below, above, -below), sums.mean, sums.mean_cov, smallest
@@ -440,7 +455,7 @@ def _placed_anew(series: Sessions, keep: NDArray[np.bool_], steps: list[int], li
 def _misfit(series: Sessions, keep: NDArray[np.bool_], bounds: Sequence[int]) -> float:
     """Sum the squared distances from the mean of each part, in units of the covariances."""
     total = 0.0
-    for first, last in zip(bounds, bounds[1:], strict=False):
+    for first, last in pairwise(bounds):
         part, own = series.part(first, last), keep[first:last]
         sums = _Sums(part, own)
         apart = part.tangents - sums.mean
@@ -524,7 +539,7 @@ def explain(
     """
     from scipy.special import chdtrc
 
-    information = np.linalg.inv(cov)
+    information: Array = np.linalg.inv(cov)
     whole = float(tangent @ information @ tangent)
     chosen: list[int] = []
     instead: list[tuple[str, ...]] = []
