@@ -324,7 +324,12 @@ def calibrate(
             show.print_lines(_lines(calibration))
         for calibration in result.pairs:
             show.print_lines(camera_lines(calibration, result.pairs))
-        show.note("written: " + ", ".join(f.name for f in written.files) + f" in {written.files[0].parent}")
+        folder = written.files[0].parent
+        names = ", ".join(str(file.relative_to(folder)) for file in written.files)
+        show.note(f"written: {names} in {folder}")
+    for finding in written.findings:
+        if finding.severity != "note":
+            show.warn(sentence(finding))
     _tell_earlier(written)
     seen = {pair.camera for own in detections for pair in own.pairs}
     _exit(result.pairs, wanted, seen, are_printed=not as_json)

@@ -102,8 +102,9 @@ class Result:
         if folder is None or Path(folder).resolve() == own.resolve():
             name = UNION if self.sessions and name is None else name
             return write_results(self.session, self.pairs, force=force, name=name, sessions=self.sessions)
-        names = _write_files(Path(folder), self.session, self.pairs, self.sessions, force=force)
-        return WrittenResults(tuple(Path(folder) / name for name in names), None, False, (), False)
+        names, lacking = _write_files(Path(folder), self.session, self.pairs, self.sessions, force=force)
+        files = tuple(Path(folder) / name for name in names)
+        return WrittenResults(files, None, False, (), False, findings=lacking)
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,7 @@ class WrittenResults:
         only_previous: cameras and LiDARs with a usable result there and no result in this run.
         is_same: whether this result is identical byte for byte to the earlier one.
         had_overlays: whether overlays of the earlier result moved to `previous`, and this one has none.
+        findings: what exports leave out or put differently, and why.
     """
 
     files: tuple[Path, ...]
@@ -125,6 +127,7 @@ class WrittenResults:
     only_previous: tuple[str, ...]
     is_same: bool
     had_overlays: bool = False
+    findings: tuple[Finding, ...] = ()
 
 
 def result_parts(name: str | None) -> tuple[str, ...]:
@@ -196,7 +199,7 @@ def write_results(
         had_overlays = has_drawn and not (draft / OVERLAYS).is_dir()
 
     with session.replacing(*parts, finish=finish) as draft:
-        names = _write_files(draft, session, calibrations, sessions or {}, force=force)
+        names, lacking = _write_files(draft, session, calibrations, sessions or {}, force=force)
     previous = folder / PREVIOUS
     return WrittenResults(
         tuple(folder / name for name in names),
@@ -205,6 +208,7 @@ def write_results(
         tuple(sorted(_usable(previous) - {f"{c.camera} and {c.lidar}" for c in calibrations})),
         is_same,
         had_overlays,
+        lacking,
     )
 
 
@@ -215,9 +219,9 @@ def _write_files(
     sessions: Mapping[str, Session],
     *,
     force: bool,
-) -> list[str]:
-    """Write result.json and the exports of usable results; return the files' names."""
-    from lce_rig.export import export, remove_exports
+) -> tuple[list[str], tuple[Finding, ...]]:
+    """Write result.json and the exports of usable results; return the files' names and what exports lack."""
+    from lce_rig.export import export_formats, remove_exports
     from lce_rig.export.result import layout
     from lce_rig.session.durable import write_atomically
 
@@ -225,8 +229,9 @@ def _write_files(
     write_atomically(folder / RESULT, layout(_document(session, calibrations, sessions)))
     if not usable:
         remove_exports(folder)
-        return [RESULT]
-    return [RESULT, *(path.name for path in export(usable, session.rig, folder, is_forced=force))]
+        return [RESULT], ()
+    exported = export_formats(usable, session.rig, folder, is_forced=force, session=session)
+    return [RESULT, *(str(path.relative_to(folder)) for path in exported.files)], exported.findings
 
 
 def _document(

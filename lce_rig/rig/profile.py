@@ -23,6 +23,23 @@ from lce_rig.rig.sync_settings import SyncSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
 _MOST_SENSORS = 64
+OutputFormat = Literal[
+    "extrinsics",
+    "urdf",
+    "camera_info",
+    "static_tf",
+    "ros2_launch",
+    "tf_static_bag",
+    "kalibr",
+    "autoware",
+    "fast_livo2",
+    "koide3",
+    "opencv",
+    "isaac",
+    "mcap",
+    "ply",
+    "ply_captures",
+]
 
 
 class Rig(Settings):
@@ -36,6 +53,7 @@ class Rig(Settings):
         base_frame: a LiDAR's or camera's frame, root of the URDF; by default that of `mount`, or the first
             LiDAR's.
         mount: the pose of one sensor on the robot; the root is then a frame of the robot.
+        exports: formats that `calibrate` and `export` write; empty for the usual ones.
         lidars: settings by the LiDAR's name.
         cameras: settings by the camera's name.
         nominal_extrinsics: the CAD model's values, a sanity check only.
@@ -48,6 +66,7 @@ class Rig(Settings):
     robot: RobotName | None = None
     base_frame: FrameName | None = None
     mount: Mount | None = None
+    exports: tuple[OutputFormat, ...] = ()
     board: BoardSettings
     lidars: Annotated[dict[Name, LidarSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
     cameras: Annotated[dict[Name, CameraSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
