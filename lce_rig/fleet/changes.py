@@ -70,7 +70,7 @@ class Sessions:
     @cached_property
     def weights(self) -> Array:
         """(N, 6, 6) inverse covariances."""
-        return np.asarray(np.linalg.inv(self.cov + _LEAST))
+        return _inverse(self.cov + _LEAST)
 
     def part(self, first: int, last: int) -> "Sessions":
         """Take sessions of one series."""
@@ -238,7 +238,7 @@ class _Sums:
         self.weighted = _times(self.weights, sessions.tangents)
         self.total = np.add.reduceat(self.weights, self.starts)
         self.total_weighted = np.add.reduceat(self.weighted, self.starts)
-        self.mean_cov = np.linalg.inv(self.total)
+        self.mean_cov = _inverse(self.total)
         self.mean = _times(self.mean_cov, self.total_weighted)
 
     def before(self) -> tuple[Array, Array]:
@@ -253,6 +253,10 @@ def _before(values: Array, starts: NDArray[np.intp], group: NDArray[np.intp]) ->
 
 def _times(matrices: Array, vectors: Array) -> Array:
     return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
+def _inverse(matrices: Array) -> Array:
+    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
 
 
 def _chi2(cov: Array, vectors: Array) -> Array:
@@ -300,8 +304,8 @@ def statistics(sessions: Sessions, keep: NDArray[np.bool_] | None = None) -> Sta
         )
     k = np.flatnonzero(kept & ~is_first & mixed[group])
     if len(k):
-        cov_before = np.linalg.inv(before[k])
-        cov_after = np.linalg.inv(sums.total[group[k]] - before[k])
+        cov_before = _inverse(before[k])
+        cov_after = _inverse(sums.total[group[k]] - before[k])
         apart = _times(cov_after, sums.total_weighted[group[k]] - before_weighted[k])
         apart -= _times(cov_before, before_weighted[k])
         step[k] = _chi2(cov_before + cov_after + sessions.shared[k] + sessions.shared[k - 1], apart)
@@ -356,7 +360,7 @@ def references(
     chi2, z = np.full(n, np.nan), np.zeros((n, 6))
     k = np.flatnonzero(~is_first)
     if len(k):
-        cov: Array = np.linalg.inv(before[k])
+        cov = _inverse(before[k])
         apart[k] = sessions.tangents[k] - _times(cov, before_weighted[k])
         cov += sessions.cov[k]
         differs = sessions.profile[k] != sessions.profile[k - 1]
@@ -365,7 +369,7 @@ def references(
         chi2[k] = _chi2(cov, apart[k])
         z[k] = np.where(keep[k, None], apart[k] / sigma[k], 0.0)
     above, below = _cusum(z, starts), _cusum(-z, starts)
-    information = np.linalg.inv(sums.mean_cov + sessions.cov[starts_now[1:] - 1])
+    information = _inverse(sums.mean_cov + sessions.cov[starts_now[1:] - 1])
     smallest = np.sqrt(limits.smallest_chi2 / np.einsum("gii->gi", information))
     return References(
         apart, sigma, chi2, np.where(above >= below, above, -below), sums.mean, sums.mean_cov, smallest
@@ -516,7 +520,7 @@ def _as_odd(
 def _as_drift(series: Sessions, keep: NDArray[np.bool_], limits: Limits, T_cam_lidar: Array) -> Found:
     chi2, slope, information = _slopes(series, _Sums(series, keep), np.array([True]))
     span = float(series.days[-1] - series.days[0])
-    tangent, cov = slope[0] * span, np.linalg.inv(information[0]) * span**2
+    tangent, cov = slope[0] * span, _inverse(information[0]) * span**2
     n = int(np.count_nonzero(keep))
     axes, sensor = explain(tangent, cov, limits, T_cam_lidar)
     return Found("drift", 0, len(keep), 0, 0, float(chi2[0]), tuple(tangent.tolist()), axes, sensor, n, n)
@@ -539,7 +543,7 @@ def explain(
     """
     from scipy.special import chdtrc
 
-    information: Array = np.linalg.inv(cov)
+    information = _inverse(cov)
     whole = float(tangent @ information @ tangent)
     chosen: list[int] = []
     instead: list[tuple[str, ...]] = []
@@ -553,7 +557,7 @@ def explain(
         if chdtrc(6 - len(chosen), whole - gain[best]) > _NOISE if len(chosen) < 6 else True:
             break
     directions = np.eye(6)[chosen]
-    own = np.linalg.inv(directions @ information @ directions.T)
+    own = _inverse(directions @ information @ directions.T)
     sizes, sigmas = own @ directions @ information @ tangent, np.sqrt(np.diag(own))
     smallest = np.sqrt(limits.smallest_chi2 / np.diag(information)[chosen])
     axes = []
