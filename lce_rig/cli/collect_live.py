@@ -57,17 +57,15 @@ class LiveArguments:
     seed: int | None
 
 
-def run_live(rig_name: str, path: Path, given: LiveArguments) -> None:
+def run_live(rig: "Rig", path: Path, given: LiveArguments) -> None:
     """Collect live into a session and report the outcome."""
     from lce_rig.collect.live.collection import collect_live
     from lce_rig.collect.live.state import HOLD_S, LiveOptions
     from lce_rig.core.errors import UsageError
-    from lce_rig.rig import load_rig
     from lce_rig.screen.live_view import open_view
 
     if given.seed is not None and not given.simulated:
         raise UsageError("--seed applies to --simulated only", "Add --simulated, or omit --seed.")
-    rig = load_rig(rig_name)
     require_kind(path, (given.seed or 0) if given.simulated else None)
     hold_s = HOLD_S if given.hold is None else given.hold
     with ExitStack() as stack:

@@ -33,6 +33,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "results": ("lce_rig.cli.results", "List the results of a session with figures and verdicts."),
     "export": ("lce_rig.cli.export", "Write a result for other programs, or into a robot's URDF."),
     "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of sessions, or the results of one."),
+    "fleet": ("lce_rig.cli.fleet", "Calibrate the sessions of many robots; keep and query results."),
 }
 EXIT_BUG = 70
 

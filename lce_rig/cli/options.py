@@ -36,6 +36,10 @@ rig_option = click.option(
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")
 
+robot_option = click.option(
+    "--robot", metavar="NAME", help="Name the robot that carries the rig; the result says so."
+)
+
 cameras_option = click.option(
     "--camera", "cameras", multiple=True, metavar="NAME", help="Use only this camera; repeatable."
 )

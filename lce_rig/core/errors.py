@@ -92,4 +92,5 @@ def reading(path: Path, kind: type[LceRigError], hint: str = "") -> Iterator[Non
 def join_shortages(errors: Sequence[NotEnoughDataError]) -> NotEnoughDataError:
     """Make one error of at least one: the first, with the others in its hint."""
     first, *others = errors
-    return NotEnoughDataError(first.what, "\n".join([first.hint, *map(str, others)]).strip())
+    hint = "\n".join([first.hint, *map(str, others)]).strip()
+    return NotEnoughDataError(first.what, hint, first.finding)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Literal, cast
+from typing import Literal, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -441,6 +441,30 @@ class SceneShare:
     change_sigma: Array
     surprise: float
     n_directions: int
+
+
+class Extrinsics(Protocol):
+    """What other evidence needs of extrinsics that boards gave, judged or not; fields as of `Calibration`."""
+
+    @property
+    def camera(self) -> str:
+        """Name of the camera."""
+
+    @property
+    def lidar(self) -> str:
+        """Name of the LiDAR."""
+
+    @property
+    def T_cam_lidar(self) -> Array:
+        """(4, 4)."""
+
+    @property
+    def cov(self) -> Array:
+        """(6, 6)."""
+
+    @property
+    def cov_shared(self) -> Array:
+        """(6, 6)."""
 
 
 @dataclass(frozen=True, eq=False)

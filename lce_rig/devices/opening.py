@@ -14,6 +14,7 @@ LIVE = {
     "v4l2": "lce_rig.devices.v4l2.driver:V4l2Source",
     "command": "lce_rig.devices.pipe.driver:ImagePipeSource",
     "davis": "lce_rig.devices.davis.driver:DavisSource",
+    "ros2": "lce_rig.devices.ros2.driver:Ros2Source",
     "sync_board": "lce_rig.devices.sync_board.driver:SyncBoard",
 }
 """Source by type of driver."""

@@ -4,9 +4,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from lce_rig.core.data_sheets import VLP_16, find_data_sheet
+from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.mount import Mount
@@ -17,11 +18,28 @@ from lce_rig.rig.sensors import (
     CameraSettings,
     LidarSettings,
 )
-from lce_rig.rig.settings import FrameName, Name, RigName, Settings, Text, problem
+from lce_rig.rig.settings import FrameName, Name, RigName, RobotName, Settings, Text, problem
 from lce_rig.rig.sync_settings import SyncSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
 _MOST_SENSORS = 64
+OutputFormat = Literal[
+    "extrinsics",
+    "urdf",
+    "camera_info",
+    "static_tf",
+    "ros2_launch",
+    "tf_static_bag",
+    "kalibr",
+    "autoware",
+    "fast_livo2",
+    "koide3",
+    "opencv",
+    "isaac",
+    "mcap",
+    "ply",
+    "ply_captures",
+]
 
 
 class Rig(Settings):
@@ -31,9 +49,11 @@ class Rig(Settings):
         format_version: version of this schema.
         name: name of the rig; a session belongs to one rig by name.
         description: one line for `lce-rig rigs`.
+        robot: name of the robot that carries this very rig; results name it.
         base_frame: a LiDAR's or camera's frame, root of the URDF; by default that of `mount`, or the first
             LiDAR's.
         mount: the pose of one sensor on the robot; the root is then a frame of the robot.
+        exports: formats that `calibrate` and `export` write; empty for the usual ones.
         lidars: settings by the LiDAR's name.
         cameras: settings by the camera's name.
         nominal_extrinsics: the CAD model's values, a sanity check only.
@@ -43,8 +63,10 @@ class Rig(Settings):
     format_version: Literal[1]
     name: RigName
     description: Text = ""
+    robot: RobotName | None = None
     base_frame: FrameName | None = None
     mount: Mount | None = None
+    exports: tuple[OutputFormat, ...] = ()
     board: BoardSettings
     lidars: Annotated[dict[Name, LidarSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
     cameras: Annotated[dict[Name, CameraSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
@@ -75,6 +97,27 @@ class Rig(Settings):
                 what = f"differs from mount.of, {self.mount.of}, which would give it two parents; remove it"
                 raise problem(what, "base_frame")
         return self
+
+    def of_robot(self, name: str | None) -> "Rig":
+        """Name the robot that carries this very rig; None leaves it as it is.
+
+        Raises:
+            UsageError: the profile names another one, or it cannot be a name.
+        """
+        if name is None or name == self.robot:
+            return self
+        if self.robot is not None:
+            raise UsageError(
+                f"this is a rig of robot {self.robot}, not of {name}",
+                f"Omit --robot {name}, or use that robot's profile or session.",
+            )
+        try:
+            TypeAdapter(RobotName).validate_python(name)
+        except ValidationError:
+            raise UsageError(
+                f"{name!r} cannot name a robot", "Use letters, digits, dots, dashes and underscores."
+            ) from None
+        return self.model_copy(update={"robot": name})
 
     @property
     def root_frame(self) -> str:

@@ -23,7 +23,7 @@ from lce_rig.rig.settings import (
     problem,
 )
 
-LIDAR_DRIVERS, CAMERA_DRIVERS = ("vlp16",), ("v4l2", "command", "davis")
+LIDAR_DRIVERS, CAMERA_DRIVERS = ("vlp16", "ros2"), ("v4l2", "command", "davis", "ros2")
 """Values of `driver.type`."""
 # Beyond this the figure is in millimetres, or the sensor is broken.
 RangeError = Annotated[float, Field(ge=0, le=0.2)]
@@ -133,6 +133,7 @@ class LidarSettings(Settings):
 
     Attributes:
         model: maker's name of the model, or "other".
+        serial: serial number of this very unit, if the device does not tell it.
         frame: frame of its points, x forward, y left, z up.
         topic: topic of its point clouds in bags.
         min_range_m: nearer returns are ignored.
@@ -147,6 +148,7 @@ class LidarSettings(Settings):
     """
 
     model: Text = VLP_16.name
+    serial: Text | None = None
     frame: FrameName = "lidar_link"
     topic: TopicName | None = None
     rate_hz: Rate = 10.0
@@ -269,12 +271,14 @@ class CameraSettings(Settings):
 
     Attributes:
         model: maker's name of the model.
+        serial: serial number of this very unit, if the device does not tell it.
         frame: the camera's body frame, x forward, y left, z up.
         optical_frame: frame of its optics, x right, y down, z forward.
         resolution_px: (width, height) of the images.
     """
 
     model: Text = ""
+    serial: Text | None = None
     frame: FrameName = "camera_link"
     optical_frame: FrameName = "camera_optical_frame"
     resolution_px: tuple[Annotated[int, Field(ge=16, le=65535)], Annotated[int, Field(ge=16, le=65535)]]

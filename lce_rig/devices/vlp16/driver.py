@@ -4,6 +4,7 @@ import select
 import threading
 import time
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -37,6 +38,7 @@ class Reception:
 
     Attributes:
         address: whose packets are taken; "" before the first.
+        serial: the sensor's serial number, by its web page; "" until that has answered.
         n_overflowed: datagrams that the kernel dropped because they were not taken in time.
         granted_bytes: receive buffer of a port.
         strangers: datagrams of other senders, by IP address; the first few.
@@ -44,6 +46,7 @@ class Reception:
     """
 
     address: str = ""
+    serial: str = ""
     n_overflowed: int = 0
     granted_bytes: int = 0
     strangers: Counter[str] = field(default_factory=Counter)
@@ -90,6 +93,7 @@ def to_status(
         problems=tuple(problems),
         figures=figures,
         device=f"{velodyne.PRODUCTS[velodyne.VLP16]} at {reception.address}" if reception.address else "",
+        serial=reception.serial,
         rates_hz={"scans": stream.rotor_hz} if stream.rotor_hz else {},
         n_packets=stream.n_data,
     )
@@ -259,6 +263,15 @@ class Vlp16Source(LiveSource):
             self._early = self.read()
             if not self._stream.n_data and time.monotonic() > until_s:
                 raise self.explain_silence(has_sent=False)
+        # Packets hold no serial number, and must not wait until a web page has answered.
+        threading.Thread(target=self._ask_serial, args=(self._reception,), daemon=True).start()
+
+    def _ask_serial(self, reception: Reception) -> None:
+        """Ask the web page once for the serial number; it is left empty where nothing answers."""
+        address = self._settings.driver.address or reception.address
+        if address:
+            with suppress(SourceError):
+                reception.serial = VelodyneWeb(address, self._web_port, _WEB_TIMEOUT_S).read_serial()
 
     def read(self) -> list[Scan]:
         """Take the packets that came, and give the scans that they complete.

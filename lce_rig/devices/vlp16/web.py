@@ -64,10 +64,12 @@ class VelodyneWeb:
 
     Attributes:
         url: its root.
+        port: of the server.
     """
 
     def __init__(self, address: str, port: int = 80, timeout_s: float = _TIMEOUT_S) -> None:
         self.url = f"http://{address}" + (f":{port}" if port != 80 else "")
+        self.port = port
         self._timeout_s = timeout_s
 
     def read(self) -> WebReport:
@@ -83,6 +85,14 @@ class VelodyneWeb:
         except SourceError:  # Not every firmware has them.
             diagnostics = {}
         return to_report(info, status, settings, diagnostics)
+
+    def read_serial(self) -> str:
+        """Read the serial number alone; "" where the page does not tell it.
+
+        Raises:
+            SourceError: nothing answers, or what answers is no Velodyne.
+        """
+        return _text(self._get("info"), "serial")
 
     def _get(self, page: str) -> dict[str, Any]:
         body = self._request(f"/cgi/{page}.json")
