@@ -37,8 +37,9 @@ def draw_in_image(evidence: Evidence, board: Board, lens: Intrinsics, links: Map
     """Draw the outline of every board into the plane of the image."""
     figure, axes = image_axes(lens)
     outlines = [outline_px(o.image.T_cam_board, board, lens) for o in evidence.observations]
+    alpha = float(np.clip(4 / len(outlines), 0.07, 0.3))
     visible = [outline[np.isfinite(outline).all(axis=1)][::6] for outline in outlines]
-    _add_shapes(axes, visible, [links[o.capture] for o in evidence.observations], 0.3)
+    _add_shapes(axes, visible, [links[o.capture] for o in evidence.observations], alpha)
     return drawing(figure, "Outlines of the boards in the image")
 
 

@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
-from lce_rig.core.results import MOTIONS, Calibration, CaptureResidual
+from lce_rig.core.results import Calibration, CaptureResidual
 from lce_rig.export.frames import T_BODY_OPTICAL
 from lce_rig.export.rotations import rpy
 from lce_rig.report.board_drawings import draw_from_above, draw_in_image, draw_ranges_and_angles
@@ -33,13 +33,14 @@ from lce_rig.report.uncertainty_drawings import (
 from lce_rig.report.worked_point import WorkedPoint, work_point
 from lce_rig.rig import Rig
 from lce_rig.words import describe, recommend, sentence
-from lce_rig.words.extrinsics import cause_words, motion_words, weakest_words
+from lce_rig.words.extrinsics import cause_words, weakest_words
 
 Overlays = Callable[[Calibration, str], Sequence[str]]
 """Gives the paths of a capture's overlays, from the folder of the page."""
 
 Row = Sequence[object]
 _STEP = 1e-6
+_AXES = {"x": "x right", "y": "y down", "z": "z forward"}
 _LENS_CODES = ("verdict.intrinsics", "verdict.known_better", "verdict.scale")
 
 
@@ -230,14 +231,20 @@ def _axis_rows(cov: Array, unit: str, kind: str) -> list[Row]:
 
 
 def _clock_rows(c: Calibration) -> list[Row]:
-    rows: list[Row] = []
-    for r in c.channel_results:
-        offset = "boards stood still"
-        if r.time_offset_s is not None and r.time_offset_sigma_s is not None:
-            offset = f"{1000 * r.time_offset_s:+.0f} +- {1000 * r.time_offset_sigma_s:.0f} ms"
-        scatter = [f"{1000 * m:.1f} mm" for m in (r.depth_scatter_m, r.depth_scatter_still_m)]
-        rows.append((r.channel, r.n_captures, f"{r.noise_px:.2f} px", offset, *scatter))
-    return rows
+    """List figures of the channels, a column each."""
+    offsets = [
+        "boards stood still"
+        if r.time_offset_s is None or r.time_offset_sigma_s is None
+        else f"{1000 * r.time_offset_s:+.0f} ± {1000 * r.time_offset_sigma_s:.0f} ms"
+        for r in c.channel_results
+    ]
+    return [
+        ("captures", *(r.n_captures for r in c.channel_results)),
+        ("corner noise", *(f"{r.noise_px:.2f} px" for r in c.channel_results)),
+        ("time offset", *offsets),
+        ("depth scatter", *(f"{1000 * r.depth_scatter_m:.1f} mm" for r in c.channel_results)),
+        ("  without compensation", *(f"{1000 * r.depth_scatter_still_m:.1f} mm" for r in c.channel_results)),
+    ]
 
 
 def _scene_rows(c: Calibration) -> list[Row]:
@@ -246,9 +253,10 @@ def _scene_rows(c: Calibration) -> list[Row]:
     for axis in () if c.scene is None else c.scene.axes:
         scale, digits, unit = (1.0, 2, "deg") if axis.unit == "deg" else (1000.0, 0, "mm")
         smallest = "none" if axis.smallest is None else f"{scale * axis.smallest:.{digits}f} {unit}"
-        change = f"{scale * axis.change:+.{digits}f} +- {scale * axis.sigma:.{digits}f} {unit}"
-        rows.append((motion_words(axis.axis), states[axis.state], change, smallest))
-    return sorted(rows, key=lambda row: [motion_words(m) for m in MOTIONS].index(str(row[0])))
+        change = f"{scale * axis.change:+.{digits}f} ± {scale * axis.sigma:.{digits}f} {unit}"
+        kind = "about" if axis.unit == "deg" else "along"
+        rows.append((f"{kind} {_AXES[axis.axis[-1]]}", states[axis.state], change, smallest))
+    return rows
 
 
 def _camera_rows(c: Calibration) -> list[Row]:

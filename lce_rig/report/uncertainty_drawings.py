@@ -1,6 +1,7 @@
 """The covariance of a result: its ellipsoids, its effect by distance, and its causes."""
 
 from collections.abc import Sequence
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from lce_rig.validation.reach import point_uncertainties
 from lce_rig.words.extrinsics import cause_words
 
 _DISTANCES_M = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0)
+# Causes of less than this, in percent, are in the table only.
+_LEAST_SHARE = 0.5
 _CIRCLE = np.stack([np.cos(np.linspace(0, 2 * np.pi, 73)), np.sin(np.linspace(0, 2 * np.pi, 73))])
 # From behind, from above, from the side: what a view shows to the right and vertically, axes of the camera.
 _VIEWS = ((0, 1), (0, 2), (2, 1))
@@ -76,14 +79,19 @@ def _draw_reach(axes: Any, centre: Sequence[float], corner: Sequence[float], tit
 
 def draw_causes(calibration: Calibration) -> Markup:
     """Draw what share of the variance each cause has, in rotation and in translation."""
-    causes = calibration.contributions
-    squares = np.array([[c.sigma_rotation_deg, c.sigma_translation_m] for c in causes]) ** 2
+    given = calibration.contributions
+    squares = np.array([[c.sigma_rotation_deg, c.sigma_translation_m] for c in given]) ** 2
     shares = 100 * squares / np.maximum(squares.sum(axis=0), 1e-30)
-    at = np.arange(len(causes))
-    figure, (axes,) = new_axes(0.75 + 0.34 * len(causes), left_in=2.0)
+    is_shown = shares.max(axis=1) >= _LEAST_SHARE
+    shares = shares[is_shown]
+    names = [
+        cause_words(c.source).removeprefix("the ") for c, shown in zip(given, is_shown, strict=True) if shown
+    ]
+    at = np.arange(len(names))
+    figure, (axes,) = new_axes(0.75 + 0.42 * len(names), left_in=2.0)
     axes.barh(at - 0.2, shares[:, 0], 0.38, color=BLUE, label="rotation")
     axes.barh(at + 0.2, shares[:, 1], 0.38, color=ORANGE, label="translation")
-    axes.set_yticks(at, [cause_words(each.source).removeprefix("the ") for each in causes], color=INK)
+    axes.set_yticks(at, [fill(name, 28) for name in names], color=INK)
     axes.tick_params(axis="y", length=0)
     axes.invert_yaxis()
     axes.set_xlabel("share of the variance, %")
