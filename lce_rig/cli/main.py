@@ -29,6 +29,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "intrinsics": ("lce_rig.cli.intrinsics", "Estimate the cameras' intrinsics from a session."),
     "lidar-intrinsics": ("lce_rig.cli.lidar_intrinsics", "Estimate a LiDAR's constant errors from sessions."),
     "verify": ("lce_rig.cli.verify", "Project the point clouds into the images and print residuals."),
+    "view": ("lce_rig.cli.view", "Show the coloured cloud and the cameras in 3D."),
     "drift": ("lce_rig.cli.drift", "Check without a board whether extrinsics still hold."),
     "results": ("lce_rig.cli.results", "List the results of a session with figures and verdicts."),
     "export": ("lce_rig.cli.export", "Write a result for other programs, or into a robot's URDF."),
