@@ -264,9 +264,7 @@ def _ring(
     return rank[ring_of_point].astype(np.int16)
 
 
-def _inferred(
-    points: NDArray[np.float32], where: str, cause: str, notes: list[str]
-) -> NDArray[np.int16]:
+def _inferred(points: NDArray[np.float32], where: str, cause: str, notes: list[str]) -> NDArray[np.int16]:
     """Number the rings by elevation, because of a cause; say both in the error where there are none."""
     try:
         ring = rings_from_elevation(points)
