@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
+from lce_rig.core.data_sheets import VLP_16, find_data_sheet
 from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.rig.board_settings import BoardSettings
@@ -14,7 +15,6 @@ from lce_rig.rig.nominal import NominalExtrinsic
 from lce_rig.rig.sensors import (
     CAMERA_DRIVERS,
     LIDAR_DRIVERS,
-    VLP16_MODELS,
     CameraSettings,
     LidarSettings,
 )
@@ -187,12 +187,12 @@ class Rig(Settings):
     def _unknown(self) -> Iterator[Finding]:
         """List drivers that do not exist, and models for which nothing but recordings works."""
         for name, lidar in self.lidars.items():
-            is_vlp16 = lidar.model.upper().startswith(VLP16_MODELS)
-            if not is_vlp16:
+            sheet = find_data_sheet(lidar.model)
+            if lidar.data_sheet() is None:
                 yield Finding(
                     "profile.unknown_model", "warning", f"lidars.{name}.model", {"value": lidar.model}
                 )
-            if lidar.driver.type == "vlp16" and not is_vlp16:
+            if lidar.driver.type == "vlp16" and sheet != VLP_16:
                 figures = {"value": lidar.driver.type, "model": lidar.model}
                 yield Finding("profile.other_driver", "warning", f"lidars.{name}.driver.type", figures)
             yield from _unknown_driver(f"lidars.{name}.driver.type", lidar.driver.type, LIDAR_DRIVERS)
