@@ -10,10 +10,11 @@ from lce_rig.fleet.changes import Sessions, references, rescaled
 from lce_rig.fleet.history import Change, History
 from lce_rig.fleet.siblings import Mounting
 from lce_rig.fleet.table import covariances, poses
-from lce_rig.report.drawing import BLUE, FAINT, ORANGE, QUIET, RED, drawing, new_figure, style
+from lce_rig.report.drawing import BLUE, FAINT, ORANGE, QUIET, RED, WIDTH_IN, drawing, new_axes, style
 from lce_rig.scene.alignment import AXES, IS_ROTATION
 from lce_rig.words.extrinsics import motion_words
 
+_HEIGHT_IN = 2.9
 _MOST_SESSIONS = 400
 
 
@@ -40,8 +41,11 @@ def in_time(history: History, table: Any, change: Change) -> Markup:
     cusum = _cusum(difference(T, np.broadcast_to(T[0], T.shape)), cov, history)[:, axis]
     days = _days([history.dates[int(k)].as_py() for k in shown])
     with style():
-        figure = new_figure(2.6)
-        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1))
+        figure, (upper,) = new_axes(_HEIGHT_IN, left_in=0.62, bottom_in=1.15, top_in=0.08)
+        left_in, width_in = 0.62, WIDTH_IN - 0.62 - 0.1
+        place = (left_in / WIDTH_IN, 0.25 / _HEIGHT_IN, width_in / WIDTH_IN, 0.8 / _HEIGHT_IN)
+        lower = figure.add_axes(place, sharex=upper)
+        upper.tick_params(labelbottom=False)
         upper.errorbar(days, values, 2 * sigma, fmt="o", ms=3, lw=0.8, color=BLUE, ecolor=FAINT)
         if change.found.kind == "odd":
             odd = at - shown[0]
@@ -92,8 +96,7 @@ def beside_siblings(mounting: Mounting) -> Markup:
     z = np.clip(mounting.z, -12, 12)
     rng = np.random.default_rng(0)
     with style():
-        figure = new_figure(2.4)
-        axes = figure.subplots()
+        figure, (axes,) = new_axes(2.4, left_in=0.6, top_in=0.08)
         for k in range(6):
             beyond = np.abs(mounting.z[:, k]) > mounting.limit
             height = k + 0.5 * (rng.random(len(z)) - 0.5)
