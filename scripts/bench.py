@@ -20,6 +20,7 @@
     scripts/bench.py scene_sharpen  boards and scene in one estimate: simulated rooms, recordings
     scripts/bench.py witness     the scene beside the boards: good results refused, wrong ones found
     scripts/bench.py growth      calibrate after detection as sessions grow: time and memory
+    scripts/bench.py fleet       500 sessions of 60 robots; lost workers, broken sessions, a million rows, S3
     scripts/bench.py speed       detection, Algorithm 1, the command line
 
 Simulated boards are kept, as long as neither simulator nor detectors change; random choices are seeded. Run
@@ -51,6 +52,7 @@ PARTS = {
     "scene_sharpen": 100,
     "witness": 20,
     "growth": 0,
+    "fleet": 0,
     "speed": 0,
 }
 
@@ -71,7 +73,7 @@ def main() -> None:
         "--output",
         type=Path,
         default=Path("build/paper"),
-        help="folder of `paper`, and of what `uncertainty` and `growth` keep",
+        help="folder of `paper`, and of what `uncertainty`, `growth` and `fleet` keep",
     )
     parser.add_argument(
         "--captures",
@@ -117,6 +119,8 @@ def main() -> None:
         bench(arguments.seeds or PARTS["witness"], arguments.only)
     elif arguments.part == "growth":
         bench(arguments.output)
+    elif arguments.part == "fleet":
+        bench(arguments.output, arguments.only)
     elif arguments.part == "corruptions":
         bench(arguments.only)
     elif arguments.part == "live":
