@@ -222,6 +222,7 @@ if TYPE_CHECKING:
 @robot_option
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export failed results too, marked NOT FOR USE.")
+@click.option("--no-report", is_flag=True, help="Do not write report.html.")
 @click.option(
     "--seed", default=0, show_default=True, type=click.IntRange(0), help="Set the seed of the random subsets."
 )
@@ -244,15 +245,16 @@ def calibrate(
     robot: str | None,
     as_json: bool,
     force: bool,
+    no_report: bool,
     method: Any,
     seed: int,
     n_draws: int,
 ) -> None:
     """Estimate the extrinsics between the LiDAR and each camera of SESSION (default: session/).
 
-    Writes SESSION/calibration/ in one step: result.json, extrinsics.yaml, URDF, camera_info and static
-    transforms. The earlier result moves to SESSION/calibration/previous/. A run without a result leaves it
-    unchanged.
+    Writes SESSION/calibration/ in one step: result.json, report.html (the result explained, with drawings),
+    extrinsics.yaml, URDF, camera_info and static transforms. The earlier result moves to
+    SESSION/calibration/previous/. A run without a result leaves it unchanged.
 
     Several SESSIONs of one rig whose sensors were not moved in between give one result from all captures. It
     goes into results/union/ of the first; nothing else changes. Each session is calibrated alone before, and
@@ -310,7 +312,7 @@ def calibrate(
             show.warn(str(not_enough(shortage)))
         if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
             show.warn(f"{reference} has no T_cam_lidar for these sensors")
-        written = result.write(name=name, force=force)
+        written = result.write(name=name, force=force, report=not no_report)
     if written.had_overlays:
         with show.progress_bar("drawing") as progress:
             lce.verify(first, result, detections[0], name=name, event_image=event_image).write(
@@ -324,7 +326,14 @@ def calibrate(
             show.print_lines(_lines(calibration))
         for calibration in result.pairs:
             show.print_lines(camera_lines(calibration, result.pairs))
-        show.note("written: " + ", ".join(f.name for f in written.files) + f" in {written.files[0].parent}")
+        folder = written.files[0].parent
+        names = ", ".join(str(file.relative_to(folder)) for file in written.files)
+        show.note(f"written: {names} in {folder}")
+    if written.report is not None:
+        show.note(f"report: {written.report}")
+    for finding in written.findings:
+        if finding.severity != "note":
+            show.warn(sentence(finding))
     _tell_earlier(written)
     seen = {pair.camera for own in detections for pair in own.pairs}
     _exit(result.pairs, wanted, seen, are_printed=not as_json)

@@ -327,9 +327,9 @@ def _solve_together(
     """
     solved = list(alone)
     for group in _groups(len(alone), links):
-        settings = alone[group[0]].sensors.settings
-        if settings.method == "ml":
-            own = {alone[k].sensors.camera: alone[k].estimate for k in group}
+        if alone[group[0]].sensors.settings.method == "ml":
+            own = {alone[k].camera: alone[k].estimate for k in group}
+            settings = {alone[k].camera: alone[k].sensors.settings for k in group}
             together = calibrate_together(own, rig.board.to_board(), settings)
             for k in group:
                 solved[k] = _part_of(together, rig, detections, alone[k])

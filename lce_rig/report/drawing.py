@@ -16,6 +16,8 @@ _VARIABLES = {
 WIDTH_IN = 4.4
 """Drawings of this width stay legible on a phone; a wide screen shows several side by side."""
 _FONT_PT = 8.5
+# Ticks are what takes time.
+_MOST_TICKS = 5
 _PAGE_HAS = [
     (re.compile(pattern, re.DOTALL), replacement)
     for pattern, replacement in (
@@ -38,30 +40,61 @@ _STYLE: Any = {
     "axes.labelcolor": QUIET,
     "axes.titlelocation": "left",
     "axes.titlecolor": INK,
+    # Else Matplotlib measures all texts to place a title above them.
+    "axes.titley": 1.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "xtick.color": QUIET,
     "ytick.color": QUIET,
+    "xtick.major.size": 0,
+    "ytick.major.size": 0,
     "text.color": INK,
     "grid.color": FAINT,
     "grid.linewidth": 0.5,
     "legend.frameon": False,
-    "figure.constrained_layout.use": True,
 }
 
 
-def style() -> Any:
-    """Give the context in which figures of a page are made and drawn."""
+def style(part: str = "") -> Any:
+    """Give the context in which figures of a part of a page are made and drawn."""
     from matplotlib import rc_context
 
-    return rc_context(_STYLE)
+    return rc_context(_STYLE | {"svg.hashsalt": part})
 
 
-def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Any:
-    """Start a Matplotlib figure for `drawing`; call it within `style`."""
+def new_axes(
+    height_in: float,
+    n_columns: int = 1,
+    *,
+    left_in: float = 0.42,
+    right_in: float = 0.1,
+    bottom_in: float = 0.42,
+    top_in: float = 0.25,
+    between_in: float = 0.45,
+) -> tuple[Any, list[Any]]:
+    """Start a Matplotlib figure for `drawing` with axes side by side; call it within `style`.
+
+    Margins are given, as measuring all texts to find them takes longer than the drawing.
+    """
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width_in, height_in))
+    figure: Any = Figure(figsize=(WIDTH_IN, height_in))
+    width_in = (WIDTH_IN - left_in - right_in - (n_columns - 1) * between_in) / n_columns
+    row = figure.subplots(
+        1,
+        n_columns,
+        squeeze=False,
+        gridspec_kw={
+            "left": left_in / WIDTH_IN,
+            "right": 1 - right_in / WIDTH_IN,
+            "bottom": bottom_in / height_in,
+            "top": 1 - top_in / height_in,
+            "wspace": between_in / width_in,
+        },
+    )[0]
+    for axes in row:
+        axes.locator_params(nbins=_MOST_TICKS)
+    return figure, list(row)
 
 
 def drawing(figure: Any, label: str) -> Markup:
@@ -71,9 +104,9 @@ def drawing(figure: Any, label: str) -> Markup:
 
     Args:
         figure: of Matplotlib, in the colours of this module; call it within `style`.
-        label: what it shows, for readers who do not see it; of one page, each has another.
+        label: what it shows, for readers who do not see it; of one part of a page, each has another.
     """
-    from matplotlib import rc_context
+    from matplotlib import rc_context, rcParams
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     figure.patch.set_alpha(0.0)
@@ -81,7 +114,7 @@ def drawing(figure: Any, label: str) -> Markup:
         axes.patch.set_alpha(0.0)
     written = StringIO()
     # Names of clipping paths are hashes of their content; equal ones of two drawings must not be mixed up.
-    with rc_context({"svg.hashsalt": label}):
+    with rc_context({"svg.hashsalt": f"{rcParams['svg.hashsalt']} {label}"}):
         canvas: Any = FigureCanvasSVG(figure)
         canvas.print_svg(written, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     return _as_part_of_a_page(written.getvalue(), label)

@@ -4,21 +4,31 @@
 forbids requests; `templates/parts.html` holds tables, drawings and badges.
 """
 
+import re
 from functools import cache
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
 
 
 @cache
 def environment() -> Environment:
     """Give the templates: everything that is put into them is escaped, and nothing may be missing."""
-    return Environment(
+    made = Environment(
         loader=PackageLoader("lce_rig.report"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    made.filters["words"] = as_markup
+    return made
+
+
+def as_markup(text: str) -> Markup:
+    """Set words of findings for a page: commands between backquotes as code, +- as one sign."""
+    escaped = str(escape(text)).replace("+-", "±")
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", escaped).replace("\n", "<br>"))
 
 
 def render(template: str, **values: object) -> str:
@@ -26,6 +36,7 @@ def render(template: str, **values: object) -> str:
 
     Args:
         template: file of `templates/`; it extends frame.html.
-        values: what the template names. Text is escaped; `drawing` returns markup, which is not.
+        values: what the template names. Text is escaped; `drawing` returns markup, which is not;
+            the filter `words` sets what `words/` writes.
     """
     return environment().get_template(template).render(**values) + "\n"

@@ -8,11 +8,14 @@ from numpy.typing import NDArray
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
+from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array
-from lce_rig.simulate.lidar import VLP16, LidarModel
+from lce_rig.simulate.lidar import LidarModel
 
 #: A revolution of whole blocks, 10.0025 Hz: scans follow each other without a gap, as a real rotor's do.
-STREAMED_VLP16 = replace(VLP16, name="vlp16 of whole blocks", period_ns=904 * velodyne.BLOCK_NS)
+STREAMED_VLP16 = replace(
+    LidarModel.of(VLP_16, 10.0), name="VLP-16 of whole blocks", period_ns=904 * velodyne.BLOCK_NS
+)
 # Between one packet in five and one in fourteen is a position packet, depending on the firmware.
 _DATA_PER_POSITION = 14
 # A GPS sends its sentence for a pulse a while after that pulse.

@@ -2,13 +2,12 @@
 
 import re
 
-from lce_rig.report.drawing import BLUE, drawing, new_figure, style
+from lce_rig.report.drawing import BLUE, drawing, new_axes, style
 
 
 def _bars(label: str = "bars"):
     with style():
-        figure = new_figure(2.0)
-        axes = figure.subplots()
+        figure, (axes,) = new_axes(2.0)
         axes.set_title("<errors> & more")
         for bar in axes.bar([1, 2], [3, 4], color=BLUE):
             bar.set_url("#first")

@@ -91,7 +91,7 @@ class Priors:
         vertical_m: its height, per rad of elevation.
         azimuth_rad, elevation_rad: of each laser, about their means, which are part of the extrinsics.
         known: the LiDAR's errors as measured before: lasers and lens have this mean and these deviations.
-        scale: relative error of the camera's distances, from squares or focal length.
+        scale: relative error of each camera's distances, from squares or focal length; one figure for all.
         scale_is_claimed: whether the covariance contains that error. It must not where the effects of focal
             length and squares are added to it (`tolerances`).
     """
@@ -107,7 +107,7 @@ class Priors:
     azimuth_rad: float = 4e-4
     elevation_rad: float = 2e-4
     known: KnownLidar | None = None
-    scale: float = 0.001
+    scale: float | tuple[float, ...] = 0.001
     scale_is_claimed: bool = True
 
     @property
