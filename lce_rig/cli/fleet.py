@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange, json_option, split_names
+from lce_rig.cli.fleet_report import report
+from lce_rig.cli.options import FiniteRange, json_option, registry_option, split_names
 
 if TYPE_CHECKING:
     from lce_rig.fleet.run import FleetRun
@@ -39,12 +40,7 @@ def fleet() -> None:
     """
 
 
-registry_option = click.option(
-    "--registry",
-    required=True,
-    metavar="DIR",
-    help="Set the folder of results: a path, or an address such as s3://bucket/registry.",
-)
+fleet.add_command(report)
 
 
 @fleet.command()

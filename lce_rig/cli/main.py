@@ -33,6 +33,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "drift": ("lce_rig.cli.drift", "Check without a board whether extrinsics still hold."),
     "results": ("lce_rig.cli.results", "List the results of a session with figures and verdicts."),
     "export": ("lce_rig.cli.export", "Write a result for other programs, or into a robot's URDF."),
+    "deploy": ("lce_rig.cli.deploy", "Put a result on a robot, ask what is there, or go back."),
     "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of sessions, or the results of one."),
     "fleet": ("lce_rig.cli.fleet", "Calibrate the sessions of many robots; keep and query results."),
 }
@@ -41,7 +42,8 @@ EXIT_BUG = 70
 EPILOG = """\b
 Exit codes: 0 done · 1 other error · 2 usage · 3 rig profile · 4 session ·
 5 recording, sensor or missing dependency · 6 not enough data ·
-7 result refused · 70 bug in lce-rig · 130 interrupted
+7 result refused · 8 target not reached or written, earlier files in place ·
+9 command after a deployment failed, new files in place · 70 bug in lce-rig · 130 interrupted
 """
 
 

@@ -68,6 +68,9 @@ class Row:
         refusals: code of each refused capture.
         mpe_m, mee_m, reprojection_px: residuals, see docs/conventions.md.
         laser_range_m, laser_range_sigma_m: range offset of each laser and its standard deviation.
+        lens_error, lens_error_sigma: errors of the profile's intrinsics as the session's boards see them,
+            given less seen: focal length (relative), principal point x and y (px), distortion (px in the
+            image's corner); standard deviations.
         time_offset_s: mean over the camera's channels.
         camera_scale: of the camera's distances.
         scene: opinion of the scene: "agrees", "contradicts" or "unknown".
@@ -115,6 +118,8 @@ class Row:
     reprojection_px: float | None = None
     laser_range_m: tuple[float, ...] | None = None
     laser_range_sigma_m: tuple[float, ...] | None = None
+    lens_error: tuple[float, ...] | None = None
+    lens_error_sigma: tuple[float, ...] | None = None
     time_offset_s: float | None = None
     camera_scale: float | None = None
     scene: str | None = None

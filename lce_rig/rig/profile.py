@@ -20,9 +20,10 @@ from lce_rig.rig.sensors import (
 )
 from lce_rig.rig.settings import FrameName, Name, RigName, RobotName, Settings, Text, problem
 from lce_rig.rig.sync_settings import SyncSettings
+from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
-_MOST_SENSORS = 64
+_MOST_SENSORS, _MOST_TARGETS = 64, 256
 OutputFormat = Literal[
     "extrinsics",
     "urdf",
@@ -57,6 +58,7 @@ class Rig(Settings):
         lidars: settings by the LiDAR's name.
         cameras: settings by the camera's name.
         nominal_extrinsics: the CAD model's values, a sanity check only.
+        targets: where `lce-rig deploy` writes results, by name.
         sync: the board that makes the pulse per second and triggers cameras; None without one.
     """
 
@@ -72,6 +74,9 @@ class Rig(Settings):
     cameras: Annotated[dict[Name, CameraSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
     nominal_extrinsics: tuple[NominalExtrinsic, ...] = ()
     sync: SyncSettings | None = None
+    targets: Annotated[dict[RobotName, TargetSettings], Field(max_length=_MOST_TARGETS)] = Field(
+        default_factory=dict
+    )
     quality: QualitySettings = QualitySettings()
     calibration: CalibrationSettings = CalibrationSettings()
     verdict: VerdictSettings = VerdictSettings()
@@ -163,7 +168,8 @@ class Rig(Settings):
     def located(self, folder: Path) -> "Rig":
         """Make the paths in a profile absolute; relative ones start at the folder its file lies in."""
         cameras = {name: camera.located(folder) for name, camera in self.cameras.items()}
-        return self.model_copy(update={"cameras": cameras})
+        targets = {name: target.located(folder) for name, target in self.targets.items()}
+        return self.model_copy(update={"cameras": cameras, "targets": targets})
 
     def warnings(self) -> tuple[Finding, ...]:
         """List valid but probably unintended settings; the subject is the key."""

@@ -15,7 +15,7 @@ from lce_rig.rig import Rig, dump_rig
 
 FORMAT_VERSION = 1
 _MAY_DIFFER = re.compile(
-    r"description|nominal_extrinsics|(lidars|cameras)\.[^.]+\.driver(\..*)?|sync\.(device|baud)"
+    r"description|nominal_extrinsics|exports|targets\..*|(lidars|cameras)\.[^.]+\.driver(\..*)?|sync\.(device|baud)"
 ).fullmatch
 # Known later than the first capture, perhaps; another one is another rig.
 _IS_IDENTITY = re.compile(r"robot|(lidars|cameras)\.[^.]+\.serial").fullmatch
@@ -80,7 +80,7 @@ class DifferingKey:
 def differing_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
     """List the keys in which two profiles differ, with both values.
 
-    The description, the nominal extrinsics and the addresses of attached sensors (such as /dev/video2) may
+    The description, the nominal extrinsics, targets of `deploy` and the addresses of attached sensors may
     differ, as no capture depends on them. The robot and serial numbers may be absent in either.
     """
     a, b = (_flatten(yaml.safe_load(dump_rig(rig))) for rig in (theirs, ours))

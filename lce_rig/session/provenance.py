@@ -116,7 +116,9 @@ def content_sha256(sessions: Iterable[Session]) -> str:
 
 def _profile(rig: Rig) -> dict[str, Any]:
     """List what a result depends on in a profile; a network is known by its content."""
-    profile = rig.model_dump(mode="json", exclude_defaults=True, exclude={"description", "robot"})
+    profile = rig.model_dump(
+        mode="json", exclude_defaults=True, exclude={"description", "robot", "targets", "exports"}
+    )
     for kind in ("lidars", "cameras"):
         for sensor in profile[kind].values():
             sensor.pop("driver", None)

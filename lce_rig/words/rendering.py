@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 FAMILIES = (
     *("detection", "drivers", "doctor", "exports", "extrinsics", "guidance", "recordings", "scene_drift"),
-    "fleet",
+    *("fleet", "deployment"),
 )
 """Modules of this package with a table PHRASES of their own."""
 
