@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Draw the pictures of docs/images/ that show a rig, with lce-rig itself, on simulated rigs.
 
-draw_figures.py [NAME...]   only these; the report and the two screens need Chromium and `pip install '.[docs]'`
+draw_figures.py [NAME...]   only these; report and screens need Chromium and `pip install '.[docs]'`
 """
 
 import sys
