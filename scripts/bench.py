@@ -22,6 +22,7 @@
     scripts/bench.py outputs     every output read by other programs: where they draw the same points
     scripts/bench.py lidars      other LiDARs, simulated: boards found, errors, time of a scan's search
     scripts/bench.py growth      calibrate after detection as sessions grow: time and memory
+    scripts/bench.py fleet       500 sessions of 60 robots; lost workers, broken sessions, a million rows, S3
     scripts/bench.py speed       detection, Algorithm 1, the command line
 
 Simulated boards are kept, as long as neither simulator nor detectors change; random choices are seeded. Run
@@ -55,6 +56,7 @@ PARTS = {
     "outputs": 0,
     "lidars": 0,
     "growth": 0,
+    "fleet": 0,
     "speed": 0,
 }
 
@@ -75,7 +77,7 @@ def main() -> None:
         "--output",
         type=Path,
         default=Path("build/paper"),
-        help="folder of `paper`, and of what `uncertainty`, `lidars` and `growth` keep",
+        help="folder of `paper`, and of what `uncertainty`, `lidars`, `growth` and `fleet` keep",
     )
     parser.add_argument(
         "--captures",
@@ -123,6 +125,8 @@ def main() -> None:
         bench(arguments.captures or 20, arguments.output, arguments.only)
     elif arguments.part == "growth":
         bench(arguments.output)
+    elif arguments.part == "fleet":
+        bench(arguments.output, arguments.only)
     elif arguments.part == "corruptions":
         bench(arguments.only)
     elif arguments.part == "live":

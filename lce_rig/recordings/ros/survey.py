@@ -19,7 +19,7 @@ from lce_rig.recordings.ros.rosbag import (
     deserialize,
 )
 from lce_rig.recordings.ros.storage import RawMessage
-from lce_rig.recordings.ros.topics import CLOUD_TYPES, IMAGE_TYPES
+from lce_rig.recordings.ros.topics import CLOUD_TYPES, IMAGE_TYPES, PACKET_TYPES
 
 _INFO = "sensor_msgs/CameraInfo"
 # Drivers start within this many messages of each other.
@@ -73,6 +73,8 @@ def survey_bag(path: Path) -> list[SensorTopic]:
     kinds = {topic: _kind(msgtype) for topic, (msgtype, n) in bag.topics.items() if n > 0}
     wanted = {topic for topic, kind in kinds.items() if kind is not None}
     wanted = {topic for topic in wanted if topic.removesuffix("/compressed") not in wanted - {topic}}
+    if any(bag.topics[topic][0] in CLOUD_TYPES for topic in wanted):
+        wanted = {topic for topic in wanted if bag.topics[topic][0] not in PACKET_TYPES}
     infos = {topic for topic, (msgtype, n) in bag.topics.items() if msgtype == _INFO and n > 0}
     first = _first_messages(bag, wanted | infos)
     found = []
@@ -91,7 +93,7 @@ def survey_bag(path: Path) -> list[SensorTopic]:
 
 
 def _kind(msgtype: str) -> Literal["scans", "frames", "events"] | None:
-    if msgtype in CLOUD_TYPES:
+    if msgtype in CLOUD_TYPES | PACKET_TYPES:
         return "scans"
     if msgtype in IMAGE_TYPES:
         return "frames"
@@ -131,7 +133,7 @@ def _probe(found: SensorTopic, message: RawMessage) -> SensorTopic | None:
             is_compressed = message.msgtype.endswith("CompressedImage")
             pixels = decode_ros_compressed_image(content) if is_compressed else decode_ros_image(content)
             return replace(found, size_px=(pixels.shape[1], pixels.shape[0]))
-        return replace(found, n_rings=_count_rings(content))
+        return found if message.msgtype in PACKET_TYPES else replace(found, n_rings=_count_rings(content))
     except (SourceError, ValueError):
         return None
 
