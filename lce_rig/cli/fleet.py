@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange, json_option, split_names
+from lce_rig.cli.fleet_report import report
+from lce_rig.cli.options import FiniteRange, json_option, registry_option, split_names
 
 if TYPE_CHECKING:
     from lce_rig.fleet.run import FleetRun
@@ -39,12 +40,7 @@ def fleet() -> None:
     """
 
 
-registry_option = click.option(
-    "--registry",
-    required=True,
-    metavar="DIR",
-    help="Set the folder of results: a path, or an address such as s3://bucket/registry.",
-)
+fleet.add_command(report)
 
 
 @fleet.command()
@@ -86,6 +82,13 @@ registry_option = click.option(
     show_default=True,
     help="Estimate as `lce-rig calibrate` does with this method.",
 )
+@click.option(
+    "--pictures",
+    type=click.Choice(["all", "sheets", "none"]),
+    default="sheets",
+    show_default=True,
+    help="Keep the overlays of all captures, their contact sheets only, or draw none.",
+)
 @click.option("--retry", is_flag=True, help="Run sessions without a result again.")
 @json_option
 def run(
@@ -97,6 +100,7 @@ def run(
     time_limit: float,
     memory_limit: float,
     method: Any,
+    pictures: Any,
     retry: bool,
     as_json: bool,
 ) -> None:
@@ -115,7 +119,7 @@ def run(
 
     place = Storage.at(registry)
     jobs = find_jobs(Storage.at(root), None if manifest is None else Storage.at(manifest))
-    settings = Settings(place.url, method, time_limit, memory_limit, retry)
+    settings = Settings(place.url, method, time_limit, memory_limit, retry, pictures)
     n_workers = workers or len(os.sched_getaffinity(0))
     show.note(f"{show.counted(len(jobs), 'session')} in {root}")
     with patience(_GRACE_S), cluster(n_workers, memory_limit, scheduler) as client:

@@ -66,3 +66,10 @@ event_image_option = click.option(
     help="Reconstruct images from events with the network, or as sums of polarities (map) "
     "[default: the profile's, else network].",
 )
+
+registry_option = click.option(
+    "--registry",
+    required=True,
+    metavar="DIR",
+    help="Set the folder of results: a path, or an address such as s3://bucket/registry.",
+)

@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import Any
 
-from lce_rig.core.data_sheets import VLP_16, find_data_sheet
+from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.reading import LiveSource
 from lce_rig.rig import DriverSettings, Rig
@@ -78,7 +78,7 @@ def edge_cameras(rig: Rig) -> list[str]:
 
 
 def _by_model(model: str) -> str | None:
-    if find_data_sheet(model) == VLP_16:
+    if velodyne.product_of(model) is not None:
         return "vlp16"
     return "davis" if model.upper().startswith("DAVIS") else None
 

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, difference, perturb, tangent_sizes
 from lce_rig.fleet.changes import (
     Found,
@@ -76,6 +77,26 @@ class Change:
     def sizes(self) -> tuple[float, float]:
         """Rotation deg and translation m."""
         return tangent_sizes(np.array(self.found.tangent))
+
+
+def finding_of(change: Change) -> Finding:
+    """State a change as a fact."""
+    found = change.found
+    code = {"drift": "fleet.drifts", "odd": "fleet.odd_session"}.get(found.kind, "fleet.moved")
+    if found.kind == "step" and not change.is_confirmed:
+        code = "fleet.moved_last"
+    figures: dict[str, Figure] = {
+        "camera": change.camera,
+        "lidar": change.lidar,
+        "sensor": change.sensor,
+        "before": change.before,
+        "after": change.after,
+        "axes": tuple(axis.axis for axis in found.axes),
+        "changes": tuple(axis.change for axis in found.axes),
+        "sigmas": tuple(axis.sigma for axis in found.axes),
+        "chi2": found.chi2,
+    }
+    return Finding(code, "note", change.robot, figures)
 
 
 @dataclass(frozen=True, eq=False)

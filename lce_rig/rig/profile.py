@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from lce_rig.core.data_sheets import VLP_16, find_data_sheet
+from lce_rig.core import velodyne
 from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.rig.board_settings import BoardSettings
@@ -193,12 +193,11 @@ class Rig(Settings):
     def _unknown(self) -> Iterator[Finding]:
         """List drivers that do not exist, and models for which nothing but recordings works."""
         for name, lidar in self.lidars.items():
-            sheet = find_data_sheet(lidar.model)
             if lidar.data_sheet() is None:
                 yield Finding(
                     "profile.unknown_model", "warning", f"lidars.{name}.model", {"value": lidar.model}
                 )
-            if lidar.driver.type == "vlp16" and sheet != VLP_16:
+            if lidar.driver.type == "vlp16" and velodyne.product_of(lidar.model) is None:
                 figures = {"value": lidar.driver.type, "model": lidar.model}
                 yield Finding("profile.other_driver", "warning", f"lidars.{name}.driver.type", figures)
             yield from _unknown_driver(f"lidars.{name}.driver.type", lidar.driver.type, LIDAR_DRIVERS)

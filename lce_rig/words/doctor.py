@@ -294,7 +294,7 @@ _PROFILE: Mapping[str, Phrase] = {
         "`lce-rig rigs new --lidar other --from RECORDING`",
     ),
     "profile.other_driver": Phrase(
-        "{subject}: {value} reads a VLP-16, and the model is {model}",
+        "{subject}: {value} reads Velodynes, and the model is {model}",
         "remove the driver block, or correct the model",
     ),
     "profile.unknown_driver": Phrase("{subject}: there is no driver {value}", "choose one of: {known}"),

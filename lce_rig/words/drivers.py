@@ -325,7 +325,10 @@ _PULSES: Mapping[str, Phrase] = {
     ),
 }
 _SETTINGS: Mapping[str, Phrase] = {
-    "settings.other_model": Phrase("the LiDAR is a {model}, not a VLP-16: its packets are not read"),
+    "settings.other_model": Phrase(
+        "the LiDAR is a {model}, the profile says {expected}: its packets are not read",
+        "correct the model in the profile",
+    ),
     "settings.motor_off": Phrase("the motor is off", "switch it on (rpm 600)"),
     "settings.laser_off": Phrase("the laser is off", "switch it on"),
     "settings.rotor_rate": Phrase(

@@ -159,7 +159,7 @@ class Vlp16Packets:
     def _pop(self) -> list[SensorPacket]:
         """Take one data packet, and the position packet that follows it now and then."""
         start_ns = int(self._starts_ns[0])
-        sent_ns = start_ns + velodyne.packet_ns(self._is_dual)
+        sent_ns = start_ns + velodyne.READ[0].packet_ns(self._is_dual)
         data = np.zeros((), velodyne.DATA_PACKET)
         data["blocks"], data["us"] = self._blocks[: velodyne.N_BLOCKS], self._count_us(start_ns)
         data["mode"], data["product"] = self._mode, velodyne.VLP16

@@ -92,7 +92,7 @@ def to_status(
         clock=ClockState(state, stream.clock.is_utc, None if ahead_ns is None else ahead_ns * 1e-9),
         problems=tuple(problems),
         figures=figures,
-        device=f"{velodyne.PRODUCTS[velodyne.VLP16]} at {reception.address}" if reception.address else "",
+        device=f"{stream.product.name} at {reception.address}" if reception.address else "",
         serial=reception.serial,
         rates_hz={"scans": stream.rotor_hz} if stream.rotor_hz else {},
         n_packets=stream.n_data,
@@ -110,7 +110,7 @@ def _find_problems(settings: LidarSettings, stream: Vlp16Stream, reception: Rece
     if reception.n_overflowed:
         overflow = {"n": reception.n_overflowed, "buffer_kib": buffer_kib}
         problems.append(Finding("stream.computer_too_slow", "warning", figures=overflow))
-    packets_per_s = 1e9 / velodyne.packet_ns(stream.mode == velodyne.DUAL)
+    packets_per_s = 1e9 / stream.product.packet_ns(stream.mode == velodyne.DUAL)
     buffer_s = reception.granted_bytes / PACKET_COST_BYTES / packets_per_s
     if 0 < buffer_s < _MIN_BUFFER_S:
         figures = {"buffer_s": buffer_s, "buffer_kib": buffer_kib}
@@ -149,9 +149,10 @@ def explain_silence(
     what = f"{sensor}: {none}data packets{whose} on UDP port {port} {began} (for {silence_s:g} s)"
     others = stream.other_models.most_common(1)
     if others:
+        wanted = stream.product.name
         return SourceError(
-            f"{sensor}: the packets on UDP port {port} come from a {others[0][0]}, not a VLP-16",
-            "Only the VLP-16 (Puck, Puck LITE) is read: check driver.address.",
+            f"{sensor}: the packets on UDP port {port} come from a {others[0][0]}, not a {wanted}",
+            f"Set the model of {sensor!r} in the profile, or check driver.address.",
         )
     flaws = stream.flaws()
     if flaws:

@@ -150,8 +150,11 @@ def to_report(
 def find_problems(report: WebReport, settings: LidarSettings) -> list[Finding]:
     """Find what on the web page keeps the profile's scans from coming."""
     problems = []
-    if report.model and velodyne.PRODUCTS[velodyne.VLP16] not in report.model.upper().replace(" ", "-"):
-        problems.append(Finding("settings.other_model", "warning", figures={"model": report.model}))
+    product = velodyne.product_of(settings.model)
+    reported = velodyne.product_of(report.model.replace(" ", "-")) or velodyne.product_of(report.model)
+    if report.model and reported != product:
+        models = {"model": report.model, "expected": settings.model}
+        problems.append(Finding("settings.other_model", "warning", figures=models))
     if report.is_motor_on is False:
         problems.append(Finding("settings.motor_off", "warning"))
     if report.is_laser_on is False:

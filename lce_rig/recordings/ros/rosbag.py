@@ -25,7 +25,9 @@ from lce_rig.recordings.ros.bag_file import BagFile, list_topics
 from lce_rig.recordings.ros.event_messages import BagEvents
 from lce_rig.recordings.ros.message_fields import MessageReader, read_header, typestore
 from lce_rig.recordings.ros.storage import RawMessage
-from lce_rig.recordings.ros.topics import CLOUD_TYPES, Target, choose_topics
+from lce_rig.recordings.ros.topics import CLOUD_TYPES, PACKET_TYPES, Target, choose_topics
+from lce_rig.recordings.velodyne.points import OFFSETS_NOTE
+from lce_rig.recordings.velodyne.stream import Vlp16Stream
 from lce_rig.rig import CameraSettings, LidarSettings, Rig
 
 # sensor_msgs/Image and CompressedImage as grey or BGR images.
@@ -201,6 +203,7 @@ class TopicDecoder:
         n_yielded: samples so far.
         losses: what was skipped.
         notes: what was assumed, in words.
+        hint: what to do about the last message that could not be decoded.
     """
 
     def __init__(self, target: Target, settings: CameraSettings | LidarSettings) -> None:
@@ -209,11 +212,17 @@ class TopicDecoder:
         self.notes: set[str] = set()
         self._target, self._settings = target, settings
         self._last_ns: int | None = None
+        self._packets: Vlp16Stream | None = None
+        self._waiting: list[Scan] = []
+        self.hint = ""
 
     def decode(self, message: RawMessage) -> Image | Scan | None:
         """Decode one message; None, and counted, where it is damaged, sent twice or late."""
         try:
             content = deserialize(message)
+            if message.msgtype in PACKET_TYPES:
+                self._take_packets(content)
+                return self._oldest()
             stamp_ns = _header_stamp_ns(content)
             if stamp_ns == 0:
                 self.notes.add("headers have no timestamps; the time of receipt is used")
@@ -221,12 +230,48 @@ class TopicDecoder:
             sample = self._to_sample(message, content, stamp_ns)
         except (SourceError, ValueError) as error:
             cause = error.what if isinstance(error, SourceError) else str(error)
+            self.hint = (error.hint or "") if isinstance(error, SourceError) else ""
             self.losses.add(damage("recording.not_decoded", cause))
             return None
         if not self._is_in_order(sample.stamp_ns):
             return None
         self.n_yielded += 1
         return sample
+
+    def finish(self) -> Iterator[Scan]:
+        """Yield the scans that wait: a revolution of packets may end with the recording."""
+        last = self._packets.finish() if self._packets else None
+        self._waiting += [] if last is None else [last]
+        while (scan := self._oldest()) is not None:
+            yield scan
+
+    def account(self) -> list[str]:
+        """Say what was assumed and skipped, in words."""
+        lines = sorted(self.notes) + worded(self.losses)
+        return lines if self._packets is None else lines + self._packets.account()
+
+    def _take_packets(self, content: Any) -> None:
+        """Assemble the packets of a message; a scan ends where the rotor passes the cut, not the message."""
+        assert isinstance(self._settings, LidarSettings)  # as packets have no camera
+        if self._packets is None:
+            self._packets = Vlp16Stream(self._target.sensor, self._settings)
+            self.notes |= {OFFSETS_NOTE, "scans are assembled from packets"}
+        for packet in content.packets:
+            host_ns = int(packet.stamp.sec * 10**9 + packet.stamp.nanosec)
+            scan = self._packets.push_data(np.asarray(packet.data).tobytes(), host_ns)
+            self._waiting += [] if scan is None else [scan]
+        others = self._packets.other_models.most_common(1)
+        if others and not self._packets.n_data:
+            what = f"its packets are of a {others[0][0]}, not of a {self._packets.product.name}"
+            raise SourceError(what, f"Set the model of {self._target.sensor!r} in the profile.")
+
+    def _oldest(self) -> Scan | None:
+        while self._waiting:
+            scan = self._waiting.pop(0)
+            if self._is_in_order(scan.stamp_ns):
+                self.n_yielded += 1
+                return scan
+        return None
 
     def _to_sample(self, message: RawMessage, content: Any, stamp_ns: int) -> Image | Scan:
         sensor, channel = self._target.sensor, self._target.channel
@@ -325,6 +370,8 @@ class BagRecording:
                 sample = decoders[message.topic].decode(message)
                 if sample is not None:
                     yield sample
+            for decoder in decoders.values():
+                yield from decoder.finish()
         finally:
             self._summarise(decoders)
         for topic, decoder in decoders.items():
@@ -332,7 +379,7 @@ class BagRecording:
             if decoder.n_yielded == 0 and found:
                 failed = found.get("recording.not_decoded")
                 cause = failed.figures["where"] if failed else "its timestamps do not increase"
-                raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}")
+                raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}", decoder.hint)
 
     def _settings(self, target: Target) -> CameraSettings | LidarSettings:
         is_lidar = target.channel is None
@@ -390,8 +437,7 @@ class BagRecording:
 
     def _summarise(self, decoders: dict[str, TopicDecoder]) -> None:
         for topic, decoder in decoders.items():
-            lines = sorted(decoder.notes) + worded(decoder.losses)
-            self.notes += [f"{topic}: {line}" for line in lines]
+            self.notes += [f"{topic}: {line}" for line in decoder.account()]
 
 
 def _header_stamp_ns(content: Any) -> int:

@@ -1,0 +1,60 @@
+"""Every output read by a program that is not ours, by the format's own conventions."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.outputs import MODELS, READERS, Case, off_px, outputs_case
+
+from lce_rig.core.geometry import Array, perturb
+from lce_rig.export import EXPORTS, is_export, remove_exports, usual_formats
+from lce_rig.rig import load_rig
+from lce_rig.rig.profile import OutputFormat
+
+
+@pytest.fixture(scope="module", params=MODELS)
+def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Case:
+    return outputs_case("rlfs", tmp_path_factory.mktemp("outputs"), model=request.param)
+
+
+@pytest.mark.parametrize(("read_by", "reader"), READERS.items(), ids=[" by ".join(key) for key in READERS])
+def test_another_program_draws_the_same_points(
+    case: Case, read_by: tuple[str, str], reader: Callable[[Case], Array]
+) -> None:
+    assert off_px(case, read_by[0], reader) < 1e-6
+
+
+def test_every_format_has_a_reader_and_a_wrong_pose_is_seen(case: Case) -> None:
+    read = {name for name, _ in READERS}
+    assert set(EXPORTS) - read == {"ply_captures"}  # written as ply is
+    wrong = perturb(case.calibration.T_cam_lidar, np.array([1e-6, 0, 0, 0, 0, 1e-6]))
+    moved = Case(
+        case.folder,
+        case.rig,
+        type(case.calibration)(**(vars(case.calibration) | {"T_cam_lidar": wrong})),
+        case.points_lidar,
+        case.lens,
+    )
+    key = ("extrinsics", "PyYAML, scipy")
+    assert off_px(moved, key[0], READERS[key]) > 1e-6
+
+
+def test_all_files_are_known_as_exports_and_nothing_else_is_removed(case: Case, tmp_path: Path) -> None:
+    import shutil
+
+    folder = tmp_path / "out"
+    shutil.copytree(case.folder, folder)
+    assert all(is_export(path) for path in folder.iterdir())
+    (folder / "mine").mkdir()
+    (folder / "mine/metadata.yaml").write_text("rosbag2_bagfile_information: {}\n", encoding="utf-8")
+    (folder / "scan.ply").write_bytes(b"ply\nformat ascii 1.0\n")
+    remove_exports(folder)
+    assert sorted(path.name for path in folder.iterdir()) == ["mine", "scan.ply"]
+
+
+def test_the_profile_names_the_formats_that_are_written() -> None:
+    assert set(OutputFormat.__args__) == set(EXPORTS)  # type: ignore[attr-defined]
+    rig = load_rig("rlfs")
+    assert usual_formats(rig)[0] == "extrinsics" and "mcap" not in usual_formats(rig)
+    assert usual_formats(rig.model_copy(update={"exports": ("ply", "urdf")})) == ("ply", "urdf")
