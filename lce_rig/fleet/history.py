@@ -160,7 +160,8 @@ def history_of(table: Any) -> History:
         table: `pyarrow.Table` with at least `COLUMNS`.
     """
     known, n_failed = _usable(table)
-    order = known[_order(table.select(_KEYS).take(pa.array(known)))]
+    keys = table.select(_KEYS)
+    order = known[_order(keys if len(known) == len(table) else keys.take(pa.array(known)))]
     in_order = table.select(_KEYS).take(pa.array(order))
     starts = _starts(in_order)
     limits = Limits.of(np.diff(starts))
