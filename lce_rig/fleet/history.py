@@ -18,6 +18,7 @@ from lce_rig.fleet.changes import (
     References,
     Sessions,
     find_changes,
+    pooled,
     references,
     rescaled,
     scale_of,
@@ -306,9 +307,10 @@ class _Reader:
         instants = pc.strptime(part["date"], format="%Y-%m-%dT%H:%M:%SZ", unit="s", error_is_null=True)
         seconds = pc.fill_null(pc.cast(instants, pa.int64()), 0).to_numpy()
         days = seconds / 86400.0
-        return Sessions(
+        sessions = Sessions(
             starts, tangents, cov - shared, shared, _codes(part["profile_sha256"]), days - days.min()
-        ), T_first
+        )
+        return pooled(sessions), T_first
 
 
 def _zero_where_null(column: Any) -> Any:
