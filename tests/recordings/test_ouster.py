@@ -1,7 +1,7 @@
 """Packets of Ousters become the points that Ouster's own library computes, and scans of one frame each.
 
-`ouster_packets.npz` holds one packet of each profile with random returns, written by ouster-sdk 1.0.1 from the
-metadata in it, and the points (16, 16, 3) that its XYZLut gives.
+`ouster_packets.npz` holds one packet of each profile with random returns, written by ouster-sdk 1.0.1 from
+the metadata in it, and the points (16, 16, 3) that its XYZLut gives.
 """
 
 import json
@@ -113,9 +113,7 @@ def test_what_is_missing_or_not_read_is_named(tmp_path: Path, rig: Rig) -> None:
     with pytest.raises(SourceError, match="no whole revolution"):
         list(OusterRecording(path, rig, SourceOptions()).samples())
     write_metadata(tmp_path / "drive.json", "RNG15_RFL8_NIR8")
-    with pytest.raises(
-        SourceError, match="no packets of 1280 bytes.*there are 3 of 3392"
-    ):
+    with pytest.raises(SourceError, match="no packets of 1280 bytes.*there are 3 of 3392"):
         open_recording(path, rig)
     with pytest.raises(SourceError, match="packets of profile FUSA"):
         write_metadata(tmp_path / "drive.json", "FUSA_RNG15_RFL8_NIR8_DUAL")
