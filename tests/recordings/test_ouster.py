@@ -113,7 +113,7 @@ def test_what_is_missing_or_not_read_is_named(tmp_path: Path, rig: Rig) -> None:
     with pytest.raises(SourceError, match="no whole revolution"):
         list(OusterRecording(path, rig, SourceOptions()).samples())
     write_metadata(tmp_path / "drive.json", "RNG15_RFL8_NIR8")
-    with pytest.raises(SourceError, match="no packets of 1280 bytes.*there are 3 of 3392"):
+    with pytest.raises(SourceError, match=r"no packets of 1280 bytes.*there are 3 of 3392"):
         open_recording(path, rig)
     with pytest.raises(SourceError, match="packets of profile FUSA"):
         write_metadata(tmp_path / "drive.json", "FUSA_RNG15_RFL8_NIR8_DUAL")
