@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lce_rig.cli import show
+from lce_rig.cli.fleet_lidar import lidar
 from lce_rig.cli.fleet_report import report
 from lce_rig.cli.options import FiniteRange, json_option, registry_option, split_names
 
@@ -41,6 +42,7 @@ def fleet() -> None:
 
 
 fleet.add_command(report)
+fleet.add_command(lidar)
 
 
 @fleet.command()
@@ -82,6 +84,13 @@ fleet.add_command(report)
     show_default=True,
     help="Estimate as `lce-rig calibrate` does with this method.",
 )
+@click.option(
+    "--pictures",
+    type=click.Choice(["all", "sheets", "none"]),
+    default="sheets",
+    show_default=True,
+    help="Keep the overlays of all captures, their contact sheets only, or draw none.",
+)
 @click.option("--retry", is_flag=True, help="Run sessions without a result again.")
 @json_option
 def run(
@@ -93,6 +102,7 @@ def run(
     time_limit: float,
     memory_limit: float,
     method: Any,
+    pictures: Any,
     retry: bool,
     as_json: bool,
 ) -> None:
@@ -111,7 +121,7 @@ def run(
 
     place = Storage.at(registry)
     jobs = find_jobs(Storage.at(root), None if manifest is None else Storage.at(manifest))
-    settings = Settings(place.url, method, time_limit, memory_limit, retry)
+    settings = Settings(place.url, method, time_limit, memory_limit, retry, pictures)
     n_workers = workers or len(os.sched_getaffinity(0))
     show.note(f"{show.counted(len(jobs), 'session')} in {root}")
     with patience(_GRACE_S), cluster(n_workers, memory_limit, scheduler) as client:

@@ -6,10 +6,11 @@ from tempfile import NamedTemporaryFile
 from typing import Any
 
 import duckdb
+import pyarrow as pa
 
 from lce_rig.core.errors import SessionError, UsageError
 from lce_rig.fleet.registry import Registry
-from lce_rig.fleet.table import SCHEMA, TABLE, read_table
+from lce_rig.fleet.table import SCHEMA, TABLE, column_names, read_table
 
 _MEMORY = "1GB"
 
@@ -45,22 +46,19 @@ def _select(path: Path, where: str, columns: Sequence[str] | None) -> Any:
     names = list(columns or SCHEMA.names)
     if not where.strip():
         return read_table(path, names)
-    read_table(path, ["robot"])  # says what is wrong with the file, if anything is
+    known = set(column_names(path))
+    held = [name for name in names if name in known]
     settings: dict[str, str | bool | int | float | list[str]] = {"memory_limit": _MEMORY, "threads": 2}
     with duckdb.connect(config=settings) as connection:
         try:
             # `filter` takes one condition and nothing else; rows keep the order of the file.
             chosen = connection.read_parquet(str(path)).filter(where)
-            held = [name for name in names if name in chosen.columns]
             found = chosen.project(", ".join(held)).to_arrow_table()
         except duckdb.Error as error:
             first = str(error).splitlines()[0]
             raise UsageError(f"--where {where!r}: {first}", _columns()) from error
-    for name in names:
-        if name not in held:
-            import pyarrow as pa
-
-            found = found.append_column(name, pa.nulls(len(found), SCHEMA.field(name).type))
+    for name in set(names) - known:
+        found = found.append_column(name, pa.nulls(len(found), SCHEMA.field(name).type))
     return found.select(names)
 
 

@@ -5,7 +5,8 @@ The table is an index. The folders of the registry hold the results, and each it
 
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -179,6 +180,8 @@ def result_columns(calibration: Calibration, rig: Rig, serials: Mapping[str, str
         "mpe_m": _known(c.metrics.mpe_m),
         "mee_m": _known(c.metrics.mee_m),
         "reprojection_px": _known(c.metrics.reprojection_px),
+        "lens_error": c.lens_error or None,
+        "lens_error_sigma": c.lens_error_sigma or None,
         "time_offset_s": float(np.mean(offsets)) if offsets else None,
         "camera_scale": _known(c.diagnostics.camera_scale),
         "scene": None if c.scene is None else c.scene.state,
@@ -245,6 +248,31 @@ def write_table(path: Path, table: Any) -> None:
     write_atomically(path, table_bytes(table))
 
 
+def column_names(source: Path | io.BytesIO) -> list[str]:
+    """List the columns that a table holds.
+
+    Raises:
+        SessionError: there is no such file, or it is not such a table.
+    """
+    with _reading(source):
+        names: list[str] = pq.read_schema(source).names
+    if "robot" not in names:
+        raise SessionError(f"{source} is not a table of results: it has no column robot")
+    return names
+
+
+@contextmanager
+def _reading(source: Path | io.BytesIO) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError:
+        raise SessionError(f"{source}: there is no such table", "`lce-rig fleet run` writes it.") from None
+    except (OSError, pa.ArrowException) as error:
+        raise SessionError(
+            f"{source} cannot be read as a table: {error}", "`lce-rig fleet table --rebuild` writes it again."
+        ) from error
+
+
 def read_table(source: Path | io.BytesIO, columns: Sequence[str] | None = None) -> Any:
     """Read a table as a `pyarrow.Table`; columns that an earlier version did not write are null.
 
@@ -255,20 +283,11 @@ def read_table(source: Path | io.BytesIO, columns: Sequence[str] | None = None) 
     Raises:
         SessionError: there is no such file, or it is not such a table.
     """
+    held = set(column_names(source))
     names = list(SCHEMA.names if columns is None else columns)
-    try:
-        with pq.ParquetFile(source) as file:
-            held = set(file.schema_arrow.names)
-            table = file.read(columns=[name for name in names if name in held])
-        if "robot" not in held:
-            raise SessionError(f"{source} is not a table of results: it has no column robot")
+    with _reading(source), pq.ParquetFile(source) as file:
+        table = file.read(columns=[name for name in names if name in held])
         for name in names:
             if name not in held:
                 table = table.append_column(SCHEMA.field(name), pa.nulls(len(table), SCHEMA.field(name).type))
         return table.select(names).cast(pa.schema([SCHEMA.field(name) for name in names]))
-    except FileNotFoundError:
-        raise SessionError(f"{source}: there is no such table", "`lce-rig fleet run` writes it.") from None
-    except (OSError, pa.ArrowException) as error:
-        raise SessionError(
-            f"{source} cannot be read as a table: {error}", "`lce-rig fleet table --rebuild` writes it again."
-        ) from error

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import lce_rig as lce
 from lce_rig.core.errors import (
@@ -57,6 +57,7 @@ _CODES: tuple[tuple[type[LceRigError], str], ...] = (
     (UsageError, "fleet.usage"),
 )
 _HASH_DIGITS = 12
+Pictures = Literal["all", "sheets", "none"]
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ class Settings:
         time_limit_s: that a session may take.
         memory_limit_mb: that its process may hold.
         retry: whether sessions without a result are run again.
+        pictures: whether overlays of all captures are kept, contact sheets of them only, or nothing is drawn.
     """
 
     registry: str
@@ -76,6 +78,7 @@ class Settings:
     time_limit_s: float = 600.0
     memory_limit_mb: float = 4000.0
     retry: bool = False
+    pictures: Pictures = "sheets"
 
     def opened(self) -> Registry:
         """The registry."""
@@ -263,7 +266,11 @@ def _calibrate(
 
     def fill(folder: Path) -> None:
         result.write(folder)
-        verification.write(folder / OVERLAYS)
+        if settings.pictures != "none":
+            checks = verification.write(folder / OVERLAYS)
+            for path in (path for check in checks for path in check.pictures):
+                if settings.pictures == "sheets":
+                    path.unlink()
 
     return publish(registry, rows, start_s, fill)
 
