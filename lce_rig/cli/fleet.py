@@ -10,6 +10,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.fleet_deploy import deploy
+from lce_rig.cli.fleet_lidar import lidar
 from lce_rig.cli.fleet_report import report
 from lce_rig.cli.options import FiniteRange, json_option, registry_option, split_names
 
@@ -43,6 +44,7 @@ def fleet() -> None:
 
 fleet.add_command(report)
 fleet.add_command(deploy)
+fleet.add_command(lidar)
 
 
 @fleet.command()

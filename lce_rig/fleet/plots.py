@@ -14,6 +14,9 @@ from lce_rig.report.drawing import BLUE, FAINT, ORANGE, QUIET, RED, WIDTH_IN, dr
 from lce_rig.scene.alignment import AXES, IS_ROTATION
 from lce_rig.words.extrinsics import motion_words
 
+MATRICES = ("T_cam_lidar", "cov", "cov_shared")
+"""Columns of the table that drawings in time require."""
+
 _HEIGHT_IN = 2.9
 _MOST_SESSIONS = 400
 
@@ -31,7 +34,7 @@ def in_time(history: History, table: Any, change: Change) -> Markup:
     # Long series: the sessions about the change.
     at = int(first) + change.found.session
     shown = np.arange(max(int(first), at - _MOST_SESSIONS // 2), min(int(last), at + _MOST_SESSIONS // 2))
-    rows = table.select(["T_cam_lidar", "cov", "cov_shared"]).take(pa.array(history.rows[shown]))
+    rows = table.select(MATRICES).take(pa.array(history.rows[shown]))
     T, cov = poses(rows["T_cam_lidar"]), covariances(rows["cov"])
     if not rows["cov_shared"].null_count:
         cov = cov - covariances(rows["cov_shared"])

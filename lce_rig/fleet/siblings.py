@@ -10,7 +10,7 @@ that any of an ordinary fleet exceeds with a probability of 5 %.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,11 +18,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Figure, Finding, ranked
 from lce_rig.core.geometry import Array, difference
 from lce_rig.fleet.history import COLUMNS, History, finding_of, history_of
-from lce_rig.fleet.table import Row, as_table, covariances, poses
+from lce_rig.fleet.query import query
+from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.table import Row, as_table, covariances, poses, result_columns
+from lce_rig.pipeline.result_files import Result
 from lce_rig.scene.alignment import AXES, IS_ROTATION
+from lce_rig.session.session import PROFILE
 
 FEWEST_SIBLINGS = 5
 _FALSE_OUTLIERS = 0.05
@@ -144,6 +148,33 @@ def deviations(apart: Array, sigma: Array) -> Array:
     spread = _OF_NORMAL * np.median(np.abs(off), axis=0)
     excess = np.maximum(sigma**2 - np.median(sigma**2, axis=0), 0.0)
     return np.asarray(off / np.sqrt(np.maximum(spread**2 + excess, 1e-18)))
+
+
+def with_registry(result: Result, registry: Registry) -> Result:
+    """Add notes on how a result compares with those of a registry; the verdict does not change.
+
+    Args:
+        result: of one session.
+        registry: with a table.
+
+    Raises:
+        SessionError: there is no table, or it cannot be read.
+    """
+    told, rig = result.provenance, result.session.rig
+    name = rig.name.replace("'", "''")
+    table = query(registry, f"rig = '{name}'", tuple(dict.fromkeys((*COLUMNS, *MOUNTING_COLUMNS))))
+    base = Row(
+        told.robot or rig.name,
+        rig=rig.name,
+        date=told.date or None,
+        session_sha256=told.session_sha256,
+        profile_sha256=result.document()["inputs_sha256"][PROFILE],
+    )
+    pairs = []
+    for pair in result.pairs:
+        notes = compare(replace(base, **result_columns(pair, rig, told.serials)), table)
+        pairs.append(replace(pair, findings=ranked([*pair.findings, *notes])))
+    return replace(result, pairs=tuple(pairs))
 
 
 def compare(row: Row, table: Any) -> list[Finding]:

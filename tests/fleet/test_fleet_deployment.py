@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from lce_rig.cli.main import run
 from lce_rig.core.errors import UsageError
 from lce_rig.export.result import layout, to_json_dict
 from lce_rig.fleet.deployment import FleetDeployment, Rollout, newest_results, read_rollout
@@ -183,3 +184,30 @@ def test_an_unknown_canary_or_target_is_refused(registry: Registry, targets: Pat
         deploy(registry, targets, ("r9",))
     rollout = FleetDeployment(registry, "base", targets).run(newest_results(registry), ("r1",))
     assert rollout.robots["r1"].state == "refused" and held(targets, "r1") is None
+
+
+@pytest.mark.usefixtures("whole")
+def test_the_verb_plans_deploys_shows_and_rolls_back(
+    targets: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def call(*options: str) -> tuple[int, str]:
+        place = ["--registry", str(targets.parent / "registry"), "--targets", str(targets)]
+        capsys.readouterr()
+        code = run(["fleet", "deploy", *place, "--target", "nav", *options])
+        return code, capsys.readouterr().out
+
+    code, planned = call("--dry-run", "--canary", "2")
+    assert code == 0 and planned.count("canary") == 2 and held(targets, "r1") is None
+    (targets.parent / "robots" / "r2" / "broken").touch()
+    assert call("--canary", "2")[0] == 7
+    assert held(targets, "r2") is not None and held(targets, "r3") is None
+    (targets.parent / "robots" / "r2" / "broken").unlink()
+    output = targets.parent / "page.html"
+    code, said = call("--canary", "r2,r5", "--json", "-o", str(output))
+    found = {name: each["state"] for name, each in json.loads(said)["robots"].items()}
+    assert code == 0 and found == dict.fromkeys(ROBOTS, "in_place")
+    assert "r5 (canary)" in output.read_text()
+    code, shown = call("--status")
+    assert code == 0 and all(robot in shown for robot in ROBOTS)
+    assert call("--rollback", "--reason", "test")[0] == 0
+    assert call("--status", "--rollback")[0] == 2
